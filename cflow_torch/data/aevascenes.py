@@ -6,21 +6,19 @@ import io
 import math
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any, Callable, Sequence
 
 import numpy as np
 from numpy.lib import format as npy
 
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
+from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, make_boxes
 from cflow_torch.data.files import file_errors, shortened
 from cflow_torch.data.json_file import read_json
-from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import path_inside
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.data.pickles import load_array
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
-from cflow_torch.windows.ego_motion import relative_transform
 
 _HINT = "copy the sequence from the data set again"
 
@@ -50,7 +48,7 @@ CATEGORY_NAME.update(dict.fromkeys(GROUND, "NONE"))
 _PATHS = {"compensated": ("point_cloud_compensated_path", "point_cloud_path"), "raw": ("point_cloud_raw_path",)}
 
 
-class AevaScenesLog(Log):
+class AevaScenesLog(BoxLog):
     """One sequence in the layout of version 0.1, 0.2 or 2. Experimental: tested on simulated sequences only.
 
     Args:
@@ -60,22 +58,15 @@ class AevaScenesLog(Log):
         ground: make ground masks from the stored class names, where every cloud of a sweep has them.
 
     Attributes:
-        log_id: name of the folder.
-        timestamps: frame times in nanoseconds, ascending.
         lidars: names of the LiDARs that are merged.
 
     Convention:
-        - Points are float32 in the vehicle frame (x forward, y left, z up, origin at the rear axle), one LiDAR after
-          the other, transformed in float64 by `vehicle_to_lidar_extrinsics`, which despite its name is
-          `T_vehicle_lidar`.
-        - `T_world_ego` is `ego_pose`, world = vehicle at the first frame.
+        - Points are in the vehicle frame (x forward, y left, z up, origin at the rear axle), one LiDAR after the other,
+          transformed in float64 by `vehicle_to_lidar_extrinsics`, which despite its name is `T_vehicle_lidar`.
+        - `T_world_ego` is `ego_pose`; the world is the vehicle at the first frame.
         - Truth comes from box tracks. Boxes of background classes (mostly poles) are not used.
         - Class names are stored as pickled strings, which are decoded without executing anything.
           `semantic_labels_idx` is not used, because its table is not published.
-
-    Raises:
-        CFlowError: no such folder or setting; `sequence.json` is missing, not JSON, or incomplete; fewer than two
-            frames.
     """
 
     def __init__(
@@ -108,15 +99,12 @@ class AevaScenesLog(Log):
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`; `is_ground` is None if one of its clouds has no class names."""
-        points, is_ground = self._points(index), None
-        names = [cloud.names("semantic_labels") for cloud in self._clouds_of(index)] if self._ground else [None]
-        if None not in names:
-            is_ground = np.array([name in GROUND for of_cloud in names for name in of_cloud or ()], dtype=bool)
-            if len(is_ground) != len(points):
-                file = self._clouds_of(index)[0].file
-                raise CFlowError(f"{file} and the other LiDARs: {len(points)} points but {len(is_ground)} class names")
-        return Sweep(points, is_ground, self._poses[index].copy(), self.timestamps[index], self._point_times(index))
+        """Read sweep `index`; a ground mask or times that one of its clouds lacks are None."""
+        names = self._column(index, "semantic_labels", np.str_) if self._ground else None
+        times = self._column(index, "time_offset_ns", np.integer)
+        is_ground = None if names is None else np.isin(names, GROUND)
+        seconds = None if times is None else times * 1e-9
+        return Sweep(self._points(index), is_ground, self._poses[index].copy(), self.timestamps[index], seconds)
 
     def radial_velocity(self, index: int) -> np.ndarray:
         """Read the (N,) float32 radial velocities of sweep `index`, m/s, positive = moving away from the LiDAR.
@@ -127,28 +115,16 @@ class AevaScenesLog(Log):
         Raises:
             CFlowError: no such sweep, or a cloud is missing or cannot be read.
         """
-        return np.concatenate([cloud.numbers("velocity", 1)[:, 0] for cloud in self._clouds_of(index)])
-
-    def labels(self, index: int) -> FlowLabels | None:
-        """Read the truth of the pair (index, index + 1) from box tracks; None for the last sweep and without boxes."""
-        self._timestamp(index)
-        if index == len(self) - 1 or not self._has_boxes:
-            return None
-        T_ego1_ego0 = relative_transform(self._poses[index + 1], self._poses[index])
-        return flow_from_boxes(self._points(index), self._boxes(index), self._boxes(index + 1), T_ego1_ego0)
+        return np.concatenate([cloud.column("velocity", np.floating) for cloud in self._clouds_of(index)])
 
     def _points(self, index: int) -> np.ndarray:
-        """Read the (N, 3) float32 points in the vehicle frame."""
         pairs = zip(self._clouds_of(index), self._mounts)
-        clouds = [transform_points(cloud.numbers("xyz", 3), mount) for cloud, mount in pairs]
-        return np.concatenate(clouds).astype(np.float32)
+        return np.concatenate([transform_points(cloud.points, mount) for cloud, mount in pairs]).astype(np.float32)
 
-    def _point_times(self, index: int) -> np.ndarray | None:
-        """Read the (N,) float64 seconds after the time stamp; None if a cloud has no times."""
+    def _column(self, index: int, key: str, kind: Any) -> np.ndarray | None:
+        """Read one value per point of a sweep, (N,); None if one of its clouds has no such array."""
         clouds = self._clouds_of(index)
-        times = [cloud.seconds("time_offset_ns", len(cloud.numbers("xyz", 3))) for cloud in clouds]
-        known = [of_cloud for of_cloud in times if of_cloud is not None]
-        return np.concatenate(known) if len(known) == len(times) else None
+        return np.concatenate([c.column(key, kind) for c in clouds]) if all(key in c.keys for c in clouds) else None
 
     def _open_clouds(self, index: int) -> list[Cloud]:
         where, clouds = f"{self._file}, frame {self._timestamp(index)}", []
@@ -162,7 +138,9 @@ class AevaScenesLog(Log):
             clouds.append(Cloud(path_inside(self.folder, paths[0], f"{where}, {name}: the path")))
         return clouds
 
-    def _boxes(self, index: int) -> Boxes:
+    def _boxes(self, index: int) -> Boxes | None:
+        if not self._has_boxes:
+            return None
         where = f"{self._file}, frame {self.timestamps[index]}"
         with file_errors(where, _HINT):
             boxes = self._frames[index].get("boxes") or []
@@ -183,47 +161,40 @@ class AevaScenesLog(Log):
 
 
 class Cloud:
-    """One .npz file in memory; arrays are unpacked when you ask for them.
+    """One .npz file in memory. A file or an array that is missing or damaged is a `CFlowError`.
 
-    A missing or damaged file, or an array of another type or shape, is a `CFlowError`.
+    Attributes:
+        keys: names of its arrays.
+        points: (N, 3) float32, metres, frame of the LiDAR.
     """
 
     def __init__(self, file: Path) -> None:
         self.file = file
         with file_errors(file, _HINT):
             self._arrays = np.load(io.BytesIO(read_bytes(file)), allow_pickle=False)
-            self._keys = list(self._arrays.files)
+            self.keys: list[str] = list(self._arrays.files)
+        self.points = self._array("xyz", np.floating, lambda shape: len(shape) == 2 and shape[1] == 3)
 
-    def numbers(self, key: str, columns: int) -> np.ndarray:
-        """Return an array as (N, columns) float32."""
-        if key not in self._keys:
-            raise CFlowError(f"{self.file} has no array {key}; it has {self._keys[:20]}")
-        array = self._array(key, np.floating, lambda a: a.size % columns == 0 and a.shape[1:] in ((), (columns,)))
-        return array.reshape(-1, columns).astype(np.float32, copy=False)
+    def column(self, key: str, kind: Any) -> np.ndarray:
+        """Return one value per point, (N,): float32 if `kind` is `np.floating`, `np.str_` for texts, else integers."""
+        rows = len(self.points)
+        return self._array(key, kind, lambda shape: shape in ((rows,), (rows, 1))).reshape(rows)
 
-    def seconds(self, key: str, rows: int) -> np.ndarray | None:
-        """Return an array of integer nanoseconds as (rows,) float64 seconds; None if there is no such array."""
-        if key not in self._keys:
-            return None
-        return self._array(key, np.integer, lambda a: a.shape in ((rows,), (rows, 1))).reshape(rows) * 1e-9
-
-    def _array(self, key: str, kind: type, is_shape: Any) -> np.ndarray:
+    def _array(self, key: str, kind: Any, is_shape: Callable[[tuple[int, ...]], bool]) -> np.ndarray:
+        if key not in self.keys:
+            raise CFlowError(f"{self.file} has no array {key}; it has {self.keys[:20]}")
         with file_errors(f"{self.file}: {key}", _HINT):
-            array: np.ndarray = self._arrays[key]
-            if not np.issubdtype(array.dtype, kind) or not is_shape(array):
+            array = self._texts(key) if kind is np.str_ else self._arrays[key]
+            if not is_shape(array.shape) or not (kind is np.str_ or np.issubdtype(array.dtype, kind)):
                 raise CFlowError(f"{self.file}: {key} has shape {array.shape} and dtype {array.dtype}; {_HINT}")
-            return array
+            return array.astype(np.float32, copy=False) if kind is np.floating else array
 
-    def names(self, key: str) -> list[str] | None:
-        """Return the texts of an array of any shape, executing nothing; None if there is no such array."""
-        if key not in self._keys:
-            return None
-        with file_errors(f"{self.file}: {key}", _HINT):
-            with self._arrays.zip.open(f"{key}.npy") as member:
-                npy.read_magic(member)
-                shape, _, dtype = npy.read_array_header_1_0(member)
-                stored = load_array(member) if dtype.hasobject else self._arrays[key]
-            texts: list[str] = stored.ravel().tolist()
-            if {type(text) for text in texts} - {str} or len(texts) != math.prod(shape):
-                raise ValueError(f"it must hold {math.prod(shape)} strings")
-            return texts
+    def _texts(self, key: str) -> np.ndarray:
+        """Return an array of strings, also of pickled ones, which are decoded without executing anything."""
+        with self._arrays.zip.open(f"{key}.npy") as member:
+            npy.read_magic(member)
+            shape, _, dtype = npy.read_array_header_1_0(member)
+            array: np.ndarray = load_array(member) if dtype.hasobject else self._arrays[key]
+        if {type(text) for text in array.ravel().tolist()} - {str} or array.size != math.prod(shape):
+            raise ValueError(f"it must hold {math.prod(shape)} strings")
+        return array

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import Sequence
 
@@ -9,11 +10,11 @@ import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import read_columns
 from cflow_torch.data.arrow_file import FeatherFile
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes
+from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, make_boxes
 from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.ground import GROUND_RULES, read_ground_raster
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.names import is_timestamp
 from cflow_torch.data.paths import PathLike, as_path, remote_errors
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
@@ -26,7 +27,7 @@ _SIZE = ("length_m", "width_m", "height_m")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
-class AV2Log(Log):
+class AV2Log(BoxLog):
     """One Argoverse 2 sensor log.
 
     Args:
@@ -34,16 +35,11 @@ class AV2Log(Log):
         ground: rule for the map's ground raster, "av2-api" or "bsfe" (`cflow_torch.data.ground`); None = no ground
             masks. A log whose map has no raster has no ground masks either.
 
-    Attributes:
-        log_id: name of the folder.
-        timestamps: sweep times in nanoseconds, ascending.
-
-    Convention: points are float32 in the ego frame of their sweep (stored as float16); poses are float64
-    `T_world_ego`, world = city. Poses are read and checked when the log is opened, sweeps when you ask for them.
-
-    Raises:
-        CFlowError: no such folder, fewer than two sweeps, a file that cannot be read, columns that are missing or have
-            the wrong type, poses that are not rigid motions or do not cover a sweep.
+    Convention:
+        - Points are in the ego frame of their sweep (stored as float16). The world is the city.
+        - Truth comes from the first of these sources that the log has: `flow_labels/<ns of sweep t>.feather` (if that
+          folder exists, a pair without a file has no truth); `flow_labels.feather`, for the first pair;
+          `annotations.feather`, for pairs inside the annotated time. As in av2-api, a box without points is absent.
     """
 
     def __init__(self, folder: PathLike, ground: str | None = "av2-api") -> None:
@@ -68,7 +64,7 @@ class AV2Log(Log):
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`, with a ground mask if the log has a raster."""
         timestamp = self._timestamp(index)
-        stored, pose, is_ground = FeatherFile(self._files[timestamp]), self._poses[timestamp], None
+        stored, pose, is_ground = FeatherFile(self._files[timestamp]), self._poses[index], None
         points = stored.floats("xyz", np.float32)
         times = None  # logs of other writers may lack them
         if "offset_ns" in stored.names:
@@ -77,56 +73,38 @@ class AV2Log(Log):
             is_ground = self._raster.is_ground(transform_points(points, pose), self._rule)
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
 
-    def labels(self, index: int) -> FlowLabels | None:
-        """Read the truth of the pair (index, index + 1) from the first of these sources that the log has.
-
-        - `flow_labels/<ns of sweep t>.feather`: if that folder exists, a pair without a file has no truth.
-        - `flow_labels.feather`, for the first pair.
-        - `annotations.feather`, for pairs inside the annotated time. As in av2-api, a box without points
-          counts as absent.
-
-        None where the log has no truth, as for its last sweep.
-        """
-        timestamp = self._timestamp(index)
-        if index == len(self) - 1:
-            return None
+    def _labels(self, index: int) -> FlowLabels | None:
         folder, first_pair = self.folder / "flow_labels", self.folder / "flow_labels.feather"
-        annotations = self.folder / "annotations.feather"
         with remote_errors(self.folder):
             if folder.is_dir():
-                file = folder / f"{timestamp}.feather"
-                return self._stored_labels(file, timestamp) if file.exists() else None
+                file = folder / f"{self.timestamps[index]}.feather"
+                return self._stored_labels(file, index) if file.exists() else None
             if index == 0 and first_pair.exists():
-                return self._stored_labels(first_pair, timestamp)
-            if annotations.exists():
-                return self._labels_from_annotations(annotations, timestamp, self.timestamps[index + 1])
-        return None
+                return self._stored_labels(first_pair, index)
+        return super()._labels(index)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read intensity, laser_number, offset_ns and any other number of the points of sweep `index`."""
         return read_columns(self._files[self._timestamp(index)])
 
-    def _points(self, timestamp: int) -> np.ndarray:
-        """(N, 3) float32."""
-        return FeatherFile(self._files[timestamp]).floats("xyz", np.float32)
+    def _points(self, index: int) -> np.ndarray:
+        return FeatherFile(self._files[self.timestamps[index]]).floats("xyz", np.float32)
 
-    def _read_poses(self) -> dict[int, np.ndarray]:
-        """Sweep time -> (4, 4) float64 T_world_ego."""
+    def _read_poses(self) -> np.ndarray:
         file = self.folder / "city_SE3_egovehicle.feather"
         stored = FeatherFile(file)
         row_of = {time: row for row, time in enumerate(stored.integers("timestamp_ns").tolist())}
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
             raise CFlowError(f"{file} has no pose at exactly the time of sweep {missing[0]} ({len(missing)} missing)")
-        rows = np.array([row_of[time] for time in self.timestamps])
-        return dict(zip(self.timestamps, _poses(stored, rows, self.timestamps)))
+        return _poses(stored, np.array([row_of[time] for time in self.timestamps]), self.timestamps)
 
-    def _stored_labels(self, file: Path, timestamp: int) -> FlowLabels:
+    def _stored_labels(self, file: Path, index: int) -> FlowLabels:
         stored = FeatherFile(file)
         flow, category = stored.floats(_FLOW, np.float32), stored.integers("classes")
-        rows = len(self._points(timestamp))
+        rows = len(self._points(index))
         if stored.num_rows != rows:
-            raise CFlowError(f"{file} has {stored.num_rows} rows but sweep {timestamp} has {rows} points")
+            raise CFlowError(f"{file} has {stored.num_rows} rows but sweep {self.timestamps[index]} has {rows} points")
         if category.size and not 0 <= category.min() <= category.max() < len(CATEGORIES):
             raise CFlowError(
                 f"{file}: classes are 0 ... {len(CATEGORIES) - 1}, got {category.min()} ... {category.max()}"
@@ -134,17 +112,26 @@ class AV2Log(Log):
         is_valid = stored.bools("is_valid") if "is_valid" in stored.names else np.ones(rows, dtype=bool)
         return FlowLabels(flow, category.astype(np.uint8), is_valid)
 
-    def _labels_from_annotations(self, file: Path, timestamp0: int, timestamp1: int) -> FlowLabels | None:
-        stored = FeatherFile(file)
-        times = stored.integers("timestamp_ns")
-        if not times.size or timestamp0 < times.min() or timestamp1 > times.max():
+    @cached_property
+    def _annotations(self) -> FeatherFile | None:
+        file = self.folder / "annotations.feather"
+        with remote_errors(self.folder):
+            return FeatherFile(file) if file.exists() else None
+
+    def _boxes(self, index: int) -> Boxes | None:
+        """Read the boxes of a sweep, in the order of the file; None outside the annotated time."""
+        stored, time = self._annotations, self.timestamps[index]
+        times = np.zeros(0) if stored is None else stored.integers("timestamp_ns")
+        if stored is None or not times.size or not times.min() <= time <= times.max():
             return None
-        is_used: np.ndarray = np.ones(len(times), dtype=bool)
+        is_used = times == time
         if "num_interior_pts" in stored.names:
-            is_used = stored.integers("num_interior_pts") >= MIN_INTERIOR_POINTS
-        boxes0, boxes1 = (_boxes(stored, np.flatnonzero(is_used & (times == t))) for t in (timestamp0, timestamp1))
-        T_ego1_ego0 = np.linalg.inv(self._poses[timestamp1]) @ self._poses[timestamp0]
-        return flow_from_boxes(self._points(timestamp0), boxes0, boxes1, T_ego1_ego0)
+            is_used &= stored.integers("num_interior_pts") >= MIN_INTERIOR_POINTS
+        rows = np.flatnonzero(is_used)
+        tracks, names = (stored.texts(column)[rows].tolist() for column in ("track_uuid", "category"))
+        with file_errors(stored.file):
+            category = category_indices(names, {name: name for name in CATEGORIES[1:]})
+            return make_boxes(tracks, category, stored.floats(_SIZE)[rows], _poses(stored, rows, tracks))
 
 
 def _is_log(folder: Path) -> bool:
@@ -155,11 +142,3 @@ def _poses(stored: FeatherFile, rows: np.ndarray, names: Sequence[int | str]) ->
     """Return the (K, 4, 4) float64 poses of K rows."""
     values = stored.floats(_POSE)[rows]
     return poses_from_quaternions(values[:, 4:], values[:, :4], lambda row: f"{stored.file}: the pose of {names[row]}")
-
-
-def _boxes(stored: FeatherFile, rows: np.ndarray) -> Boxes:
-    """Return the boxes of some rows, in the order of the file."""
-    tracks, names = (stored.texts(column)[rows].tolist() for column in ("track_uuid", "category"))
-    with file_errors(stored.file):
-        category = category_indices(names, {name: name for name in CATEGORIES[1:]})
-        return make_boxes(tracks, category, stored.floats(_SIZE)[rows], _poses(stored, rows, tracks))

@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.files import shortened
-from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError
 
@@ -88,6 +88,35 @@ def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.
     """
     local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
     return (np.abs(local) <= np.asarray(size) / 2).all(axis=1)
+
+
+class BoxLog(Log):
+    """Base class of logs whose truth comes from tracked boxes.
+
+    Attributes:
+        _poses: (K, 4, 4) float64 `T_world_ego`.
+    """
+
+    _poses: np.ndarray
+
+    def _points(self, index: int) -> np.ndarray:
+        """Read the (N, 3) float32 points of a sweep, in its ego frame."""
+        raise NotImplementedError
+
+    def _boxes(self, index: int) -> Boxes | None:
+        """Read the boxes of a sweep; None = it is not annotated."""
+        raise NotImplementedError
+
+    def _motion(self, index: int) -> np.ndarray:
+        """Return the (4, 4) float64 `T_ego1_ego0` of a pair."""
+        T_ego1_ego0: np.ndarray = np.linalg.inv(self._poses[index + 1]) @ self._poses[index]
+        return T_ego1_ego0
+
+    def _labels(self, index: int) -> FlowLabels | None:
+        boxes0, boxes1 = self._boxes(index), self._boxes(index + 1)
+        if boxes0 is None or boxes1 is None:
+            return None
+        return flow_from_boxes(self._points(index), boxes0, boxes1, self._motion(index))
 
 
 def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego0: np.ndarray) -> FlowLabels:

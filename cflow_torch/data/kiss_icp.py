@@ -30,10 +30,7 @@ class KissICPLog(Log):
         timestamps: 0, 1, 2, ..., because the loaders have no common way to return times; 0.1 s per sweep is assumed.
 
     Convention: points and poses are those of the loader, in the frame of the LiDAR; poses are the data set's own
-    (`gt_poses`), None if it has none. `is_ground` and times of points are None.
-
-    Raises:
-        CFlowError: KISS-ICP or a package that its loader needs is missing; no such loader; nothing that it can read.
+        (`gt_poses`), None if it has none.
     """
 
     def __init__(self, root: PathLike, loader: str, sequence: str | None = None) -> None:

@@ -42,15 +42,21 @@ class FlowLabels:
 class Log(Protocol):
     """One drive, a sequence of sweeps: `len(log)`, `log[-1]`, `log[1:3]`, `for sweep in log` and `with log` work.
 
-    To write your own reader, inherit from this class, set `log_id` and `timestamps`, and implement `sweep`.
+    To write your own reader, inherit from this class, set `log_id` and `timestamps`, and implement `sweep`. If the log
+    has truth, implement `labels`, too.
 
     Attributes:
-        log_id: name of the log, safe as a folder name.
-        timestamps: sweep times, ascending.
+        log_id: name of the log, safe as a folder name; that of its file or folder, unless the reader says otherwise.
+        timestamps: sweep times, ascending; in nanoseconds, unless the reader says otherwise.
+
+    Convention: our readers return float32 points and float64 poses `T_world_ego`. Opening a log reads its poses and
+        times, and `sweep` and `labels` read the rest.
 
     Raises:
-        CFlowError: `sweep` and `labels` raise it if the index does not exist, or if a file of the sweep is missing,
-            damaged or of another size than the files that belong to it. Other sweeps can still be read.
+        CFlowError: the constructors of our readers raise it for a file that is missing, damaged or incomplete, a
+            setting that is not allowed, and fewer than two sweeps. `sweep` and `labels` raise it if the index does
+            not exist, or if a file of the sweep is missing, damaged or of another size than the files that belong to
+            it. Other sweeps can still be read.
     """
 
     log_id: str
@@ -61,8 +67,12 @@ class Log(Protocol):
         raise NotImplementedError
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Read the truth of the pair (index, index + 1); None where the log has none."""
+        """Read the truth of the pair (index, index + 1); None for the last sweep, and where the log has none."""
         self._timestamp(index)
+        return self._labels(index) if index < len(self) - 1 else None
+
+    def _labels(self, index: int) -> FlowLabels | None:
+        """Read the truth of a pair that exists."""
         return None
 
     def columns(self, index: int) -> Mapping[str, np.ndarray]:

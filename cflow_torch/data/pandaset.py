@@ -54,21 +54,13 @@ class PandaSetLog(Log):
     Args:
         folder: sequence folder with `lidar/00.pkl.gz` ..., `lidar/poses.json` and `lidar/timestamps.json`.
 
-    Attributes:
-        log_id: name of the folder.
-        timestamps: sweep times in nanoseconds, ascending.
-
     Convention:
-        - Points are stored in the world, compensated for ego motion. We return them as float32 in the frame of the
-          LiDAR's pose at the sweep's time (x right, y forward, z up), those of both LiDARs in the order of the file.
+        - Points are stored in the world, compensated for ego motion. We return them in the frame of the LiDAR's pose at
+          the sweep's time (x right, y forward, z up), those of both LiDARs in the order of the file.
         - Ground masks come from the classes of points in `annotations/semseg`; None for a sequence without them.
         - Truth comes from the tracked cuboids of `annotations/cuboids`; each LiDAR's points from its own cuboids. If
           points have classes, these are the categories. A point is then valid only if it is in a cuboid and has the
           class of an object, or neither; smoke, spray and reflections are not valid.
-
-    Raises:
-        CFlowError: a file is missing or cannot be read; fewer than two sweeps; the numbers of sweeps, poses and times
-            differ.
     """
 
     def __init__(self, folder: PathLike) -> None:
@@ -93,11 +85,7 @@ class PandaSetLog(Log):
         is_ground = None if classes is None else np.isin(classes, _GROUND)
         return Sweep(points, is_ground, self._poses[index].copy(), time, shots - time * 1e-9)
 
-    def labels(self, index: int) -> FlowLabels | None:
-        """Read the truth of the pair (index, index + 1); None for the last sweep and without cuboids."""
-        self._timestamp(index)
-        if index == len(self) - 1:
-            return None
+    def _labels(self, index: int) -> FlowLabels | None:
         files = [self.folder / "annotations" / "cuboids" / self._files[k].name for k in (index, index + 1)]
         with remote_errors(self.folder):
             if not all(file.exists() for file in files):

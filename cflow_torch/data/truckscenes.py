@@ -42,16 +42,11 @@ class TruckScenesLog(NuScenesLog):
             LiDAR's sweep.
 
     Attributes:
-        log_id: name of the scene.
         timestamps: times of the reference LiDAR's sweeps (LIDAR_LEFT, else the first), in microseconds.
 
-    Convention: points are float32 in the ego frame at the reference's time stamp (x forward, y left, z up, origin on
-        the ground). From every other LiDAR we take the sweep closest in time; none if it is more than 60 ms off. Poses
-        are float64 `T_world_ego`, world = UTM, with coordinates of some 1e6 m. Between the reference's sweeps, poses
-        are interpolated. `is_ground` is None: TruckScenes has no ground mask.
-
-    Raises:
-        CFlowError: as `NuScenesLog`.
+    Convention: points are in the ego frame at the reference's time stamp. From every other LiDAR we take the sweep
+        closest in time; none if it is more than 60 ms off. The world is UTM, with coordinates of some 1e6 m. Between
+        the reference's sweeps, poses are interpolated. All else is as in `NuScenesLog`.
     """
 
     _categories: ClassVar[Mapping[str, str]] = TRUCKSCENES_CATEGORIES

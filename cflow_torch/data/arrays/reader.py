@@ -66,7 +66,6 @@ class ArraysLog(Log):
         bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes.
 
     Attributes:
-        log_id: name of the folder.
         files: the clouds, in order.
         timestamps: nanoseconds, from `times`, else from the poses (TUM), else from file names of 16 digits or more
             (microseconds, nanoseconds), else 0, 1, 2, ...; in that last case sweeps have no `timestamp_ns`.
@@ -76,10 +75,6 @@ class ArraysLog(Log):
         Sweeps are in the ego frame: points are transformed by `ego_T_lidar` in float64, then rounded to float32. Poses
         with times of their own (TUM) are interpolated at the times of the sweeps, if these are known. Otherwise there
         must be one pose per sweep. The frame should have z up, because the method works in the bird's-eye view.
-
-    Raises:
-        CFlowError: fewer than two clouds, clouds of several suffixes, poses or times that do not fit, or a setting that
-            names a missing file.
     """
 
     def __init__(

@@ -59,22 +59,16 @@ class BagLog(Log):
             are known; False: the clouds are already compensated.
 
     Attributes:
-        log_id: name of the file or folder, without its suffix.
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
         timestamps: nanoseconds of the clouds' headers (where they are 0: of their arrival). Clouds before the first
             or after the last pose are left out.
         topic, frame, deskew: the settings in use.
 
-    Convention: points are float32 in the ego frame. Poses are float64 `T_world_ego`, interpolated at the time of the
-        cloud; the world is the root of the transforms, or that of the topic. A topic's poses are those of its
-        `child_frame_id`, if transforms connect it to the ego frame, else of the ego frame itself. `is_ground` is None.
-        Times of points: see `messages.seconds_after`.
+    Convention: points are in the ego frame. Poses are interpolated at the time of the cloud; the world is the root of
+        the transforms, or that of the topic. A topic's poses are those of its `child_frame_id`, if transforms connect
+        it to the ego frame, else of the ego frame itself. Times of points: see `messages.seconds_after`.
 
     Cost: opening a bag reads all its clouds, poses and transforms once.
-
-    Raises:
-        CFlowError: rosbags is missing; not a bag; no such topic, or several and none chosen; fewer than two sweeps;
-            frames that no transforms connect.
     """
 
     def __init__(

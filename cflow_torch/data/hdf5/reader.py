@@ -47,7 +47,6 @@ class HDF5Log(Log):
         needs_poses: False = sweeps of a scene without poses have the pose None, for `with_poses`.
 
     Attributes:
-        log_id: file name without its suffix.
         timestamps: names of the groups as integers, ascending, in nanoseconds or microseconds as the data set has
             them; the `timestamp_ns` of sweeps are nanoseconds.
         ego_T_lidar: (4, 4) float64, the one in use.
@@ -60,10 +59,6 @@ class HDF5Log(Log):
         - "auto" uses the file's attribute `ego_T_lidar` if it has one (our writer's files do), otherwise
           `recognized_extrinsics` of the first sweep.
         - Index files next to a scene are pickles: they are never opened.
-
-    Raises:
-        CFlowError: h5py is missing, the file is not an HDF5 file, it has fewer than two sweeps, or `ego_T_lidar` is not
-            a rigid motion.
     """
 
     def __init__(self, file: PathLike, ego_T_lidar: Any = "auto", needs_poses: bool = True) -> None:

@@ -80,12 +80,12 @@ class NuScenesLog(Log):
         log_id: name of the scene.
         timestamps: sweep times of the data set, in microseconds; `Sweep.timestamp_ns` is in nanoseconds.
 
-    Convention: points are float32 in the ego frame at the sweep's time stamp (x forward, y left, z up, origin on the
-        ground below the rear axle); nuScenes itself has compensated ego motion. Poses are float64 `T_world_ego`.
-        Points are read when you ask for them. `is_ground` is None: nuScenes has no ground mask.
-
-    Raises:
-        CFlowError: see `nuscenes.tables.Tables.scene`; fewer than two sweeps, an unknown category, no such LiDAR.
+    Convention:
+        - Points are in the ego frame at the sweep's time stamp (x forward, y left, z up, origin on the ground below the
+          rear axle); nuScenes itself has compensated ego motion. It has no ground masks.
+        - Truth comes from boxes, which are annotated at 2 Hz and interpolated by `nuscenes.tracks.Tracks.at`. If an
+          object is annotated at only one of the two samples around either sweep, its points are not valid. There is no
+          truth outside the annotated time.
     """
 
     _categories: ClassVar[Mapping[str, str]] = NUSCENES_CATEGORIES
@@ -125,18 +125,8 @@ class NuScenesLog(Log):
         times = lag * 1e-6 if lag.any() else None
         return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000, times)
 
-    def labels(self, index: int) -> FlowLabels | None:
-        """Read the truth of the pair (index, index + 1), from the boxes at both times.
-
-        Boxes are annotated at 2 Hz and interpolated by `nuscenes.tracks.Tracks.at`. If an object is annotated at only
-        one of the two samples around either sweep, its points are not valid. None for the last sweep, outside the
-        annotated time, and if the data set has no annotations.
-        """
-        time0 = self._timestamp(index)
-        if index == len(self) - 1:
-            return None
-        time1 = self.timestamps[index + 1]
-        if self._tracks.at(time0) is None or self._tracks.at(time1) is None:
+    def _labels(self, index: int) -> FlowLabels | None:
+        if None in map(self._tracks.at, self.timestamps[index : index + 2]):
             return None
         points, lag = self._cloud(index)
         flow = np.zeros((len(points), 3), dtype=np.float32)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from functools import lru_cache
+from dataclasses import replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Sequence
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
+from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, make_boxes, upright_poses
 from cflow_torch.data.files import file_errors, find_folders
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, as_path, remote_errors
 from cflow_torch.data.waymo.parquet import (
     BOX,
@@ -27,7 +28,6 @@ from cflow_torch.data.waymo.parquet import (
 )
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
 from cflow_torch.types import CFlowError, Sweep
-from cflow_torch.windows.ego_motion import relative_transform
 
 SEARCH_DEPTH = 2  # <root>/<data set>/<split>
 BOX_CATEGORY = {0: "NONE", 1: "REGULAR_VEHICLE", 2: "PEDESTRIAN", 3: "SIGN", 4: "BICYCLIST"}
@@ -59,7 +59,7 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
     return sorted(file for split in splits for file in (split / "lidar").glob("*.parquet"))
 
 
-class WaymoLog(Log):
+class WaymoLog(BoxLog):
     """One segment. Experimental: of the released files we could test only the poses, no range images.
 
     Args:
@@ -67,22 +67,16 @@ class WaymoLog(Log):
         lasers: names in `waymo.range_image.LASERS`. Those that the segment does not have are left out.
         both_returns: also read the second return of each pixel, after all first returns of its laser.
 
-    Attributes:
-        log_id: name of the segment.
-        timestamps: start of the TOP scan of each frame, nanoseconds (stored in microseconds), ascending.
-
     Convention:
-        - Points are float32 in the vehicle frame of their frame (x forward, y left, z up, origin at the rear axle),
-          computed in float64: laser by laser, and row by row of the range image.
+        - `timestamps` are the starts of the TOP scans.
+        - Points are in the vehicle frame of their frame (x forward, y left, z up, origin at the rear axle), computed in
+          float64: laser by laser, and row by row of the range image.
         - `T_world_ego` is `world_from_vehicle`, about the middle of the TOP scan.
         - The data set has no ground masks: `is_ground` is None.
         - Truth comes from box tracks. Points in a no-label zone are invalid; boxes of unknown type are background.
 
     Cost: opening reads keys, calibration and vehicle poses. A sweep decodes the row groups that hold its rows; the
         released files are not sorted by time, so that can be the whole file (seconds).
-
-    Raises:
-        CFlowError: a file is missing, cannot be read or lacks columns; fewer than two frames; a frame without pose.
     """
 
     def __init__(self, file: PathLike, lasers: Sequence[str] = tuple(LASERS), both_returns: bool = False) -> None:
@@ -106,31 +100,26 @@ class WaymoLog(Log):
         self._poses = self._read_poses(times)
         if TOP in self._lasers:
             self._pixel_poses.frame_lasers()
-        self._boxes: dict[int, Boxes] | None = None
         self._frame = lru_cache(_KEPT_FRAMES)(self._read_frame)
 
     def sweep(self, index: int) -> Sweep:
-        time = self._timestamp(index) // 1000
-        return Sweep(self._frame(time)[0].copy(), None, self._poses[time].copy(), time * 1000)
+        time = self._timestamp(index)
+        return Sweep(self._points(index).copy(), None, self._poses[index].copy(), time)
 
-    def labels(self, index: int) -> FlowLabels | None:
-        """Read the truth of the pair (index, index + 1) from `lidar_box`; None for the last sweep and without boxes."""
-        time0 = self._timestamp(index) // 1000
-        if index == len(self) - 1:
-            return None
-        if self._boxes is None:
-            self._boxes = self._read_boxes()
-        if not self._boxes:
-            return None
-        time1 = self._timestamp(index + 1) // 1000
-        points, in_no_label_zone = self._frame(time0)
-        boxes0, boxes1 = (self._boxes.get(time, make_boxes([], [], [], [])) for time in (time0, time1))
-        T_ego1_ego0 = relative_transform(self._poses[time1], self._poses[time0])
-        labels = flow_from_boxes(points, boxes0, boxes1, T_ego1_ego0)
-        return FlowLabels(labels.flow, labels.category, labels.is_valid & ~in_no_label_zone)
+    def _points(self, index: int) -> np.ndarray:
+        return self._frame(index)[0]
 
-    def _read_frame(self, time: int) -> tuple[np.ndarray, np.ndarray]:
+    def _labels(self, index: int) -> FlowLabels | None:
+        labels = super()._labels(index)
+        return labels and replace(labels, is_valid=labels.is_valid & ~self._frame(index)[1])
+
+    def _boxes(self, index: int) -> Boxes | None:
+        boxes = self._boxes_of_frames
+        return boxes.get(self.timestamps[index] // 1000, make_boxes([], [], [], [])) if boxes else None
+
+    def _read_frame(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Read the (N, 3) float32 points in the vehicle frame, and (N,) bool whether each lies in a no-label zone."""
+        time = self.timestamps[index] // 1000
         keys = [(time, laser) for laser in self._lasers]
         images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
         pixel_pose = None
@@ -145,7 +134,7 @@ class WaymoLog(Log):
                     continue
                 poses = pixel_pose if key[1] == TOP else None
                 with file_errors(f"{self.file}, frame {time}, laser {key[1]}"):
-                    found, pixels = range_image_points(image, self._calibration[key[1]], poses, self._poses[time])
+                    found, pixels = range_image_points(image, self._calibration[key[1]], poses, self._poses[index])
                 points.append(found)
                 zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
         return np.concatenate(points).astype(np.float32), np.concatenate(zone)
@@ -168,16 +157,16 @@ class WaymoLog(Log):
                 calibration[laser] = LaserCalibration(mount, table, *ends)
         return calibration
 
-    def _read_poses(self, times: Sequence[int]) -> dict[int, np.ndarray]:
-        """Read frame time -> (4, 4) float64 `T_world_ego`."""
+    def _read_poses(self, times: Sequence[int]) -> np.ndarray:
         component = Component(self.file, "vehicle_pose")
         stored = {row[TIME]: row[VEHICLE_POSE] for row in component.rows((TIME, VEHICLE_POSE))}
         missing = [time for time in times if time not in stored]
         if missing:
             raise CFlowError(f"{component.file} has no pose for frame {missing[0]}; copy it again")
-        return {time: matrix_of(stored[time], f"{component.file}: the pose of frame {time}") for time in times}
+        return np.stack([matrix_of(stored[time], f"{component.file}: the pose of frame {time}") for time in times])
 
-    def _read_boxes(self) -> dict[int, Boxes]:
+    @cached_property
+    def _boxes_of_frames(self) -> dict[int, Boxes]:
         """Read frame time -> boxes; empty if the segment has no labels (the testing split)."""
         component = Component(self.file, "lidar_box")
         file = component.file
