@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import sys
 import warnings
+from importlib import import_module
+from typing import Any
 
 _NOT_OF_USERS = ("cflow_torch", "torch", "contextlib")  # packages between the user's code and a warning
 
@@ -22,6 +24,14 @@ class CFlowWarning(UserWarning):
 
 class NoActivePoints(CFlowWarning):
     """A window without an active point, so its result is empty."""
+
+
+def import_optional(module: str, need: str) -> Any:
+    """Import a module of a package that may be missing; `need` is the error then, and says how to install it."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise CFlowError(need) from error
 
 
 def warn(text: str, category: type[CFlowWarning] = CFlowWarning) -> None:

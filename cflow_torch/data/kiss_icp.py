@@ -11,7 +11,8 @@ import numpy as np
 from cflow_torch.data.files import shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.types import Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 _OTHERS = {"rosbag": "bags", "mcap": "bags"}  # loaders without random access -> our own reader
@@ -35,11 +36,8 @@ class KissICPLog(Log):
 
     def __init__(self, root: PathLike, loader: str, sequence: str | None = None) -> None:
         self.root = as_path(root)
-        try:
-            from kiss_icp.datasets import available_dataloaders, dataset_factory
-        except ImportError:
-            raise CFlowError("KISS-ICP's loaders need it: pip install kiss-icp") from None
-        names = sorted(set(available_dataloaders()) - set(_OTHERS))
+        datasets = import_optional("kiss_icp.datasets", "KISS-ICP's loaders need it: pip install kiss-icp")
+        names = sorted(set(datasets.available_dataloaders()) - set(_OTHERS))
         if loader not in names:
             other = f", or use data={_OTHERS[loader]}" if loader in _OTHERS else ""
             raise CFlowError(f"loader={loader}: choose one of {', '.join(names)}{other}")
@@ -47,7 +45,7 @@ class KissICPLog(Log):
         self._what = f"{self.root}, KISS-ICP's loader {loader}"
         with _loader_errors(self._what):
             settings = {} if sequence is None else {"sequence": str(sequence)}
-            self._dataset = dataset_factory(loader, self.root, **settings)
+            self._dataset = datasets.dataset_factory(loader, self.root, **settings)
             self.timestamps = range(len(self._dataset))
             poses = getattr(self._dataset, "gt_poses", None)
         self._check_count(self._what)

@@ -9,12 +9,17 @@ import numpy as np
 from tqdm import tqdm
 
 from cflow_torch.data.log import Log, LogWrapper
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.types import Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 # KISS-ICP starts with a static vehicle: its first steps are off by up to 14 cm at 6 m/s, later ones by 1 to 3 cm.
 _RUN_IN = 5  # sweeps
 _FEWEST_POINTS = 100
+_NEED = (
+    "there are no poses, and estimating them needs KISS-ICP: pip install kiss-icp, or pass poses (for arrays "
+    "T_ego1_ego0, for a folder poses.txt)"
+)
 _MAX_RANGE = 100.0  # metres; KISS-ICP's own default, which also sets its voxel size (a hundredth)
 
 
@@ -62,20 +67,13 @@ class Odometry:
     """KISS-ICP with the settings of `poses_from_odometry`, sweep by sweep; a missing package is a `CFlowError`."""
 
     def __init__(self) -> None:
-        try:
-            from kiss_icp.config import load_config
-            from kiss_icp.kiss_icp import KissICP
-        except ImportError:
-            raise CFlowError(
-                "there are no poses, and estimating them needs KISS-ICP: pip install kiss-icp, "
-                "or pass poses (for arrays T_ego1_ego0, for a folder poses.txt)"
-            ) from None
-        config = load_config(None)
+        kiss_icp, configs = (import_optional(f"kiss_icp.{name}", _NEED) for name in ("kiss_icp", "config"))
+        config = configs.load_config(None)
         config.data.deskew = False
         config.data.max_range = _MAX_RANGE
         config.mapping.voxel_size = _MAX_RANGE / 100
         config.registration.max_num_threads = 1
-        self._odometry = KissICP(config)
+        self._odometry = kiss_icp.KissICP(config)
 
     def next_pose(self, points: np.ndarray, name: str) -> np.ndarray:
         """Return `T_world_ego` of the next sweep; the world is the ego frame of the first.

@@ -10,6 +10,7 @@ import torch
 
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_pose_flow, residual_for_harness
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
 
@@ -24,8 +25,7 @@ def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
         (N, 3) float32, metres, axes of ego1. It is computed in float64 and rounded once, because the difference of two
         float32 positions at 100 m has 1e-5 m of noise.
     """
-    start, transform = np.asarray(points, dtype=np.float64), np.asarray(T_ego1_ego0, dtype=np.float64)
-    return (start @ transform[:3, :3].T + transform[:3, 3] - start).astype(np.float32)
+    return (transform_points(points, np.asarray(T_ego1_ego0, np.float64)) - points).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.paths import PathLike
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import import_optional
 
 
 def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
@@ -57,8 +57,4 @@ def write_pcd(path: PathLike, fields: Mapping[str, np.ndarray]) -> None:
 
 
 def _pypcd4() -> Any:
-    try:
-        import pypcd4
-    except ImportError:
-        raise CFlowError("PCD files need pypcd4: pip install pypcd4") from None
-    return pypcd4
+    return import_optional("pypcd4", "PCD files need pypcd4: pip install pypcd4")

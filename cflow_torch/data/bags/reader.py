@@ -15,7 +15,8 @@ from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.rigid_motion import poses_at, transform_points
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.types import Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -24,6 +25,7 @@ _CLOUD = "sensor_msgs/msg/PointCloud2"
 _POSES = tuple(f"{name}Stamped" for name in ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseWithCovariance"))
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *_POSES)
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_NEED = "bags need rosbags: pip install rosbags"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 _SLICE = 1e-4  # seconds during which we use one pose of the vehicle: 3 mm at 30 m/s
 
@@ -136,15 +138,12 @@ class BagLog(Log):
     def _reader(self) -> Any:
         """Return the bag, opened by this process: after a fork or unpickling it is opened again."""
         if self._opened[0] != os.getpid():
-            try:
-                from rosbags.highlevel import AnyReader
-                from rosbags.typesys import Stores, get_typestore
-            except ImportError:
-                raise CFlowError("bags need rosbags: pip install rosbags") from None
+            rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
             for file in [self.path] if self.path.is_file() else self.path.iterdir():
                 check_file(file)
             # Bags of ROS 2 before Iron do not describe their messages; these types never changed.
-            reader = AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
+            reader = rosbags.AnyReader([self.path], default_typestore=types_of_old_bags)
             reader.open()
             self._opened = (os.getpid(), reader)
         return self._opened[1]

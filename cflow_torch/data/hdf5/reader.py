@@ -14,7 +14,8 @@ from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argove
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.names import is_timestamp
 from cflow_torch.data.paths import PathLike, as_path, source_for_random_access
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.types import Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 # Time stamps count from 1970 or 1980: smaller ones are microseconds (16 digits), others nanoseconds (18 or 19).
@@ -226,11 +227,7 @@ scene_errors = partial(file_errors, hint="copy or write the scene again")
 
 def import_h5py() -> Any:
     """Import h5py; a missing package is a `CFlowError`."""
-    try:
-        import h5py
-    except ImportError:
-        raise CFlowError("HDF5 scenes need h5py: pip install h5py") from None
-    return h5py
+    return import_optional("h5py", "HDF5 scenes need h5py: pip install h5py")
 
 
 def open_scene(file: Path) -> Any:

@@ -26,7 +26,6 @@ DYNAMIC_THRESHOLD = 0.05  # metres per sweep, the evaluation's threshold for dyn
 LARGEST = float(np.finfo(np.float16).max)  # 65504 m
 _FLOW = dict.fromkeys(("flow_tx_m", "flow_ty_m", "flow_tz_m"), "float16")
 _EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can store
-_DTYPES = {"halffloat": "float16", "float": "float32", "double": "float64"}  # Arrow's names -> NumPy's
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,10 @@ VERSIONS: dict[int, SubmissionVersion] = {
     version.number: version
     for version in (
         SubmissionVersion(
-            1, "Argoverse 2 scene flow 2023 (EvalAI challenge 2010, phase 4018)", {**_FLOW, "is_dynamic": "bool"}, True
+            1,
+            "Argoverse 2 scene flow 2023 (EvalAI challenge 2010, phase 4018)",
+            {**_FLOW, "is_dynamic": "bool"},
+            True,
         ),
         SubmissionVersion(3, "multi-dataset challenge 2026 (sceneflow.argoverse.org)", _FLOW, False),
     )
@@ -215,32 +217,25 @@ def _open_archive(path: Path) -> dict[str, Callable[[], bytes]]:
 
 
 def _check_file(name: str, read: Callable[[], bytes], rows: int, version: SubmissionVersion) -> list[str]:
-    """All problems of the file of one frame, one line each."""
+    """List all problems of the file of one frame, one line each."""
     try:
         with file_errors(name):  # a damaged zip makes zipfile raise nearly anything
-            problems = _check_table(FeatherFile(name, read()), rows, version)
+            file = FeatherFile(name, read())
+            columns = {each: file.read([each]).column(0) for each in version.columns if each in file.names}
+            dtypes = {each: np.dtype(column.type.to_pandas_dtype()) for each, column in columns.items()}
     except CFlowError as error:
-        problems = [f"cannot be read ({shortened(error)})"]
-    return [f"{name}: {problem}" for problem in problems]
-
-
-def _check_table(file: FeatherFile, rows: int, version: SubmissionVersion) -> list[str]:
+        return [f"{name}: cannot be read ({shortened(error)})"]
     problems = []
     if set(file.names) != set(version.columns):
         problems.append(f"columns are {', '.join(file.names)}, expected {', '.join(version.columns)}")
     if file.num_rows != rows:
         problems.append(f"{file.num_rows} rows, expected {rows}")
-    for column, dtype in version.columns.items():
-        if column in file.names:
-            problems += _check_values(column, file.read([column]).column(0), dtype)
-    return problems
-
-
-def _check_values(column: str, values: Any, expected: str) -> list[str]:
-    dtype = _DTYPES.get(str(values.type), str(values.type))
-    if dtype != expected:
-        return [f"column {column} is {dtype}, expected {expected}"]
-    if values.null_count:
-        return [f"column {column} has {values.null_count} empty values"]
-    bad = int((~np.isfinite(values.to_numpy())).sum())
-    return [f"column {column} has {bad} values that are NaN or infinite"] if bad else []
+    for column, values in columns.items():
+        if dtypes[column] != version.columns[column]:
+            problems.append(f"column {column} is {dtypes[column]}, expected {version.columns[column]}")
+        elif values.null_count:
+            problems.append(f"column {column} has {values.null_count} empty values")
+        elif not np.isfinite(values.to_numpy()).all():
+            bad = int((~np.isfinite(values.to_numpy())).sum())
+            problems.append(f"column {column} has {bad} values that are NaN or infinite")
+    return [f"{name}: {problem}" for problem in problems]
