@@ -26,11 +26,7 @@ _ABANDONED = 3600.0  # seconds without a change after which a temporary file bel
 def atomic_file(path: PathLike) -> Iterator[Any]:
     """Open a binary file for writing that takes its name only when everything is written.
 
-    Args:
-        path: final name; its folder is created if it does not exist.
-
-    Yields:
-        The open file. If the block raises, the new file is removed and an older one stays.
+    If the block raises, the new file is removed and an older one stays. Missing folders are created.
 
     Convention:
         - Local files get a temporary name in the same folder, `.NAME.<random>.tmp`, and are renamed at the end. Only a
@@ -96,14 +92,7 @@ def _put_file(path: Any) -> Iterator[IO[bytes]]:
 
 @contextmanager
 def new_folder(root: PathLike, name: str) -> Iterator[Path]:
-    """Create the folder `root/name`, which takes its name only when the block ends.
-
-    Args:
-        root: on this machine; it is created if it does not exist.
-        name: of the log.
-
-    Yields:
-        An empty folder under a temporary name. If the block raises, it is removed.
+    """Create the folder `root/name`, which takes its name only when the block ends; if that raises, it is removed.
 
     Raises:
         CFlowError: the folder exists, would be remote, or `name` cannot be used as a folder name.
@@ -126,15 +115,10 @@ def new_folder(root: PathLike, name: str) -> Iterator[Path]:
 
 
 def remove_stale(folder: PathLike) -> list[str]:
-    """Remove the temporary files and folders that killed processes have left in a folder.
+    """Remove the temporary files and folders that killed processes have left in a folder, and return their names.
 
     They count as left if they have not changed for an hour: a shorter time could hit another process that still writes.
-
-    Args:
-        folder: local or remote; its subfolders are not searched.
-
-    Returns:
-        Sorted names of what was removed; empty if the folder does not exist.
+    The folder may be remote. Its subfolders are not searched.
 
     Raises:
         OSError: the folder cannot be listed, or a file in it cannot be removed.
@@ -161,16 +145,9 @@ def _is_abandoned(path: Path) -> bool:
 
 
 def ensure_writable(folder: PathLike) -> Path:
-    """Create a folder and write a trial file, so that long work does not fail at its end.
+    """Create a folder and write a trial file, so that long work does not fail at its end; return its path.
 
-    Args:
-        folder: local or remote. What killed processes left in it is removed, see `remove_stale`.
-
-    Returns:
-        Its path.
-
-    Raises:
-        CFlowError: the folder cannot be created or written to.
+    What killed processes left in it is removed, see `remove_stale`. If it cannot be written to, raise a `CFlowError`.
     """
     folder = as_path(folder)
     try:

@@ -53,11 +53,8 @@ def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int
     """Return the Argoverse 2 indices of K boxes.
 
     Args:
-        names: their categories in the words of the data set.
+        names: their categories in the words of the data set. Unknown ones are a `CFlowError`.
         known: category of the data set -> category of Argoverse 2.
-
-    Raises:
-        CFlowError: a name is unknown; the message lists the known ones.
     """
     unknown = sorted(set(names) - set(known))
     if unknown:
@@ -76,15 +73,9 @@ def upright_poses(heading_centre: Any) -> np.ndarray:
 
 
 def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Tell which points lie inside an oriented box, faces included.
+    """Return (N,) bool: which of the (N, 3) points lie inside a box of (3,) `size`, faces included.
 
-    Args:
-        points: (N, 3) float, metres.
-        size: (3,) float64, metres: length, width, height.
-        pose: (4, 4) float64, box coordinates to the frame of the points.
-
-    Returns:
-        (N,) bool.
+    `pose` is (4, 4) float64, box coordinates to the frame of the points.
     """
     local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
     return (np.abs(local) <= np.asarray(size) / 2).all(axis=1)

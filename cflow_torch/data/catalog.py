@@ -223,8 +223,6 @@ class GroundSegmentedLog(LogWrapper):
 
     Attributes:
         has_found_ground: True once ground was found although nobody asked for it, by "auto".
-
-    Cost: one call of `find_ground` per sweep without a mask.
     """
 
     def __init__(self, log: Log, method: str = "grid") -> None:

@@ -61,15 +61,7 @@ def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], hint:
 
 
 def read_npy(path: Path, hint: str) -> np.ndarray:
-    """Read the array of a .npy file; pickled objects are never loaded.
-
-    Args:
-        path: the file.
-        hint: what the user can do about a file that cannot be read, for the message.
-
-    Raises:
-        CFlowError: the file is missing, truncated, not a .npy file, or holds an array of objects.
-    """
+    """Read the array of a .npy file; pickled objects are never loaded. Errors as in `file_errors`."""
     with file_errors(path, hint):
         array = np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
         if not isinstance(array, np.ndarray):

@@ -39,15 +39,11 @@ class GroundRaster:
     scale: float
 
     def is_ground(self, points: np.ndarray, rule: str = "av2-api") -> np.ndarray:
-        """Tell which points lie on or below the ground.
-
-        Args:
-            points: (N, 3) float, metres, CITY frame.
-            rule: name in `GROUND_RULES`.
+        """Tell which of the (N, 3) points, metres in the CITY frame, lie on or below the ground.
 
         Returns:
-            (N,) bool: within the threshold of the surface (limit included) or below it. False outside the raster and
-            where its height is NaN.
+            (N,) bool: within the threshold of a rule in `GROUND_RULES` of the surface (limit included) or below it.
+            False outside the raster and where its height is NaN.
         """
         threshold, to_cell = GROUND_RULES[rule]
         xyz: np.ndarray = np.asarray(points, dtype=np.float64)

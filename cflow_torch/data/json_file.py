@@ -58,11 +58,9 @@ def flatten(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:
-    """List the settings that differ, as "key was A, is B; ..."; "" if none does.
+    """List the settings of two nested dictionaries that differ, as "key was A, is B; ..."; "" if none does.
 
-    Args:
-        before, now: nested dictionaries.
-        ignored: joined keys that may differ.
+    The keys `ignored`, in the form of `flatten`, may differ.
     """
     old, new = flatten(before), flatten(now)
     changed = sorted(key for key in {*old, *new} - set(ignored) if old.get(key) != new.get(key))

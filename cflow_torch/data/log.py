@@ -146,11 +146,7 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
 
 
 def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
-    """Iterate over the windows of all pairs of a log, in order; each sweep is read once.
-
-    Raises:
-        CFlowError: a sweep cannot be read.
-    """
+    """Iterate over the windows of all pairs of a log, in order; each sweep is read once."""
     cached = CachedLog(log, num_history + num_future + 2)
     return (window(cached, index, num_history, num_future) for index in range(len(log.timestamps) - 1))
 
@@ -191,25 +187,18 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
 
 
 class LogWrapper(Log):
-    """Base class of logs that change the sweeps of another log; every other attribute is that of the other log.
-
-    Args:
-        log: any log.
-    """
+    """Base class of logs that change the sweeps of another log; every other attribute is that of the other log."""
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
 
     def labels(self, index: int) -> FlowLabels | None:
-        """Read the labels of the wrapped log."""
         return self.log.labels(index)
 
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
-        """Read the other columns of the wrapped log."""
         return self.log.columns(index)
 
     def close(self) -> None:
-        """Close the wrapped log."""
         self.log.close()
 
     @property
@@ -224,12 +213,7 @@ class LogWrapper(Log):
 
 
 class CachedLog(LogWrapper):
-    """A log that keeps its last sweeps in memory, because neighbouring windows share all sweeps but one.
-
-    Args:
-        log: any log.
-        count: number of sweeps to keep.
-    """
+    """A log that keeps its last `count` sweeps in memory, because neighbouring windows share all sweeps but one."""
 
     def __init__(self, log: Log, count: int) -> None:
         super().__init__(log)

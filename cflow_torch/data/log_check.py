@@ -117,14 +117,11 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
 def check_static_world(log: Log) -> list[StaticResidual]:
     """Measure whether the static world moves between two sweeps of a log, and warn if it does.
 
-    Args:
-        log: any log. We compare the two pairs over which the vehicle turns most if it has `poses`, else first and last.
+    We compare the two pairs over which the vehicle turns most if the log has `poses`, else first and last. There is one
+    warning, with the verdict on the worst pair.
 
     Returns:
         The residuals; empty for a log of one sweep.
-
-    Warns:
-        CFlowWarning: once, with the verdict on the worst pair.
 
     Cost: reads two sweeps per pair; 0.15 s each.
     """
@@ -174,8 +171,7 @@ def check_log(log: Log) -> None:
 def find_problems(log: Log) -> list[str]:
     """List mistakes that do not show as an error in any single sweep, and what was done about missing ground masks.
 
-    Args:
-        log: any log. A sweep that cannot be read is skipped here; reading it later raises the error.
+    A sweep that cannot be read is skipped here; reading it later raises the error.
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """

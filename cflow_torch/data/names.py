@@ -19,15 +19,7 @@ def is_safe_name(name: Any) -> bool:
 
 
 def safe_name(name: Any, what: str) -> str:
-    """Return a name from data if it can name one file or folder that stays in its folder.
-
-    Args:
-        name: from data.
-        what: what it names, for the message.
-
-    Raises:
-        CFlowError: `is_safe_name` is False.
-    """
+    """Return a name from data, or raise a `CFlowError` that begins with `what` if it is not a safe name."""
     if not is_safe_name(name):
         shown = ascii(name)[: _SHOWN + 2] if isinstance(name, str) else f"a {type(name).__name__}"
         raise CFlowError(f"{what} {shown} cannot be used as a file or folder name: {_RULE}; rename it in the data")
@@ -37,13 +29,9 @@ def safe_name(name: Any, what: str) -> str:
 def path_inside(folder: Path, relative: Any, what: str) -> Path:
     """Return the path of a file that a table names, below a folder. Links are followed: users link data sets.
 
-    Args:
-        folder: of the data set.
-        relative: from a table, folders separated by /.
-        what: what it names, for the message.
-
     Raises:
-        CFlowError: the value is not a text, is empty or absolute, or a name in it is not safe, such as `..`.
+        CFlowError: `relative` is not a text, is empty or absolute, or a name in it is not safe, such as `..`. The
+            message begins with `what`.
     """
     names = relative.split("/") if isinstance(relative, str) else [""]
     named = [name for name in names if name not in ("", ".")]

@@ -76,17 +76,11 @@ class Odometry:
         self._odometry = kiss_icp.KissICP(config)
 
     def next_pose(self, points: np.ndarray, name: str) -> np.ndarray:
-        """Return `T_world_ego` of the next sweep; the world is the ego frame of the first.
+        """Return the (4, 4) float64 `T_world_ego` of the next sweep; the world is the ego frame of the first.
 
         Args:
-            points: (N, 3+) float, metres.
+            points: (N, 3+) float, metres. Fewer than 100 finite ones in range are a `CFlowError`.
             name: of the sweep, for an error.
-
-        Returns:
-            (4, 4) float64.
-
-        Raises:
-            CFlowError: fewer than 100 finite points in range, or the result is not a rigid motion.
         """
         points = points[:, :3].astype(np.float64)
         points = points[np.isfinite(points).all(1)]
@@ -97,18 +91,7 @@ class Odometry:
 
 
 class PosedLog(LogWrapper):
-    """A log with other poses.
-
-    Args:
-        log: any log.
-        poses: (K, 4, 4) `T_world_ego`, one per sweep.
-
-    Attributes:
-        poses: (K, 4, 4) float64.
-
-    Raises:
-        CFlowError: `poses` is not one rigid motion per sweep.
-    """
+    """A log with other poses, (K, 4, 4) `T_world_ego`, one rigid motion per sweep."""
 
     def __init__(self, log: Log, poses: Any) -> None:
         super().__init__(log)
@@ -122,11 +105,5 @@ class PosedLog(LogWrapper):
 
 
 def with_poses(log: Log) -> Log:
-    """Return the log itself if its first sweep has a pose, else the log with poses from odometry.
-
-    Raises:
-        CFlowError: as `poses_from_odometry`.
-    """
-    if log.sweep(0).pose is not None:
-        return log
-    return PosedLog(log, poses_from_odometry(log))
+    """Return the log itself if its first sweep has a pose, else the log with `poses_from_odometry`."""
+    return log if log.sweep(0).pose is not None else PosedLog(log, poses_from_odometry(log))

@@ -99,9 +99,7 @@ def forget_listings(path: Any) -> None:
 def read_bytes(path: Path) -> bytes:
     """Read a file, in one request if it is remote.
 
-    Raises:
-        OSError: as for a local file, and if the remote file system cannot be reached. Devices and pipes, which an
-            unpacked archive can contain, are refused.
+    Devices and pipes, which an unpacked archive can contain, and an unreachable file system are an OSError, too.
     """
     if not is_remote(path):
         check_file(path)
@@ -115,9 +113,6 @@ def source_for_random_access(path: Path) -> Any:
     """Return what a library that reads parts of a large file should open: its name, or an open file if it is remote.
 
     Cost: one request per block of 1 MiB that holds wanted bytes; the last 32 blocks of each file are kept.
-
-    Raises:
-        OSError: a remote file cannot be opened; later, that it cannot be read.
     """
     if not is_remote(path):
         return check_file(path)
@@ -129,9 +124,6 @@ def source_for_mmap(path: Path) -> Any:
 
     The last four copies stay in unnamed files of the folder for temporary files (TMPDIR), which vanish with the
     process however it ends.
-
-    Raises:
-        OSError: a remote file cannot be read, or there is no space for the copy.
     """
     return pa.BufferReader(_copy(path)) if is_remote(path) else check_file(path)
 

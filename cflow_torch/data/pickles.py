@@ -52,20 +52,12 @@ class _Unpickler(pickle.Unpickler):
 
 
 def load_array(stream: IO[bytes]) -> np.ndarray:
-    """Load a pickled array of numbers, texts or truth values.
-
-    Raises:
-        Exception: nearly any, if the pickle is damaged, names something else, or holds something else.
-    """
+    """Load a pickled array of numbers, texts or truth values. Another pickle raises nearly any exception."""
     return _array(_load(stream))
 
 
 def load_columns(stream: IO[bytes]) -> dict[str, np.ndarray]:
-    """Load the columns of a data frame that pandas pickled, by name, without pandas.
-
-    Raises:
-        Exception: as `load_array`.
-    """
+    """Load the columns of a data frame that pandas pickled, by name, without pandas. Errors as in `load_array`."""
     frame = _load(stream).state
     manager = frame["_mgr"] if "_mgr" in frame else frame["_data"]
     if manager.state is None:

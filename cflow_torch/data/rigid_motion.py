@@ -65,14 +65,9 @@ def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> n
 
 
 def interpolate_poses(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Interpolate between pairs of poses: positions linearly, rotations at a constant rate along the shorter arc.
+    """Interpolate between pairs of (K, 4, 4) float64 poses: positions linearly, rotations along the shorter arc.
 
-    Args:
-        poses0, poses1: (K, 4, 4) float64.
-        fraction: (K,) float64, 0 = the first pose, 1 = the second; other values extrapolate.
-
-    Returns:
-        (K, 4, 4) float64.
+    `fraction` is (K,) float64, 0 = the first pose, 1 = the second. Other values extrapolate at the same rate.
     """
     rotation = _rotations_between(poses0[:, :3, :3], poses1[:, :3, :3], fraction)
     return _poses(rotation, poses0[:, :3, 3] + fraction[:, None] * (poses1[:, :3, 3] - poses0[:, :3, 3]))
@@ -101,7 +96,6 @@ def to_rotations(quaternions: np.ndarray) -> np.ndarray:
 
 
 def _rotations_between(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Interpolate (M, 3, 3) rotations at a constant rate along the shorter arc."""
     # Not kornia's `Quaternion.slerp`: before kornia 0.8 it may take the longer arc, and gives NaN for equal rotations.
     from kornia.geometry.conversions import axis_angle_to_quaternion, quaternion_to_axis_angle
 

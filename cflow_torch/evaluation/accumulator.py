@@ -33,11 +33,11 @@ class Accumulator(ABC):
 
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Number of cells along each axis."""
+        """Return the number of cells along each axis."""
 
     @abstractmethod
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Flat cell of each scored point, (K,) int64, and its quantities, (K,) float64 each."""
+        """Return the flat cell of each scored point, (K,) int64, and its quantities, (K,) float64 each."""
 
     def update_points(self, scored: ScoredPoints) -> None:
         """Add the scored points of one frame."""
@@ -52,11 +52,7 @@ class Accumulator(ABC):
         self.sums += sums
 
     def merge(self, other: Accumulator) -> None:
-        """Add the frames of another accumulator of the same kind and definition.
-
-        Raises:
-            CFlowError: the kinds or definitions differ.
-        """
+        """Add the frames of another accumulator; a `CFlowError` if it has another kind or definition."""
         if type(other) is not type(self) or other.definition != self.definition:
             raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
         for name in self.totals:

@@ -25,11 +25,7 @@ def mean_of_present(values: np.ndarray) -> float:
 
 
 def bucket_cells(scored: ScoredPoints, definition: Definition) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the cell (class and speed bucket) of each point.
-
-    Returns:
-        (M,) int64 cell = class * number of buckets + bucket, and (M,) bool, False where a point has no cell.
-    """
+    """Return the (M,) int64 cell of each point, class * number of buckets + bucket, and (M,) bool, False = no cell."""
     meta, bucket = meta_class(scored.category), interval_of(scored.speed, definition.speed_edges)
     if definition.background == "static":
         bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
@@ -62,7 +58,7 @@ def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarra
 
 
 class BucketedEPE(Accumulator):
-    """Streaming dynamic bucket-normalised EPE.
+    """Dynamic bucket-normalised EPE.
 
     Let e and v be the mean end-point error and the mean true speed of all points of a class in a bucket, over all
     frames. `static_epe` is e of the first bucket, in metres. `dynamic_error` is the mean of e / v over the other
@@ -73,7 +69,7 @@ class BucketedEPE(Accumulator):
     """
 
     def shape(self) -> tuple[int, ...]:
-        """(classes, buckets)."""
+        """Return (classes, buckets)."""
         return len(META_NAMES), len(self.definition.speed_edges) - 1
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
@@ -94,7 +90,7 @@ class BucketedEPE(Accumulator):
 
 
 class BucketedByRange(Accumulator):
-    """Streaming `BucketedEPE` of every range between the definition's `region_edges`, in one pass.
+    """`BucketedEPE` of every range between the definition's `region_edges`, in one pass.
 
     Args:
         definition: name or `Definition`. Its `region` ("box" or "disc"), `region_axes` and `closed` define how a range
@@ -104,7 +100,7 @@ class BucketedByRange(Accumulator):
     """
 
     def shape(self) -> tuple[int, ...]:
-        """(ranges, classes, buckets)."""
+        """Return (ranges, classes, buckets)."""
         return len(self.definition.region_edges) - 1, len(META_NAMES), len(self.definition.speed_edges) - 1
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
@@ -128,7 +124,7 @@ class BucketedByRange(Accumulator):
 
 
 class RangeWiseEPE(Accumulator):
-    """Streaming range-wise EPE of all categories. The definition's region does not apply.
+    """Range-wise EPE of all categories. The definition's region does not apply.
 
     Convention: distance includes height. A range contains its lower edge, not its upper one. Means are over all points
     of all frames; "mean" gives every range that has points the same weight.
@@ -137,7 +133,7 @@ class RangeWiseEPE(Accumulator):
     num_quantities = 1
 
     def shape(self) -> tuple[int, ...]:
-        """(ranges, static / dynamic)."""
+        """Return (ranges, static / dynamic)."""
         return len(self.definition.range_edges) - 1, 2
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:

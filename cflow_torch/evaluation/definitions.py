@@ -133,11 +133,7 @@ DEFINITIONS: Dict[str, Definition] = {
 
 
 def get_definition(definition: Union[str, Definition]) -> Definition:
-    """Return the definition of this name. A `Definition` is returned as it is.
-
-    Raises:
-        CFlowError: no definition has this name.
-    """
+    """Return the definition of a name, or the given one; a `CFlowError` if no definition has the name."""
     if isinstance(definition, Definition):
         return definition
     if definition not in DEFINITIONS:
@@ -163,5 +159,5 @@ def interval_of(values: np.ndarray, edges: Sequence[float], closed: bool = False
 
 
 def range_names(edges: Sequence[float]) -> List[str]:
-    """Names of the ranges between ascending edges: "0-35", "35-70"."""
+    """Return the names of the ranges between ascending edges: "0-35", "35-70"."""
     return [f"{low:g}-{high:g}" for low, high in zip(edges, edges[1:])]

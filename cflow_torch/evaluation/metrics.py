@@ -39,17 +39,10 @@ class SceneFlowMetrics:
     def __init__(self, definition: str | Definition = "opensceneflow") -> None:
         self.definition = get_definition(definition)
         self.parts: dict[str, Any] = {name: _ACCUMULATORS[name](self.definition) for name in self.definition.metrics}
-        self.num_frames = 0
-        self.num_points = 0
-        self.num_nan = 0
+        self.num_frames = self.num_points = self.num_nan = 0
 
     def update(self, frame: EvalFrame) -> None:
-        """Add one frame.
-
-        Raises:
-            CFlowError: NaN where the definition does not allow it; the definition needs `T_ego1_ego0` and the frame
-                has none.
-        """
+        """Add one frame; a `CFlowError` as in `score_points`."""
         scored = score_points(frame, self.definition)
         for metric in self.parts.values():
             metric.update_points(scored)
@@ -58,11 +51,7 @@ class SceneFlowMetrics:
         self.num_nan += scored.num_nan
 
     def merge(self, other: SceneFlowMetrics) -> None:
-        """Add the frames of another accumulator of the same definition.
-
-        Raises:
-            CFlowError: the definitions differ.
-        """
+        """Add the frames of another accumulator; a `CFlowError` if its definition is another one."""
         for metric, another in zip(self.parts.values(), other.parts.values()):
             metric.merge(another)
         self.num_frames += other.num_frames

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.evaluation.definitions import Definition
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.types import CFlowError, as_numpy
@@ -105,7 +106,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
 
 
 def _predicted_total(frame: EvalFrame) -> np.ndarray:
-    """(N, 3) float32 predicted total flow, axes of t+1."""
+    """Return the (N, 3) float32 predicted total flow, axes of t+1."""
     if frame.flow is not None:
         return as_numpy(frame.flow)
     residual = as_numpy(frame.residual_flow)  # type: ignore[arg-type]
@@ -115,14 +116,14 @@ def _predicted_total(frame: EvalFrame) -> np.ndarray:
 
 
 def _residual_at_t(points: np.ndarray, total: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
-    """(M, 3) float32 residual in the axes of t: end point in coordinates of t, minus the start point."""
+    """Return the (M, 3) float32 residual in the axes of t: end point in coordinates of t, minus the start point."""
     start = points.astype(np.float64)
     rotation, translation = T_ego1_ego0[:3, :3], T_ego1_ego0[:3, 3]
     return ((start + total - translation) @ rotation - start).astype(np.float32)
 
 
 def _candidates(frame: EvalFrame, definition: Definition, position: np.ndarray) -> np.ndarray:
-    """(N,) bool: valid truth, not ground, inside the evaluation mask and the crop."""
+    """Return (N,) bool: valid truth, not ground, inside the evaluation mask and the crop."""
     keep = frame.labels.is_valid.copy()
     if definition.exclude_ground and frame.is_ground is not None:
         keep &= ~as_numpy(frame.is_ground)
@@ -137,9 +138,6 @@ def _candidates(frame: EvalFrame, definition: Definition, position: np.ndarray) 
 
 
 def _position(frame: EvalFrame, definition: Definition) -> np.ndarray:
-    """(N, 3) points in the frame in which ranges are measured: float32 at t, float64 at t+1."""
+    """Return the (N, 3) points in the frame in which ranges are measured: float32 at t, float64 at t+1."""
     points = as_numpy(frame.points)
-    if definition.region_axes == "t":
-        return points
-    T = frame.transform()
-    return points @ T[:3, :3].T + T[:3, 3]
+    return points if definition.region_axes == "t" else transform_points(points, frame.transform())

@@ -48,7 +48,7 @@ def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: fl
 
 
 class ThreeWayEPE(Accumulator):
-    """Streaming three-way EPE: foreground dynamic, foreground static, background static, and their mean.
+    """Three-way EPE: foreground dynamic, foreground static, background static, and their mean.
 
     Args:
         definition: name or `Definition`.
@@ -68,7 +68,7 @@ class ThreeWayEPE(Accumulator):
         self.frame_sums = np.zeros(len(_SETS) + 1, dtype=np.float64)  # per-frame values of the sets and the IoU
 
     def shape(self) -> tuple[int, ...]:
-        """(categories, motions, distances)."""
+        """Return (categories, motions, distances)."""
         return len(CATEGORIES), len(MOTIONS), len(DISTANCES)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:

@@ -33,15 +33,15 @@ class CorrelationFlowEstimator:
                 an item of a data set; or pairs (frame, `TimeSyncedAVLidarData`), as `load_frame_list` returns them.
 
         Returns:
-            K - 1 `EgoLidarFlow`. Flow i has a row for each point of `frames[i].pc.full_pc`, in their order.
-
-        Convention:
+            K - 1 `EgoLidarFlow`. Flow i has a row for each point of `frames[i].pc.full_pc`, in their order. The frames
+            before i, at most `num_history`, are its history.
             full_flow: (N, 3) float32, metres until frame i + 1, residual (ego motion removed), in the axes of the
                 points of frame i. 0 for inactive points and outside `point_cloud_range`.
             mask: the frame's own `pc.mask`. A flow of 0 outside the method's range is scored like any other.
-            The history of frame i is the frames before it, at most `num_history`.
+
+        Convention:
             A point is active if `pc.mask` is True (not ground, in the range of the data set) and, in a pair
-                (frame, data), `is_ground_points` is False. `in_range_mask` of a pair is ignored.
+            (frame, data), `is_ground_points` is False. `in_range_mask` of a pair is ignored.
 
         Raises:
             CFlowError: a bad field, which the message names ("frames[1].pc.mask"); the package is not installed.

@@ -37,22 +37,18 @@ class CorrelationFlowModel(nn.Module):
         """Estimate the flow of a batch of sequences.
 
         Args:
-            forward_mode: ignored, because training runs no differently.
+            forward_mode, logger: ignored.
             batched_sequence: B `TorchFullFrameInputSequence`, K >= 2 sweeps each. We use full_pc (K, PadN, 3),
-                full_pc_mask (K, PadN), pc_poses_sensor_to_ego and pc_poses_ego_to_global (K, 4, 4), and loader_type.
-            logger: ignored.
+                full_pc_mask (K, PadN; NaN = padding row), pc_poses_sensor_to_ego and pc_poses_ego_to_global
+                (K, 4, 4), and loader_type.
 
         Returns:
             B `TorchFullFrameOutputSequence`, on the device of their input. A causal loader gets one flow, of sweep
-            K - 2, with the sweeps before it as history. A non-causal loader gets K - 1 flows; the sweeps before i are
-            the history of i.
-
-        Convention:
+            K - 2; a non-causal one gets K - 1 flows. The sweeps before a sweep are its history.
             ego_flows: (1 or K - 1, PadN, 3) float32, metres until the next sweep, residual (ego motion removed), in the
                 axes of the sweep's own points; 0 for inactive points, NaN in padding rows.
-            valid_flow_mask: float32 like the loader's masks: `full_pc_mask` as 0 and 1, NaN in padding rows. A flow of
-                0 outside the method's range is scored like any other.
-            Padding rows are those with NaN in `full_pc_mask`.
+            valid_flow_mask: float32, `full_pc_mask` as 0 and 1, NaN in padding rows. A flow of 0 outside the method's
+                range is scored like any other.
 
         Raises:
             CFlowError: a bad field, which the message names ("batched_sequence[0].full_pc_mask"); SceneFlowZoo is
@@ -75,11 +71,7 @@ class CorrelationFlowModel(nn.Module):
 
 
 def register(name: str = "CorrelationFlow") -> None:
-    """Register the model with `models.construct_model` of the checkout, so that a config can name it.
-
-    Raises:
-        CFlowError: SceneFlowZoo is not on the path.
-    """
+    """Register the model with `models.construct_model` of the checkout, so that a config can name it."""
     import_from("models", "name_to_class_lookup", _HOW)[name.lower()] = CorrelationFlowModel
 
 

@@ -40,15 +40,7 @@ def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
 
 
 def write_pcd(path: PathLike, fields: Mapping[str, np.ndarray]) -> None:
-    """Write a binary cloud, atomically.
-
-    Args:
-        path: file name.
-        fields: field name without spaces -> (N,) array of float32, float64 or integers, all of one length.
-
-    Raises:
-        CFlowError: pypcd4 is missing.
-    """
+    """Write a binary cloud, atomically; field name without spaces -> (N,) float32, float64 or integers."""
     pypcd4 = _pypcd4()
     kinds = [values.dtype for values in fields.values()]
     cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)

@@ -65,12 +65,7 @@ def ply_fields(content: bytes) -> dict[str, np.ndarray]:
 
 
 def write_ply(path: PathLike, fields: Mapping[str, np.ndarray]) -> None:
-    """Write vertices in binary, atomically.
-
-    Args:
-        path: file name.
-        fields: property name -> (N,) float32, float64 or integers of up to 32 bits, all of one length.
-    """
+    """Write vertices in binary, atomically; property name -> (N,) float32, float64 or integers of up to 32 bits."""
     kinds = {name: values.dtype.str[1:] for name, values in fields.items()}
     properties = "".join(f"property {_NAMES[kind]} {name}\n" for name, kind in kinds.items())
     little = np.dtype([(name, "<" + kind) for name, kind in kinds.items()])

@@ -67,11 +67,7 @@ def read_poses(path: PathLike) -> Trajectory:
 
 
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
-    """Return (K, 4, 4) or (K, 3, 4) numbers as (K, 4, 4) float64.
-
-    Raises:
-        CFlowError: another shape, not numbers, or not rigid motions; the message names the `source`.
-    """
+    """Return (K, 4, 4) or (K, 3, 4) rigid motions as (K, 4, 4) float64; an error names the `source`."""
     if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or matrices.dtype.kind not in "fiu":
         raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; pass (K, 4, 4) numbers")
     poses = np.tile(np.eye(4), (len(matrices), 1, 1))
@@ -97,11 +93,7 @@ def read_calibration(path: PathLike) -> np.ndarray:
 
 
 def read_times(path: PathLike) -> np.ndarray:
-    """Read a file with one time in seconds per line (KITTI's `times.txt`) as (K,) int64 nanoseconds.
-
-    Raises:
-        CFlowError: no such file, not numbers, or times that do not ascend.
-    """
+    """Read a file with one ascending time in seconds per line (KITTI's `times.txt`) as (K,) int64 nanoseconds."""
     words, _ = _read_table(path)
     if words.shape[1] != 1:
         raise CFlowError(f"{path} must have one time in seconds per line")

@@ -83,24 +83,17 @@ def write_hdf5_labels(
     made_by: str = "",
     overwrite: bool = False,
 ) -> int:
-    """Write labels for self-supervised training into a scene.
+    """Write labels for self-supervised training into a scene, in the way of `write_hdf5_results`.
 
     Args:
         file: `<scene>.h5`; every other key keeps its contents.
         labels: (time stamp, {key: (N,) values}) of sweeps, keys of `LABELS` and `ground_mask`, which is only written
             if the sweep has none; consumed one by one.
         made_by: description of the method, stored as the attribute `LABELLED` of the scene.
-        overwrite: replace existing labels.
+        overwrite: replace existing labels; if it is False, a scene with labels is a `CFlowError`.
 
     Returns:
         Number of sweeps written.
-
-    Convention: as for `write_hdf5_results`, compressed as the points are; the scene is always the old or the new one.
-
-    Raises:
-        CFlowError: see `write_hdf5_results`; or the scene has labels, and `overwrite` is False.
-
-    Cost: one copy of the scene.
     """
     if not overwrite and labelled_by(file) is not None:
         raise CFlowError(f"{file} already has labels: overwrite=true replaces them, or label a copy")
@@ -108,11 +101,7 @@ def write_hdf5_labels(
 
 
 def labelled_by(file: str | Path) -> str | None:
-    """Return `made_by` of a scene's labels, "" if it is unknown, None if the scene has no labels.
-
-    Raises:
-        CFlowError: the scene cannot be read.
-    """
+    """Return `made_by` of a scene's labels, "" if it is unknown, None if the scene has no labels."""
     with open_scene(Path(file)) as scene, file_errors(file):
         has_labels = any(set(scene[stamp]) & set(LABELS) for stamp in scene if is_timestamp(stamp))
         made_by = scene.attrs.get(LABELLED, "" if has_labels else None)

@@ -77,10 +77,7 @@ def write_hdf5_scene(
 def write_index_files(folder: str | Path) -> None:
     """Write `index_total.pkl`, `index_flow.pkl` and `index_eval.pkl` for all scenes of a folder.
 
-    Convention: each is OpenSceneFlow's pickled list of [scene, time stamp], both strings.
-
-    Raises:
-        CFlowError: no such folder, or a scene that cannot be read.
+    Each is OpenSceneFlow's pickled list of [scene, time stamp], both strings.
     """
     folder = Path(folder)
     total, flow, scored = [], [], []

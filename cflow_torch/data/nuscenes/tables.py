@@ -128,9 +128,6 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
         key, values: keep only rows whose field `key` is one of `values`; no key = all rows.
 
     Cost: memory of twice the file, and of the rows that are kept.
-
-    Raises:
-        CFlowError: the file is missing, truncated, not a list of rows, or a row lacks a field.
     """
     file = folder / f"{table}.json"
 
@@ -165,11 +162,7 @@ class Tables:
 
     @cached_property
     def scenes(self) -> dict[str, str]:
-        """Name of each scene -> its token, sorted by name.
-
-        Raises:
-            CFlowError: scene.json cannot be read, has two scenes of one name, or a name that cannot be a folder's.
-        """
+        """Name of each scene -> its token, sorted by name."""
         rows, file = read_table(self.folder, "scene"), self.folder / "scene.json"
         scenes = {safe_name(row["name"], f"{file}: the scene"): row["token"] for row in rows}
         if len(scenes) < len(rows):

@@ -44,11 +44,7 @@ class Component:
         self._row_of: dict[Key, int] = {}
 
     def rows(self, columns: Sequence[str]) -> list[dict[str, Any]]:
-        """Read some columns of all rows.
-
-        Raises:
-            CFlowError: the file is missing, lacks a column or cannot be read.
-        """
+        """Read some columns of all rows."""
         with file_errors(self.file, self._hint):
             parquet = pq.ParquetFile(source_for_random_access(self.file))
             check_columns(self.file, parquet.schema_arrow.names, columns, self._hint)
@@ -61,20 +57,14 @@ class Component:
         return self._row_of
 
     def images(self, keys: Sequence[Key], column: str, channels: int) -> dict[Key, np.ndarray | None]:
-        """Read the range images of some rows.
+        """Read the range images of some rows: frame time and laser -> (H, W, channels), None if the file has a null.
 
         Args:
-            keys: frame times and lasers.
+            keys: frame times and lasers; a `CFlowError` if one has no row.
             column: name without its `.values` and `.shape`.
             channels: of each image.
 
-        Returns:
-            Key -> (H, W, channels) image, None if the file has a null.
-
         Cost: decodes every row group that holds a wanted row, a few rows at a time.
-
-        Raises:
-            CFlowError: there is no such row, the file cannot be read, or a cell is not an image.
         """
         missing = [key for key in keys if key not in self.frame_lasers()]
         if missing:

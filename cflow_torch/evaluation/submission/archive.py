@@ -35,7 +35,7 @@ class SubmissionVersion:
     Args:
         number: 1 or 3, as OpenSceneFlow numbers them.
         server: the leaderboard that accepts it.
-        columns: column -> dtype, in the order in which they are written.
+        columns: column -> dtype, in order.
         is_masked: True: total flow (ego motion included) of the points of the evaluation mask, in the order of the
             mask. False: residual flow (motion of objects alone) of every point of the sweep.
     """
@@ -61,11 +61,7 @@ VERSIONS: dict[int, SubmissionVersion] = {
 
 
 def get_version(number: Any) -> SubmissionVersion:
-    """Return the format of this number.
-
-    Raises:
-        CFlowError: there is no such version.
-    """
+    """Return the format of this number; if there is none, raise a `CFlowError`."""
     if number not in VERSIONS:
         closed = "; version 2 (Argoverse 2, 2024) is closed and was removed" if number == 2 else ""
         raise CFlowError(f"version={number!r}: give one of {', '.join(map(str, VERSIONS))}{closed}")
@@ -81,11 +77,11 @@ def encode(
         version: the format.
         result: flow of the N points of sweep t.
         is_ground: (N,) bool, True = ground; None = no point is ground.
-        mask: (N,) bool, points to write. Required if `version.is_masked`, refused otherwise.
+        mask: (N,) bool, points to write; None = all, for versions without a mask.
 
     Returns:
-        Columns by name, in the order of the format (flow in metres until the next sweep, float16; `is_dynamic` bool),
-        and (M,) float64, metres, the error of each row from rounding to float16.
+        Columns by name (flow in metres until the next sweep, float16; `is_dynamic` bool), and (M,) float64, metres, the
+        error of each row from rounding to float16.
 
     Convention:
         A residual flow is in the axes of t+1, as OpenSceneFlow writes it, and 0 for ground points. `is_dynamic` is
@@ -95,8 +91,7 @@ def encode(
         CFlowError: the mask is missing or not allowed; a value is NaN, infinite or beyond float16.
     """
     if (mask is not None) != version.is_masked:
-        need = "needs a mask" if version.is_masked else "contains every point: leave out the mask"
-        raise CFlowError(f"submission version {version.number} {need}")
+        raise CFlowError(f"submission version {version.number} needs {'a' if version.is_masked else 'no'} mask")
     residual = as_numpy(result.residual_flow).astype(np.float32)
     if mask is not None:
         keep = np.asarray(mask, dtype=bool)
@@ -112,13 +107,7 @@ def encode(
 
 
 def to_half(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Round a flow to float16.
-
-    Args:
-        flow: (M, 3) of any float type, metres.
-
-    Returns:
-        (M, 3) float16, and (M,) float64, metres, the error of each row.
+    """Round a flow, (M, 3) metres, to float16; also return the (M,) float64 metres by which each row is off.
 
     Raises:
         CFlowError: a value is NaN, infinite, or larger than float16 can hold.
@@ -131,16 +120,7 @@ def to_half(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]) -> None:
-    """Write the file of one frame atomically.
-
-    Args:
-        folder: root of the submission.
-        name: inside the archive, `<log>/<time stamp>.feather`.
-        columns: what `encode` returned.
-
-    Raises:
-        CFlowError: the log's name cannot be a folder's.
-    """
+    """Write the columns of one frame atomically to a submission folder, as `<log>/<time stamp>.feather`."""
     log_id, _, stem = name.rpartition("/")
     file = Path(folder) / safe_name(log_id, "the log") / stem
     table = pa.table({key: pa.array(values) for key, values in columns.items()})
@@ -154,18 +134,10 @@ def is_complete(folder: str | Path, name: str, rows: int, version: SubmissionVer
 
 
 def pack(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
-    """Zip the files of a submission folder, atomically.
-
-    Args:
-        folder: root of the submission.
-        names: frames to take.
-        file: the zip to write.
+    """Zip the named files of a submission folder, atomically. If one is missing, no zip is written.
 
     Convention: entries are sorted by name, dated 1980-01-01, mode 0644, deflated. So the same files and the same zlib
         give the same bytes.
-
-    Raises:
-        OSError: a file is missing. No zip is written then.
     """
     with atomic_file(file) as raw, zipfile.ZipFile(raw, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in sorted(set(names)):
@@ -185,7 +157,7 @@ def check_submission(path: str | Path, version: SubmissionVersion, expected: Map
         expected: name -> number of rows of every file that the archive must contain. It may contain no other.
 
     Returns:
-        All problems, one line each, with the name of the file and what is wrong; empty if there are none.
+        All problems, one line each; empty if there are none.
 
     Convention: the order of columns is free. Values are only checked for being finite. Ground rows are not compared
         with 0, because any finite flow is a valid submission.
@@ -201,7 +173,7 @@ def check_submission(path: str | Path, version: SubmissionVersion, expected: Map
 
 
 def _open_archive(path: Path) -> dict[str, Callable[[], bytes]]:
-    """Name -> function that reads the file, of a zip or a folder."""
+    """Return name -> function that reads the file, of a zip or a folder."""
     if path.is_dir():
         files = {file.relative_to(path): file for file in sorted(path.rglob("*")) if file.is_file()}
         return {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Iterable, Mapping, Sequence
@@ -64,22 +65,15 @@ class MaskArchive:
 
 
 def log_mask(log: Log, index: int) -> np.ndarray | None:
-    """Read the (N,) bool evaluation mask that a log stores itself; None where it has none."""
+    """Read the (N,) bool evaluation mask that a log stores (method `eval_mask`); None where it has none."""
     read = getattr(log, "eval_mask", None)
     return None if read is None else read(index)
 
 
 def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = None) -> np.ndarray:
-    """Select the points of a sweep that are evaluated.
+    """Return the (N,) bool mask of the points of sweep `index` that are evaluated.
 
-    Args:
-        log: may have a method `eval_mask(index)` that returns (N,) bool or None, as `HDF5Log` has.
-        index: number of the sweep in the log.
-        sweep: the sweep.
-        masks: official masks. They take precedence.
-
-    Returns:
-        (N,) bool: the official mask, else the log's own, else the official rule (not ground, |x| and |y| <= 50 m).
+    It is the official mask, else the log's own (`log_mask`), else the official rule: not ground, |x| and |y| <= 50 m.
 
     Raises:
         CFlowError: the number of rows differs from that of the sweep; neither a mask nor the ground is known.
@@ -109,11 +103,7 @@ class Frame:
         return f"{self.log.log_id}/{self.log.timestamps[self.index]}.feather"
 
     def count_rows(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> int:
-        """Count the rows of its file. Reads the sweep.
-
-        Raises:
-            CFlowError: the sweep or its mask cannot be read.
-        """
+        """Count the rows of its file; this reads the sweep."""
         sweep = self.log.sweep(self.index)
         return int(point_mask(self.log, self.index, sweep, masks).sum()) if version.is_masked else len(sweep.points)
 
@@ -124,10 +114,8 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> lis
     Args:
         log: one drive.
         listed: log id -> time stamps of exactly the frames to submit (a frame list, or `frames` of a mask archive).
-
-    Convention:
-        Without a list: the sweeps that have an evaluation mask if the log has any, else the pairs 0, 5, 10 ... The last
-        sweep is left out, because it has no successor; OpenSceneFlow writes no file for it either.
+            None = the sweeps that have an evaluation mask if the log has any, else the pairs 0, 5, 10 ... The last
+            sweep is left out, because it has no successor; OpenSceneFlow writes no file for it either.
 
     Raises:
         CFlowError: a listed time stamp is not in the log, or is its last; the log's name cannot be a folder's.
@@ -142,20 +130,10 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> lis
 
 
 def read_frame_list(file: str | Path) -> dict[str, list[int]]:
-    """Read a list of frames: plain text, one `<log>/<time stamp>` a line, # for comments.
-
-    Returns:
-        Log id -> time stamps.
-
-    Raises:
-        CFlowError: the file is not text, cannot be read, or has a line that is not a frame.
-    """
-    file = Path(file)
-    try:
+    """Read log id -> time stamps from a text file: one `<log>/<time stamp>` a line, # for comments."""
+    file, result = Path(file), defaultdict(list)
+    with file_errors(file, "pass a text file of frames"):
         lines = read_bytes(file).decode("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise CFlowError(f"{file} cannot be read as a text file of frames ({error})") from error
-    result: dict[str, list[int]] = {}
     for number, line in enumerate(lines, 1):
         entry = line.partition("#")[0].strip()
         if not entry:
@@ -163,16 +141,12 @@ def read_frame_list(file: str | Path) -> dict[str, list[int]]:
         log, _, stamp = entry.rpartition("/")
         if not log or not is_timestamp(stamp):
             raise CFlowError(f"{file}, line {number}: {entry!r} is not a frame; write <log>/<time stamp>")
-        result.setdefault(log, []).append(int(stamp))
-    return result
+        result[log].append(int(stamp))
+    return dict(result)
 
 
 def require_logs(logs: Iterable[Log], listed: Mapping[str, Sequence[int]] | None) -> None:
-    """Check that the names of logs are unique and that every listed log exists.
-
-    Raises:
-        CFlowError: two logs have one name, or a listed log is not in the data.
-    """
+    """Raise a `CFlowError` if two logs have one name, or if a listed log is not in the data."""
     names = [log.log_id for log in logs]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

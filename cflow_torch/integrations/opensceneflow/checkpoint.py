@@ -14,24 +14,19 @@ from cflow_torch.types import CFlowError
 
 
 def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
-    """Write the checkpoint without weights.
+    """Write the checkpoint without weights and return its path.
 
     Args:
         file: for example `cflow.ckpt`. Its stem labels the output folder and the printed tables, and save.py stores
             its results under this name.
         overwrite: replace an existing file.
 
-    Returns:
-        The file.
-
     Convention:
         It contains plain containers only, so that `torch.load(weights_only=True)` reads it. It has no `model.target`,
-        because the harness prefers the settings of a checkpoint to those of the command line: so overrides and sweeps
-        work.
+        because the harness prefers the settings of a checkpoint to those of the command line, which must win.
 
     Raises:
         CFlowError: the file exists already (it might contain weights).
-        OSError: it cannot be written.
     """
     file = Path(file)
     if file.exists() and not overwrite:

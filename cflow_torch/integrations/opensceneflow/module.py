@@ -34,7 +34,7 @@ class CFlow(nn.Module):
             "valid" = flow of the valid rows only, with their indices in "pc0_valid_point_idxes". Do not combine it
             with iter_only, which ignores the indices.
         device: "auto" = that of the batch.
-        voxel_size, grid_feature_size: ignored. The harness requires the one and passes the other.
+        voxel_size, grid_feature_size: ignored. The harness passes them.
         preset, method: as for `make_config`; "default" if neither is given.
         **settings: any setting of the method except `num_history` and `num_future`; the others are those of the
             preset. A setting that the method does not have is named in a warning and ignored.
@@ -102,7 +102,6 @@ class CFlow(nn.Module):
         return {key: [output[key] for output in outputs] for key in outputs[0]}
 
     def _output(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> dict[str, Tensor]:
-        """Output of one sample."""
         pc0, pc1 = batch["pc0"][b][:, :3], batch["pc1"][b][:, :3]
         num_points = len(sample.rows0)  # ground points follow them
         residual, is_valid = result.residual_flow[:num_points], result.is_valid[:num_points]
