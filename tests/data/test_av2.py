@@ -71,47 +71,30 @@ def folder(tmp_path: Path) -> Path:
     return log
 
 
-def test_the_real_log_is_read(av2_folder: Path, data_root: Path) -> None:
+def test_the_real_log_is_read(av2_folder: Path, data_root: Path, tmp_path: Path) -> None:
     assert av2_folder in find_sources("av2", data_root)
     log = AV2Log(av2_folder)
-    assert log.log_id == av2_folder.name
-    assert list(log.timestamps) == [315966265259836000, 315966265360032000]
+    assert (log.log_id, list(log.timestamps)) == (av2_folder.name, [315966265259836000, 315966265360032000])
     pair = window(log, 0)
-    assert pair.pc0.points.shape == (99_229, 3)
-    assert pair.pc1.points.shape == (99_466, 3)
-    assert pair.pc0.points.dtype == np.float32
-    assert pair.pc0.pose.dtype == np.float64
-    T = np.linalg.inv(pair.pc1.pose) @ pair.pc0.pose
-    npz = np.load(av2_folder / "ego_motion.npz")["ego_motion"][0]
+    assert (pair.pc0.points.shape, pair.pc1.points.shape) == ((99_229, 3), (99_466, 3))
+    assert (pair.pc0.points.dtype, pair.pc0.pose.dtype) == (np.float32, np.float64)
+    T, npz = np.linalg.inv(pair.pc1.pose) @ pair.pc0.pose, np.load(av2_folder / "ego_motion.npz")["ego_motion"][0]
     np.testing.assert_allclose(T[:3, :3], npz[:3, :3], atol=1e-7)
     np.testing.assert_allclose(T[:3, 3], npz[:3, 3], atol=1e-3)  # the npz was made in float32: 0.8 mm
-    assert log.labels(1) is None
-
-
-def test_real_ground_differs_from_the_stored_one_in_one_point(av2_folder: Path) -> None:
     # The stored mask was made with city coordinates in float32 (steps of 0.5 mm at 5 km). There one point, 0.4 mm from
     # the border of a raster cell, falls into the next cell.
-    stored = feather.read_table(str(av2_folder / "flow_labels.feather"))["is_ground_0"].to_numpy()
-    is_ground = AV2Log(av2_folder).sweep(0).is_ground
-    assert stored.sum() == 17_374
-    assert is_ground.sum() == 17_373
-    assert (is_ground != stored).sum() == 1
+    mask = feather.read_table(str(av2_folder / "flow_labels.feather"))["is_ground_0"].to_numpy()
+    is_ground = pair.pc0.is_ground
+    assert (mask.sum(), is_ground.sum(), (is_ground != mask).sum()) == (17_374, 17_373, 1)
     assert AV2Log(av2_folder, ground="bsfe").sweep(0).is_ground.sum() == 18_754
     assert AV2Log(av2_folder, ground=None).sweep(0).is_ground is None
-
-
-def test_real_box_truth_equals_the_stored_one(av2_folder: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "log"
-    copy.mkdir()
-    for entry in av2_folder.iterdir():
+    for entry in av2_folder.iterdir():  # without the stored labels, the boxes give them
         if entry.name != "flow_labels.feather":
-            (copy / entry.name).symlink_to(entry)
-    made, stored = AV2Log(copy).labels(0), AV2Log(av2_folder).labels(0)
-    assert made is not None and stored is not None
-    assert stored.is_valid.all()
+            (tmp_path / entry.name).symlink_to(entry)
+    made, stored = AV2Log(tmp_path).labels(0), log.labels(0)
+    assert stored.is_valid.all() and log.labels(1) is None
     np.testing.assert_array_equal(made.category, stored.category)
-    distance = np.linalg.norm(made.flow - stored.flow, axis=1)
-    assert distance.max() < 1e-3  # 0.8 mm: the stored flow has the float32 ego motion
+    assert np.linalg.norm(made.flow - stored.flow, axis=1).max() < 1e-3  # the stored flow has the float32 ego motion
     ends = np.flatnonzero(~made.is_valid)
     assert len(ends) == 9  # boxes that hold no point at t+1; stored as ego motion, without a flag
     assert (stored.category[ends] > 0).all()

@@ -105,9 +105,10 @@ def test_wrong_topics_are_refused(settings: Any, message: str, recording: TinyRe
 def test_broken_bags_are_refused(recording: TinyRecording, tmp_path: Path) -> None:
     path = write_bag(tmp_path, "ros1", recording)
     whole = path.read_bytes()
-    for content in (b"", b"#ROSBAG V2.0\n", whole[: len(whole) // 2]):
+    pointer = b"version https://git-lfs.github.com/spec/v1\n"
+    for content in (b"", b"#ROSBAG V2.0\n", whole[: len(whole) // 2], pointer):
         path.write_bytes(content)
-        with pytest.raises(CFlowError, match="drive.bag.*complete bag"):
+        with pytest.raises(CFlowError, match="drive.bag.*" + ("git-lfs" if content == pointer else "complete bag")):
             BagLog(path)
     (message,) = [BagWriter(tmp_path, "ros2")]
     cloud = message.make("sensor_msgs/msg/PointCloud2", *message.cloud(0, np.ones((5, 3)), None))

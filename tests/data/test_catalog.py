@@ -92,30 +92,3 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
     assert find_sources(name, tmp_path / "b") == [tmp_path / "b"]
     with pytest.raises(CFlowError, match="nowhere is not a folder"):
         find_sources(name, tmp_path / "nowhere")
-
-
-@pytest.mark.parametrize(
-    ("name", "files"),
-    [
-        ("av2", ["sensors/lidar/1.feather", "sensors/lidar/2.feather", "city_SE3_egovehicle.feather"]),
-        ("hdf5", ["a.h5"]),
-        ("nuscenes", ["v1.0-mini/scene.json"]),
-        ("truckscenes", ["v1.2-mini/scene.json"]),
-        ("waymo", ["lidar/a.parquet"]),
-        ("aevascenes", ["sequence.json"]),
-        ("pandaset", ["lidar/poses.json", "lidar/timestamps.json"]),
-        ("bags", ["a.bag"]),
-        ("bags", ["bag/metadata.yaml", "bag/a.mcap"]),
-        ("arrays", ["1.bin", "2.bin"]),
-    ],
-)
-def test_git_lfs_pointers_are_refused(name: str, files: list[str], tmp_path: Path) -> None:
-    """A clone without git-lfs has pointers instead of large files. These are as long as ten points of a `.bin`."""
-    if name == "bags":
-        pytest.importorskip("rosbags")
-    pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{64 * '0'}\nsize 1234\n".ljust(128 + 32)
-    for file in files:
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).write_text(pointer)
-    with pytest.raises(CFlowError, match="is a git-lfs pointer"):
-        open_log(name, find_sources(name, tmp_path)[0], check=False).sweep(0)
