@@ -48,9 +48,9 @@ def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NE
         reach: metres, half side of the box.
 
     Returns:
-        "dynamic", "static": end-point error in metres of dynamic objects and of the static background; "pedestrian":
-        mean of error divided by speed of dynamic pedestrians; "missed": share of the points of dynamic objects whose
-        flow is less than half of the true one; "moving": number of points of dynamic objects.
+        "dynamic", "static": end-point error in metres of dynamic objects and of the static background; "ratio",
+        "pedestrian": mean of error divided by speed of dynamic objects and of those that are pedestrians; "missed":
+        share of the points of dynamic objects whose flow is less than half of the true one; "moving": their number.
     """
     definition = Definition(
         "pooled",
@@ -67,10 +67,10 @@ def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NE
         walks = moves & (points.category == CATEGORY_INDEX["PEDESTRIAN"])
         static = points.in_region & ~points.is_dynamic & (points.category == 0)
         is_missed = np.linalg.norm(points.predicted_flow, axis=1) < 0.5 * points.speed
-        errors = points.error[moves], points.error[walks] / points.speed[walks], points.error[static]
-        of_frames.append((*errors, is_missed[moves]))
+        ratios = (points.error[chosen] / points.speed[chosen] for chosen in (moves, walks))
+        of_frames.append((points.error[moves], *ratios, points.error[static], is_missed[moves]))
     pooled = [np.concatenate(values) for values in zip(*of_frames)]
-    names = ("dynamic", "pedestrian", "static", "missed")
+    names = ("dynamic", "ratio", "pedestrian", "static", "missed")
     return {**dict(zip(names, map(mean_of_present, pooled))), "moving": float(len(pooled[0]))}
 
 

@@ -29,6 +29,7 @@ import json
 import sys
 import time
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Callable, Iterator, NamedTuple, Sequence
 
@@ -41,10 +42,11 @@ from cflow_torch import make_config, make_model
 from cflow_torch.config import PRESETS
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.log import window
-from cflow_torch.evaluation.definitions import Definition
-from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
-from cflow_torch.evaluation.scored_points import score_points
-from cflow_torch.types import Window, as_numpy
+from cflow_torch.types import as_numpy
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "ablation"))
+from score import pooled_figures  # noqa: E402
+from sets import Item, between, make_item  # noqa: E402
 
 OURS = ("default", "paper", "keypoints")
 HARNESS = {  # name -> YAML file and class of the model in the checkout
@@ -60,28 +62,24 @@ Method = Callable[["Case"], np.ndarray]
 
 
 class Case(NamedTuple):
-    """A window, its truth, and what the methods get.
+    """A window with its truth, and what the methods get.
 
     Args:
-        name: "SET, window INDEX".
-        window: sweeps with ground masks.
-        frame: function that makes the input of the metrics from (N, 3) residual flow.
+        item: the window, with ground masks.
         T_ego1_ego0: (4, 4) float64.
         rows: (N0',) int64, rows of sweep t that are not ground and within reach.
         pc0, pc1: (N0', 3), (N1', 3) float32 metres, frame of t+1.
     """
 
-    name: str
-    window: Window
-    frame: Callable[[np.ndarray], EvalFrame]
+    item: Item
     T_ego1_ego0: np.ndarray
     rows: np.ndarray
     pc0: np.ndarray
     pc1: np.ndarray
 
 
-def cases(path: Path, given: argparse.Namespace) -> Iterator[tuple[str, Case]]:
-    """The chosen windows of the logs at a path, with the names of their sets."""
+def cases(path: Path, given: argparse.Namespace) -> Iterator[tuple[str, str, Case]]:
+    """The chosen windows of the logs at a path, with the names of their sets and windows."""
     data_set = recognise(path)
     for source in find_sources(data_set, path):
         log = open_log(data_set, source, check=False)
@@ -89,44 +87,22 @@ def cases(path: Path, given: argparse.Namespace) -> Iterator[tuple[str, Case]]:
         chosen = range(given.start, len(log.timestamps) - 1, given.every) if has_history else [0]
         for index in list(chosen)[: given.windows]:
             labels = log.labels(index)
-            if labels is None:
-                continue
-            sweeps = window(log, index, max(given.history))
-            eval_mask = log.eval_mask(index) if hasattr(log, "eval_mask") else None
-            yield log.log_id, make_case(f"{log.log_id}, {index}", sweeps, labels, eval_mask, given.reach)
+            if labels is not None:
+                eval_mask = log.eval_mask(index) if hasattr(log, "eval_mask") else None
+                item = make_item(window(log, index, max(given.history)), labels, eval_mask)
+                yield log.log_id, f"{log.log_id}, {index}", make_case(item, given.reach)
 
 
-def make_case(name: str, sweeps: Window, labels: Any, eval_mask: Any, reach: float) -> Case:
+def make_case(item: Item, reach: float) -> Case:
     """Compensate ego motion, and leave out ground and what is out of reach."""
-    T_ego1_ego0 = np.linalg.inv(as_numpy(sweeps.pc1.pose, np.float64)) @ as_numpy(sweeps.pc0.pose, np.float64)
-    points = [as_numpy(sweep.points)[:, :3].astype(np.float32) for sweep in (sweeps.pc0, sweeps.pc1)]
-    pose_flow = ego_motion_flow(points[0], T_ego1_ego0)
-    moved = (points[0] + pose_flow, points[1])
-    masks = []
-    for sweep, at in zip((sweeps.pc0, sweeps.pc1), moved):
+    pair = item.window.pc0, item.window.pc1
+    points = [as_numpy(sweep.points)[:, :3].astype(np.float32) for sweep in pair]
+    moved = (points[0] + item.pose_flow, points[1])
+    rows = []
+    for sweep, at in zip(pair, moved):
         ground = np.zeros(len(at), bool) if sweep.is_ground is None else as_numpy(sweep.is_ground)
-        masks.append(~ground & np.isfinite(at).all(1) & (np.abs(at[:, :2]) <= reach).all(1))
-
-    def frame(residual_flow: np.ndarray) -> EvalFrame:
-        of_pair = {"pose_flow": pose_flow, "T_ego1_ego0": T_ego1_ego0, "is_ground": sweeps.pc0.is_ground}
-        return EvalFrame(points[0], labels, residual_flow, eval_mask=eval_mask, **of_pair)
-
-    rows = np.flatnonzero(masks[0])
-    return Case(name, sweeps, frame, T_ego1_ego0, rows, moved[0][rows], moved[1][masks[1]])
-
-
-def scores(case: Case, residual_flow: np.ndarray, reach: float) -> dict[str, float]:
-    """Means over the scored points of a window; NaN without such points."""
-    definition = Definition(name="peers", metrics=("three_way",), region="box", max_range=reach, dynamic_threshold=0.05)
-    points = score_points(case.frame(residual_flow), definition)
-    moves = points.in_region & points.is_dynamic & (points.category > 0)
-    static = points.in_region & ~points.is_dynamic & (points.category == 0)
-    values = {
-        "dynamic": points.error[moves],
-        "ratio": points.error[moves] / points.speed[moves],
-        "static": points.error[static],
-    }
-    return {name: float(each.mean()) if len(each) else float("nan") for name, each in values.items()}
+        rows.append(np.flatnonzero(~ground & np.isfinite(at).all(1) & (np.abs(at[:, :2]) <= reach).all(1)))
+    return Case(item, between(*pair), rows[0], moved[0][rows[0]], moved[1][rows[1]])
 
 
 def preset(name: str, num_history: int, reach: float) -> Method:
@@ -136,8 +112,8 @@ def preset(name: str, num_history: int, reach: float) -> Method:
     model = make_model(make_config(name, point_cloud_range=(*low, *high), **settings), "cpu")
 
     def method(case: Case) -> np.ndarray:
-        older = case.window.pch[:num_history]
-        return model([replace(case.window, pch=older)])[0].numpy()["residual_flow"]
+        sweeps = case.item.window
+        return model([replace(sweeps, pch=sweeps.pch[:num_history])])[0].numpy()["residual_flow"]
 
     return method
 
@@ -146,7 +122,7 @@ def on_rows(estimate: Callable[[Case], np.ndarray]) -> Method:
     """A method that returns the flow of `pc0` only; other points get zero."""
 
     def method(case: Case) -> np.ndarray:
-        flow = np.zeros((len(as_numpy(case.window.pc0.points)), 3), np.float32)
+        flow = np.zeros_like(case.item.pose_flow)
         flow[case.rows] = estimate(case)
         return flow
 
@@ -211,11 +187,7 @@ def of_harness(name: str, root: Path) -> Method:
 
 
 def make_method(name: str, num_history: int, given: argparse.Namespace) -> Method:
-    """A method by its name.
-
-    Raises:
-        ImportError: a package is missing.
-    """
+    """A method by its name; an ImportError if a package is missing."""
     if name in HARNESS:
         if given.opensceneflow is None:
             raise ImportError("give --opensceneflow PATH")
@@ -237,7 +209,8 @@ def measure(method: Method, case: Case, reach: float) -> dict[str, float]:
     begin = time.process_time()
     flow = method(case)
     seconds = time.process_time() - begin
-    return {**scores(case, flow, reach), "cpu": seconds}
+    figures = pooled_figures([case.item.frame(flow)], reach=reach)
+    return {**{name: figures[name] for name in ("dynamic", "ratio", "static")}, "cpu": seconds}
 
 
 def mean_of(rows: Sequence[dict[str, Any]], column: str) -> float:
@@ -297,11 +270,10 @@ def main() -> None:
     parser.add_argument("--windows", type=int, help="at most so many windows of a set")
     parser.add_argument("--reach", type=float, default=35.0, help="metres, half side of the square")
     parser.add_argument("--json", type=Path, help="file for the figures of every window")
-    parser.add_argument(
-        "--merge", type=Path, nargs="*", default=[], help="files of earlier runs; new figures replace them"
-    )
+    parser.add_argument("--merge", type=Path, nargs="*", default=[], help="earlier runs; new figures replace them")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    key = itemgetter("window", "method", "history")
     rows = {key(row): row for file in given.merge for row in json.loads(file.read_text())}
     runs = [(name, history) for name in given.methods for history in (given.history if name in OURS[:2] else (0,))]
     all_cases = [each for path in given.paths for each in cases(path, given)]
@@ -311,21 +283,16 @@ def main() -> None:
         except ImportError as error:
             print(f"skipped {name}: {error}", file=sys.stderr)
             continue
-        for set_name, case in all_cases:
-            if history and len(case.window.pch) < history:
+        for set_name, window_name, case in all_cases:
+            if len(case.item.window.pch) < history:
                 continue
-            row = {"set": set_name, "window": case.name, "method": name, "history": history}
+            row = {"set": set_name, "window": window_name, "method": name, "history": history}
             row.update(measure(method, case, given.reach))
             rows[key(row)] = row
             print(json.dumps(row), file=sys.stderr, flush=True)
             if given.json:
                 given.json.write_text(json.dumps(list(rows.values()), indent=1) + "\n", encoding="utf-8")
     print(table(sorted(rows.values(), key=lambda row: (METHODS.index(row["method"]), row["history"]))))
-
-
-def key(row: dict[str, Any]) -> tuple[Any, ...]:
-    """What a row measures."""
-    return row["window"], row["method"], row["history"]
 
 
 if __name__ == "__main__":
