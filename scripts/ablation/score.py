@@ -52,14 +52,8 @@ def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NE
         "pedestrian": mean of error divided by speed of dynamic objects and of those that are pedestrians; "missed":
         share of the points of dynamic objects whose flow is less than half of the true one; "moving": their number.
     """
-    definition = Definition(
-        "pooled",
-        ("three_way",),
-        region="box",
-        max_range=reach,
-        dynamic_threshold=MOVES * step,
-        three_way_flow="residual",
-    )
+    scored = {"region": "box", "max_range": reach, "dynamic_threshold": MOVES * step, "three_way_flow": "residual"}
+    definition = Definition("pooled", ("three_way",), **scored)
     of_frames: list[tuple[np.ndarray, ...]] = []
     for frame in frames:
         points = score_points(frame, definition)

@@ -22,7 +22,8 @@ from cflow_torch.data.hdf5 import HDF5Log
 from cflow_torch.data.log import CachedLog, FlowLabels, window
 from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
-from cflow_torch.types import CFlowError, Sweep, Window, as_numpy
+from cflow_torch.types import CFlowError, Window, as_numpy
+from cflow_torch.windows.ego_motion import relative_transform
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "figures"))
 import drives  # noqa: E402
@@ -59,15 +60,9 @@ class Item:
 
     def frame(self, residual_flow: Any) -> EvalFrame:
         """The input of the metrics, for (N, 3) estimated residual flow."""
-        return EvalFrame(
-            points=self.window.pc0.points,
-            labels=self.labels,
-            residual_flow=residual_flow,
-            pose_flow=self.pose_flow,
-            T_ego1_ego0=between(self.window.pc0, self.window.pc1),
-            is_ground=self.window.pc0.is_ground,
-            eval_mask=self.eval_mask,
-        )
+        pc0, of_pair = self.window.pc0, {"pose_flow": self.pose_flow, "T_ego1_ego0": between(self.window)}
+        masks = {"is_ground": pc0.is_ground, "eval_mask": self.eval_mask}
+        return EvalFrame(pc0.points, self.labels, residual_flow, **of_pair, **masks)
 
 
 @dataclass(frozen=True)
@@ -129,31 +124,22 @@ def _is_of(scored: ScoredSet, name: str) -> bool:
     return name in (scored.name, scored.group) or scored.name.startswith(f"{name}-")
 
 
-def between(start: Sweep, end: Sweep) -> np.ndarray:
-    """(4, 4) float64 T_end_start, ego coordinates of one sweep to those of another."""
-    T_world_start, T_world_end = as_numpy(start.pose, np.float64), as_numpy(end.pose, np.float64)
-    return np.linalg.inv(T_world_end) @ T_world_start
+def between(pair: Window) -> np.ndarray:
+    """(4, 4) float64 `T_ego1_ego0`."""
+    return relative_transform(pair.pc1.pose, pair.pc0.pose)
 
 
 def make_item(scored: Window, labels: FlowLabels, eval_mask: np.ndarray | None = None) -> Item:
     """An item with the ego motion of the poses."""
-    pose_flow = ego_motion_flow(as_numpy(scored.pc0.points)[:, :3], between(scored.pc0, scored.pc1))
-    return Item(scored, labels, pose_flow, eval_mask)
+    return Item(scored, labels, ego_motion_flow(as_numpy(scored.pc0.points)[:, :3], between(scored)), eval_mask)
 
 
 def data_root() -> Path:
-    """Folder of the real data: $CFLOW_DATA, else ../shared/data next to the checkout.
-
-    Raises:
-        CFlowError: the folder lacks the data.
-    """
+    """Folder of the real data: $CFLOW_DATA, else ../shared/data next to the checkout; a `CFlowError` if it lacks it."""
     root = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
     for part in (AV2, KITTI):
         if not (root / part).exists():
-            raise CFlowError(
-                f"no {part} in {root}: set CFLOW_DATA to the folder of the real data, or leave out the sets "
-                "real, odd and merged (--sets sim)"
-            )
+            raise CFlowError(f"no {part} in {root}: set CFLOW_DATA to the folder of the real data, or give --sets sim")
     return root
 
 
@@ -195,7 +181,7 @@ def kitti_steps(step: int) -> list[Item]:
             pairs.append((sweep.points, log.values(i, "flow_instance_id"), labels.flow, usable))
         scored = Window(sweeps.sweep(start), sweeps.sweep(start + step))
         first = log.labels(start)
-        flow, is_known = chain_flow(pairs, ego_motion_flow(scored.pc0.points, between(scored.pc0, scored.pc1)))
+        flow, is_known = chain_flow(pairs, ego_motion_flow(scored.pc0.points, between(scored)))
         labels = FlowLabels(flow, first.category, first.is_valid & is_known)
         items.append(make_item(scored, labels, log.eval_mask(start)))
     return items
@@ -267,21 +253,10 @@ _REAL: tuple[tuple[str, str, int, Callable[[], list[Item]], int], ...] = (
         for part, path in PANDASET.items()
     ),
 )
-_STAGES = (
-    "hedge",
-    "crowd",
-    "tram",
-    "rolling_shutter",
-    "appearing",
-    "tree",
-    "bridge",
-    "gantry",
-    "wires",
-    "abreast",
-    "border",
-)
+_STAGES = (drives.hedge, drives.crowd, drives.tram, drives.rolling_shutter, drives.appearing, drives.tree)
+_STAGES += (drives.bridge, drives.gantry, drives.wires, drives.abreast, drives.border)
 _SCENES: dict[str, Callable[[int], drives.Staged]] = {
-    **{name: getattr(drives, name) for name in _STAGES},
+    **{stage.__name__: stage for stage in _STAGES},
     **{f"walkers-{gap:g}": partial(drives.walkers, gap=gap) for gap in (0.1, 0.2, 0.3, 0.5)},
     **{
         f"facade-{profile}-{step:g}": partial(drives.facade, step=step, profile=profile)

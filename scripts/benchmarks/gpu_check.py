@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import time
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Callable, Dict, List, Sequence
@@ -24,25 +23,24 @@ from table import markdown
 from torch.profiler import ProfilerActivity, profile
 
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
+from cflow_torch.cli.bench import measure
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
-from cflow_torch.stages import TimedModel, stage_seconds
+from cflow_torch.stages import stage_seconds
 
 TOLERANCE = 1e-4  # metres; also of scores and confidences
 EXACT = ("cluster_id", "is_valid")
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 PAPER, KEYS, DEFAULT = make_config("paper"), make_config("paper", method="keypoints"), make_config("default")
 TWO = PAPER.replace(num_history=2, pixel_sizes=(0.4, 0.1))
+SMALL = (-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)
 LITTLE = 30_000_000  # bytes, less than a batch needs
 # name -> (settings, number of windows in a batch)
 VARIANTS: dict[str, tuple[Config, int]] = {
     "dense, h = 0": (PAPER, 1),
     "dense, h = 0, +-70 m": (PAPER.replace(point_cloud_range=(-70.0, -70.0, -3.0, 70.0, 70.0, 5.0)), 1),
     "dense, h = 0, connectivity 4": (PAPER.replace(connectivity=4), 1),
-    "dense, h = 0, conv": (
-        PAPER.replace(correlation="conv", point_cloud_range=(-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)),
-        1,
-    ),
+    "dense, h = 0, conv": (PAPER.replace(correlation="conv", point_cloud_range=SMALL), 1),
     "dense, h = 4, 5 scales": (PAPER.replace(num_history=4, pixel_sizes=SCALES), 1),
     "dense, h = 2, 2 scales": (TWO, 3),
     "dense, h = 2, 2 scales, max_memory 30 MB": (TWO.replace(max_memory=LITTLE), 3),
@@ -71,11 +69,6 @@ STREETS: list[Window] = []  # filled by `main`
 Rows = List[Dict[str, Any]]
 
 
-def make_streets() -> list[Window]:
-    """Simulated windows."""
-    return [window(make_drive(seed=seed, num_sweeps=SWEEPS), SWEEPS - 2, SWEEPS - 2) for seed in SEEDS]
-
-
 def windows_for(config: Config, number: int) -> list[Window]:
     """Windows with the history of a config; there are three different ones, which are repeated."""
     chosen = [STREETS[i % len(STREETS)] for i in range(number)]
@@ -86,26 +79,22 @@ def check_equality(device: str) -> Rows:
     """Compare GPU and CPU in every variant: rows that differ in each field, the largest difference of the floats."""
     rows = []
     for name, (config, number) in VARIANTS.items():
-        windows = windows_for(config, number)
-        on_gpu, on_cpu = (make_model(config, where)(windows) for where in (device, "cpu"))
-        rows.append({"variant": name, **compare(on_gpu, on_cpu)})
+        results = (make_model(config, where)(windows_for(config, number)) for where in (device, "cpu"))
+        rows.append({"variant": name, **compare(*results)})
     return rows
 
 
 def compare(results: Sequence[FlowResult], expected: Sequence[FlowResult]) -> dict[str, Any]:
     """Points, points that differ in each field, the largest difference of a float, and whether all is equal."""
     row: dict[str, Any] = {"points": sum(len(result.flow) for result in expected)}
+    row.update((field.name, 0) for field in fields(FlowResult))
     largest = 0.0
-    for field in fields(FlowResult):
-        row[field.name] = 0
+    for name in expected[0].numpy():
         for a, b in zip(results, expected):
-            x, y = getattr(a, field.name), getattr(b, field.name)
-            if y is None:  # only the verified method has a confidence
-                continue
-            x = x.cpu()
-            row[field.name] += int((x != y).view(len(y), -1).any(1).sum())
-            if x.is_floating_point() and x.numel():
-                largest = max(largest, float((x - y).abs().max()))
+            x, y = a.numpy()[name], b.numpy()[name]
+            row[name] += int((x != y).reshape(len(y), -1).any(1).sum())
+            if y.dtype.kind == "f":
+                largest = max(largest, float(np.abs(x - y).max(initial=0)))
     row["largest_difference"] = largest
     row["same"] = all(row[name] == 0 for name in EXACT) and largest <= TOLERANCE
     return row
@@ -113,19 +102,13 @@ def compare(results: Sequence[FlowResult], expected: Sequence[FlowResult]) -> di
 
 def measure_speed(device: str) -> Rows:
     """Milliseconds of a batch and windows per second, from NumPy arrays and from tensors on the device."""
-    rows = []
+    rows, sizes = [], (1, 8, 32) if device == "cuda" else (1, 2)
     for name, config in MEASURED.items():
-        for size in (1, 8, 32) if device == "cuda" else (1, 2):
-            host = windows_for(config, size)
-            for kind, windows in (("arrays", host), (device, [on_device(each, device) for each in host])):
-                watch, end = TimedModel(make_model(config, device)), time.monotonic() + 2
-                for run in range(30):
-                    if run < 3 or time.monotonic() < end:
-                        watch(windows)
-                median = watch.report()["median"]
-                rows.append(
-                    {"work": name, "input": kind, "batch": size, "ms": 1000 * median, "windows/s": size / median}
-                )
+        host = windows_for(config, len(STREETS))
+        for kind, windows in (("arrays", host), (device, [on_device(each, device) for each in host])):
+            for size, found in measure(make_model(config, device), windows, 3, sizes)["batches"].items():
+                of_batch = {"ms": 1000 * found["median"], "windows/s": found["windows_per_s"]}
+                rows.append({"work": name, "input": kind, "batch": size, **of_batch})
     return rows
 
 
@@ -203,7 +186,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", choices=("cuda", "cpu"))
     parser.add_argument("--skip", nargs="*", default=[], choices=list(PARTS))
     given = parser.parse_args()
-    STREETS.extend(make_streets())
+    STREETS.extend(window(make_drive(seed=seed, num_sweeps=SWEEPS), SWEEPS - 2, SWEEPS - 2) for seed in SEEDS)
     name = torch.cuda.get_device_name() if given.device == "cuda" else "no GPU: the CPU is compared with itself"
     report: dict[str, Any] = {"device": name, "platform": platform.platform(), "torch": torch.__version__}
     print(json.dumps(report))

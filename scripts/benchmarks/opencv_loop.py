@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from cflow_torch.config import Config, DenseConfig
-from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
+from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.types import FlowResult, Sweep, Window, as_numpy
 
 _SQUARE = np.ones((3, 3), np.uint8)
 # Smallest score that is an overlap. One common pixel scores 1 / sqrt(E_m E_w), above 1e-4 up to 10,000 pixels each;
@@ -49,16 +50,8 @@ class Clusters(NamedTuple):
 
 
 def opencv() -> Any:
-    """Import cv2.
-
-    Raises:
-        CFlowError: OpenCV is not installed.
-    """
-    try:
-        import cv2
-    except ImportError:
-        raise CFlowError("the OpenCV loop needs OpenCV: pip install opencv-python-headless") from None
-    return cv2
+    """Import cv2."""
+    return import_optional("cv2", "the OpenCV loop needs OpenCV: pip install opencv-python-headless")
 
 
 def opencv_flow(window: Window, config: Config) -> FlowResult:
@@ -71,15 +64,11 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
     Returns:
         `FlowResult` of CPU tensors, rows in the order of pc0.
 
-    Convention:
-        Ties between shifts depend on the rounding of `cv2.matchTemplate`; all else equals `CorrelationFlow`.
-
     Raises:
         CFlowError: OpenCV is not installed, or the loop does not have the method, clustering or view.
 
     Cost: one `cv2.matchTemplate` per cluster, sweep and scale.
     """
-    opencv()  # raise first if it is not installed
     if not isinstance(config, DenseConfig) or config.clustering != "components":
         raise CFlowError("the OpenCV loop has method='dense', clustering='components' only")
     if config.sectional_view or config.max_speed is not None:
@@ -300,7 +289,7 @@ def _cloud(sweep: Sweep, moved: np.ndarray, steps: float, config: Config) -> Clo
     x, y, z = moved
     is_active = (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= z0) & (z <= z1) & np.isfinite(z)
     if sweep.is_ground is not None:
-        is_active &= ~_numpy(sweep.is_ground)
+        is_active &= ~as_numpy(sweep.is_ground)
     rows = np.flatnonzero(is_active)
     return Cloud(moved[:2].take(rows, 1), steps, rows)
 
@@ -310,7 +299,7 @@ def _compensate(sweep: Sweep, sweep1: Sweep) -> tuple[np.ndarray, np.ndarray]:
     points = _columns(sweep)
     if sweep.pose is None:
         return points, points
-    matrix = np.linalg.inv(_numpy(sweep1.pose)) @ _numpy(sweep.pose)
+    matrix = np.linalg.inv(as_numpy(sweep1.pose)) @ as_numpy(sweep.pose)
     rotation, translation = matrix[:3, :3, None], matrix[:3, 3:]
     with np.errstate(invalid="ignore"):  # for points that are not finite
         # We avoid a product of large matrices, after which the threads of BLAS spin for tens of milliseconds.
@@ -322,8 +311,4 @@ def _compensate(sweep: Sweep, sweep1: Sweep) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _columns(sweep: Sweep) -> np.ndarray:
-    return np.ascontiguousarray(_numpy(sweep.points)[:, :3].T, dtype=np.float64)
-
-
-def _numpy(values: Any) -> np.ndarray:
-    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
+    return np.ascontiguousarray(as_numpy(sweep.points)[:, :3].T, dtype=np.float64)

@@ -102,7 +102,7 @@ def make_case(item: Item, reach: float) -> Case:
     for sweep, at in zip(pair, moved):
         ground = np.zeros(len(at), bool) if sweep.is_ground is None else as_numpy(sweep.is_ground)
         rows.append(np.flatnonzero(~ground & np.isfinite(at).all(1) & (np.abs(at[:, :2]) <= reach).all(1)))
-    return Case(item, between(*pair), rows[0], moved[0][rows[0]], moved[1][rows[1]])
+    return Case(item, between(item.window), rows[0], moved[0][rows[0]], moved[1][rows[1]])
 
 
 def preset(name: str, num_history: int, reach: float) -> Method:
