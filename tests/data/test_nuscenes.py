@@ -149,46 +149,38 @@ def test_scenes_of_a_version_share_their_tables(tiny, tmp_path):
     assert (first.log_id, len(first), log.log_id, len(log)) == ("tiny", 6, "second", 4)
 
 
-@pytest.mark.parametrize("content", [b'{"token": "a"}', b"[1, 2]", b'[{"a": 1}]'])
-def test_tables_of_another_layout_are_refused(tiny, content):
-    (tiny / VERSION / "sample_data.json").write_bytes(content)
-    with pytest.raises(CFlowError, match="cannot read .*sample_data.json .*(KeyError|not a list of rows)"):
-        open_log(tiny)
-
-
 @pytest.mark.parametrize(
     ("table", "change", "complaint"),
     [
         ("sample_data", {"ego_pose_token": "x"}, "cannot read .*tiny .KeyError: 'x'"),
         ("sample_data", {"timestamp": 1_533_279_682_100_000}, "sample_data.json has two rows .*one time"),
         ("sample_data", {"timestamp": "noon"}, "cannot read .*tiny"),
+        ("sample_data", lambda rows: {"token": "a"}, "cannot read .*sample_data.json .*KeyError"),
+        ("sample_data", lambda rows: [1, 2], "cannot read .*sample_data.json .*not a list of rows"),
+        ("sample_data", lambda rows: rows[:1], "has 1 sweeps"),
         ("ego_pose", {"rotation": [0.9, 0, 0, 0]}, "ego_pose.json: .* is not a rigid motion"),
         ("ego_pose", {"translation": [1, 2, float("nan")]}, "ego_pose.json: .* is not a rigid motion"),
         ("sample_annotation", {"size": ["a", 1, 1]}, "cannot read .*tiny"),
         ("sensor", {"modality": "camera"}, "has no LiDAR"),
+        (
+            "category",
+            lambda rows: [{**row, "name": "vehicle.spaceship"} for row in rows],
+            "category.json: the categories .*spaceship.* are unknown",
+        ),
     ],
 )
-def test_inconsistent_rows_are_refused(tiny, table, change, complaint):
-    edit(tiny, table, lambda rows: rows[0].update(change))
+def test_inconsistent_tables_are_refused(tiny, table, change, complaint):
+    edit(tiny, table, (lambda rows: rows[0].update(change)) if isinstance(change, dict) else change)
     with pytest.raises(CFlowError, match=complaint):
         open_log(tiny)
 
 
-def test_unknown_categories_are_refused(tiny):
-    edit(tiny, "category", lambda rows: [{**row, "name": "vehicle.spaceship"} for row in rows])
-    with pytest.raises(CFlowError, match="category.json: the categories .*spaceship.* are unknown"):
-        open_log(tiny)
-
-
-@pytest.mark.parametrize(
-    ("num_sweeps", "scene", "complaint"),
-    [(1, "", "has 1 sweeps"), (6, "scene-0061", "no scene 'scene-0061'"), (6, "", r"\.bin is missing; copy")],
-)
-def test_what_is_missing_is_named(tmp_path, num_sweeps, scene, complaint):
-    tiny = write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=num_sweeps), tmp_path, key_frame_interval=0.1)
+def test_what_is_missing_is_named(tiny):
+    with pytest.raises(CFlowError, match="no scene 'scene-0061'"):
+        NuScenesLog(SceneSource(tiny, VERSION, "scene-0061"))
     min((tiny / "samples" / "LIDAR_TOP").iterdir()).unlink()
-    with pytest.raises(CFlowError, match=complaint):
-        (NuScenesLog(SceneSource(tiny, VERSION, scene)) if scene else open_log(tiny)).sweep(0)
+    with pytest.raises(CFlowError, match=r"\.bin is missing; copy"):
+        open_log(tiny).sweep(0)
 
 
 def test_a_bad_sweep_costs_no_other(tiny):

@@ -12,6 +12,7 @@ from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.arrays.poses_text import write_kitti_poses
 from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.log import LogWrapper
 from cflow_torch.data.log_check import check_static_world
 from cflow_torch.data.odometry import PosedLog, poses_from_odometry, with_poses
 from cflow_torch.simulator import make_drive
@@ -19,16 +20,18 @@ from cflow_torch.simulator import make_drive
 needs_kiss_icp = pytest.mark.skipif(find_spec("kiss_icp") is None, reason="needs KISS-ICP (extra odometry)")
 
 
-class NoPoses:
-    """A log without poses, and optionally without points."""
-
-    def __init__(self, log, is_empty=False) -> None:
-        self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
-        self.is_empty = is_empty
+class NoPoses(LogWrapper):
+    """A log without poses."""
 
     def sweep(self, index):
-        sweep = self.log.sweep(index)
-        return Sweep(np.full((200, 3), np.nan, np.float32) if self.is_empty else sweep.points)
+        return Sweep(self.log.sweep(index).points)
+
+
+class Empty(LogWrapper):
+    """A log of sweeps without a finite point."""
+
+    def sweep(self, index):
+        return Sweep(np.full((200, 3), np.nan, np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +55,7 @@ def test_poses_of_a_simulated_drive_are_estimated(drive):
         assert metres < 0.05 and degrees < 0.2, index
     assert np.array_equal(poses, poses_from_odometry(NoPoses(drive))), "the same again"
     with pytest.raises(CFlowError, match="fewer than 100 points"):
-        poses_from_odometry(NoPoses(drive, is_empty=True))
+        poses_from_odometry(Empty(drive))
 
 
 @needs_kiss_icp

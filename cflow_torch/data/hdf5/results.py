@@ -83,7 +83,7 @@ def write_hdf5_labels(
     made_by: str = "",
     overwrite: bool = False,
 ) -> int:
-    """Write labels for self-supervised training into a scene, in the way of `write_hdf5_results`.
+    """Write labels for self-supervised training into a copy of a scene, which replaces it at the end.
 
     Args:
         file: `<scene>.h5`; every other key keeps its contents.
