@@ -15,7 +15,7 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, read_column
 from cflow_torch.data.arrays.ply import ply_fields, write_ply
 from cflow_torch.data.arrays.poses_text import (
     Trajectory,
-    poses_at,
+    covered_poses,
     read_poses,
     read_times,
     write_kitti_poses,
@@ -265,9 +265,9 @@ def test_poses_of_another_rate_are_interpolated(tmp_path):
     with pytest.raises(CFlowError, match="same time"):
         ArraysLog(folder)
     gap = Trajectory(truth[:2], np.array([0, 10**9]), "tum")
-    assert np.array_equal(poses_at(gap, [0, 10**9], "x"), gap.poses), "a pose at its time stays as it is"
+    assert np.array_equal(covered_poses(gap, [0, 10**9], "x"), gap.poses), "a pose at its time stays as it is"
     with pytest.raises(CFlowError, match="no pose near"):
-        poses_at(gap, [5 * 10**8], "x")
+        covered_poses(gap, [5 * 10**8], "x")
 
 
 def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):

@@ -118,7 +118,7 @@ def write_times(path: PathLike, times_ns: Sequence[int]) -> None:
     np.savetxt(path, [_seconds(time) for time in times_ns], "%s")
 
 
-def poses_at(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np.ndarray:
+def covered_poses(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np.ndarray:
     """Interpolate poses at given times: positions linearly, rotations at a constant rate.
 
     Args:

@@ -9,15 +9,9 @@ from typing import Any, Sequence
 
 import numpy as np
 
+from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud, read_columns
-from cflow_torch.data.arrays.poses_text import (
-    Trajectory,
-    checked_poses,
-    poses_at,
-    read_calibration,
-    read_poses,
-    read_times,
-)
+from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.files import find_folders, read_npy
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote
@@ -130,23 +124,23 @@ class ArraysLog(Log):
             file = _resolve(self.folder, poses, POSE_FILES, "poses", kitti)
             if file is None:
                 return None, "", False
-            trajectory = read_poses(file)
+            trajectory = poses_text.read_poses(file)
             chosen = _resolve(self.folder, calibration, ("calib.txt",), "calibration")
             if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
                 return trajectory, str(file), False
-            T_cam_lidar = read_calibration(chosen)
+            T_cam_lidar = poses_text.read_calibration(chosen)
             in_lidar = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
             return replace(trajectory, poses=in_lidar), str(file), True
         if poses is None:
             return None, "", False
-        return Trajectory(checked_poses(np.asarray(poses), "poses"), None, "matrix"), "poses", False
+        return Trajectory(poses_text.checked_poses(np.asarray(poses), "poses"), None, "matrix"), "poses", False
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
         count = len(self.files)
         file = _resolve(self.folder, times, ("times.txt",), "times")
         if file is not None:
-            stamps = read_times(file).tolist()
+            stamps = poses_text.read_times(file).tolist()
             if len(stamps) != count:
                 raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
             return stamps
@@ -160,7 +154,7 @@ class ArraysLog(Log):
     def _one_each(self, trajectory: Trajectory, source: str, stamps: list[int] | None) -> np.ndarray:
         """Return (K, 4, 4), one pose per sweep."""
         if trajectory.times_ns is not None and stamps is not None:
-            return poses_at(trajectory, stamps, source)
+            return poses_text.covered_poses(trajectory, stamps, source)
         if len(trajectory.poses) != len(self.files):
             raise CFlowError(
                 f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "

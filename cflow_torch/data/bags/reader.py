@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import Trajectory
-from cflow_torch.data.arrays.poses_text import poses_at as covered_poses
+from cflow_torch.data.arrays.poses_text import Trajectory, covered_poses
 from cflow_torch.data.bags.messages import Frames, Sample, other_columns, points_and_times, sample, sorted_poses
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
