@@ -142,12 +142,7 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
 
 
 def find_sources(name: str, root: Any) -> Sequence[Any]:
-    """Return one source per log under a path, for `open_log`.
-
-    Raises:
-        CFlowError: no such data set, or nothing of its format at the path.
-        OSError: a remote path cannot be reached.
-    """
+    """Return one source per log under a path, for `open_log`; none is a `CFlowError`."""
     top, (module, _), form = as_path(root), _reader(name), DATA_SETS[name]
     with remote_errors(top):
         if form.find:

@@ -45,7 +45,7 @@ def file_errors(file: Any, hint: str = "copy it again", doing: str = "read") -> 
 
 
 def shortened(text: Any) -> str:
-    """The text on one line of at most 400 characters."""
+    """Return the text on one line of at most 400 characters."""
     line = " ".join(str(text).split())
     return line if len(line) <= _MAX_TEXT else line[:_MAX_TEXT] + " ..."
 

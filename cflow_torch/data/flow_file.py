@@ -24,8 +24,8 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
     Args:
         path: file name, by convention `<log id>/<time stamp of sweep t>.feather`.
         result: flow of one window.
-        contents: which parts to write, names of `CONTENTS` and `ON_REQUEST`. The pose flow, and with it the total flow,
-            follow from the poses; without these two a file has about a seventeenth of the size.
+        contents: names of `CONTENTS` and `ON_REQUEST`. Pose flow and total flow follow from the poses; a file without
+            them has about a seventeenth of the size.
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
@@ -46,8 +46,7 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
 def read_flow(path: PathLike) -> FlowResult:
     """Read a result that `write_flow` wrote; fields that the file does not hold are None.
 
-    Raises:
-        CFlowError: the file is missing, cannot be reached, is truncated, or holds none of the contents.
+    Another file, or one that cannot be read, is a `CFlowError`.
     """
     path = as_path(path)
     fields = {}

@@ -22,9 +22,6 @@ class FlowLabels:
         flow: (N, 3) float32, metres, TOTAL flow t -> t+1 (ego motion included), axes of ego1.
         category: (N,) uint8, Argoverse 2 index 1 ... 30, 0 = background.
         is_valid: (N,) bool, False where the truth is unknown.
-
-    Raises:
-        CFlowError: wrong type, shape or dtype.
     """
 
     flow: np.ndarray

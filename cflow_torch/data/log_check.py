@@ -67,9 +67,6 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
         another position than the poses state shows only when the vehicle turns: by its distance times the rotation, 12
         cm for 1.35 m and 5 degrees.
 
-    Raises:
-        CFlowError: no such pair of sweeps.
-
     Cost: reads two sweeps and takes about 0.15 s on one core.
 
     Source: the fit is the normal distributions transform in the plane (Biber and Strasser, 2003).

@@ -32,10 +32,9 @@ def poses_from_odometry(log: Log) -> np.ndarray:
     Returns:
         (K, 4, 4) float64, in the frame of the points.
 
-    Convention:
-        KISS-ICP runs with its own settings, without de-skewing, on one thread, so that the poses do not depend on the
-        number of threads. It needs a few sweeps to adapt to the speed, so we take the first five steps from a second
-        run, backwards from the eleventh sweep.
+    Convention: KISS-ICP runs with its own settings, without de-skewing, on one thread, so that the poses do not depend
+        on the number of threads. It needs a few sweeps to adapt to the speed, so we take the first five steps from a
+        second run, backwards from the eleventh sweep.
 
     Raises:
         CFlowError: KISS-ICP is not installed, a sweep has fewer than 100 finite points in range, or the result is not a

@@ -15,15 +15,14 @@ from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
-    """Compute the flow of a static world, T p - p.
+    """Compute the flow of a static world, T p - p, (N, 3) float32 metres in the axes of ego1.
+
+    It is computed in float64 and rounded once, because the difference of two float32 positions at 100 m has 1e-5 m of
+    noise.
 
     Args:
         points: (N, 3) float, metres, ego frame of t.
         T_ego1_ego0: (4, 4), ego coordinates of t to those of t+1.
-
-    Returns:
-        (N, 3) float32, metres, axes of ego1. It is computed in float64 and rounded once, because the difference of two
-        float32 positions at 100 m has 1e-5 m of noise.
     """
     return (transform_points(points, np.asarray(T_ego1_ego0, np.float64)) - points).astype(np.float32)
 
@@ -123,11 +122,7 @@ class EvalFrame:
         return cls(points=window.pc0.points, labels=labels, **parts)
 
     def transform(self) -> np.ndarray:
-        """Return T_ego1_ego0, (4, 4) float64.
-
-        Raises:
-            CFlowError: the frame has only `pose_flow`.
-        """
+        """Return T_ego1_ego0, (4, 4) float64; a `CFlowError` if the frame has only `pose_flow`."""
         if self.T_ego1_ego0 is None:
             raise CFlowError("this definition measures in another frame: pass T_ego1_ego0 to the evaluation frame")
         return as_numpy(self.T_ego1_ego0)

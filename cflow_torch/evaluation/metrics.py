@@ -27,13 +27,11 @@ _ACCUMULATORS: dict[str, Callable[..., Accumulator]] = {
 
 
 class SceneFlowMetrics:
-    """Accumulate all metrics of a definition, frame by frame.
+    """Accumulate all metrics of a definition over frames, in any order.
 
     Args:
         definition: a name in `DEFINITIONS` ("opensceneflow", "bucketed_scene_flow_eval", "av2", ...) or a
             `Definition`.
-
-    Convention: frames come in any order. `merge` combines parts that were scored separately.
     """
 
     def __init__(self, definition: str | Definition = "opensceneflow") -> None:
@@ -59,10 +57,7 @@ class SceneFlowMetrics:
         self.num_nan += other.num_nan
 
     def compute(self) -> dict[str, Any]:
-        """Return the scores of all frames so far as plain numbers.
-
-        The keys are "definition", `num_frames`, `num_points`, `num_nan`, and one per metric, which has a dictionary.
-        """
+        """Return "definition", `num_frames`, `num_points`, `num_nan`, and a dictionary of plain numbers per metric."""
         return {
             "definition": self.definition.name,
             "num_frames": self.num_frames,

@@ -75,7 +75,7 @@ def _number(value: float) -> str:
 
 
 def markdown(header: Sequence[object], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Lines of a Markdown table, the first column left-aligned, the others right-aligned."""
+    """Return the lines of a Markdown table, the first column left-aligned, the others right-aligned."""
     cells = [[str(cell) for cell in row] for row in (header, *rows)]
     first, *others = [max(len(cell) for cell in column) for column in zip(*cells)]
     lines = [[row[0].ljust(first), *(cell.rjust(width) for cell, width in zip(row[1:], others))] for row in cells]

@@ -132,15 +132,10 @@ class SequenceFlow(nn.Module):
 
 
 def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Tensor:
-    """Rotate residual flow from the axes of ego1 to those of the points of t.
+    """Rotate (N, 3) residual flow from the axes of ego1 to those of the points of t; `now`, `following` are t, t+1.
 
-    Args:
-        residual_flow: (N, 3) float, metres, axes of ego1.
-        now, following: frames t and t+1.
-
-    Returns:
-        (N, 3) float32, rotated by (R_global_ego0 R_ego_sensor)^T R_global_ego1 in float64. There is no translation,
-        because a flow is a difference of positions.
+    The rotation is (R_global_ego0 R_ego_sensor)^T R_global_ego1, in float64. A flow is not translated, because it is a
+    difference of positions.
     """
     rotation = np.eye(4)
     global_R_sensor = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]
@@ -149,11 +144,7 @@ def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Te
 
 
 def import_from(module: str, name: str, how: str) -> Any:
-    """Import a name from a module of a harness.
-
-    Raises:
-        CFlowError: the module is missing, or is another one of that name. The message contains `how` to install it.
-    """
+    """Import a name from a module of a harness. If it is missing, a `CFlowError` says `how` to install it."""
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:

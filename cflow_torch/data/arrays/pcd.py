@@ -13,10 +13,7 @@ from cflow_torch.errors import import_optional
 
 
 def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
-    """Read the fields of a text, binary or compressed cloud of version 0.7.
-
-    Args:
-        content: of a `.pcd` file.
+    """Read the fields of a `.pcd` file of version 0.7: text, binary or compressed.
 
     Returns:
         Field name -> (N,) array of the dtype that SIZE and TYPE state, in the order of the file.

@@ -28,10 +28,7 @@ _LONGEST_HEADER = 65536  # bytes
 
 
 def ply_fields(content: bytes) -> dict[str, np.ndarray]:
-    """Read all properties of the vertices.
-
-    Args:
-        content: of a `.ply` file whose first element is `vertex`; further elements, such as faces, are not read.
+    """Read all properties of the vertices of a `.ply` file, whose first element must be `vertex`. Faces are not read.
 
     Returns:
         Property name -> (N,) array of the type that the header states, in the byte order of the machine.

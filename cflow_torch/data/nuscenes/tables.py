@@ -43,10 +43,10 @@ class SceneSource:
     """The location of a scene.
 
     Args:
-        root: data root, which `sample_data.filename` is relative to.
+        root: data root, to which `sample_data.filename` is relative.
         version: folder of the tables, for example "v1.0-mini".
         name: of the scene.
-        tables: the tables of that version, shared by its scenes so that they are read once; None = read them again.
+        tables: of that version, shared by its scenes so that they are read once; None = read them again.
     """
 
     root: Path
@@ -172,8 +172,7 @@ class Tables:
     def scene(self, name: str) -> tuple[np.ndarray, dict[str, LidarChain], Annotations]:
         """Return all rows of a scene, linked and checked.
 
-        Returns:
-            Sample times (ascending int64, microseconds), LiDARs by channel in the order of sensor.json, boxes.
+        They are its sample times (ascending int64, microseconds), LiDARs by channel in the order of sensor.json, boxes.
 
         Raises:
             CFlowError: no such scene; a table that is missing, truncated, or not of this format; a row that refers to

@@ -103,7 +103,7 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor
 
 
 def _ground_of_t(batch: Mapping[str, Any], b: int) -> Tensor:
-    """(K, 3) ground points of t, which the harness has taken out of pc0; none if the batch does not have them."""
+    """Return the (K, 3) ground points of t, which the harness has taken out of pc0; none if the batch lacks them."""
     if "origin_pc0" not in batch or "gm0" not in batch:
         return torch.zeros((0, 3))
     points, is_ground = _entry(batch, "origin_pc0", b), _mask(batch, "gm0", b)
@@ -122,7 +122,7 @@ def _mask(batch: Mapping[str, Any], key: str, b: int) -> Tensor:
 
 
 def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> np.ndarray | None:
-    """(4, 4) float64 ego_T_lidar of a sample; None = identity."""
+    """Return the (4, 4) float64 ego_T_lidar of a sample; None = identity."""
     if not isinstance(ego_T_lidar, str):
         return None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
     if "timestamp" not in batch or "gm0" not in batch:
@@ -138,7 +138,7 @@ def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> np.ndarra
 
 
 def _entry(batch: Mapping[str, Any], key: str, b: int) -> Any:
-    """Sample b of a key, whose value is a tensor with a batch dimension or a list."""
+    """Return sample b of a key, whose value is a tensor with a batch dimension or a list."""
     if key not in batch:
         raise CFlowError(f"the batch has no '{key}', which the method needs; it has {', '.join(map(str, batch))}")
     try:
