@@ -26,6 +26,7 @@ data. You can compare whether a change helps, but not the numbers. The tables ha
 CSV files next to the pictures have each class. The runs of a table are those of the table before if it names none.
 docs/settings.md has the commands.
 """
+ABOUT_OTHERS = "pictures across data sets show the paper's other methods, with numbers in scripts/paper/figures.yaml"
 Cells = List[List[str]]
 
 
@@ -171,7 +172,8 @@ def write_pages(results: Path, output: Path) -> None:
         notes += [about["note"]] if "note" in about else []
         last_described = described or last_described
         if name in PER_SET:
-            notes.append("the picture shows the paper's other methods, with numbers in scripts/paper/figures.yaml")
+            if name == PER_SET[0]:
+                notes.append(ABOUT_OTHERS)
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
         page += [*(f"- {line}" for line in notes), ""] if notes else []
         if draw is not None and is_figure:
