@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from difflib import get_close_matches
 from functools import lru_cache
@@ -76,24 +75,9 @@ def near(word: str, known: Iterable[str]) -> str:
     return f" (did you mean {found[0]}?)" if found else ""
 
 
-def meanings(file: Path) -> list[str]:
-    """The comments next to the settings in a YAML file, in the order of `own_settings`."""
-    text = file.read_text(encoding="utf-8")
-    found: dict[str, str] = dict(re.findall(r"^ *(\w+):[^#\n]*# (.*)$", text, re.MULTILINE))
-    names = [(name.partition(".")[0], name.rpartition(".")[2]) for name in own_settings(file)]
-    return [found.get(last, found.get(first, "")) for first, last in names]
-
-
-def default_text(value: Any) -> str:
-    """A default as you would write it on the command line."""
-    return json.dumps(list(value) if isinstance(value, tuple) else value).replace('"', "")
-
-
 def settings_help(command: str) -> str:
-    """The settings of a command with their meaning and default, and the choices of its groups, for its help."""
-    file = CONFIGS / f"{command}.yaml"
-    lines = ["\nsettings:"]
-    for (name, value), what in zip(own_settings(file).items(), meanings(file)):
-        lines.append(f"{name:15} {what}; default {default_text(value)}")
-    lines += [f"{group}={'|'.join(names)}" for group, names in groups(command).items()]
-    return "\n  ".join([*lines, "data.NAME, model.NAME, ...: `cflow settings` lists them"]) + "\n"
+    """The settings of a command as in its YAML file, and the choices of its groups, for its help."""
+    text = (CONFIGS / f"{command}.yaml").read_text(encoding="utf-8")
+    own = re.sub(r"^((defaults|hydra):.*\n( .*\n)+|#.*\n)", "", text, flags=re.MULTILINE).strip()
+    lines = [*own.splitlines(), *(f"{group}={'|'.join(names)}" for group, names in groups(command).items())]
+    return "\n  ".join(["\nsettings:", *lines, "data.NAME, model.NAME, ...: `cflow settings` lists them"]) + "\n"

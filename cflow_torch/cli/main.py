@@ -84,15 +84,12 @@ def _run(arguments: list[str]) -> None:
     has_settings = command not in _WITHOUT_SETTINGS
     if "-h" in rest or "--help" in rest:
         return print(_help(command, has_settings), end="")
+    if has_settings:
+        return _run_with_settings(command, rest)
     try:
-        if not has_settings:
-            return import_module(f"cflow_torch.cli.{command}").task(rest)  # type: ignore[no-any-return]
-        from cflow_torch.cli.arguments import check_call
-
-        check_call(command, rest)
+        import_module(f"cflow_torch.cli.{command}").task(rest)
     except CFlowError as error:
         _exit_wrong(error)
-    return _run_with_settings(command, rest)
 
 
 def _help(command: str, has_settings: bool) -> str:
@@ -106,51 +103,60 @@ def _help(command: str, has_settings: bool) -> str:
 
 def _run_with_settings(command: str, rest: list[str]) -> None:
     import hydra
-    from hydra.core.hydra_config import HydraConfig
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
 
     from cflow_torch.cli import schemas  # noqa: F401 (registers them)
-    from cflow_torch.cli.arguments import fixed_settings, split
+    from cflow_torch.cli.arguments import fixed_settings, split, unknown_options
     from cflow_torch.cli.refusals import UnfinishedJob, explain
-    from cflow_torch.errors import CFlowError
-
-    def task(cfg: Any) -> Any:
-        from cflow_torch.cli.run import complete_data  # imports torch, which Hydra's own answers do not need
-        from cflow_torch.fleet.progress import show_warnings_as_lines
-
-        show_warnings_as_lines()
-        try:
-            OmegaConf.resolve(cfg)
-            for source in HydraConfig.get().runtime.config_sources:
-                if source.schema == "file" and source.path not in sys.path:  # the folder of a user's own reader
-                    sys.path.append(source.path)
-            cfg.data = complete_data(cfg.data)
-            return import_module(f"cflow_torch.cli.{command}").task(cfg)
-        except (CFlowError, OmegaConfBaseException) as error:
-            _exit_wrong(explain(error, command))
-        except Exception as error:
-            if isinstance(error, UnfinishedJob):
-                raise
-            _exit_if_refused(error)
-            traceback.print_exc()
-            message = "this is a bug of cflow: please report it with the lines above and the output of `cflow info`"
-            raise UnfinishedJob(message) from None
 
     overrides, options = split(rest)
+    for option in unknown_options(options):
+        _exit_wrong(f"unknown option {option!r}: give settings as NAME=VALUE; `cflow {command} --help` lists them")
     # The folder of a job is named after what is swept, and after what tells sweeps into the same output apart.
     unnamed = {"output", "overwrite", *fixed_settings(overrides)} - {"experiment", "data.label"}
     names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
     sys.argv = [f"cflow {command}", *overrides, names, *options]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
+    main_of = hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)
     try:
-        hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)(task)()
+        main_of(lambda cfg: _run_job(command, cfg))()
     except UnfinishedJob as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
     except Exception as error:
         _exit_if_refused(error)
         _exit_wrong(explain(error, command))
+
+
+def _run_job(command: str, cfg: Any) -> Any:
+    """Run a command with the settings that Hydra has composed, perhaps as a job of a sweep."""
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from cflow_torch.cli.refusals import UnfinishedJob, check_settings, explain
+    from cflow_torch.errors import CFlowError
+
+    try:
+        OmegaConf.resolve(cfg)
+        check_settings(cfg)
+        for source in HydraConfig.get().runtime.config_sources:
+            if source.schema == "file" and source.path not in sys.path:  # the folder of a user's own reader
+                sys.path.append(source.path)
+        from cflow_torch.cli.run import complete_data  # imports torch, which takes seconds
+        from cflow_torch.fleet.progress import show_warnings_as_lines
+
+        show_warnings_as_lines()
+        cfg.data = complete_data(cfg.data)
+        return import_module(f"cflow_torch.cli.{command}").task(cfg)
+    except UnfinishedJob:
+        raise
+    except (CFlowError, OmegaConfBaseException) as error:
+        _exit_wrong(explain(error, command))
+    except Exception as error:
+        _exit_if_refused(error)
+        traceback.print_exc()
+        message = "this is a bug of cflow: please report it with the lines above and the output of `cflow info`"
+        raise UnfinishedJob(message) from None
 
 
 def _exit_wrong(message: object) -> None:

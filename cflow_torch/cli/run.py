@@ -195,8 +195,6 @@ def find_logs(cfg: DictConfig) -> Sources:
         chosen = format_of(data.profile)
         logs = benchmark_logs(data.cache, data.profile, seeds, num_sweeps, data.scenes)
         return Sources(chosen.data_set, {"check": False, **chosen.settings}, logs)
-    if OmegaConf.is_missing(data, "root"):
-        raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     name, root = settings.pop("name"), settings.pop("root")
     return Sources(name, settings, list(find_sources(name, root)))
 

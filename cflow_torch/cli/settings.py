@@ -17,13 +17,14 @@ examples:
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Iterator
 
 import yaml  # type: ignore[import-untyped]
 
-from cflow_torch.cli.choices import CONFIGS, SETTERS, default_text, files, meanings, near, own_settings
+from cflow_torch.cli.choices import CONFIGS, files, near, settings
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, WINDOW, describe, make_config
 from cflow_torch.errors import CFlowError
@@ -48,13 +49,15 @@ target:
   device: auto  # auto = that of the batch
   voxel_size: [0.1, 0.1, 2000.0]  # the harness asks for it; without effect, pixel_sizes counts
 """
+_COMMANDS = sorted(file.stem for file in CONFIGS.glob("*.yaml") if file.stem != "hydra")
 _Z = 1000.0  # metres; the harness computes with the region, so infinite bounds of z are replaced by this one
 
 
 def task(arguments: list[str]) -> None:
     """Run `cflow settings`."""
     if not arguments:
-        print("\n\n".join([_PAGE, *(text for _, text in _sections())]))
+        sections = (f"## {title}\n\n" + "\n".join(lines) for _, title, lines in _sections())
+        print("\n\n".join([_PAGE, *sections]))
     elif len(arguments) == 2 and arguments[0] == "--opensceneflow":
         from cflow_torch.data.atomic import ensure_writable, write_text
 
@@ -85,8 +88,8 @@ def harness_models() -> dict[str, str]:
     return models
 
 
-def _sections() -> Iterator[tuple[list[str], str]]:
-    """The sections of the page, and the names of each."""
+def _sections() -> Iterator[tuple[list[str], str, list[str]]]:
+    """The sections of the page: their names, title and lines."""
     for method, kind in METHODS.items():
         presets = {preset: make_config(preset) for preset, (of, _) in PRESETS.items() if of == method}
         rows = ["| setting | default | presets | allowed | meaning |", "|---|---|---|---|---|"]
@@ -96,67 +99,40 @@ def _sections() -> Iterator[tuple[list[str], str]]:
             cells = [f"`model.{f.name}`", f"`{_yaml(f.default)}`", changed, describe(f), f.metadata["help"]]
             rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
         chosen = [f"model={preset}" for preset in presets]
-        text = "\n".join([f"## Method `{method}`: {', '.join(chosen)}", "", *rows])
-        yield ["model", method, *presets, *chosen], text
-    for file in _files():
-        text = f"```yaml\n{file.read_text(encoding='utf-8').strip()}\n```"
-        yield [_name(file).replace("cflow ", "")], f"## {_name(file)}\n\n{text}"
-
-
-def _files() -> list[Path]:
-    """The YAML files of the commands, then of the groups."""
-    commands = [file for file in sorted(CONFIGS.glob("*.yaml")) if file.stem != "hydra"]
-    return commands + [file for group in sorted(CONFIGS.glob("*/")) for file in files(group.name)]
-
-
-def _name(file: Path) -> str:
-    return f"cflow {file.stem}" if file.parent == CONFIGS else f"{file.parent.name}={file.stem}"
-
-
-def _title(file: Path) -> str:
-    """The first line of the comment at the top of a YAML file."""
-    lines = file.read_text(encoding="utf-8").splitlines()
-    return next(line[2:] for line in lines if not line.startswith("# @"))
+        yield [method, *presets, *chosen, "model"], f"Method `{method}`: {', '.join(chosen)}", rows
+    chosen_files = [file for group in sorted(CONFIGS.glob("*/")) for file in files(group.name)]
+    for file in [*(CONFIGS / f"{command}.yaml" for command in _COMMANDS), *chosen_files]:
+        name = file.stem if file.parent == CONFIGS else f"{file.parent.name}={file.stem}"
+        text = file.read_text(encoding="utf-8").strip()
+        yield [name], name if "=" in name else f"cflow {name}", ["```yaml", *text.splitlines(), "```"]
 
 
 def _about(name: str) -> list[str]:
-    """The sections, the choices of a group and the settings of one name.
+    """The sections of this name, the first lines of the choices of a group, and the lines of a setting.
 
     Raises:
         CFlowError: nothing has this name.
     """
-    found = [text for names, text in _sections() if name in names]
-    choices = [f"{_name(file):28} {_title(file)}" for file in _files() if file.parent == CONFIGS / name]
+    group, _, setting = name.rpartition(".")
+    own_line = re.compile(rf"(\| `model\.| *){re.escape(setting)}(`|:)")
+    found: list[str] = []
+    choices: list[str] = []
+    titles_of: dict[str, list[str]] = {}  # line of a setting -> sections
+    for names, title, lines in _sections():
+        if name in names:
+            found.append("\n".join([f"## {title}", "", *lines]))
+        elif title.startswith(f"{name}="):
+            choices.append(f"{title:28} {next(line[2:] for line in lines if re.match('# [^@]', line))}")
+        elif group in ("", "model", title.partition("=")[0]) or any(line.startswith(f"{group}:") for line in lines):
+            for line in filter(own_line.match, lines):
+                titles_of.setdefault(line.strip(), []).append(title)
     found += ["\n".join(choices)] if choices else []
-    chosen: dict[str, dict[str, list[str]]] = {}  # setting and meaning -> default -> where
-    for key, meaning, default, where in _entries():
-        if name in (key, key.rpartition(".")[2]):
-            chosen.setdefault(f"{key}: {meaning}", {}).setdefault(default, []).append(where)
-    for head, defaults in chosen.items():
-        lines = [f"  default {default}: {', '.join(names)}" for default, names in defaults.items()]
-        found.append("\n".join([head, *lines]))
+    found += [f"{', '.join(titles)}:\n  {line}" for line, titles in titles_of.items()]
     if not found:
-        known = [key for key, *_ in _entries()] + [one for names, _ in _sections() for one in names]
+        known = [key for command in _COMMANDS for key in settings(command)]
+        known += [one for names, *_ in _sections() for one in names]
         raise CFlowError(f"settings {name}: nothing has this name{near(name, known)}; `cflow settings` lists all")
     return found
-
-
-def _entries() -> Iterator[tuple[str, str, str, str]]:
-    """Every setting: its dotted name, meaning, default, and where it has this default."""
-    for method, kind in METHODS.items():
-        presets = [(f"model={preset}", make_config(preset)) for preset, (of, _) in PRESETS.items() if of == method]
-        for where, config in [(f"method {method}", kind()), *presets]:
-            for f in fields(kind):
-                value = getattr(config, f.name)
-                if value != f.default or where.startswith("method"):
-                    yield f"model.{f.name}", f"{f.metadata['help']}; {describe(f)}", _yaml(value), where
-    for file in _files():
-        group = file.parent.name
-        if group not in SETTERS:
-            prefix = "" if file.parent == CONFIGS or group == "picture" else f"{group}."
-            for (key, value), meaning in zip(own_settings(file).items(), meanings(file)):
-                if key != group:
-                    yield prefix + key, meaning, default_text(value), _name(file)
 
 
 def _yaml(value: Any) -> str:
