@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 
 from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
+from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.cli.record import Scores
 from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
@@ -55,7 +56,8 @@ def task(cfg: DictConfig) -> None:
 
     for log in logs:
         remove_stale(output / log.log_id)
-    failures += run.for_each_pair(logs, model, keep, lambda log: range(len(log.timestamps) - 1))
+    pairs = [(log, index) for log in logs for index in range(len(log.timestamps) - 1)]
+    failures += for_each_pair(pairs, model, keep)
     scores.report(output, logs, model.report(), failures)
     print(f"picture: {picture}")
     if shows and results:

@@ -19,6 +19,7 @@ from contextlib import suppress
 from omegaconf import DictConfig
 
 from cflow_torch.cli import run
+from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.cli.record import Scores, finished_results, objective
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.stages import TimedModel
@@ -37,7 +38,7 @@ def task(cfg: DictConfig) -> float:
     model = TimedModel(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
     ensure_writable(output)
-    failures += run.for_each_pair(logs, model, scores.add, pairs)
+    failures += for_each_pair([(log, index) for log in logs for index in pairs(log)], model, scores.add)
     if scores.metrics.num_frames == 0 and failures:
         raise CFlowError("no pair could be scored; {} failed first: {}".format(*failures[0]))
     if scores.metrics.num_frames == 0:

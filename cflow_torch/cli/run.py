@@ -17,24 +17,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__, estimate
 from cflow_torch.cli.choices import CONFIGS, own_settings
-from cflow_torch.cli.estimates import estimates
 from cflow_torch.cli.info import processor
 from cflow_torch.cli.refusals import UnfinishedJob as UnfinishedJob
 from cflow_torch.config import config_from
 from cflow_torch.data.atomic import write_text
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.flow_file import read_flow
-from cflow_torch.data.log import CachedLog, Log, window
+from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.manifest import frame_file
 from cflow_torch.fleet.progress import log_line
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
-from cflow_torch.stages import TimedModel
-from cflow_torch.types import CFlowError, FlowResult, Window
+from cflow_torch.types import CFlowError, FlowResult
 
 Failures = List[Tuple[str, str]]
-UseResult = Callable[[Log, int, Window, FlowResult], None]
 # Settings of `data` that are not passed to the reader.
 _NOT_OF_READER = ("label", "first", "step")
 
@@ -247,32 +244,6 @@ def collect_failures(failures: Failures, name: str) -> Iterator[None]:
     except (CFlowError, OSError) as error:
         failures.append((name, str(error)))
         log_line(f"failed: {name}: {error}")
-
-
-def for_each_pair(logs: Sequence[Log], model: TimedModel, use: UseResult, pairs: Callable[[Log], range]) -> Failures:
-    """Estimate the flow of the pairs of every log, and call a function with each. A bad frame is reported and skipped.
-
-    Args:
-        logs: of at least two sweeps.
-        model: the method.
-        use: called with the log, the index of the pair, its window and its result.
-        pairs: function log -> indices of its pairs.
-
-    Returns:
-        (frame, message) of every pair that failed.
-    """
-    config = model.config
-    failures: Failures = []
-    recent = [CachedLog(log, config.num_sweeps) for log in logs]
-    indices = [(log, index) for log in recent for index in pairs(log)]
-
-    def read(pair: tuple[CachedLog, int]) -> Window:
-        return window(*pair, config.num_history, config.num_future)
-
-    for (log, index), answer in estimates(model, indices, read):
-        with collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
-            use(log.log, index, *answer())
-    return failures
 
 
 def finish(failures: Failures) -> None:

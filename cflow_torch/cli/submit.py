@@ -23,11 +23,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__
 from cflow_torch.cli import run
-from cflow_torch.cli.estimates import estimates
+from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready
-from cflow_torch.data.log import Log, window
+from cflow_torch.data.log import Log
 from cflow_torch.evaluation.submission.archive import (
     SubmissionVersion,
     check_submission,
@@ -49,7 +49,7 @@ from cflow_torch.evaluation.submission.frames import (
 from cflow_torch.fleet.manifest import claim_folder
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.stages import TimedModel
-from cflow_torch.types import CFlowError, Window
+from cflow_torch.types import CFlowError, FlowResult, Window
 
 Plan = List[Tuple[Frame, int]]  # with the number of rows
 _Masks = Optional[MaskArchive]
@@ -76,7 +76,7 @@ def task(cfg: DictConfig) -> None:
         return
     folder, file = output / f"v{version.number}", output / f"v{version.number}.zip"
     _claim(cfg, output, folder, file)
-    failures += _write(cfg, plan, model, version, masks, folder)
+    failures += _write(plan, model, version, masks, folder)
     run.finish(failures)
     _check(folder, version, plan)
     pack(folder, [frame.name for frame, _ in plan], file)
@@ -116,24 +116,19 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
     return plan, failures
 
 
-def _write(
-    cfg: DictConfig, plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Masks, folder: Path
-) -> Failures:
+def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Masks, folder: Path) -> Failures:
     """Estimate and write the frames that do not exist yet."""
-    failures: Failures = []
-    largest, total, count, config = 0.0, 0.0, 0, model.config
+    largest, total, count = 0.0, 0.0, 0
     todo = [frame for frame, rows in plan if not is_complete(folder, frame.name, rows, version)]
 
-    def read(frame: Frame) -> Window:
-        return window(frame.log, frame.index, config.num_history, config.num_future)
+    def write(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
+        nonlocal largest, total, count
+        mask = point_mask(log, index, sweeps.pc0, masks) if version.is_masked else None
+        columns, error = encode(version, result, sweeps.pc0.is_ground, mask)
+        write_frame(folder, Frame(log, index).name, columns)
+        largest, total, count = max(largest, error.max(initial=0.0)), total + error.sum(), count + len(error)
 
-    for frame, estimate in estimates(model, todo, read):
-        with run.collect_failures(failures, frame.name):
-            sweeps, result = estimate()
-            mask = point_mask(frame.log, frame.index, sweeps.pc0, masks) if version.is_masked else None
-            columns, error = encode(version, result, sweeps.pc0.is_ground, mask)
-            write_frame(folder, frame.name, columns)
-            largest, total, count = max(largest, error.max(initial=0.0)), total + error.sum(), count + len(error)
+    failures = for_each_pair([(frame.log, frame.index) for frame in todo], model, write)
     print(f"frames written: {len(todo) - len(failures)}, already there: {len(plan) - len(todo)}")
     if count:
         mean = total / count

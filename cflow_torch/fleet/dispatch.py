@@ -27,10 +27,10 @@ class Process(Protocol):
     """A worker process of an engine. Its methods block; only `close` may be called while another one runs."""
 
     def start(self) -> None:
-        """Start the process, again after it has died, and make a `WorkerProcess` in it."""
+        """Start the process, again after it has died, and call `make_step` in it."""
 
     def call(self, unit: Unit, stop: bool) -> Step:
-        """Call `WorkerProcess.step`; raises `WorkerDied` if the process ends before it answers."""
+        """Call its result, `Steps`; raises `WorkerDied` if the process ends before it answers."""
 
     def close(self) -> None:
         """End the process, whatever it does."""

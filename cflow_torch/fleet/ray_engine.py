@@ -18,7 +18,7 @@ from cflow_torch.fleet.job import Event, Job, Step, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
 from cflow_torch.fleet.manifest import MANIFEST, make_identity
 from cflow_torch.fleet.processes import WorkerDied
-from cflow_torch.fleet.work import WorkerProcess, describe
+from cflow_torch.fleet.work import describe, make_step
 from cflow_torch.types import CFlowError
 
 _OBJECT_STORE_BYTES = 200 * 2**20  # it holds names and events only; Ray's default is 30 % of the memory
@@ -35,26 +35,21 @@ def run_ray(
     num_gpus: Any = AUTO,
     retries: int = 1,
 ) -> Iterator[Event]:
-    """Do all units.
+    """Do all units with Ray actors, see `run_local`.
 
     The driver and the workers exchange units and events, a few kB each; workers read and write files themselves. On a
     cluster, all machines must reach data and output under the same names (a shared file system, an object store) and
     have the same versions of cflow_torch, torch and numpy. A node that does not is refused.
 
     Args:
-        job: the run; its folder is claimed already (`manifest.claim_folder`).
-        units: numbered as in `split`.
+        job, units, stop: as for `run_local`.
         layout: one worker per device. Workers that do not fit into the cluster start when there is room. Ray chooses
             the GPUs.
-        stop: called often. Once it returns True, frames that have begun are finished and no others begin.
         address: None = start a cluster in this process, and end it; "auto" or "HOST:PORT" = join the cluster that this
             machine is part of. An existing connection of the caller is used and kept.
         num_cpus: CPUs of the cluster that a worker takes; "auto" = 1 without a GPU, 0 with one.
         num_gpus: GPUs that a worker takes, may be a fraction; "auto" = 1 if the device is a GPU.
         retries: how often a unit, and then each of its frames by itself, is repeated after a worker died on it.
-
-    Yields:
-        Events as they happen. A worker that dies is replaced and its unit is repeated, see `dispatch`.
 
     Raises:
         CFlowError: Ray is not installed, there is no cluster or no room for one worker in it, no worker can start, or a
@@ -73,9 +68,8 @@ def run_ray(
         "CPU": _number("num_cpus", num_cpus, int(not is_gpu)),
         "GPU": _number("num_gpus", num_gpus, int(is_gpu)),
     }
-    output = as_path(job.output)
-    if not is_remote(output):  # workers may run in another folder
-        job = replace(job, output=str(output.absolute()))
+    if not is_remote(as_path(job.output)):  # workers may run in another folder
+        job = replace(job, output=str(as_path(job.output).absolute()))
     count = min(len(layout.devices), len(units))
     used = sorted(set(layout.devices)) if is_gpu else []
     if address is None and used not in ([], ["cuda"], [f"cuda:{k}" for k in range(len(used))]):
@@ -84,10 +78,9 @@ def run_ray(
     with _cluster(ray, address, count, needs, len(used)):
         _check_room(ray, needs)
         actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
-        device = "cuda" if is_gpu else layout.devices[0]  # a worker sees only the GPUs that Ray gives it
-        yield from dispatch(
-            [_Process(ray, actor, os.getcwd(), job, device) for _ in range(count)], units, stop, retries
-        )
+        device = "cuda" if is_gpu else "cpu"  # a worker sees only the GPUs that Ray gives it
+        processes = [_Process(ray, actor, os.getcwd(), job, device) for _ in range(count)]
+        yield from dispatch(processes, units, stop, retries)
 
 
 class _Actor:
@@ -112,10 +105,10 @@ class _Actor:
             raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
         with suppress(OSError):  # relative paths of data must mean the same as in the driver
             os.chdir(self._folder)
-        self._process = WorkerProcess(job, self._device)
+        self._step = make_step(job, self._device)
 
     def step(self, unit: Unit, stop: bool) -> Step:
-        return self._process.step(unit, stop)
+        return self._step(unit, stop)
 
 
 class _Process:

@@ -13,13 +13,13 @@ from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.dispatch import dispatch
-from cflow_torch.fleet.job import Event, Failed, Job, Noted, Shard, Step, Unit, split
+from cflow_torch.fleet.job import Event, Failed, Job, Noted, Shard, Unit, split
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import SIGNALS, ChildProcess
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import Counters
-from cflow_torch.fleet.work import Worker, WorkerProcess
+from cflow_torch.fleet.work import Worker, make_step
 from cflow_torch.types import CFlowError
 
 _SHOWN = 3  # how often a message is shown; the report names all logs that it is about
@@ -35,10 +35,10 @@ def run_local(
     timeout: float = 600.0,
     memory: float | None = None,
 ) -> Iterator[Event]:
-    """Do all units.
+    """Do all units with processes of this machine.
 
     Args:
-        job: the run.
+        job: the run; its folder is claimed already (`manifest.claim_folder`).
         units: numbered as in `split`.
         layout: one worker per device. A single worker without a memory limit runs in this process.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
@@ -46,39 +46,24 @@ def run_local(
         memory: bytes of address space that each worker process may use, of which Python and torch need about 3e9;
             None = no limit. Use it on a CPU only: the driver of a GPU reserves far more than it uses.
 
-    Raises:
-        CFlowError: no worker can start, or a setting is out of range.
-
     Yields:
         Events as they happen. A worker that dies is replaced and its unit is repeated, see `dispatch`.
+
+    Raises:
+        CFlowError: no worker can start, or a setting is out of range.
     """
     for name, value in (("timeout", timeout), ("memory", 1 if memory is None else memory)):
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
             raise CFlowError(f"engine.{name}={value!r}: give a number above 0")
-    if len(layout.devices) == 1 and memory is None:
-        yield from _run_here(job, units, layout, stop)
-    elif units:
-        processes = [ChildProcess(_make_worker, job, device, memory, timeout=timeout) for device in layout.devices]
+    if len(layout.devices) > 1 or memory is not None:
+        processes = [ChildProcess(make_step, job, device, memory, timeout=timeout) for device in layout.devices]
         yield from dispatch(processes, units, stop, _RETRIES)
-
-
-def _run_here(job: Job, units: Sequence[Unit], layout: Layout, stop: Callable[[], bool]) -> Iterator[Event]:
-    worker = Worker(job, layout.devices[0])
-    try:
+        return
+    with closing(Worker(job, layout.devices[0])) as worker:
         for unit in units:
             if stop():
                 break
             yield from worker.run(unit, stop)
-    finally:
-        worker.close()
-
-
-def _make_worker(job: Job, device: str, memory: float | None) -> Callable[[Unit, bool], Step]:
-    if memory is not None:
-        import resource  # not available on Windows
-
-        resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
-    return WorkerProcess(job, device).step
 
 
 ENGINES: dict[str, Any] = {"local": run_local, "ray": run_ray}

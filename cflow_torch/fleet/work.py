@@ -138,16 +138,16 @@ class Worker:
         """Pass frames through the reading thread, this thread and the writing thread."""
         size = self._job.batch
         batches = iter([todo[i : i + size] for i in range(0, len(todo), size)])
-        reading: deque[Future[list[_Frame]]] = deque()
+        reading: deque[list[Future[_Frame]]] = deque()
         writing: deque[Future[_Frame]] = deque()
         while True:
             while len(reading) <= self._ahead and not stop():
                 batch = next(batches, None)
                 if batch is None:
                     break
-                reading.append(self._reader.submit(self._read, log, batch))
+                reading.append([self._reader.submit(self._read, log, index) for index in batch])
             if reading and not stop():
-                frames = reading.popleft().result()
+                frames = [future.result() for future in reading.popleft()]
                 self._compute(frames)
                 writing.extend(self._writer.submit(self._write, folder, frame) for frame in frames)
             elif not writing:
@@ -157,10 +157,7 @@ class Worker:
             while writing and (len(writing) > most or writing[0].done()):
                 yield writing.popleft().result()
 
-    def _read(self, log: Log, batch: Sequence[int]) -> list[_Frame]:
-        return [self._read_one(log, index) for index in batch]
-
-    def _read_one(self, log: Log, index: int) -> _Frame:
+    def _read(self, log: Log, index: int) -> _Frame:
         frame = _Frame(int(log.timestamps[index]))
         with _stage(frame, "read"):
             frame.content = sweeps = window(log, index, self._job.config.num_history, self._job.config.num_future)
@@ -206,35 +203,46 @@ class Worker:
         return frame
 
 
-class WorkerProcess(Worker):
-    """A worker that has a process of its own and does some frames at each call of its parent.
+def make_step(job: Job, device: str, memory: float | None = None) -> Callable[[Unit, bool], Step]:
+    """Make a worker in its own process, which on a CPU computes on one thread: other workers use the other cores.
 
     Args:
         job: the run.
-        device: where to compute. On a CPU the process computes on one thread: other workers use the other cores.
+        device: where to compute.
+        memory: bytes of address space that the process may use; None = no limit.
+    """
+    if memory is not None:
+        import resource  # not available on Windows
 
-    Raises:
-        CFlowError: the device does not exist or cannot be used.
+        resource.setrlimit(resource.RLIMIT_AS, (int(memory), int(memory)))
+    if device == "cpu":
+        torch.set_num_threads(1)
+        pyarrow.set_cpu_count(1)
+    show_warnings_as_lines()
+    return Steps(Worker(job, device))
+
+
+class Steps:
+    """Runs the units of a worker a while at each call, so that its parent can follow them.
+
+    Args:
+        worker: what computes.
     """
 
-    def __init__(self, job: Job, device: str) -> None:
-        if device == "cpu":
-            torch.set_num_threads(1)
-            pyarrow.set_cpu_count(1)
-        show_warnings_as_lines()
-        super().__init__(job, device)
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
         self._events: Iterator[Event] | None = None  # of the current unit
         self._stops = False
 
-    def step(self, unit: Unit, stop: bool) -> Step:
-        """Begin a unit, or continue it for a while.
+    def __call__(self, unit: Unit, stop: bool) -> Step:
+        """Begin a unit, or continue it.
 
         Args:
             unit: the same at each call until the unit has ended.
             stop: finish the frames that have begun, and begin no others.
         """
         self._stops = stop
-        running, self._events = self._events or self.run(unit, lambda: self._stops), None
+        running, self._events = self._events or self._worker.run(unit, lambda: self._stops), None
         events: list[Event] = []
         until = time.monotonic() + _REPORT_EVERY_S
         try:

@@ -17,7 +17,7 @@ from scenes import RANGE, scene
 from small_logs import write_small_log
 
 from cflow_torch import make_config, make_model
-from cflow_torch.cli import estimates, run
+from cflow_torch.cli import pairs, run
 from cflow_torch.cli.bench import measure
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.record import objective
@@ -205,7 +205,7 @@ def test_worker_processes_give_the_results_of_one_process(
     sorted(root.glob("sensors/lidar/*"))[0].write_bytes(b"broken")
     records = []
     for name, workers in (("one", 1), ("two", 2)):
-        monkeypatch.setattr(estimates, "choose_layout", lambda *_, count=workers: Layout(("cpu",) * count, 1))
+        monkeypatch.setattr(pairs, "choose_layout", lambda *_, count=workers: Layout(("cpu",) * count, 1))
         assert evaluate(f"data.root={root}", f"output={tmp_path / name}") == 1
         records.append(results_of(tmp_path / name))
     one, two = records

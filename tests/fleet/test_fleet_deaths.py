@@ -17,7 +17,7 @@ from cflow_torch.fleet import run as running
 from cflow_torch.fleet import work
 
 DEADLY = "CFLOW_TEST_DEADLY"  # folder of files <log>.<time stamp> with the name of a cause and how often it occurs
-REAL_MAKE = running._make_worker
+REAL_MAKE = running.make_step
 LIMIT = 12e9  # bytes, of a worker's address space
 
 CAUSES: dict[str, Callable[[], Any]] = {
@@ -57,7 +57,7 @@ def test_dying_workers_lose_only_the_frame_that_always_kills(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv(DEADLY, str(tmp_path))
-    monkeypatch.setattr(running, "_make_worker", make_deadly_worker)
+    monkeypatch.setattr(running, "make_step", make_deadly_worker)
     logs = [AV2Log(folder) for folder in sorted(fleet.iterdir())]
     for log, cause in zip(logs, once):
         (tmp_path / f"{log.log_id}.{log.timestamps[2]}").write_text(f"{cause}:1")

@@ -24,7 +24,7 @@ from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import ChildProcess
 from cflow_torch.fleet.report import Counters, format_missing, format_report
 from cflow_torch.fleet.run import run_local
-from cflow_torch.fleet.work import Worker, WorkerProcess
+from cflow_torch.fleet.work import Steps, Worker
 from cflow_torch.simulator import make_drive
 
 
@@ -131,20 +131,21 @@ class ThreadProcess:
         self.num_starts += 1
         if self.num_starts <= self.failed_starts:
             raise WorkerDied("by SIGKILL")
-        self.worker = WorkerProcess(self.job, "cpu")
+        self.worker = Worker(self.job, "cpu")
+        self.step = Steps(self.worker)
         self.worker._ahead = 0  # without read-ahead, so that the frames before the deadly one are on disk
-        self.worker._read_one = self._read_one  # type: ignore[method-assign]
+        self.worker._read = self._read  # type: ignore[method-assign]
 
-    def _read_one(self, log: Any, index: int) -> Any:
+    def _read(self, log: Any, index: int) -> Any:
         frame = f"{log.log_id}/{log.timestamps[index]}"
         if self.deadly.get(frame, 0) > 0:
             self.deadly[frame] -= 1
             raise Death
-        return Worker._read_one(self.worker, log, index)
+        return Worker._read(self.worker, log, index)
 
     def call(self, unit: Unit, stop: bool) -> Any:
         try:
-            return self.worker.step(unit, stop)
+            return self.step(unit, stop)
         except Death:
             raise WorkerDied("by SIGSEGV") from None
 

@@ -1,4 +1,4 @@
-"""Flow of many pairs, one window at a time; on a CPU in worker processes, one per core.
+"""Estimate the flow of many pairs, one window at a time; on a CPU in worker processes, one per core.
 
 Threads would not help: a window is thousands of small operations, and only one thread at a time runs the interpreter.
 """
@@ -8,12 +8,13 @@ from __future__ import annotations
 import os
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from queue import SimpleQueue
-from typing import Any, Callable, Iterator, Sequence, Tuple, TypeVar
+from typing import Any, Callable, Iterator, Sequence, Tuple
 
 import torch
 
+from cflow_torch.cli.run import Failures, collect_failures
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
 from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.progress import frames, show_warnings_as_lines
@@ -24,68 +25,77 @@ from cflow_torch.windows.inspection import inactive_is_an_error
 
 _AHEAD = 2  # windows per worker that are read ahead
 
-Item = TypeVar("Item")
+Pair = Tuple[Log, int]  # a log and the index of the first of two sweeps
 Answer = Callable[[], Tuple[Window, FlowResult]]
 
 
-def estimates(
-    model: TimedModel, items: Sequence[Item], read: Callable[[Item], Window]
-) -> Iterator[tuple[Item, Answer]]:
-    """Estimate the flow of many pairs. Results do not depend on the number of processes.
+def for_each_pair(
+    pairs: Sequence[Pair], model: TimedModel, use: Callable[[Log, int, Window, FlowResult], None]
+) -> Failures:
+    """Estimate the flow of pairs, and call a function with each, in order. A bad pair is reported and skipped.
 
     Args:
-        model: the method; it receives the times of all pairs.
-        items: the pairs.
-        read: returns the window of a pair; called in this process.
+        pairs: those of a log lie next to each other.
+        model: the method; it receives the times of all pairs. Results do not depend on the number of processes.
+        use: called with the log, the index of the pair, its window and its result.
 
-    Yields:
-        Each item, in order, and a function that returns its window and flow, or raises the error of that pair.
+    Returns:
+        (frame, message) of every pair that failed.
     """
+    failures: Failures = []
+    for (log, index), answer in _answers(pairs, model):
+        with collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
+            use(log, index, *answer())
+    return failures
+
+
+def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, Answer]]:
+    """Yield each pair and a function that returns its window and flow, or raises the error of that pair."""
     method: Any = model.model
-    most = len(items) // frames_per_worker(method.config)
-    devices = choose_layout(method.device, AUTO, AUTO, os.environ, most).devices
+    config, recent = method.config, None
+
+    def read(log: Log, index: int) -> Window:
+        nonlocal recent  # the log of the last pair
+        if recent is None or recent.log is not log:
+            recent = CachedLog(log, config.num_sweeps)
+        return window(recent, index, config.num_history, config.num_future)
+
+    devices = choose_layout(method.device, AUTO, AUTO, os.environ, len(pairs) // frames_per_worker(config)).devices
     count = len(devices) if devices[0] == "cpu" else 1
     if count < 2:
-        for item in frames(items):
-            yield item, lambda item=item: _estimate(model, read(item))  # type: ignore[misc]
+        for pair in frames(pairs):
+            yield pair, lambda pair=pair: _estimate(model, read(*pair))  # type: ignore[misc]
         return
     processes = [ChildProcess(_make_estimate, method) for _ in range(count)]
     idle: SimpleQueue[ChildProcess] = SimpleQueue()
     for process in processes:
         idle.put(process)
 
-    def compute(sweeps: Window) -> tuple[Window, dict[str, Any], Any]:
+    def compute(sweeps: Window) -> tuple[Window, FlowResult]:
         process = idle.get()
         try:
-            return (sweeps, *process.call(sweeps))
+            arrays, seconds = process.call(sweeps)
         except WorkerDied as death:
             raise CFlowError(f"a worker process died on it {death}") from None
         finally:
             idle.put(process)
-
-    def answer(future: Future[Any]) -> tuple[Window, FlowResult]:
-        sweeps, arrays, seconds = future.result()
         model.pairs.append(seconds)
         return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
-    def take() -> tuple[Item, Answer]:
-        item, future = waiting.popleft()
-        return item, partial(answer, future)
-
-    waiting: deque[tuple[Item, Future[Any]]] = deque()
+    waiting: deque[tuple[Pair, Future[Any]]] = deque()
     with ThreadPoolExecutor(count) as threads:
         try:
-            for item in frames(items):
+            for pair in frames(pairs):
                 future: Future[Any] = Future()
                 try:
-                    future = threads.submit(compute, read(item))
+                    future = threads.submit(compute, read(*pair))
                 except (CFlowError, OSError) as error:
                     future.set_exception(error)
-                waiting.append((item, future))
+                waiting.append((pair, future))
                 if len(waiting) > _AHEAD * count:
-                    yield take()
+                    yield waiting[0][0], waiting.popleft()[1].result
             while waiting:
-                yield take()
+                yield waiting[0][0], waiting.popleft()[1].result
         finally:
             for _, future in waiting:
                 future.cancel()
