@@ -12,7 +12,7 @@ from typing import Any, Sequence
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from cflow_torch.cli.comparison import RESULTS, summary
+from cflow_torch.cli.comparison import RESULTS, headline, summary
 from cflow_torch.cli.run import Failures, machine, versions, write_config
 from cflow_torch.data.json_file import describe_changes, json_ready, write_json
 from cflow_torch.data.log import Log
@@ -106,14 +106,11 @@ def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
 
 
 def objective(results: dict[str, Any]) -> float:
-    """The number that a sweeper minimises: the mean dynamic error, over ranges if the definition has them, else the
-    three-way end-point error in metres. NaN without scored points."""
-    if "bucketed_by_range" in results:
-        value = results["bucketed_by_range"]["mean"]["dynamic_error"]
-    elif "bucketed" in results:
-        value = results["bucketed"]["mean"]["dynamic_error"]
-    else:
-        value = results["three_way"]["epe_3way"]
+    """The number that a sweeper minimises: the mean dynamic error, or if the definition has none, the three-way
+    end-point error in metres. NaN without scored points."""
+    if results.keys() & {"bucketed", "bucketed_by_range"}:
+        return headline(results, {})["dynamic_error"]
+    value = results["three_way"]["epe_3way"]
     return float("nan") if value is None else float(value)
 
 

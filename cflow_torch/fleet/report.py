@@ -27,11 +27,10 @@ def forecast(job: Job, units: Sequence[Unit]) -> str:
     for unit in units:
         try:
             log_id, frames, todo = _count(job, unit)
+            total, left = total + frames, left + todo
+            lines.append(f"{frames:8} {todo:8}  {log_id}")
         except Exception as error:
             lines.append(f"{'?':>8} {'?':>8}  {source_name(unit.source)}: cannot be opened: {describe(error)}")
-            continue
-        total, left = total + frames, left + todo
-        lines.append(f"{frames:8} {todo:8}  {log_id}")
     return "\n".join([*lines, f"{total:8} {left:8}  in total; dry run: nothing was written to {job.output}"])
 
 
@@ -39,10 +38,8 @@ def count_todo(job: Job, units: Sequence[Unit], enough: int) -> int:
     """Count the frames that a run would compute, until there are enough. Logs that cannot be opened have none."""
     count = 0
     for unit in units:
-        if count >= enough:
-            break
         with suppress(Exception):
-            count += _count(job, unit)[2]
+            count += _count(job, unit)[2] if count < enough else 0
     return count
 
 
@@ -85,8 +82,10 @@ class Counters:
 
     def add(self, event: Event) -> int:
         """Count an event. Returns the number of frames that it settles: they are on disk, or have failed."""
-        if not isinstance(event, Noted):
-            self._unopened.discard(event.unit)
+        if isinstance(event, Noted):
+            self.notes[event.name, event.message] += 1
+            return 0
+        self._unopened.discard(event.unit)
         if isinstance(event, Opened):
             num_before = len(event.frames) - len(event.todo)
             self.num_opened += 1
@@ -94,18 +93,14 @@ class Counters:
             self.num_before += num_before
             self._waiting.update({(event.unit, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
             return num_before
-        if isinstance(event, Noted):
-            self.notes[event.name, event.message] += 1
-            return 0
         if isinstance(event, Done):
             self._seconds.update(event.seconds)
         else:
             self.failures.append((event.name, event.message))
             self.num_failed += event.timestamp is not None
-        if event.timestamp is None:
-            return 0
-        self._waiting.pop((event.unit, event.timestamp), None)
-        return 1
+        if event.timestamp is not None:
+            self._waiting.pop((event.unit, event.timestamp), None)
+        return int(event.timestamp is not None)
 
     def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
         """Return all figures of a run.
@@ -154,28 +149,27 @@ def format_report(report: dict[str, Any], verbose: bool = False) -> str:
     """Return the report as a table, if `verbose` with the times of the stages."""
     frames, shard, devices = report["frames"], report["shard"], report["devices"]
     workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
-    rows = [
-        ("status", report["status"] + (f" by {report['stopped_by']}" if report["stopped_by"] else "")),
-        ("engine", f"{report['engine']}, {workers}, shard {shard['index']} of {shard['count']}"),
-        ("frames", frames["total"]),
-        ("  complete before", frames["complete_before"]),
-        ("  computed", frames["computed"]),
-        ("  failed", frames["failed"]),
-        ("  not done", frames["waiting"]),
-    ]
-    if report["notes"]:
-        rows.append(("warnings", sum(count for *_, count in report["notes"])))
-    if frames["failed_logs"]:
-        rows.append(("logs or parts of logs that failed", frames["failed_logs"]))
-    if frames["unopened_units"]:
-        rows.append(("logs or parts of logs not begun", frames["unopened_units"]))
-    rows.append(("seconds", f"{report['seconds']:.1f}"))
-    rows.append(("frames/s", f"{report['frames_per_s']:.2f}"))
+    rows = {
+        "status": report["status"] + (f" by {report['stopped_by']}" if report["stopped_by"] else ""),
+        "engine": f"{report['engine']}, {workers}, shard {shard['index']} of {shard['count']}",
+        "frames": frames["total"],
+        "  complete before": frames["complete_before"],
+        "  computed": frames["computed"],
+        "  failed": frames["failed"],
+        "  not done": frames["waiting"],
+    }
+    seldom = {
+        "warnings": sum(count for *_, count in report["notes"]),
+        "logs or parts of logs that failed": frames["failed_logs"],
+        "logs or parts of logs not begun": frames["unopened_units"],
+    }
+    rows.update({name: count for name, count in seldom.items() if count})
+    rows.update({"seconds": f"{report['seconds']:.1f}", "frames/s": f"{report['frames_per_s']:.2f}"})
     if verbose and report["stages"]:
-        rows.append(("ms per frame and worker (stages overlap)", ""))
-        rows += [(f"  {name}", f"{1e3 * seconds:.1f}") for name, seconds in report["stages"].items()]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows)
+        rows["ms per frame and worker (stages overlap)"] = ""
+        rows.update({f"  {name}": f"{1e3 * seconds:.1f}" for name, seconds in report["stages"].items()})
+    width = max(map(len, rows))
+    return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows.items())
 
 
 def format_missing(report: dict[str, Any]) -> str:
