@@ -74,7 +74,7 @@ def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, A
     def compute(sweeps: Window) -> tuple[Window, FlowResult]:
         process = idle.get()
         try:
-            arrays, seconds = process.call(sweeps)
+            ((arrays, seconds),) = process.call(sweeps)
         except WorkerDied as death:
             raise CFlowError(f"a worker process died on it {death}") from None
         finally:
@@ -108,14 +108,14 @@ def _estimate(model: TimedModel, sweeps: Window) -> tuple[Window, FlowResult]:
         return sweeps, model([sweeps])[0]
 
 
-def _make_estimate(method: SceneFlowModel) -> Callable[[Window], tuple[dict[str, Any], Any]]:
+def _make_estimate(method: SceneFlowModel) -> Callable[..., Iterator[tuple[dict[str, Any], Any]]]:
     """Make the function that a worker process calls: window -> arrays and seconds."""
     torch.set_num_threads(1)
     show_warnings_as_lines()
     model = TimedModel(method)
 
-    def estimate(sweeps: Window) -> tuple[dict[str, Any], Any]:
+    def estimate(sweeps: Window, stop: Callable[[], bool]) -> Iterator[tuple[dict[str, Any], Any]]:
         _, result = _estimate(model, sweeps)
-        return result.numpy(), model.pairs.pop()  # tensors would take shared memory, of which containers have little
+        yield result.numpy(), model.pairs.pop()  # tensors would take shared memory, of which containers have little
 
     return estimate

@@ -9,7 +9,7 @@ from queue import Empty, Queue
 from threading import Thread
 from typing import Any, Callable, Iterator, Protocol, Sequence
 
-from cflow_torch.fleet.job import Done, Event, Failed, Noted, Opened, Step, Unit
+from cflow_torch.fleet.job import Done, Event, Failed, Noted, Opened, Unit
 from cflow_torch.fleet.processes import WorkerDied
 from cflow_torch.fleet.progress import log_line
 from cflow_torch.fleet.work import describe, source_name
@@ -24,13 +24,16 @@ _MAX_DEATHS = 10
 
 
 class Process(Protocol):
-    """A worker process of an engine. Its methods block; only `close` may be called while another one runs."""
+    """A worker process of an engine. While one of its methods blocks, only `stop` and `close` may be called."""
 
     def start(self) -> None:
-        """Start the process, again after it has died, and call `make_step` in it."""
+        """Start the process, again after it has died, and call `make_worker` in it."""
 
-    def call(self, unit: Unit, stop: bool) -> Step:
-        """Call its result, `Steps`; raises `WorkerDied` if the process ends before it answers."""
+    def call(self, unit: Unit) -> Iterator[Event]:
+        """Do a unit; raises `WorkerDied` if the process ends before the unit does."""
+
+    def stop(self) -> None:
+        """Tell the worker to finish the frames that have begun."""
 
     def close(self) -> None:
         """End the process, whatever it does."""
@@ -66,8 +69,10 @@ def dispatch(
     num_units, num_workers, deadline = len(units), len(processes), float("inf")
     try:
         while num_units > 0 and time.monotonic() < deadline:
-            if stop():
-                deadline = min(deadline, time.monotonic() + _GRACE_S)
+            if deadline == float("inf") and stop():
+                deadline = time.monotonic() + _GRACE_S
+                for process in processes:
+                    process.stop()
             try:
                 answer = answers.get(timeout=_POLL_S)
             except Empty:
@@ -122,7 +127,7 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
         piece = pieces.popleft()
         missing = None if piece.only is None else set(piece.only)  # frames that are not settled; None = not known
         try:
-            for event in _events(process, piece, stop):
+            for event in process.call(piece):
                 if not isinstance(event, Opened):
                     if missing is not None and isinstance(event, (Done, Failed)) and event.timestamp is not None:
                         missing.discard(event.timestamp)
@@ -136,6 +141,8 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
             continue
         except WorkerDied as death:
             how = str(death)
+        if stop():
+            return
         _start(process)
         num_deaths += 1
         stamps = sorted(missing or [])
@@ -153,10 +160,3 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
             frame = "/".join([name, *map(str, stamps)])
             message = f"{piece.deaths} worker{'s' * (piece.deaths > 1)} died on it, the last one {how}"
             yield Failed(unit.number, frame, message, stamps[0] if stamps else None)
-
-
-def _events(process: Process, unit: Unit, stop: Callable[[], bool]) -> Iterator[Event]:
-    has_ended = False
-    while not has_ended:
-        events, has_ended = process.call(unit, stop())
-        yield from events

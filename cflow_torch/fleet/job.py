@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Mapping, NamedTuple, Sequence, Union
+from typing import Any, Mapping, Sequence, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
@@ -105,13 +105,6 @@ class Noted:
 
 
 Event = Union[Opened, Done, Failed, Noted]
-
-
-class Step(NamedTuple):
-    """Events of a unit since the last call of its worker. `has_ended`: none will follow."""
-
-    events: list[Event]
-    has_ended: bool
 
 
 def split(units: Sequence[Unit], workers: int) -> list[Unit]:

@@ -1,4 +1,4 @@
-"""Child processes that answer calls. A process that has died is started again."""
+"""Child processes that do calls. A process that has died is started again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import multiprocessing
 import signal
 import traceback
 from contextlib import suppress
-from typing import Any, Callable
+from typing import Any, Callable, Iterator
 
 from cflow_torch.types import CFlowError
 
@@ -18,17 +18,18 @@ class WorkerDied(Exception):
 
 
 class ChildProcess:
-    """A child process that answers one call at a time. Its methods block.
+    """A child process that does one call at a time.
 
     Args:
-        make: called in the child process; returns the function that answers the calls.
-        arguments: of `make`. They are pickled, like all that a call takes and returns.
+        make: called in the child process; returns the generator function that does the calls. It gets the arguments of
+            a call, then a function that is True after `stop`.
+        arguments: of `make`. They are pickled, like all that a call takes and yields.
         timeout: seconds after which a process that has not answered is ended; None = no limit.
 
     Convention: the child process ignores `SIGNALS` and ends when its parent does.
     """
 
-    def __init__(self, make: Callable[..., Callable[..., Any]], *arguments: Any, timeout: float | None = None) -> None:
+    def __init__(self, make: Callable[..., Callable[..., Iterator[Any]]], *arguments: Any, timeout: Any = None) -> None:
         self._make, self._arguments, self._timeout = make, arguments, timeout
         self._process: Any = None
         self._pipe: Any = None
@@ -50,19 +51,25 @@ class ChildProcess:
             raise WorkerDied(f"at its start ({error})") from error
         finally:
             pipe.close()
-        self._answer()
+        list(self._answers())
 
-    def call(self, *arguments: Any) -> Any:
-        """Return the answer to a call. If there is no process, one is started first.
+    def call(self, *arguments: Any) -> Iterator[Any]:
+        """Yield what a call yields, as it happens. If there is no process, one is started first.
 
         Raises:
             WorkerDied, CFlowError, OSError, RuntimeError: as `start`, also from the call.
         """
         if self._process is None:
             self.start()
-        with suppress(OSError):  # the process has died: `_answer` finds out how
+        with suppress(OSError):  # the process has died: `_answers` finds out how
             self._pipe.send(arguments)
-        return self._answer()
+        yield from self._answers()
+
+    def stop(self) -> None:
+        """Tell this call and later ones to end soon. Another thread may be in `call`."""
+        if self._process is not None:
+            with suppress(OSError):
+                self._pipe.send(None)
 
     def close(self) -> None:
         """Kill the process, whatever it does."""
@@ -72,42 +79,55 @@ class ChildProcess:
             process.join()
             self._pipe.close()
 
-    def _answer(self) -> Any:
-        process = self._process
-        try:
-            is_there = self._pipe.poll(self._timeout)
-            answer, error = self._pipe.recv() if is_there else (None, None)
-            how = "" if is_there else f"after {self._timeout:g} s without an answer"
-        except (EOFError, OSError):
-            process.join()
-            how = _how(process.exitcode)
-        if how:
-            self.close()
-            raise WorkerDied(how)
-        if error is not None:
-            raise error
-        return answer
+    def _answers(self) -> Iterator[Any]:
+        process, has_ended = self._process, False
+        while not has_ended:
+            how = ""
+            try:
+                if self._pipe.poll(self._timeout):
+                    answer, error, has_ended = self._pipe.recv()
+                else:
+                    how = f"after {self._timeout:g} s without an answer"
+            except (EOFError, OSError):
+                process.join()
+                how = _how(process.exitcode)
+            if how:
+                self.close()
+                raise WorkerDied(how)
+            if error is not None:
+                raise error
+            if not has_ended:
+                yield answer
 
 
-def _serve(pipe: Any, make: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    """Answer calls until the parent closes the pipe or ends."""
+def _serve(pipe: Any, make: Callable[..., Any], arguments: Any) -> None:
+    """Make the function and do calls until the parent closes the pipe or ends."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)  # the parent receives them as well and says when to stop
+    function, is_stopped = None, False
+
+    def stop() -> bool:
+        return is_stopped or pipe.poll()  # during a call the parent sends nothing but the stop
+
     with suppress(EOFError, OSError):
-        answer, error = _attempt(make, arguments)
-        pipe.send((None, error))
-        while answer is not None:
-            pipe.send(_attempt(answer, pipe.recv()))
-
-
-def _attempt(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, Exception | None]:
-    """(what a function returns, what it raises)."""
-    try:
-        return function(*arguments), None
-    except (CFlowError, OSError) as error:
-        return None, error
-    except Exception:
-        return None, RuntimeError(traceback.format_exc())
+        while True:
+            error: Exception | None = None
+            try:
+                if function is None:
+                    function = make(*arguments)
+                else:
+                    for answer in function(*arguments, stop):
+                        pipe.send((answer, None, False))
+            except (CFlowError, OSError) as caught:
+                error = caught
+            except Exception:
+                error = RuntimeError(traceback.format_exc())
+            pipe.send((None, error, True))
+            if function is None:
+                return
+            arguments = pipe.recv()
+            while arguments is None:  # from `ChildProcess.stop`
+                is_stopped, arguments = True, pipe.recv()
 
 
 def _how(status: int | None) -> str:

@@ -14,11 +14,11 @@ from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.dispatch import dispatch
-from cflow_torch.fleet.job import Event, Job, Step, Unit
+from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
 from cflow_torch.fleet.manifest import MANIFEST, make_identity
 from cflow_torch.fleet.processes import WorkerDied
-from cflow_torch.fleet.work import describe, make_step
+from cflow_torch.fleet.work import describe, make_worker
 from cflow_torch.types import CFlowError
 
 _OBJECT_STORE_BYTES = 200 * 2**20  # it holds names and events only; Ray's default is 30 % of the memory
@@ -77,7 +77,8 @@ def run_ray(
         raise CFlowError(f"engine=ray cannot choose {', '.join(used)}: set CUDA_VISIBLE_DEVICES, and give device=cuda")
     with _cluster(ray, address, count, needs, len(used)):
         _check_room(ray, needs)
-        actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
+        settings = {"num_cpus": needs["CPU"], "num_gpus": needs["GPU"], "max_concurrency": 2}  # `run` and `stop`
+        actor = ray.remote(_Actor).options(**settings)
         device = "cuda" if is_gpu else "cpu"  # a worker sees only the GPUs that Ray gives it
         processes = [_Process(ray, actor, os.getcwd(), job, device) for _ in range(count)]
         yield from dispatch(processes, units, stop, retries)
@@ -93,7 +94,7 @@ class _Actor:
     """
 
     def __init__(self, folder: str, job: Job, device: str) -> None:
-        self._folder, self._job, self._device = folder, job, device
+        self._folder, self._job, self._device, self._stops = folder, job, device, False
 
     def start(self) -> None:
         import ray
@@ -105,10 +106,13 @@ class _Actor:
             raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
         with suppress(OSError):  # relative paths of data must mean the same as in the driver
             os.chdir(self._folder)
-        self._step = make_step(job, self._device)
+        self._run = make_worker(job, self._device)
 
-    def step(self, unit: Unit, stop: bool) -> Step:
-        return self._step(unit, stop)
+    def run(self, unit: Unit) -> Iterator[Event]:
+        yield from self._run(unit, lambda: self._stops)
+
+    def stop(self) -> None:
+        self._stops = True
 
 
 class _Process:
@@ -122,8 +126,13 @@ class _Process:
         self._actor = self._class.remote(*self._arguments)
         self._get(self._actor.start.remote())
 
-    def call(self, unit: Unit, stop: bool) -> Step:
-        return self._get(self._actor.step.remote(unit, stop))  # type: ignore[no-any-return]
+    def call(self, unit: Unit) -> Iterator[Event]:
+        for event in self._actor.run.options(num_returns="streaming").remote(unit):
+            yield self._get(event)
+
+    def stop(self) -> None:
+        if self._actor is not None:
+            self._actor.stop.remote()
 
     def close(self) -> None:
         if self._actor is not None:

@@ -19,7 +19,7 @@ from cflow_torch.fleet.processes import SIGNALS, ChildProcess
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.report import Counters
-from cflow_torch.fleet.work import Worker, make_step
+from cflow_torch.fleet.work import Worker, make_worker
 from cflow_torch.types import CFlowError
 
 _SHOWN = 3  # how often a message is shown; the report names all logs that it is about
@@ -56,7 +56,7 @@ def run_local(
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
             raise CFlowError(f"engine.{name}={value!r}: give a number above 0")
     if len(layout.devices) > 1 or memory is not None:
-        processes = [ChildProcess(make_step, job, device, memory, timeout=timeout) for device in layout.devices]
+        processes = [ChildProcess(make_worker, job, device, memory, timeout=timeout) for device in layout.devices]
         yield from dispatch(processes, units, stop, _RETRIES)
         return
     with closing(Worker(job, layout.devices[0])) as worker:

@@ -22,7 +22,7 @@ from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.names import safe_name
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Step, Unit
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Unit
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
 from cflow_torch.fleet.progress import log_line, show_warnings_as_lines
 from cflow_torch.stages import FlowModel, stage_seconds
@@ -30,7 +30,6 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.inspection import inactive_is_an_error, repeats
 
 _AHEAD = 2  # batches that are read ahead, and that wait to be written
-_REPORT_EVERY_S = 0.5  # a call of a worker process and its answer take a millisecond or two
 _LOST_DEVICE = 70  # exit status
 
 
@@ -82,25 +81,30 @@ class Worker:
             stop: called before each batch. Once it returns True, computed frames are written and no others begin.
 
         Yields:
-            `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`.
+            `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something else than a frame
+            fails, `Failed` without a time stamp.
 
         Raises:
             DeviceLost: the GPU can no longer be used.
         """
         try:
-            log = self._open(unit.source)
-            folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
-            stamps = {i: int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
-            if unit.only is not None:
-                stamps = {i: stamp for i, stamp in stamps.items() if stamp in unit.only}
-            complete = set() if self._job.redo else complete_frames(folder)
-            todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
-            if todo or complete:
-                claim_log(folder, log, self._job.identity)
-            remove_stale(folder)
+            yield from self._run(unit, stop)
+        except DeviceLost:
+            raise
         except Exception as error:
             yield Failed(unit.number, source_name(unit.source), describe(error))
-            return
+
+    def _run(self, unit: Unit, stop: Callable[[], bool]) -> Iterator[Event]:
+        log = self._open(unit.source)
+        folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
+        stamps = {i: int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
+        if unit.only is not None:
+            stamps = {i: stamp for i, stamp in stamps.items() if stamp in unit.only}
+        complete = set() if self._job.redo else complete_frames(folder)
+        todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
+        if todo or complete:
+            claim_log(folder, log, self._job.identity)
+        remove_stale(folder)
         yield Opened(unit.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
         checks = bool(self._job.settings.get("check", True))
         if checks and 0 in todo:
@@ -108,10 +112,10 @@ class Worker:
                 for text in find_problems(log):
                     yield Noted(unit.number, log.log_id, text)
         for frame in self._pass(log, folder, list(todo), stop):
+            name = f"{log.log_id}/{frame.timestamp}"
             if checks and frame.is_repetition:
-                yield Noted(unit.number, f"{log.log_id}/{frame.timestamp}", "the next sweep has the same points")
+                yield Noted(unit.number, name, "the next sweep has the same points")
             if isinstance(frame.content, Exception):
-                name = f"{log.log_id}/{frame.timestamp}"
                 yield Failed(unit.number, name, describe(frame.content), frame.timestamp)
             else:
                 yield Done(unit.number, frame.timestamp, frame.seconds)
@@ -203,13 +207,18 @@ class Worker:
         return frame
 
 
-def make_step(job: Job, device: str, memory: float | None = None) -> Callable[[Unit, bool], Step]:
+def make_worker(
+    job: Job, device: str, memory: float | None = None
+) -> Callable[[Unit, Callable[[], bool]], Iterator[Event]]:
     """Make a worker in its own process, which on a CPU computes on one thread: other workers use the other cores.
 
     Args:
         job: the run.
         device: where to compute.
         memory: bytes of address space that the process may use; None = no limit.
+
+    Returns:
+        `Worker.run`, which ends the process if its GPU is lost.
     """
     if memory is not None:
         import resource  # not available on Windows
@@ -219,45 +228,16 @@ def make_step(job: Job, device: str, memory: float | None = None) -> Callable[[U
         torch.set_num_threads(1)
         pyarrow.set_cpu_count(1)
     show_warnings_as_lines()
-    return Steps(Worker(job, device))
+    worker = Worker(job, device)
 
-
-class Steps:
-    """Runs the units of a worker a while at each call, so that its parent can follow them.
-
-    Args:
-        worker: what computes.
-    """
-
-    def __init__(self, worker: Worker) -> None:
-        self._worker = worker
-        self._events: Iterator[Event] | None = None  # of the current unit
-        self._stops = False
-
-    def __call__(self, unit: Unit, stop: bool) -> Step:
-        """Begin a unit, or continue it.
-
-        Args:
-            unit: the same at each call until the unit has ended.
-            stop: finish the frames that have begun, and begin no others.
-        """
-        self._stops = stop
-        running, self._events = self._events or self._worker.run(unit, lambda: self._stops), None
-        events: list[Event] = []
-        until = time.monotonic() + _REPORT_EVERY_S
+    def run(unit: Unit, stop: Callable[[], bool]) -> Iterator[Event]:
         try:
-            for event in running:
-                events.append(event)
-                # The parent must know the frames of a unit before one of them can kill this process.
-                if isinstance(event, Opened) or time.monotonic() > until:
-                    self._events = running
-                    return Step(events, has_ended=False)
+            yield from worker.run(unit, stop)
         except DeviceLost as error:  # a new process can use the GPU again
             log_line(f"a worker ends: {error}")
             os._exit(_LOST_DEVICE)
-        except Exception as error:
-            events.append(Failed(unit.number, source_name(unit.source), describe(error)))
-        return Step(events, has_ended=True)
+
+    return run
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from cflow_torch.fleet import run as running
 from cflow_torch.fleet import work
 
 DEADLY = "CFLOW_TEST_DEADLY"  # folder of files <log>.<time stamp> with the name of a cause and how often it occurs
-REAL_MAKE = running.make_step
+REAL_MAKE = running.make_worker
 LIMIT = 12e9  # bytes, of a worker's address space
 
 CAUSES: dict[str, Callable[[], Any]] = {
@@ -31,7 +31,7 @@ CAUSES: dict[str, Callable[[], Any]] = {
 
 def make_deadly_worker(*arguments: Any) -> Any:
     """A worker that dies when it reads a frame of `DEADLY`."""
-    step, read = REAL_MAKE(*arguments), work.window
+    run_units, read = REAL_MAKE(*arguments), work.window
 
     def deadly_read(log: Any, index: int, *num_sweeps: int) -> Any:
         file = Path(os.environ[DEADLY]) / f"{log.log_id}.{log.timestamps[index]}"
@@ -43,7 +43,7 @@ def make_deadly_worker(*arguments: Any) -> Any:
         return read(log, index, *num_sweeps)
 
     work.window = deadly_read
-    return step
+    return run_units
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_dying_workers_lose_only_the_frame_that_always_kills(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv(DEADLY, str(tmp_path))
-    monkeypatch.setattr(running, "make_step", make_deadly_worker)
+    monkeypatch.setattr(running, "make_worker", make_deadly_worker)
     logs = [AV2Log(folder) for folder in sorted(fleet.iterdir())]
     for log, cause in zip(logs, once):
         (tmp_path / f"{log.log_id}.{log.timestamps[2]}").write_text(f"{cause}:1")

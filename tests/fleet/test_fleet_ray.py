@@ -33,13 +33,13 @@ def test_equals_the_local_engine_byte_for_byte(fleet: Path, single: dict[str, by
 class LethalActor(ray_engine._Actor):
     """A worker whose process is killed at each call of a unit that still has a file next to the output."""
 
-    def step(self, unit: Unit, stop: bool) -> Any:
+    def run(self, unit: Unit) -> Any:
         file = Path(self._job.output).parent / f"kills-{unit.number}"
         count = int(file.read_text()) if file.exists() else 0
         if count > 0:
             file.write_text(str(count - 1))
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().step(unit, stop)
+        yield from super().run(unit)
 
 
 @pytest.mark.slow

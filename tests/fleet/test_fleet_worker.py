@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 import threading
 import time
 from dataclasses import replace
@@ -24,7 +22,7 @@ from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import ChildProcess
 from cflow_torch.fleet.report import Counters, format_missing, format_report
 from cflow_torch.fleet.run import run_local
-from cflow_torch.fleet.work import Steps, Worker
+from cflow_torch.fleet.work import Worker
 from cflow_torch.simulator import make_drive
 
 
@@ -131,8 +129,7 @@ class ThreadProcess:
         self.num_starts += 1
         if self.num_starts <= self.failed_starts:
             raise WorkerDied("by SIGKILL")
-        self.worker = Worker(self.job, "cpu")
-        self.step = Steps(self.worker)
+        self.worker, self.is_stopped = Worker(self.job, "cpu"), False
         self.worker._ahead = 0  # without read-ahead, so that the frames before the deadly one are on disk
         self.worker._read = self._read  # type: ignore[method-assign]
 
@@ -143,11 +140,14 @@ class ThreadProcess:
             raise Death
         return Worker._read(self.worker, log, index)
 
-    def call(self, unit: Unit, stop: bool) -> Any:
+    def call(self, unit: Unit) -> Any:
         try:
-            return self.step(unit, stop)
+            yield from self.worker.run(unit, lambda: self.is_stopped)
         except Death:
             raise WorkerDied("by SIGSEGV") from None
+
+    def stop(self) -> None:
+        self.is_stopped = True
 
     def close(self) -> None:
         self.is_closed.set()
@@ -196,7 +196,7 @@ def test_a_unit_that_kills_ten_workers_is_left(fleet: Path, single: dict[str, by
 
 def test_a_log_that_cannot_be_opened_alive_is_left(source: Path, tmp_path: Path) -> None:
     class Deadly(ThreadProcess):
-        def call(self, unit: Unit, stop: bool) -> Any:
+        def call(self, unit: Unit) -> Any:
             raise WorkerDied("by SIGABRT")
 
     died, again, failed = dispatch([Deadly(make_job(tmp_path))], units_of([source]), lambda: False, retries=1)
@@ -248,7 +248,7 @@ def test_an_error_outside_of_frames_fails_only_its_unit(
 
 def test_a_stop_does_not_wait_for_a_worker_that_hangs(source: Path, tmp_path: Path, monkeypatch: Any) -> None:
     class Hanging(ThreadProcess):
-        def call(self, unit: Unit, stop: bool) -> Any:
+        def call(self, unit: Unit) -> Any:
             self.is_closed.wait()
             raise WorkerDied("by SIGKILL")
 
@@ -259,16 +259,25 @@ def test_a_stop_does_not_wait_for_a_worker_that_hangs(source: Path, tmp_path: Pa
     assert time.monotonic() - start < 20
 
 
+def make_countdown(count: int) -> Callable[..., Iterator[Any]]:
+    def countdown(number: int, stop: Callable[[], bool]) -> Iterator[Any]:
+        yield from (number / k for k in range(count, 0, -1))
+        yield 1 / number and stop()
+
+    return countdown
+
+
 def test_a_child_process_passes_answers_and_errors() -> None:
-    process = ChildProcess(functools.partial, operator.truediv, 6, timeout=60)
+    process = ChildProcess(make_countdown, 3, timeout=60)
     try:
-        assert process.call(2) == 3.0
+        assert list(process.call(6)) == [2.0, 3.0, 6.0, False]
         with pytest.raises(RuntimeError, match="ZeroDivisionError"):
-            process.call(0)
+            list(process.call(0))
         process._process.kill()
         with pytest.raises(WorkerDied, match="by signal 9, Killed"):
-            process.call(2)
-        assert process.call(3) == 2.0, "another process"
+            list(process.call(6))
+        assert next(process.call(3)) == 1.0, "another process"
+        process.stop()
     finally:
         process.close()
 
