@@ -1,46 +1,15 @@
-"""All settings with their defaults, bounds and help, and the presets, which list only the settings that they change."""
+"""The settings of each method, and the presets, which list only what they change."""
 
 from __future__ import annotations
 
 import math
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
-from numbers import Integral, Real
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Optional, Tuple, TypeVar
 
 from cflow_torch.errors import CFlowError
+from cflow_torch.setting import LIMIT, checked, setting
 
 Kind = TypeVar("Kind", bound="Config")
-# Whole numbers stay below this, because they are compared with tensors of int64 and of float64.
-_MOST = 2**53
-# Names of the types of values in error messages.
-_NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers"}
-
-
-def setting(
-    default: Any,
-    help: str,
-    *,
-    kind: type | None = None,
-    optional: bool = False,
-    low: float = -math.inf,
-    above: float = -math.inf,
-    high: float = math.inf,
-    choices: tuple[Any, ...] = (),
-) -> Any:
-    """A field of a `Config`.
-
-    Args:
-        default: its default value.
-        help: its meaning and unit.
-        kind: int, float, bool, str or tuple (of floats); None = the type of the default.
-        optional: None is a value as well.
-        low, high: smallest and largest value, both allowed.
-        above: largest value that is not allowed.
-        choices: all values, if they can be listed.
-    """
-    limits = {"kind": kind or type(default), "optional": optional, "low": low, "above": above, "high": high}
-    return field(default=default, metadata={"help": help, "choices": choices, **limits})
 
 
 def _method(name: str) -> Any:
@@ -86,12 +55,12 @@ class Config:
         kind=float,
         optional=True,
         above=0,
-        high=float(_MOST),
+        high=float(LIMIT),
     )
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            object.__setattr__(self, f.name, _checked(f, getattr(self, f.name)))
+            object.__setattr__(self, f.name, checked(f, getattr(self, f.name)))
         _check_space(self.pixel_sizes, self.point_cloud_range, self.ego_box)
 
     @property
@@ -284,8 +253,8 @@ def make_config(preset: str | None = None, method: str | None = None, **override
         CFlowError: an unknown preset or field (the message lists the fields), an invalid value, or a preset of another
             method.
     """
-    if method is not None and method not in CONFIGS:
-        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CONFIGS))}")
+    if method is not None:
+        _class_of(method)  # raises the error
     if preset is None:
         preset = _PRESET_OF_METHOD[method] if method is not None else "default"
     if preset in REMOVED_PRESETS:
@@ -311,23 +280,13 @@ def config_from(settings: dict[str, Any]) -> Config:
     Raises:
         CFlowError: a missing or unknown method, an unknown field, an invalid value.
     """
-    method = settings.get("method")
+    return _class_of(settings.get("method"))().replace(**settings)
+
+
+def _class_of(method: str | None) -> type[Config]:
     if method not in CONFIGS:
         raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CONFIGS))}")
-    return CONFIGS[method]().replace(**settings)
-
-
-def describe(f: Any) -> str:
-    """The allowed values of a field of a `Config` in words: "a number of at least 1 and of at most 2, or None"."""
-    limits = f.metadata
-    low, above, high = limits["low"], limits["above"], limits["high"]
-    if limits["choices"]:
-        return f"one of {', '.join(map(repr, limits['choices']))}"
-    text = _NAMES[limits["kind"]]
-    text += f" of at least {low:g}" if low > -math.inf else ""
-    text += f" above {above:g}" if above > -math.inf else ""
-    text += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
-    return text + (", or None" if limits["optional"] else "")
+    return CONFIGS[method]
 
 
 def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
@@ -350,28 +309,6 @@ def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
     if unknown:
         raise CFlowError(f"unknown setting {', '.join(unknown)}: the fields are {', '.join(['pixel_size', *names])}")
     return overrides
-
-
-def _checked(f: Any, value: Any) -> Any:
-    """The value of a field in its plain type; `CFlowError` if it is not allowed."""
-    limits = f.metadata
-    kind, choices = limits["kind"], limits["choices"]
-    if value is None and limits["optional"]:
-        return None
-    if kind is tuple:
-        with suppress(TypeError, ValueError, OverflowError):
-            return tuple(float(v) for v in value)
-        raise CFlowError(f"{f.name}={value!r}: give {describe(f)}")
-    wanted = {int: Integral, float: Real}.get(kind, kind)
-    is_allowed = isinstance(value, wanted) and (kind is bool or not isinstance(value, bool))
-    if is_allowed and choices:
-        is_allowed = value in choices
-    elif is_allowed and kind in (int, float):
-        is_in_bounds = limits["low"] <= value <= limits["high"] and value > limits["above"]
-        is_allowed = is_in_bounds and (isinstance(value, float) or abs(value) < _MOST)
-    if not is_allowed:
-        raise CFlowError(f"{f.name}={value!r}: give {describe(f)}")
-    return kind(value)
 
 
 def _check_space(sizes: tuple[float, ...], box: tuple[float, ...], own: tuple[float, ...] | None) -> None:

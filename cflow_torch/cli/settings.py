@@ -26,8 +26,9 @@ import yaml  # type: ignore[import-untyped]
 
 from cflow_torch.cli.choices import CONFIGS, files, near, settings
 from cflow_torch.config import CONFIGS as METHODS
-from cflow_torch.config import PRESETS, WINDOW, describe, make_config
+from cflow_torch.config import PRESETS, WINDOW, make_config
 from cflow_torch.errors import CFlowError
+from cflow_torch.setting import describe
 
 _PAGE = """# Settings
 

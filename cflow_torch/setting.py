@@ -1,0 +1,80 @@
+"""One setting of a method: its default, meaning and bounds, and the check of a value."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import field
+from numbers import Integral, Real
+from typing import Any
+
+from cflow_torch.errors import CFlowError
+
+# Whole numbers stay below this, because they are compared with tensors of int64 and of float64.
+LIMIT = 2**53
+# Names of the types of values in error messages.
+_NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers"}
+
+
+def setting(
+    default: Any,
+    help: str,
+    *,
+    kind: type | None = None,
+    optional: bool = False,
+    low: float = -math.inf,
+    above: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[Any, ...] = (),
+) -> Any:
+    """A field of a `Config`.
+
+    Args:
+        default: its default value.
+        help: its meaning and unit.
+        kind: int, float, bool, str or tuple (of floats); None = the type of the default.
+        optional: None is a value as well.
+        low, high: smallest and largest value, both allowed.
+        above: largest value that is not allowed.
+        choices: all values, if they can be listed.
+    """
+    limits = {"kind": kind or type(default), "optional": optional, "low": low, "above": above, "high": high}
+    return field(default=default, metadata={"help": help, "choices": choices, **limits})
+
+
+def describe(f: Any) -> str:
+    """The allowed values of a field of a `Config` in words: "a number of at least 1 and of at most 2, or None"."""
+    limits = f.metadata
+    low, above, high = limits["low"], limits["above"], limits["high"]
+    if limits["choices"]:
+        return f"one of {', '.join(map(repr, limits['choices']))}"
+    text = _NAMES[limits["kind"]]
+    text += f" of at least {low:g}" if low > -math.inf else ""
+    text += f" above {above:g}" if above > -math.inf else ""
+    text += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
+    return text + (", or None" if limits["optional"] else "")
+
+
+def checked(f: Any, value: Any) -> Any:
+    """The value of a field in its plain type.
+
+    Raises:
+        CFlowError: it is not allowed.
+    """
+    limits = f.metadata
+    kind = limits["kind"]
+    if value is None and limits["optional"]:
+        return None
+    with suppress(TypeError, ValueError, OverflowError):
+        if kind is tuple:
+            return tuple(float(v) for v in value)
+        is_allowed = isinstance(value, {int: Integral, float: Real}.get(kind, kind))
+        if kind in (int, float):
+            is_in_bounds = limits["low"] <= value <= limits["high"] and value > limits["above"]
+            is_small = isinstance(value, float) or abs(value) < LIMIT
+            is_allowed &= is_in_bounds and is_small and not isinstance(value, bool)
+        if limits["choices"]:
+            is_allowed &= value in limits["choices"]
+        if is_allowed:
+            return kind(value)
+    raise CFlowError(f"{f.name}={value!r}: give {describe(f)}")
