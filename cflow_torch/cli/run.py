@@ -1,4 +1,4 @@
-"""Shared by the commands: settings, logs, the loop over pairs that skips bad frames."""
+"""Shared by the commands: settings, output folders, logs, failures."""
 
 from __future__ import annotations
 

@@ -125,16 +125,16 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
     pieces = deque([unit])
     while pieces and not stop():
         piece = pieces.popleft()
-        missing = None if piece.only is None else set(piece.only)  # frames that are not settled; None = not known
+        missing = set(piece.only or ())  # time stamps of frames that are not settled
         try:
             for event in process.call(piece):
                 if not isinstance(event, Opened):
-                    if missing is not None and isinstance(event, (Done, Failed)) and event.timestamp is not None:
-                        missing.discard(event.timestamp)
+                    if isinstance(event, (Done, Failed)):
+                        missing.discard(event.timestamp)  # type: ignore[arg-type]
                     yield event
                     continue
                 if is_opened:  # a repetition: the other frames were written just before the last process died
-                    yield from (Done(unit.number, stamp, {}) for stamp in (missing or set()).difference(event.todo))
+                    yield from (Done(unit.number, stamp, {}) for stamp in missing.difference(event.todo))
                 else:
                     yield event
                 name, is_opened, missing = event.log_id, True, set(event.todo)
@@ -145,13 +145,13 @@ def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) ->
             return
         _start(process)
         num_deaths += 1
-        stamps = sorted(missing or [])
-        piece = replace(piece, only=None if missing is None else frozenset(missing), deaths=piece.deaths + 1)
         if num_deaths == max(_MAX_DEATHS, 2 * (retries + 1)):
             message = f"{num_deaths} workers died on this part of the log, the last one {how}: the rest is left"
             yield Failed(unit.number, name, message)
             return
         yield Noted(unit.number, name, f"a worker died {how}; another one goes on with the frames that are missing")
+        stamps = sorted(missing)
+        piece = replace(piece, only=frozenset(missing) if is_opened else None, deaths=piece.deaths + 1)
         if piece.deaths <= retries:
             pieces.append(piece)
         elif len(stamps) > 1:
