@@ -17,6 +17,9 @@ from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.windows.ground import CHOICES, find_ground_batch
 from cflow_torch.windows.validation import choose_device, keep_nearest
 
+# Arguments of `estimate_flow` that a `Sweep` contains.
+_NOT_WITH_SWEEPS = ("T_ego1_ego0", "gm0", "gm1", "dt0", "dt1", "T_ego1_egoh", "gmh", "dth", "T_ego1_egof", "gmf", "dtf")
+
 
 def estimate_flow(
     pc0: Array | Sweep,  # (N0, 3+), metres, ego frame of sweep t
@@ -89,6 +92,7 @@ def estimate_flow(
 
     Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
+    arguments = dict(locals())
     if ground not in CHOICES:
         raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
     if config is None:
@@ -101,16 +105,7 @@ def estimate_flow(
     if moved is None and any(transform is not None for transform in (*T_ego1_egoh, *T_ego1_egof)):
         moved = "another transform"
     if isinstance(pc0, Sweep) or isinstance(pc1, Sweep):
-        one = {"T_ego1_ego0": T_ego1_ego0, "gm0": gm0, "gm1": gm1, "dt0": dt0, "dt1": dt1}
-        several = {
-            "T_ego1_egoh": T_ego1_egoh,
-            "gmh": gmh,
-            "dth": dth,
-            "T_ego1_egof": T_ego1_egof,
-            "gmf": gmf,
-            "dtf": dtf,
-        }
-        extra = [name for name, value in {**one, **several}.items() if value is not None and len(value) > 0]
+        extra = [name for name in _NOT_WITH_SWEEPS if arguments[name] is not None and len(arguments[name]) > 0]
         if extra:
             raise CFlowError(f"{', '.join(extra)} and a Sweep are given: put masks, poses and times into the Sweep")
         window = Window(pc0, pc1, tuple(pch), tuple(pcf))  # type: ignore[arg-type]  # it refuses arrays
