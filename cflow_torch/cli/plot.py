@@ -30,10 +30,11 @@ from tqdm import tqdm
 
 from cflow_torch.applications.deskewing import deskew
 from cflow_torch.cli import run
+from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.fleet.progress import frames as counted
+from cflow_torch.data.log import Log, window
 from cflow_torch.model import SceneFlowModel
+from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.animation import Frame, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
@@ -130,19 +131,19 @@ def _animate(cfg: DictConfig, model: SceneFlowModel, output: Path) -> Path:
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
     chosen, log = run.chosen_pairs(cfg), find_log(cfg)
-    recent = CachedLog(log, model.config.num_sweeps)
     pairs = chosen(log)
     if not pairs:
         raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ensure_writable(output)
     frames: list[Frame] = []
-    for pair in counted(pairs):
-        sweeps = window(recent, pair, model.config.num_history, model.config.num_future)
-        (result,) = model([sweeps])
+
+    def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         flow = result.residual_flow
         result = replace(result, pose_flow=flow, flow=flow)  # frees the flow that is not drawn
-        title = f"{log.log_id}, {(log.timestamps[pair] - log.timestamps[pairs[0]]) / 1e9:.1f} s"
+        title = f"{log.log_id}, {(log.timestamps[index] - log.timestamps[pairs[0]]) / 1e9:.1f} s"
         frames.append(Frame(sweeps.pc0.points, result, sweeps.pc0.is_ground, title))
+
+    run.finish(for_each_pair([(log, index) for index in pairs], TimedModel(model), keep))
     figures = flow_figures(
         frames,
         point_cloud_range=model.config.point_cloud_range,
