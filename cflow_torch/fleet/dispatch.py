@@ -7,10 +7,10 @@ from collections import deque
 from dataclasses import replace
 from queue import Empty, Queue
 from threading import Thread
-from typing import Any, Callable, Iterator, Protocol, Sequence
+from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.fleet.job import Done, Event, Failed, Noted, Opened, Unit
-from cflow_torch.fleet.processes import WorkerDied
+from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.progress import log_line
 from cflow_torch.fleet.work import describe, source_name
 from cflow_torch.types import CFlowError
@@ -23,24 +23,8 @@ _MAX_FAILED_STARTS = 3  # in a row; then a worker is given up
 _MAX_DEATHS = 10
 
 
-class Process(Protocol):
-    """A worker process of an engine. While one of its methods blocks, only `stop` and `close` may be called."""
-
-    def start(self) -> None:
-        """Start the process, again after it has died, and call `make_worker` in it."""
-
-    def call(self, unit: Unit) -> Iterator[Event]:
-        """Do a unit; raises `WorkerDied` if the process ends before the unit does."""
-
-    def stop(self) -> None:
-        """Tell the worker to finish the frames that have begun."""
-
-    def close(self) -> None:
-        """End the process, whatever it does."""
-
-
 def dispatch(
-    processes: Sequence[Process], units: Sequence[Unit], stop: Callable[[], bool], retries: int
+    processes: Sequence[ChildProcess], units: Sequence[Unit], stop: Callable[[], bool], retries: int
 ) -> Iterator[Event]:
     """Do all units.
 
@@ -48,7 +32,8 @@ def dispatch(
     written as a whole or not at all, and complete ones are skipped.
 
     Args:
-        processes: one per worker, not started yet. Each is used by a thread of its own.
+        processes: one per worker, not started yet, whose calls take a unit and yield its events. Each is used by a
+            thread of its own, except for `stop` and `close`.
         units: numbered as in `split`.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
         retries: how often a unit, and then each of its frames by itself, is repeated.
@@ -92,7 +77,7 @@ def dispatch(
             process.close()
 
 
-def _work(process: Process, todo: Queue[Any], answers: Queue[Any], stop: Callable[[], bool], retries: int) -> None:
+def _work(process: ChildProcess, todo: Queue[Any], answers: Queue[Any], stop: Callable[[], bool], retries: int) -> None:
     """Do units until None comes. After a stop, units that have not begun are taken and left undone."""
     unit = None
     try:
@@ -107,7 +92,7 @@ def _work(process: Process, todo: Queue[Any], answers: Queue[Any], stop: Callabl
             answers.put(None)
 
 
-def _start(process: Process) -> None:
+def _start(process: ChildProcess) -> None:
     for _ in range(_MAX_FAILED_STARTS):
         try:
             return process.start()
@@ -119,7 +104,7 @@ def _start(process: Process) -> None:
     )
 
 
-def _do(process: Process, unit: Unit, stop: Callable[[], bool], retries: int) -> Iterator[Event]:
+def _do(process: ChildProcess, unit: Unit, stop: Callable[[], bool], retries: int) -> Iterator[Event]:
     """Do a unit and yield its events. When the process dies, start it again and repeat the frames that are missing."""
     name, is_opened, num_deaths = source_name(unit.source), False, 0
     pieces = deque([unit])

@@ -17,7 +17,7 @@ from cflow_torch.fleet.dispatch import dispatch
 from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
 from cflow_torch.fleet.manifest import MANIFEST, make_identity
-from cflow_torch.fleet.processes import WorkerDied
+from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.work import describe, make_worker
 from cflow_torch.types import CFlowError
 
@@ -115,19 +115,20 @@ class _Actor:
         self._stops = True
 
 
-class _Process:
-    """The driver's side of an actor, see `dispatch.Process`."""
+class _Process(ChildProcess):
+    """An actor in place of a child process."""
 
     def __init__(self, ray: ModuleType, actor: Any, *arguments: Any) -> None:
-        self._ray, self._class, self._arguments = ray, actor, arguments
+        super().__init__(actor.remote, *arguments)
+        self._ray = ray
         self._actor: Any = None
 
     def start(self) -> None:
-        self._actor = self._class.remote(*self._arguments)
+        self._actor = self._make(*self._arguments)
         self._get(self._actor.start.remote())
 
-    def call(self, unit: Unit) -> Iterator[Event]:
-        for event in self._actor.run.options(num_returns="streaming").remote(unit):
+    def call(self, *arguments: Any) -> Iterator[Event]:
+        for event in self._actor.run.options(num_returns="streaming").remote(*arguments):
             yield self._get(event)
 
     def stop(self) -> None:
