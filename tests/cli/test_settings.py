@@ -143,7 +143,7 @@ def test_the_page_lists_every_setting(cflow: Cflow, capsys: pytest.CaptureFixtur
     [
         (
             "max_speed",
-            ["Method `dense`: model=paper, Method `keypoints`: model=keypoints:", "| `null` |", "default `60.0`, fast"],
+            ["Method `dense`: model=paper, Method `keypoints`: model=keypoints:", "default `60.0`, offline `60.0`"],
         ),
         ("shard.index", ["cflow flow, cflow label:\n  index: auto  # index of this process"]),
         ("data", ["data=av2 ", "data=hdf5 "]),
