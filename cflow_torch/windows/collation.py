@@ -144,7 +144,7 @@ def make_batch(
     """
     timeline = Timeline.of(windows, config, grid, needs_times)
     ground = GroundHeights(len(windows), grid, device) if needs_ground else None
-    pieces = PieceReader(timeline, config, grid, device, num_axes, ground).pieces()
+    pieces = list(PieceReader(timeline, config, grid, device, num_axes, ground).pieces())
     with torch.inference_mode(False):  # becomes part of the results
         pose_flow = torch.cat([piece.pose_flow for piece in pieces if piece.pose_flow is not None])
     point_times = [piece.point_times for piece in pieces if piece.point_times is not None]

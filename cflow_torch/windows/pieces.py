@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, NamedTuple, Sequence
+from typing import Any, Iterable, Iterator, NamedTuple, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
+from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero, take_columns
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import compensate
@@ -56,48 +57,53 @@ class PieceReader:
     num_axes: int
     ground: GroundHeights | None
 
-    def pieces(self) -> list[Piece]:
-        """Read the pieces in the order of the timeline.
+    def pieces(self) -> Iterator[Piece]:
+        """Yield the pieces in the order of the timeline.
 
-        A CPU reads each sweep alone, because one transform for all points is faster than one for each. A GPU waits for
-        launches rather than for memory, so it reads all sweeps t+1 at once, then all sweeps t, then all others.
+        A CPU reads each sweep alone, in pieces that fit its cache. A GPU waits for operations rather than for memory,
+        so it reads all sweeps t+1 at once, then all sweeps t, then all others.
         """
         if self.device.type == "cpu":
-            return [self._read([entry]) for entry in self.timeline.entries]
-        groups = groupby(self.timeline.entries, lambda entry: min(entry.step, 2))
-        return [self._read(list(group)) for _, group in groups]
+            for entry in self.timeline.entries:
+                num_points = entry.sweep.points.shape[0]
+                yield from self._read([entry], chunks(0, max(num_points, 1), self.device))  # an empty sweep is a piece
+        else:
+            for _, group in groupby(self.timeline.entries, lambda entry: min(entry.step, 2)):
+                yield from self._read(list(group), [slice(None)])
 
-    def _read(self, group: Sequence[Entry]) -> Piece:
-        """Read the points of some sweeps, one sweep after the other."""
+    def _read(self, group: Sequence[Entry], parts: Iterable[slice]) -> Iterator[Piece]:
+        """Yield the given rows of a group of sweeps, counted through all of them."""
         step, grid, num_axes = group[0].step, self.grid, self.num_axes
+        sweeps = [entry.sweep for entry in group]
         window, image, matrix = self._of_points(group)
+        ground, times = self._ground(group), self._times(group)
+        region = Grid(grid.pixel_size, self.config.point_cloud_range[:3], self.config.point_cloud_range[3:])
         # z matters where the region bounds it. A transform spreads a z that is not finite to x and y.
         is_flat = matrix is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
         checked_axes = 2 if is_flat else 3
-        raw = read_positions([entry.sweep for entry in group], self.device)
-        moved = raw if matrix is None else compensate(raw, matrix, 3 if step == 1 else max(num_axes, checked_axes))
-        is_active = grid.contains(moved[:checked_axes])
-        if any(entry.sweep.is_ground is not None for entry in group):
-            is_ground = torch.cat([read_ground(entry.sweep, self.device) for entry in group])
-            if self.ground is not None and step == 1:
-                found = flat_nonzero(is_active & is_ground)
-                self.ground.add(_select(window, found), moved.index_select(1, found))
-            is_active &= ~is_ground
-        if self.config.ego_box is not None:
-            x0, y0, x1, y1 = self.config.ego_box
-            is_active &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
-        pose_flow, row = None, None
-        if step == 1:
-            region = Grid(grid.pixel_size, self.config.point_cloud_range[:3], self.config.point_cloud_range[3:])
-            has_result = is_active if region == grid else is_active & region.contains(moved)
-            pose_flow = _pose_flow(raw, moved)
-            positions = moved[:num_axes]
-        else:
-            row = flat_nonzero(is_active)
-            is_active = has_result = torch.ones_like(row, dtype=torch.bool)
-            positions = take_columns(moved[:num_axes], row)
-        of_point = _select(image, row) + torch.zeros_like(is_active, dtype=torch.int32)
-        return Piece(step, positions, is_active, has_result, of_point, self._times(group, row), pose_flow)
+        for rows in parts:
+            raw = read_positions(sweeps, self.device, rows)
+            moved = raw if matrix is None else compensate(raw, matrix, 3 if step == 1 else max(num_axes, checked_axes))
+            is_active, pose_flow, row = grid.contains(moved[:checked_axes]), None, None
+            if ground is not None:
+                if self.ground is not None and step == 1:
+                    found = flat_nonzero(is_active & ground[rows])
+                    self.ground.add(_select(window, found), moved.index_select(1, found))
+                is_active &= ~ground[rows]
+            if self.config.ego_box is not None:
+                x0, y0, x1, y1 = self.config.ego_box
+                is_active &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
+            if step == 1:
+                has_result = is_active if region == grid else is_active & region.contains(moved)
+                pose_flow = _pose_flow(raw, moved)
+                positions = moved[:num_axes]
+            else:
+                row = flat_nonzero(is_active)
+                is_active = has_result = torch.ones_like(row, dtype=torch.bool)
+                positions = take_columns(moved[:num_axes], row)
+            of_point = _select(image, row) + torch.zeros_like(is_active, dtype=torch.int32)
+            point_times = None if times is None else _select(times[rows], row).float()
+            yield Piece(step, positions, is_active, has_result, of_point, point_times, pose_flow)
 
     def _of_points(self, group: Sequence[Entry]) -> tuple[int | Tensor, int | Tensor, Tensor | None]:
         """Window and image of each point, (N,) or one number for all, and its transform, (3, 4, N) or (3, 4, 1)."""
@@ -114,12 +120,17 @@ class PieceReader:
         window, image = known.index_select(0, entry_of_point).unbind(1)
         return window, image.int(), None if matrix is None else matrix.index_select(2, entry_of_point)
 
-    def _times(self, group: Sequence[Entry], row: Tensor | None) -> Tensor | None:
-        """Times of some points, sweep intervals, 0 in windows whose times are not used; None = no window uses them."""
+    def _ground(self, group: Sequence[Entry]) -> Tensor | None:
+        """(N,) bool, False in sweeps without a mask; None = no sweep has one."""
+        if all(entry.sweep.is_ground is None for entry in group):
+            return None
+        return torch.cat([read_ground(entry.sweep, self.device) for entry in group])
+
+    def _times(self, group: Sequence[Entry]) -> Tensor | None:
+        """(N,) float64 sweep intervals, 0 in windows whose times are not used; None = no window uses them."""
         if all(entry.interval is None for entry in self.timeline.entries):
             return None
-        times = [read_point_times(entry.sweep, entry.name, entry.interval, self.device) for entry in group]
-        return _select(torch.cat(times), row).float()  # type: ignore[no-any-return]
+        return torch.cat([read_point_times(entry.sweep, entry.name, entry.interval, self.device) for entry in group])
 
 
 def _select(values: Any, row: Tensor | None) -> Any:

@@ -14,6 +14,7 @@ from torch import Tensor
 from cflow_torch.config import Config
 from cflow_torch.types import CFlowError, Sweep, Window, named_sweeps
 
+_ALL_ROWS = slice(None)
 # Largest time of a point, seconds from the instant of its sweep. Larger numbers have another unit.
 _LONGEST_TIME = 10.0
 # Times of points are multiples of this part of a sweep interval, so that their sums are exact in any order.
@@ -96,11 +97,11 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
     return chosen
 
 
-def read_positions(sweeps: Sequence[Sweep], device: torch.device) -> Tensor:
-    """(3, N) float64 copy of x, y and z of each sweep, one sweep after the other."""
+def read_positions(sweeps: Sequence[Sweep], device: torch.device, rows: slice = _ALL_ROWS) -> Tensor:
+    """(3, N) float64 copy of x, y and z of some rows of each sweep, one sweep after the other."""
     parts = []
     for sweep in sweeps:
-        columns = sweep.points[:, :3].T
+        columns = sweep.points[rows, :3].T
         if not isinstance(columns, Tensor):
             # A GPU receives float32 where the input is no wider. Both types are in native byte order.
             narrow = device.type != "cpu" and columns.dtype.itemsize <= 4
