@@ -50,6 +50,23 @@ def divide(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
     return groups.divide(piece[pair_of_point])
 
 
+def settle(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
+    """Take moving groups as static that are a small piece of a confirmed object that has stopped.
+
+    The visible outline of a stopped object changes while the vehicle passes it, and a piece of it seems to move. If the
+    box of the object holds most points of a group, and more static points than points of the group, the object has
+    stopped. Without this step the track would follow the piece.
+    """
+    known = tracks.is_confirmed.nonzero()[:, 0]
+    box = box_of_point(groups.point, tracks.box[known], tracks.size[known] + _MARGIN, tracks.heading[known])
+    moves, is_inside = groups.group >= 0, box >= 0
+    num_static = torch.bincount(box[is_inside & ~moves], minlength=len(known))
+    pairs = torch.stack([groups.group, box])[:, is_inside & moves]
+    (group, box), count = torch.unique(pairs, dim=1, return_counts=True)
+    is_piece = (count > groups.count[group] / 2) & (groups.count[group] < num_static[box])
+    return groups.without(group[is_piece])
+
+
 def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> Matches:
     """Match tracks, with (P, 3) points and the track of each, to the moving groups and static points of a sweep."""
     moves = groups.group >= 0

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.indices import lookup
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
 MOVING = 0.05  # metres per sweep: least residual flow of a moving point, as in evaluation
@@ -73,6 +74,15 @@ class MovingGroups:
         group[moves] = index
         confidence = self.confidence[origin]
         return replace(self, group=group, cluster=self.cluster[origin], count=count, confidence=confidence)
+
+    def without(self, group: Tensor) -> MovingGroups:
+        """Take the points of some groups as static, given the (K,) indices of these groups."""
+        is_kept = torch.ones_like(self.count, dtype=torch.bool)
+        is_kept[group] = False
+        index = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)
+        kept = {name: getattr(self, name)[is_kept] for name in ("cluster", "count", "confidence")}
+        group = lookup(index, torch.where(self.group < 0, len(index), self.group), -1)
+        return replace(self, group=group, **kept)
 
     def mean(self, values: Tensor) -> Tensor:
         """(G, C) means over the groups, of values (M, C) per point."""

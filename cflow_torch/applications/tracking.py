@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import Matches, boxes, divide, match
+from cflow_torch.applications.association import Matches, boxes, divide, match, settle
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import confirmed, join_tables
@@ -89,7 +89,7 @@ class Tracker:
         times = self._times(sweeps)
         groups = MovingGroups.of(sweeps, result)
         tracks, points, track_index = self._predict(groups.point.device, times)
-        groups = divide(groups, tracks)
+        groups = divide(settle(groups, tracks), tracks)
         matches = match(tracks, points, track_index, groups)
         flow = groups.mean(groups.step)
         tracks, track_of_group = self._update(tracks, groups, flow, matches, times)

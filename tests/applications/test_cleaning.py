@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from staged_cars import Staged, straight
 from test_tracks_of_runs import calls_on_a_drive
 
-from cflow_torch import CFlowError, CleanLog, Sweep, static_map
+from cflow_torch import CFlowError, CleanLog, FlowResult, Sweep, static_map
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.log import Log
 
@@ -46,6 +47,23 @@ def test_waiting_cars_are_removed_by_their_tracks_and_parked_cars_stay() -> None
     assert by_tracks.cost.removed == removed > 0 and f"removed {removed} more points" in str(by_tracks.cost)
     assert by_tracks.cost.points == sum(len(log.sweep(k).points) for k in range(len(log)))
     assert not by_flow.moving(2)[log.world(2)[2] == 0].any() and not by_flow.moving(12)[log.world(12)[2] == 1].any()
+
+
+def test_a_piece_of_a_waiting_car_that_seems_to_move_does_not_take_its_track() -> None:
+    class Outline(Staged):
+        """After the car has stopped, the flow of its front end is wrong in every second sweep."""
+
+        def result(self, index: int, confidence: float = 0.9) -> FlowResult:
+            result, (points, flow, car) = super().result(index, confidence), self.world(index)
+            is_front = (car == 0) & (points[:, 0] > points[car == 0, 0].max() - 0.7) & (flow[:, 0] == 0)
+            result.residual_flow[is_front] = torch.tensor([-0.2 * (index % 2), 0.0, 0.0])
+            return result
+
+    steps = np.cumsum([1.0] * 5 + [0.6, 0.3, 0.1] + [0.0] * 8)
+    log = Outline([np.stack([steps, 0 * steps], 1)])
+    clean = cleaned(log, remove_stopped=True)
+    for index in range(len(log) - 1):
+        assert np.array_equal(clean.moving(index), log.world(index)[2] == 0), index
 
 
 def test_ground_and_point_times_stay_with_their_rows() -> None:
