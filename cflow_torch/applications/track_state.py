@@ -14,6 +14,9 @@ _NO_CONFIDENCE = 0.7  # log-odds of a method without confidence
 _THIN = 0.12  # metres; we do not trust narrower boxes: posts, and slices of fronts along which a shadow moves
 _MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # metres, and share of the length of its box: least net displacement
 _TRAVEL_FACTOR = 2.0  # largest factor between the net displacement of its box and that of its flow
+# Without that evidence, its box has to move farther, and more exactly as its flow predicts.
+_LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres, and at least its length; share of it; sweeps
+_JUMP, _SMALL = 1.5, 1.5  # factor of its length, plus metres, from which a box shows another part of its object
 
 
 @dataclass(frozen=True)
@@ -110,14 +113,27 @@ class Tracks(NamedTuple):
         """Their filtered states."""
         return States(self.position, self.velocity, self.covariance)
 
-    def have_shown_motion(self) -> Tensor:
-        """(K,) bool: the confidence suffices, and both ends of the box have moved about as far as the flow predicts.
+    def start_again(self, index: Tensor, length: Tensor) -> None:
+        """Start the evidence again for the indexed tracks whose `length` (K,) was very different in the sweep before.
 
-        A part of a wall has flow, too, but its box grows, shrinks or jumps.
+        Another part of the object has become visible, or it was merged with another one, so its centre has jumped.
         """
-        predicted = self.travel.norm(dim=1)
-        centre = ((self.box - self.start) * self.travel).sum(1) / predicted.clamp(min=1e-9)
-        slower_end = centre - (self.size[:, 0] - self.start_length).abs() / 2
-        least = torch.maximum(_MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH * self.size[:, 0], predicted / _TRAVEL_FACTOR)
-        has_moved = (slower_end >= least) & (centre <= predicted * _TRAVEL_FACTOR)
-        return self.is_moving & has_moved & (self.evidence >= _MIN_EVIDENCE)
+        ratio = (self.size[index, 0] + _SMALL) / (length + _SMALL)
+        index = index[(ratio > _JUMP) | (ratio < 1 / _JUMP)]
+        self.write(index, start=self.box[index], start_length=self.size[index, 0], travel=0.0, evidence=0.0)
+
+    def have_shown_motion(self) -> Tensor:
+        """(K,) bool: the box of the track has moved about as its flow predicts, and far enough for its confidence.
+
+        If the confidence suffices, both ends of the box have moved at least a little: a piece of a wall has flow, too,
+        but its box grows, shrinks or jumps. Otherwise, the box has moved far, and very nearly as predicted.
+        """
+        predicted, length = self.travel.norm(dim=1), self.size[:, 0]
+        moved = self.box - self.start
+        centre = (moved * self.travel).sum(1) / predicted.clamp(min=1e-9)
+        slower_end = centre - (length - self.start_length).abs() / 2
+        least = torch.maximum(_MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH * length, predicted / _TRAVEL_FACTOR)
+        is_evident = (slower_end >= least) & (centre <= predicted * _TRAVEL_FACTOR) & (self.evidence >= _MIN_EVIDENCE)
+        has_gone_far = predicted >= torch.maximum(length, self.start_length).clamp(min=_LONG_TRAVEL)
+        is_exact = (moved - self.travel)[:, :2].norm(dim=1) <= _TRAVEL_ERROR * predicted
+        return self.is_moving & (is_evident | (has_gone_far & is_exact & (self.num_moving >= _MIN_SWEEPS)))

@@ -175,6 +175,7 @@ class Tracker:
         self._num_tracks += num_new
         tracks = Tracks(*map(torch.cat, zip(tracks, new)))
 
+        length = tracks.size[matches.track, 0]
         tracks.missed.add_(1)
         tracks.is_moving.fill_(False)
         tracks.cluster.fill_(-1)
@@ -182,6 +183,7 @@ class Tracker:
         tracks.write(track_of_group, num_points=groups.count, cluster=groups.cluster, confidence=groups.confidence)
         tracks.write(stopped, missed=0, num_points=torch.maximum(matches.num_points, tracks.num_points[stopped]))
         tracks.num_moving[track_of_group] += 1
+        tracks.start_again(matches.track, length)
         tracks.add_evidence(track_of_group, groups.confidence)
         tracks.is_confirmed.logical_or_(tracks.have_shown_motion())
         tracks.travel[track_of_group] += flow  # to the next sweep

@@ -140,14 +140,34 @@ def test_a_far_car_of_few_points_has_one_id() -> None:
     assert len(set(table["id"])) == 1 and len(table["id"]) >= 13
 
 
-def test_low_confidence_confirms_no_track_and_missing_confidence_does() -> None:
+def test_low_confidence_confirms_only_long_motion_that_fits_and_missing_confidence_any() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     unsure = [(index, log.result(index, 0.5)) for index in range(11)]
+    table = track(log, unsure)
+    assert np.flatnonzero(table["is_confirmed"])[0] == 5, "it has moved by its own length of 3.8 m"
+    for _, result in unsure:
+        result.residual_flow.mul_(1.4)
     assert len(track(log, unsure)["id"]) == 0
+    unsure = [(index, log.result(index)) for index in range(11)]
     for _, result in unsure:
         object.__setattr__(result, "confidence", None)
     table = track(log, unsure)
     assert len(table["id"]) == 11 and np.isnan(table["confidence"]).all() and table["is_confirmed"].sum() == 9
+
+
+def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then_on() -> None:
+    class Hidden(Staged):
+        """Only the front of the car is visible in the first two sweeps, so its centre jumps back then."""
+
+        def world(self, index: int) -> Any:
+            points, flow, car = super().world(index)
+            kept = (car < 0) | (index >= 2) | (points[:, 0] > self.paths[0, index, 0] + 3)
+            return points[kept], flow[kept], car[kept]
+
+    log = Hidden([straight((0, 0), (0.15, 0.0), 14)])
+    table = track(log, log.results())
+    assert len(table["id"]) == 13 and len(set(table["id"])) == 1
+    assert np.array_equal(table["is_confirmed"], np.arange(13) >= 7)
 
 
 def test_ids_survive_empty_sweeps_and_missing_frames() -> None:
