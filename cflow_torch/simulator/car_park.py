@@ -9,9 +9,10 @@ import numpy as np
 
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import NOWHERE, Ground
-from cflow_torch.simulator.objects import Body, Route
+from cflow_torch.simulator.objects import Body
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
+from cflow_torch.simulator.trajectories import Route
 
 HALF_SIZE = 55.0  # of the paved square, metres
 AISLES = (-34.0, -17.0, 0.0, 17.0, 34.0)  # y of the middles of the aisles, metres

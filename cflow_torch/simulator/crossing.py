@@ -9,9 +9,10 @@ import numpy as np
 
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.objects import Body, Route
+from cflow_torch.simulator.objects import Body
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, PAVEMENT, SOUTH, WEST, furniture, houses, lane
+from cflow_torch.simulator.trajectories import Route
 
 HALF_WIDTH = 7.0  # of both streets, metres
 STOP = HALF_WIDTH + 5.5  # of the stop lines from the middle, metres

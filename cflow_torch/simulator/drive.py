@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections import OrderedDict
+from dataclasses import replace
 from typing import Callable, Mapping, TypeVar
 
 import numpy as np
@@ -235,7 +236,7 @@ class Drive(Log):
 
     def _body_of(self, returns: Returns) -> np.ndarray:
         """(N,) int64 index of each point's body; the number of bodies = the ground."""
-        return np.append(self.scene.table.body, len(self.scene.bodies))[returns.solid.numpy()]
+        return np.append(self.scene.body_of_solid, len(self.scene.bodies))[returns.solid.numpy()]
 
     def _annotated(self, scene: Scene) -> np.ndarray:
         """(num_sweeps, num_bodies) bool: within range, so that an annotator would see it; background always."""
@@ -273,7 +274,8 @@ def make_drive(
     lidars = in_weather(_choose("sensor profile", profile, PROFILES), *_choose("weather", weather, WEATHER))
     world = _choose("scene", scene, SCENES)(np.random.default_rng([seed, 0]))
     if lidars.has_trailer:
-        world = world.with_own(own_truck(world.ego))
+        own = own_truck(world.ego)
+        world = replace(world, bodies=(*world.bodies, *own), num_own=len(own))
     parts = [profile, *([scene] if scene != "street" else []), *([weather] if weather != "clear" else [])]
     return Drive(world, lidars, seed, num_sweeps, f"synthetic-{'-'.join(parts)}-{seed:04d}")
 

@@ -41,8 +41,8 @@ class Ground:
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Height of road or pavement at world (x, y), float64 metres."""
-        on_pavement = self.is_pavement(torch.from_numpy(x), torch.from_numpy(y)).numpy()
-        return self.road_height(x, y) + self.kerb * on_pavement
+        depth = self.pavement_depth(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+        return self.road_height(x, y) + self.kerb * (depth > 0)
 
     def pavement_depth(self, x: Tensor, y: Tensor) -> Tensor:
         """Distance of (x, y) from the kerb: positive on the pavement, negative on the road, metres."""
@@ -51,17 +51,6 @@ class Ground:
         radius = self.corner_radius
         in_corner = (u < radius) & (v < radius) & (u > 0) & (v > 0)
         return torch.where(in_corner, radius - torch.hypot(radius - u, radius - v), torch.minimum(u, v))
-
-    def is_pavement(self, x: Tensor, y: Tensor) -> Tensor:
-        """bool, `pavement_depth` > 0, in a third of the time."""
-        u = y.abs() - self.half_widths[0]
-        v = (x - self.crossing_x).abs() - self.half_widths[1]
-        raised = (u > 0) & (v > 0)
-        at_corner = (raised & (u < self.corner_radius) & (v < self.corner_radius)).nonzero(as_tuple=True)
-        if len(at_corner[0]):
-            u, v = self.corner_radius - u[at_corner], self.corner_radius - v[at_corner]
-            raised[at_corner] = torch.hypot(u, v) < self.corner_radius
-        return raised
 
     def pose(self, x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> np.ndarray:
         """Poses of frames on the ground, tilted with it.
@@ -130,4 +119,4 @@ class Ground:
 
     def _is_pavement_along(self, origin: Tensor, directions: Tensor, t: Tensor) -> Tensor:
         x, y = origin[:2].to(directions.dtype)
-        return self.is_pavement(x + t * directions[0], y + t * directions[1])
+        return self.pavement_depth(x + t * directions[0], y + t * directions[1]) > 0

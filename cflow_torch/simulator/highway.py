@@ -8,9 +8,10 @@ import numpy as np
 
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import NOWHERE, Ground
-from cflow_torch.simulator.objects import Body, Route
+from cflow_torch.simulator.objects import Body
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, WEST
+from cflow_torch.simulator.trajectories import Route
 
 LANES = (2.9, 6.6, 10.3)  # of the middles of the lanes from the median, fast lane first, metres
 EDGE = 13.5  # where the grass begins

@@ -28,12 +28,12 @@ class Motion:
     def __init__(self, scene: Scene, profile: LidarProfile, stamps: np.ndarray) -> None:
         self._scene, self._profile, self._stamps = scene, profile, stamps
         self._dynamic, solids = scene.dynamic_part()
-        table = scene.table
-        self._row = np.full(len(table.body), -1)
+        body = scene.body_of_solid
+        self._row = np.full(len(body), -1)
         self._row[solids] = np.arange(len(solids))
         self._static = scene.solids(0.0, scene.body_poses(np.zeros(1))[0])
         self._T_static_world = _inverse(self._static.pose.numpy())
-        self._is_own = torch.from_numpy(table.body >= len(scene.bodies) - scene.num_own)
+        self._is_own = torch.from_numpy(body >= len(scene.bodies) - scene.num_own)
 
     def ego_poses(self, seconds: np.ndarray) -> np.ndarray:
         """(T, 4, 4) float64 `T_world_ego` at `seconds` (T,)."""

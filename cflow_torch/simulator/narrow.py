@@ -8,9 +8,10 @@ import numpy as np
 
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import NOWHERE, Ground
-from cflow_torch.simulator.objects import Body, Route
+from cflow_torch.simulator.objects import Body
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
+from cflow_torch.simulator.trajectories import Route
 
 HALF_WIDTH = 3.1  # metres
 PAVEMENT = 1.5

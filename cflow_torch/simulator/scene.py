@@ -5,41 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Sequence
 
 import numpy as np
 import torch
 
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.objects import HIP, Body, Route
+from cflow_torch.simulator.objects import HIP, Body, Solid
 from cflow_torch.simulator.raycast import Solids
-
-
-@dataclass(frozen=True)
-class SolidTable:
-    """The solids of all bodies, one row each; columns as in `objects.Solid`.
-
-    Args:
-        body: (P,) int64, index of the body that a solid belongs to.
-    """
-
-    body: np.ndarray
-    kind: np.ndarray
-    centre: np.ndarray
-    half: np.ndarray
-    pitch: np.ndarray
-    roll: np.ndarray
-    albedo: np.ndarray
-    is_foliage: np.ndarray
-    swing: np.ndarray
-    stride: np.ndarray
-    phase: np.ndarray
-
-    @classmethod
-    def of(cls, bodies: tuple[Body, ...]) -> SolidTable:
-        """List the solids in the order of the bodies."""
-        body = np.repeat(np.arange(len(bodies)), [len(b.solids) for b in bodies])
-        return cls(body, *(np.array(column) for column in zip(*(solid for b in bodies for solid in b.solids))))
+from cflow_torch.simulator.trajectories import Route
 
 
 @dataclass(frozen=True)
@@ -60,13 +33,15 @@ class Scene:
     num_own: int = 0
 
     @cached_property
-    def table(self) -> SolidTable:
-        """The solids of the bodies."""
-        return SolidTable.of(self.bodies)
+    def body_of_solid(self) -> np.ndarray:
+        """(P,) int64 index of the body that each solid belongs to."""
+        return np.repeat(np.arange(len(self.bodies)), [len(body.solids) for body in self.bodies])
 
-    def with_own(self, own: Sequence[Body]) -> Scene:
-        """The scene with the recording vehicle added."""
-        return Scene(self.ground, self.ego, (*self.bodies, *own), len(own))
+    @cached_property
+    def _columns(self) -> dict[str, np.ndarray]:
+        """Fields of the P solids, in the order of the bodies."""
+        rows = (solid for body in self.bodies for solid in body.solids)
+        return dict(zip(Solid._fields, map(np.array, zip(*rows))))
 
     def body_poses(self, seconds: np.ndarray) -> np.ndarray:
         """(T, num_bodies, 4, 4) float64 `T_world_body` at `seconds` (T,)."""
@@ -77,7 +52,7 @@ class Scene:
         """The scene reduced to its moving bodies, and (P',) int64 index in this scene of each of its solids."""
         is_dynamic = np.array([not body.is_static for body in self.bodies])
         chosen = tuple(body for body, moves in zip(self.bodies, is_dynamic) if moves)
-        return Scene(self.ground, self.ego, chosen), np.flatnonzero(is_dynamic[self.table.body])
+        return Scene(self.ground, self.ego, chosen), np.flatnonzero(is_dynamic[self.body_of_solid])
 
     def solids(self, seconds: float, body_poses: np.ndarray) -> Solids:
         """All solids at one time.
@@ -86,20 +61,20 @@ class Scene:
             seconds: time, which moves the legs.
             body_poses: (num_bodies, 4, 4) float64 `T_world_body` at that time.
         """
-        table = self.table
+        of = self._columns
         # In the body: rotate about x, about y, move to the centre; a leg then swings about the y axis through the hip.
-        angle = table.swing * np.sin(2 * math.pi * table.stride * seconds + table.phase)
+        angle = of["swing"] * np.sin(2 * math.pi * of["stride"] * seconds + of["phase"])
         hip = np.where(angle[:, None] == 0, 0, (0, 0, HIP))
-        pose = _rotation(1, table.pitch) @ _rotation(0, table.roll)
-        pose[:, :3, 3] = table.centre - hip
+        pose = _rotation(1, of["pitch"]) @ _rotation(0, of["roll"])
+        pose[:, :3, 3] = of["centre"] - hip
         pose = _rotation(1, angle) @ pose
         pose[:, :3, 3] += hip
         return Solids(
-            torch.from_numpy(table.kind),
-            torch.from_numpy(body_poses[table.body] @ pose),
-            torch.from_numpy(table.half),
-            torch.from_numpy(table.albedo).float(),
-            torch.from_numpy(table.is_foliage),
+            torch.from_numpy(of["kind"]),
+            torch.from_numpy(body_poses[self.body_of_solid] @ pose),
+            torch.from_numpy(of["half"]),
+            torch.from_numpy(of["albedo"]).float(),
+            torch.from_numpy(of["is_foliage"]),
         )
 
 

@@ -13,8 +13,9 @@ import numpy as np
 
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.objects import Body, Route
+from cflow_torch.simulator.objects import Body
 from cflow_torch.simulator.scene import Scene
+from cflow_torch.simulator.trajectories import Route
 
 EAST, NORTH, WEST, SOUTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
 PAVEMENT = 4.0  # width, metres

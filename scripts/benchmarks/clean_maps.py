@@ -12,7 +12,7 @@ the last, in real scenes those with labels. Times are processor seconds per swee
 DUFOMap (pip install dufomap; optional): 0.1 m, d_s 0.2, d_p 2 and 1, clusters and propagation, rays from the LiDAR (the
 first one of several), points of 2 ... 50 m (with others it finds no moving point on KITTI).
 
-The case "light" has a car that brakes and stops, and a car that starts up; its sensor is av2.
+The case "light" has two cars that brake and stop, one of them in reverse; its sensor is av2.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from cflow_torch.simulator import objects
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.objects import Route
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.scene import Scene
+from cflow_torch.simulator.trajectories import Route
 
 SEED = 300
 DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}
 
 
 def light(num_sweeps: int) -> SimulatedLog:
-    """A car that stops after half of the sweeps, a car that starts up then, a parked car, houses."""
+    """Two cars that stop after half of the sweeps, one of them in reverse, a parked car, houses."""
     rng, half = np.random.default_rng(0), 0.05 * num_sweeps
     routes = (
         Route(16, 3.5, math.pi, speed=3 * half, acceleration=-3),

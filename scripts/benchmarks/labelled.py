@@ -74,7 +74,7 @@ class SimulatedLog(Log):
         now, then = scene.body_poses(times)[:, :, :3, 3]
         distance = np.concatenate([np.zeros((1, 3)), then - now])
         solid = self.drive.returns(index * self.step).solid.numpy()
-        body = np.append(scene.table.body, len(now))[solid]
+        body = np.append(scene.body_of_solid, len(now))[solid]
         object_id = np.where(body < len(now), body + 1, 0)
         moves, sometimes = np.linalg.norm(distance, axis=1) >= MOVING, [False, *(not b.is_static for b in scene.bodies)]
         of_points = moves[object_id], np.array(sometimes)[object_id]

@@ -14,10 +14,11 @@ import numpy as np
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.objects import Body, Route, Solid, box
+from cflow_torch.simulator.objects import Body, Solid, box
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.raycast import CYLINDER
 from cflow_torch.simulator.scene import Scene
+from cflow_torch.simulator.trajectories import Route
 
 PAIR, NUM_SWEEPS = 5, 11  # sweep t, so that four older ones exist, and four after t+1
 FLAT = Ground((0.0, 0.0), 0.0, kerb=0.0, half_widths=(1e4, 1.0), crossing_x=1e5)
@@ -55,7 +56,7 @@ def drive_past(
 
 def body_of(drive: Drive) -> np.ndarray:
     """(N,) index of the body that each point of sweep t was measured on, -1 = ground."""
-    return np.append(drive.scene.table.body, -1)[drive.returns(PAIR).solid.numpy()]
+    return np.append(drive.scene.body_of_solid, -1)[drive.returns(PAIR).solid.numpy()]
 
 
 def hedge(seed: int) -> Staged:

@@ -53,14 +53,14 @@ def on_boxes(drive, index, is_chosen):
     """Returns on boxes of the chosen bodies: rows, world points at the time of the shot, poses of the boxes at the time
     stamp, and a function that returns the distances of points from the faces of these boxes."""
     returns = drive.returns(index)
-    solid, table = returns.solid.numpy(), drive.scene.table
-    chosen = np.array([is_chosen(body) for body in drive.scene.bodies])[table.body] & (table.kind == BOX)
-    rows = np.flatnonzero((solid >= 0) & np.append(chosen, False)[solid])
-    pose = drive.scene.solids(drive._seconds[index], drive._body_poses[index]).pose.numpy()[solid[rows]]
+    solid, solids = returns.solid.numpy(), drive.scene.solids(drive._seconds[index], drive._body_poses[index])
+    chosen = np.array([is_chosen(body) for body in drive.scene.bodies])[drive.scene.body_of_solid]
+    rows = np.flatnonzero((solid >= 0) & np.append(chosen & (solids.kind.numpy() == BOX), False)[solid])
+    pose = solids.pose.numpy()[solid[rows]]
 
     def distance(world):
         local = np.einsum("nji,nj->ni", pose[:, :3, :3], world - pose[:, :3, 3])
-        return np.abs((np.abs(local) - table.half[solid[rows]]).max(1))
+        return np.abs((np.abs(local) - solids.half_size.numpy()[solid[rows]]).max(1))
 
     return rows, world_at_shot(drive, index, returns)[rows], pose, distance
 
@@ -149,7 +149,7 @@ def test_radial_velocity_is_the_derivative_of_the_range(name, drives):
 def test_the_truck_has_no_returns_of_itself_and_its_trailer_occludes(drives):
     drive = drives["truckscenes"]
     returns, points = drive.returns(0), drive.sweep(0).points
-    hidden = drive.scene.table.body >= len(drive.scene.bodies) - drive.scene.num_own
+    hidden = drive.scene.body_of_solid >= len(drive.scene.bodies) - drive.scene.num_own
     assert drive.scene.num_own == 2 and not np.append(hidden, False)[returns.solid.numpy()].any()
     behind = (np.abs(points[:, 1]) < 1.0) & (points[:, 0] < -12) & (points[:, 0] > -60) & (returns.unit.numpy() < 2)
     ahead = (np.abs(points[:, 1]) < 1.0) & (points[:, 0] > 12) & (points[:, 0] < 60)
