@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
-from time import perf_counter
 from typing import Any, Callable
 
 import numpy as np
@@ -26,25 +25,6 @@ _MAX_DISTANCE = 100.0  # metres of a box from the vehicle
 _MAX_VOXELS = 1 << 20  # of a map in each direction from its first sweep
 
 
-@dataclass
-class StoppedCost:
-    """What `remove_stopped` costs in a log.
-
-    Args:
-        points: points of all sweeps.
-        removed: points that are removed only because an object stopped or has yet to start.
-        seconds: of tracking and boxes, without the flow.
-    """
-
-    points: int = 0
-    removed: int = 0
-    seconds: float = 0.0
-
-    def __str__(self) -> str:
-        share = self.removed / max(self.points, 1)
-        return f"remove_stopped removed {self.removed} more points ({share:.2%}) and took {self.seconds:.1f} s more"
-
-
 class CleanLog(Log):
     """A log without its moving points. Every command, writer and loader takes it like any other log.
 
@@ -61,7 +41,7 @@ class CleanLog(Log):
 
     Attributes:
         log_id, timestamps: those of the log.
-        cost: what `remove_stopped` costs; None before the first sweep is returned, or without it.
+        num_stopped: points that only `remove_stopped` removes; None without it, or before the first sweep is returned.
 
     Examples:
         >>> write_array_log(CleanLog(log), "outputs/clean")
@@ -85,7 +65,7 @@ class CleanLog(Log):
         self._log = CachedLog(log, 2 if model is None else model.config.num_sweeps)
         self._flow: Any = lru_cache(2)(flow if flow is not None else lambda index: self._estimate(model, index))
         self._bits: list[np.ndarray] | None = None
-        self.cost: StoppedCost | None = None
+        self.num_stopped: int | None = None
         self._tracks_objects = remove_stopped
 
     def sweep(self, index: int) -> Sweep:
@@ -150,20 +130,16 @@ class CleanLog(Log):
 
     def _track(self) -> list[np.ndarray]:
         """Packed bits of `moving` for every sweep: points of objects that move, have stopped, or have yet to start."""
-        tracker, tables, bits, cost = Tracker(), [], [], StoppedCost()
+        tracker, tables, bits, num_moving = Tracker(), [], [], 0
         for index in range(len(self.timestamps)):
             moves = removed = self._moves(index)
-            begin = perf_counter()
             if index < len(self.timestamps) - 1:
                 table, track_id = tracker.push(window(self._log, index), self._flow(index))
                 tables.append({**table, "sweep": np.full(len(table["id"]), index)})
                 stopped = table["id"][table["is_confirmed"] & ~table["is_moving"]]
                 removed = moves | np.isin(track_id, stopped)
             bits.append(np.packbits(removed))
-            cost.points += len(moves)
-            cost.removed += int(removed.sum() - moves.sum())
-            cost.seconds += perf_counter() - begin
-        begin = perf_counter()
+            num_moving += int(moves.sum())
         tracks = confirmed(join_tables(tables))
         first = np.unique(tracks["id"], return_index=True)[1]  # the first row of each track
         first = first[np.hypot(tracks["vx"][first], tracks["vy"][first]) < _SLOW]
@@ -176,12 +152,8 @@ class CleanLog(Log):
                 torch.from_numpy(np.stack([start[name][waits] for name in names], 1))
                 for names in ("xyz", ("length", "width", "height"))
             )
-            waiting = _inside(sweep, centre, size, torch.from_numpy(start["heading"][waits]))
-            before = int(np.unpackbits(bits[index]).sum())
-            bits[index] = bits[index] | np.packbits(waiting)
-            cost.removed += int(np.unpackbits(bits[index]).sum()) - before
-        cost.seconds += perf_counter() - begin
-        self.cost = cost
+            bits[index] |= np.packbits(_inside(sweep, centre, size, torch.from_numpy(start["heading"][waits])))
+        self.num_stopped = sum(int(np.unpackbits(each).sum()) for each in bits) - num_moving
         return bits
 
 

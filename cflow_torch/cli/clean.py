@@ -49,15 +49,16 @@ def task(cfg: DictConfig) -> None:
         folder, file = output / log.log_id, output / f"{log.log_id}.ply"
         flow: Callable[[int], FlowResult] | None = None if stored is None else partial(stored, log)
         with run.collect_failures(failures, log.log_id):
-            suffix, cost = cfg.suffix or _own_suffix(log), ""
+            suffix, more = cfg.suffix or _own_suffix(log), ""
             if not folder.exists():
                 clean = CleanLog(log, model, flow, cfg.remove_stopped)
                 poses = None if log.sweep(0).pose is None else "kitti"
                 write_array_log(clean, output, suffix, poses)
-                cost = "" if clean.cost is None else f"; {clean.cost}"
+                if clean.num_stopped is not None:
+                    more = f"; remove_stopped removed {clean.num_stopped} more points"
             bin_columns = max(3 + len(log.columns(0)), KITTI_COLUMNS) if suffix == ".bin" else KITTI_COLUMNS
             to_read = "" if bin_columns == KITTI_COLUMNS else f", read them with data.bin_columns={bin_columns}"
-            print(f"{folder}: {len(log.timestamps)} sweeps{to_read}{cost}")
+            print(f"{folder}: {len(log.timestamps)} sweeps{to_read}{more}")
             if cfg.map and not file.exists():
                 points = static_map(ArraysLog(folder, ground=None, bin_columns=bin_columns), cfg.voxel_size)
                 write_cloud(file, points)

@@ -140,11 +140,8 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
     axes.set_facecolor(_SLATE)
     x, y = position[:, 0], position[:, 1]
     dots = axes.scatter(x, y, s=size, c=error, cmap="hot", vmin=0, vmax=MAX_ERROR, linewidths=0, zorder=2)
-    box = style.legend_box(axes, position, error > 0, (1.8, 0.66))
-    bar = axes.figure.colorbar(dots, cax=box.inset_axes((0.1, 0.7, 0.8, 0.18)), orientation="horizontal")
+    bar = style.color_bar(axes, dots, f"error, m (white ≥ {MAX_ERROR:g})", position, error > 0)
     bar.set_ticks([0, 0.1, 0.2, 0.3], labels=["0", "0.1", "0.2", "0.3"])
-    bar.set_label(f"error, m (white ≥ {MAX_ERROR:g})", fontsize=10, color=style.INK, labelpad=1)
-    bar.ax.tick_params(labelsize=10, labelcolor=style.INK, color=style.INK, length=2, pad=2)
     draw_ego(axes, "white", _SLATE)
 
 

@@ -52,11 +52,8 @@ def plot_map(points: Array, title: str | None = None) -> Figure:
     lowest, highest = np.percentile(shown[:, 2], _HEIGHTS)
     dots = axes.scatter(x, y, s=dot_area(axes), c=z, cmap="viridis_r", vmin=lowest, vmax=highest, linewidths=0)
     style.draw_scale(axes)
-    box = style.legend_box(axes, position, np.zeros(len(position), bool), (1.8, 0.66))
-    bar = figure.colorbar(dots, cax=box.inset_axes((0.1, 0.7, 0.8, 0.18)), orientation="horizontal")
-    bar.set_label("height, m", fontsize=10, color=style.INK, labelpad=1)
+    bar = style.color_bar(axes, dots, "height, m", position, np.zeros(len(position), bool))
     bar.ax.locator_params(nbins=4)
-    bar.ax.tick_params(labelsize=10, labelcolor=style.INK, color=style.INK, length=2, pad=2)
     if title:
         style.add_heading(figure, _HEAD / 2, title)
     style.add_caption(figure, f"{len(position)} points from above")

@@ -123,6 +123,15 @@ def draw_scale(axes: Axes) -> None:
     axes.text(x + length / 2, above, f"{length:g} m", fontsize=12, ha="center", va="bottom", **options)
 
 
+def color_bar(axes: Axes, dots: Any, label: str, position: np.ndarray, is_important: np.ndarray) -> Any:
+    """Draw the colour bar of some dots in a corner of their panel, see `legend_box`."""
+    box = legend_box(axes, position, is_important, (1.8, 0.66))
+    bar: Any = axes.figure.colorbar(dots, cax=box.inset_axes((0.1, 0.7, 0.8, 0.18)), orientation="horizontal")
+    bar.set_label(label, fontsize=10, color=INK, labelpad=1)
+    bar.ax.tick_params(labelsize=10, labelcolor=INK, color=INK, length=2, pad=2)
+    return bar
+
+
 def legend_box(
     axes: Axes, position: np.ndarray, is_important: np.ndarray, inches: tuple[float, float], corner: str | None = None
 ) -> Axes:
