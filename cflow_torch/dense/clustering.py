@@ -50,7 +50,7 @@ class Clusters:
 
 
 def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Clusters, Tensor, Tensor]:
-    """Find the clusters of all windows from their images.
+    """Aggregate the sweeps of each window, dilate, label, split oversized components, drop those that cannot move.
 
     Args:
         sweeps: images of B windows of S sweeps.
@@ -58,31 +58,16 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
 
     Returns:
         clusters: M clusters.
-        cluster_of_cell: (B * S * H * W + 1,) int32, as `cluster_images` returns it.
-        cell_of_point: (P,) int64, index of each point into `cluster_of_cell`.
-    """
-    clusters, cluster_of_cell = cluster_images(sweeps.occupancy, sweeps.grid.pixel_size, config)
-    return clusters, cluster_of_cell, sweeps.pixel
-
-
-def cluster_images(images: Tensor, pixel_size: float, config: ClusteringConfig) -> tuple[Clusters, Tensor]:
-    """Aggregate the sweeps of each window, dilate, label, split oversized components, drop those that cannot move.
-
-    Args:
-        images: (B, S, H, W) bool, occupancy; index 0 of S is sweep t+1.
-        pixel_size: s, metres.
-        config: `connectivity`, `max_extent` (d^max), `labeling`.
-
-    Returns:
-        clusters: M clusters.
         cluster_of_cell: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none. The last
             entry, M, is for points outside the images. Undefined for empty pixels.
+        cell_of_point: (P,) int64, index of each point into `cluster_of_cell`.
 
     Convention:
         Clusters never join across windows. Both engines return identical clusters.
 
     Source: Alg. clustering.
     """
+    images, pixel_size = sweeps.occupancy, sweeps.grid.pixel_size
     _, num_steps, height, width = images.shape
     area = height * width
     aggregated = pad(images.unbind(1))
@@ -118,7 +103,7 @@ def cluster_images(images: Tensor, pixel_size: float, config: ClusteringConfig) 
     for m in range(num_steps):
         cluster_of_cell[m * area :].scatter_(0, cell, cluster)
     cluster_of_cell[-1:] = kept.numel()
-    return clusters, cluster_of_cell
+    return clusters, cluster_of_cell, sweeps.pixel
 
 
 def _can_move(component: Tensor, num_components: int, occupied: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
     num_labels = 0
     for index in range(batch.num_windows):
         points = ((pixel < num_cells) & (window == index)).nonzero()[:, 0]
-        found = torch.from_numpy(hdbscan_labels(positions[:, points].t().cpu().numpy(), config.min_cluster_size))
+        found = torch.from_numpy(_labels(positions[:, points].t().cpu().numpy(), config.min_cluster_size))
         label[points] = torch.where(found >= 0, found + num_labels, found).to(label.device)
         num_labels += int(found.max()) + 1 if found.numel() else 0
 
@@ -66,19 +66,8 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
     return clusters, cluster_of_label[label], torch.arange(len(label), device=label.device)
 
 
-def hdbscan_labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:
-    """Label each point by HDBSCAN.
-
-    Args:
-        points: (N, 3) float64, metres.
-        min_cluster_size: smallest cluster, points.
-
-    Returns:
-        (N,) int64, 0 ... L - 1, -1 = noise.
-
-    Raises:
-        CFlowError: the extra is not installed.
-    """
+def _labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:
+    """(N,) int64 label of each of (N, 3) points: 0 ... L - 1, -1 = noise."""
     if len(points) <= min_cluster_size:  # the library cannot build its tree from so few points
         return np.full(len(points), -1, dtype=np.int64)
     try:

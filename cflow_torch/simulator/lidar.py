@@ -73,8 +73,7 @@ def scan(
 
     Args:
         profile: the units and their quality.
-        solids: everything except the ground, in the world.
-        ground: the ground, in the world.
+        solids, ground: everything except the ground, and the ground, in the world.
         T_world_ego: (4, 4) float64.
         generator: source of noise, drop-out and the azimuth at which the sweep begins.
     """
@@ -104,15 +103,7 @@ def scan(
 def scan_rolling(
     profile: LidarProfile, solids: MovingSolids, ground: Ground, ego: EgoMotion, generator: torch.Generator
 ) -> Returns:
-    """Simulate a sweep of all units of a vehicle in which every shot has its own time.
-
-    Args:
-        profile: the units and their quality.
-        solids: everything except the ground.
-        ground: the ground, in the world.
-        ego: motion of the vehicle.
-        generator: source of noise, drop-out and the azimuth at which the sweep begins.
-    """
+    """Simulate a sweep of all units of a vehicle in which every shot has its own time. Args: as of `scan`."""
     of_units = []
     for number, unit in enumerate(profile.units):
         first, end = unit.active_columns or (0, unit.num_columns)

@@ -11,8 +11,8 @@ import numpy as np
 from cflow_torch.viz import colorings
 from cflow_torch.viz.clusters import PALETTE
 from cflow_torch.viz.colorings import FIRST, GROUND, STATIC, UNKNOWN, ramp_entry, wheel_entry
-from cflow_torch.viz.panel import ARROW_STEPS, MAX_ERROR, MIN_ERROR, MOVING
-from cflow_torch.viz.scene import EGO_OUTLINE, Scene, ViewerFrame
+from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_ERROR, MOVING
+from cflow_torch.viz.scene import Scene, ViewerFrame
 
 _UNIT = 0.01  # metres; 16 bits reach to 327 m
 _REACH = 32000 * _UNIT

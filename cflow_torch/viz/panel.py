@@ -25,6 +25,7 @@ FLOW_CAPTION = (
     f"grey: static   colour: moves more than {MOVING:g} m per sweep   "
     f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / style.SWEEP_RATE:g} s at {style.SWEEP_RATE} Hz)"
 )
+EGO_OUTLINE = ((2.4, 0.0), (-1.9, 1.15), (-1.0, 0.0), (-1.9, -1.15))  # metres
 _RING, _MOST_RINGS = 10.0, 20  # metres between two rings; a view with more rings gets wider steps
 _HIGHEST = 2.0  # largest height of a panel, in widths; the smallest is the height of two wheels
 
@@ -188,7 +189,7 @@ def draw_ego(axes: Axes, color: str = style.INK, halo: Any = "white") -> None:
     if not (left <= 0 <= right and bottom <= 0 <= top):
         return
     effects = [withStroke(linewidth=3, foreground=halo)]
-    axes.fill([2.4, -1.9, -1.0, -1.9], [0, 1.15, 0, -1.15], color=color, linewidth=0, zorder=9, path_effects=effects)
+    axes.fill(*zip(*EGO_OUTLINE), color=color, linewidth=0, zorder=9, path_effects=effects)
     # The name is behind the vehicle, where it covers no lane, unless the view ends there.
     x, side = (-2.3, "right") if left < -0.1 * (right - left) else (2.8, "left")
     size = 12 if style.inches_of(axes)[0] > 4 else 9

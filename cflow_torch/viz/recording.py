@@ -12,8 +12,8 @@ from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 from cflow_torch.viz.clusters import cluster_colors
-from cflow_torch.viz.panel import ARROW_STEPS, MOVING
-from cflow_torch.viz.scene import EGO_OUTLINE, MAX_FLOW, Scene, ViewerFrame
+from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MOVING
+from cflow_torch.viz.scene import MAX_FLOW, Scene, ViewerFrame
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:

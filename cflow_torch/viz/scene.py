@@ -13,7 +13,6 @@ from cflow_torch.viz.panel import MIN_ARROW_POINTS, MOVING, group_medians
 from cflow_torch.viz.style import SWEEP_RATE
 
 MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
-EGO_OUTLINE = ((2.4, 0.0), (-1.9, 1.15), (-1.0, 0.0), (-1.9, -1.15))  # metres, as in `panel`
 
 
 @dataclass(frozen=True)
