@@ -51,11 +51,11 @@ def divide(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
 
 
 def settle(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
-    """Take moving groups as static that are a small piece of a confirmed object that has stopped.
+    """Take a moving group as static if it is a small piece of a confirmed object that has stopped.
 
-    The visible outline of a stopped object changes while the vehicle passes it, and a piece of it seems to move. If the
-    box of the object holds most points of a group, and more static points than points of the group, the object has
-    stopped. Without this step the track would follow the piece.
+    While the vehicle passes a stopped object, its visible outline changes, and a piece of it seems to move. We take a
+    group for such a piece if the box of the object holds most of its points, and static points in a larger number.
+    Otherwise the track would follow the piece.
     """
     known = tracks.is_confirmed.nonzero()[:, 0]
     box = box_of_point(groups.point, tracks.box[known], tracks.size[known] + _MARGIN, tracks.heading[known])

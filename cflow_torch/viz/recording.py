@@ -106,13 +106,7 @@ def load_rerun() -> Any:
 
 
 class _Drive:
-    """Log of one drive to a stream of rerun.
-
-    Args:
-        rr: the package.
-        stream: the stream to log to.
-        max_flow: metres per sweep, full colour.
-    """
+    """Log one drive to a `stream` of rerun, the package `rr`. Flow of `max_flow` metres per sweep has full colour."""
 
     def __init__(self, rr: Any, stream: rerun.RecordingStream, max_flow: float) -> None:
         self.rr, self.stream, self.max_flow = rr, stream, max_flow
