@@ -29,8 +29,7 @@ from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import describe_changes
 from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError, FlowResult
-from cflow_torch.viz.bev import save_picture
-from cflow_torch.viz.static_map import plot_map
+from cflow_torch.viz.bev import plot_map, save_picture
 
 
 def task(cfg: DictConfig) -> None:
