@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scenes import pose
 from staged_cars import Staged, straight
 from test_tracks_of_runs import calls_on_a_drive
 
@@ -95,8 +96,7 @@ def test_other_columns_stay_with_their_rows(tmp_path: Path, suffix: str) -> None
 
 
 def test_a_clean_log_is_written_and_read_like_any_log(tmp_path: Path) -> None:
-    poses = np.tile(np.eye(4), (12, 1, 1))
-    poses[:, 0, 3] = np.arange(12)
+    poses = np.stack([pose(k, 0, 0) for k in range(12)])
     log = Staged([straight((0, 0), (0.9, 0.0))], poses)
     back = ArraysLog(write_array_log(cleaned(log), tmp_path, ".ply"))
     assert len(back) == 12 and np.allclose(back.poses, poses)

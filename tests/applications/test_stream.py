@@ -126,20 +126,14 @@ def test_a_bad_sweep_is_refused_and_the_stream_goes_on(
     assert_same_bits(result, expected(good, 1, settings))
 
 
-@pytest.mark.parametrize(
-    "settings, message",
-    [
+def test_settings_that_a_stream_cannot_have_are_refused(sweeps: list[Sweep]) -> None:
+    for settings, message in (
         ({"preset": "offline"}, "does not know later sweeps"),
         ({"ground": "grass"}, "ground="),
         ({"max_gap": 0}, "max_gap"),
-    ],
-)
-def test_settings_that_a_stream_cannot_have_are_refused(settings: dict, message: str) -> None:
-    with pytest.raises(CFlowError, match=message):
-        FlowStream(**settings)
-
-
-def test_a_sweep_with_more_is_refused(sweeps: list[Sweep]) -> None:
+    ):
+        with pytest.raises(CFlowError, match=message):
+            FlowStream(**settings)
     with pytest.raises(CFlowError, match="into the Sweep"):
         FlowStream("default").push(sweeps[0], sweeps[0].pose)
 
