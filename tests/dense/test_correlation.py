@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 import torch
 from oracle.dense import scene_flow_in_1view
-from scenes import RANGE, config, same_bits, scene
+from scenes import same_bits
 
 from cflow_torch import CFlowError
 from cflow_torch.dense import packing
-from cflow_torch.dense.clustering import find_clusters
 from cflow_torch.dense.correlation import best_shifts
-from cflow_torch.dense.projection import project
-from cflow_torch.dense.templates import Images, TemplatePairs, make_pairs
+from cflow_torch.dense.templates import Images, TemplatePairs
 from cflow_torch.windows import memory
-from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.collation import make_batch
 
 ENGINES = ("fft", "conv")
 Pair = Tuple[np.ndarray, int, Optional[float]]  # template, its target, radius
@@ -69,23 +65,7 @@ def random_pairs(rng, sizes, num_pairs, with_radius) -> tuple[list[np.ndarray], 
     return targets, pairs
 
 
-SIZES = [
-    (1, 1),
-    (1, 2),
-    (2, 1),
-    (2, 2),
-    (1, 9),
-    (12, 1),
-    (8, 8),
-    (9, 8),
-    (3, 7),
-    (16, 5),
-    (17, 16),
-    (2, 33),
-    (40, 3),
-    (1, 300),
-    (66, 50),
-]
+SIZES = [(1, 1), (1, 2), (2, 2), (12, 1), (8, 8), (9, 8), (3, 7), (17, 16), (2, 33), (1, 300), (66, 50)]
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -127,26 +107,6 @@ def test_the_layout_for_a_gpu_gives_equal_shifts(monkeypatch):
     monkeypatch.setattr(packing, "_LINES_CPU", packing._LINES_GPU)
     found = best_shifts(as_pairs(targets, pairs))
     assert torch.equal(found[0], shift) and same_bits(found[1], score)
-
-
-def test_clusters_may_have_different_pixel_sizes():
-    """Only the radius depends on the pixel size of the cluster."""
-    settings, grid = config(num_history=2), Grid(0.25, RANGE[:3], RANGE[3:])
-    windows = [scene(seed, num_history=2) for seed in (1, 2)]
-    batch = make_batch(windows, settings, grid, torch.device("cpu"))
-    clusters, _, _ = find_clusters(project(batch, None, grid), settings)
-    sizes = torch.tensor([0.25, 0.5, 1.0], dtype=torch.float64)
-    of_cluster = sizes[torch.arange(len(clusters.window)) % 3]
-    by_size = [make_pairs(clusters, batch, float(size), 30.0) for size in sizes]
-    mixed = make_pairs(clusters, batch, of_cluster, 30.0)
-    assert mixed.radius is not None and len(mixed.cluster) > len(clusters.window) > 6
-    for pair, cluster in enumerate(mixed.cluster.tolist()):
-        radius = by_size[cluster % 3].radius
-        assert radius is not None and mixed.radius[pair] == radius[pair]
-    same = make_pairs(clusters, batch, torch.full_like(of_cluster, 0.25), 30.0)
-    for name in ("cluster", "source", "size", "radius"):
-        assert torch.equal(getattr(same, name), getattr(by_size[0], name))
-    assert make_pairs(clusters, batch, of_cluster, None).radius is None
 
 
 def test_a_cluster_that_is_too_large_is_refused(monkeypatch):

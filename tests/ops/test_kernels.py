@@ -1,0 +1,110 @@
+"""Medians, adjugates, nearest pixels, lower surfaces and morphology, against NumPy, SciPy and loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from cflow_torch.ops import morphology
+from cflow_torch.ops.kornia_engine import close_3x3_kornia
+from cflow_torch.ops.labeling import pad
+from cflow_torch.ops.linear import adjugate
+from cflow_torch.ops.lower_surface import UNKNOWN, _cone, lower_surface
+from cflow_torch.ops.nearest import nearest_set_pixel
+from cflow_torch.ops.segments import masked_median, segment_median
+
+
+def test_medians_are_numpys():
+    rng = np.random.default_rng(6)
+    for width in (1, 2, 3, 6):
+        values, mask = rng.normal(size=(40, width)).round(1), rng.random((40, width)) < 0.6
+        found = masked_median(torch.from_numpy(values), torch.from_numpy(mask)).tolist()
+        assert found == [float(np.median(v[m])) if m.any() else 0.0 for v, m in zip(values, mask)]
+    for num_segments in (1, 5, 40):
+        values, index = rng.integers(-4, 5, 60).astype(np.float64), rng.integers(0, num_segments, 60)
+        median = segment_median(torch.from_numpy(values), torch.from_numpy(index), num_segments)
+        members = [values[index == segment] for segment in range(num_segments)]
+        assert median.tolist() == [float(np.median(m)) if len(m) else 0.0 for m in members]
+    nothing = torch.zeros(0, dtype=torch.float64)
+    assert segment_median(nothing, nothing.long(), 3).tolist() == [0, 0, 0]
+
+
+def test_adjugate_is_the_inverse_times_the_determinant():
+    factors = np.random.default_rng(0).normal(size=(50, 3, 3))
+    matrices = factors @ factors.transpose(0, 2, 1)
+    found, determinant = adjugate(torch.from_numpy(matrices.transpose(1, 2, 0).copy()))
+    inverse = (found / determinant).permute(2, 0, 1)
+    np.testing.assert_allclose(inverse, np.linalg.inv(matrices), rtol=1e-8)
+    np.testing.assert_allclose(determinant, np.linalg.det(matrices), rtol=1e-8)
+    alone = [adjugate(torch.from_numpy(matrix[:, :, None].copy()))[0] for matrix in matrices]
+    assert torch.equal(torch.cat(alone, 2), found)
+
+
+def test_singular_whole_numbers_give_exactly_zero():
+    matrix = torch.tensor([[1.0, 2, 3], [2, 4, 6], [3, 6, 9]], dtype=torch.float64)[:, :, None]
+    found, determinant = adjugate(matrix)
+    assert not found.any() and determinant.tolist() == [0.0]
+
+
+def test_the_nearest_pixel_is_the_first_in_raster_order_among_ties():
+    for seed in range(9):
+        rng = np.random.default_rng(seed)
+        seeds = rng.random((3, 11, 8)) < (0.0, 0.02, 0.2)[seed % 3]
+        seeds[1] = False
+        pixels = np.sort(rng.choice(seeds.size, 60, replace=False))
+        expected = []
+        for image, row, col in zip(*np.unravel_index(pixels, seeds.shape)):
+            found = np.argwhere(seeds[image])  # in raster order, so argmin breaks ties
+            best = found[((found - (row, col)) ** 2).sum(1).argmin()] if len(found) else None
+            expected.append(-1 if best is None else int(np.ravel_multi_index((image, *best), seeds.shape)))
+        assert nearest_set_pixel(torch.from_numpy(seeds), torch.from_numpy(pixels)).tolist() == expected
+    assert nearest_set_pixel(torch.ones((1, 2, 2), dtype=torch.bool), torch.zeros(0, dtype=torch.int64)).shape == (0,)
+
+
+def test_cones_are_the_highest_surfaces_of_limited_slope():
+    heights = torch.from_numpy(np.random.default_rng(0).integers(-900, 900, (2, 7, 9)).astype(np.int32))
+    found = _cone(heights, 51)
+    for b, r, c in np.ndindex(*heights.shape):
+        steps = np.abs(np.arange(7) - r)[:, None] + np.abs(np.arange(9) - c)
+        assert found[b, r, c] == (heights[b].numpy() + 51 * steps).min()
+
+
+def test_the_lower_surface_passes_below_objects():
+    slope = 40 * np.arange(40)[:, None] + np.zeros((40, 40))
+    low = torch.from_numpy(slope.astype(np.int32))[None]
+    ground = low.clone()
+    low[0, 10:14, 10:14] += 1500  # a box
+    low[0, 25:30, 5:20] = UNKNOWN
+    found = lower_surface(low)[0]
+    assert (found - ground[0]).abs().max() <= 70
+
+
+SQUARE = np.ones((1, 3, 3), dtype=bool)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (1, 8, 1), (3, 13, 17), (2, 11, 12), (0, 5, 5)])
+def test_closing_equals_scipy(shape):
+    rng = np.random.default_rng(len(shape))
+    for density in (0.0, 0.1, 0.5, 0.95, 1.0):
+        image = rng.random(shape) < density
+        given = torch.from_numpy(image)
+        padded = pad([given])
+        before = padded.clone()
+        found = morphology.close_3x3(padded, *shape[1:])
+        closed = found[:, : shape[1], : shape[2]]
+        assert found.shape == padded.shape and found.sum() == closed.sum()  # nothing in the margin
+        assert torch.equal(padded, before)
+        if image.size:
+            dilated = ndimage.binary_dilation(image, SQUARE)
+            assert (closed.numpy() == ndimage.binary_erosion(dilated, SQUARE, border_value=1)).all()
+            assert torch.equal(close_3x3_kornia(given), closed)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 2), (9, 13)])
+def test_erosion_with_a_cross_is_scipys_with_background_outside(shape):
+    for seed in range(8):
+        image = np.random.default_rng(seed).random((2, *shape)) < 0.8
+        expected = np.stack([ndimage.binary_erosion(part, border_value=0) for part in image])
+        assert np.array_equal(morphology.erode_cross(torch.from_numpy(image)).numpy(), expected)
