@@ -287,30 +287,20 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
 # ---- the real pair
 
 
-def submit_pair(av2_folder: Path, tmp_path: Path) -> Path:
-    """Write tmp_path/v1 with the official masks, and return their file."""
-    masks = write_masks(tmp_path / "masks.zip", LOG, TIME, official_mask(read_pair(av2_folder)))
-    call = ["submit", "data=av2", f"data.root={av2_folder}", "version=1", "model=paper", f"masks={masks}"]
-    assert cflow(*call, f"output={tmp_path}") == 0
-    return masks
-
-
-def test_the_real_pair_with_its_masks(av2_folder: Path, tmp_path: Path) -> None:
+def test_av2_accepts_the_real_pair_with_its_masks(av2_tools: Any, av2_folder: Path, tmp_path: Path) -> None:
     """Point 31058 is 0.4 mm from the edge of a cell of the ground raster (city x 5242.499975, column 566.9986). av2's
     float32 coordinates (5242.500488) put it into the next cell, where it is ground; float64 does not. So the official
     mask has one point less than the rule computed here, and the submission uses the official mask."""
-    masks, log = MaskArchive(submit_pair(av2_folder, tmp_path)), AV2Log(av2_folder)
-    columns = read(tmp_path / "v1" / LOG / f"{TIME}.feather")
-    assert {len(values) for values in columns.values()} == {78_506}
-    own, official = (point_mask(log, 0, log.sweep(0), given) for given in (None, masks))
+    file = write_masks(tmp_path / "masks.zip", LOG, TIME, official_mask(read_pair(av2_folder)))
+    call = ["submit", "data=av2", f"data.root={av2_folder}", "version=1", "model=paper", f"masks={file}"]
+    assert cflow(*call, f"output={tmp_path}") == 0
+    written, log = tmp_path / "v1" / LOG / f"{TIME}.feather", AV2Log(av2_folder)
+    assert {len(values) for values in read(written).values()} == {78_506}
+    own, official = (point_mask(log, 0, log.sweep(0), given) for given in (None, MaskArchive(file)))
     assert np.flatnonzero(own != official).tolist() == [31058]
 
-
-def test_av2_accepts_the_real_pair(av2_tools: Any, av2_folder: Path, tmp_path: Path) -> None:
     tools = av2_tools.make_submission_archive
-    masks = submit_pair(av2_folder, tmp_path)
-    tools.validate(tmp_path / "v1", masks)  # raises if it does not accept a file
-    file = tmp_path / "v1" / LOG / f"{TIME}.feather"
-    file.write_bytes(in_table(lambda t: t.slice(1))(file.read_bytes()))
+    tools.validate(tmp_path / "v1", file)  # raises if it does not accept a file
+    written.write_bytes(in_table(lambda t: t.slice(1))(written.read_bytes()))
     with pytest.raises(ValueError, match="rows"):
-        tools.validate(tmp_path / "v1", masks)
+        tools.validate(tmp_path / "v1", file)

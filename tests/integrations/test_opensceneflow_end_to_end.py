@@ -64,16 +64,14 @@ class Harness:
     work: Path
 
     def run(self, name: str, script: str, *overrides: Any) -> str:
-        """Run a script and return what it printed. An override "-m" must come first.
+        """Run a script and return what it printed.
 
         Raises:
             AssertionError: the exit status is not 0, or an exception was swallowed.
         """
-        sweep = list(overrides[:1]) if overrides[:1] == ("-m",) else []
         # The scripts replace the last folder but one by the name of the model; what they write stays in `work`.
-        folders = [f"hydra.run.dir={self.work}/runs-{name}/job", f"hydra.sweep.dir={self.work}/sweep-{name}"]
+        settings = [SEARCHPATH, f"hydra.run.dir={self.work}/runs-{name}/job", *map(str, overrides)]
         python = os.environ.get("OPENSCENEFLOW_PYTHON", sys.executable)
-        settings = [*sweep, SEARCHPATH, *folders, *map(str, overrides[len(sweep) :])]
         environment = {
             **os.environ,
             "PYTHONPATH": os.pathsep.join([*map(str, FOLDERS), os.environ.get("PYTHONPATH", "")]),
@@ -88,17 +86,12 @@ class Harness:
         return done.stdout
 
 
-def read_scores(text: str) -> list[dict[str, float]]:
-    """Read the printed scores of each job, by the names of `SCORES`, "static" and "dynamic"."""
-    starts = [row.start() for row in ROW.finditer(text) if row.group(1) == next(iter(SCORES))]
-    jobs = []
-    for start, end in zip(starts, [*starts[1:], len(text)]):
-        rows, mean = dict(ROW.findall(text[start:end])), MEAN.search(text[start:end])
-        assert set(rows) == set(SCORES) and mean is not None and math.isfinite(float(mean.group(1))), text[start:end]
-        rows["static"], rows["dynamic"] = mean.groups()
-        jobs.append({name: float(digits) for name, digits in rows.items()})
-    assert jobs, text[-6000:]
-    return jobs
+def read_scores(text: str) -> dict[str, float]:
+    """Read the printed scores, by the names of `SCORES`, "static" and "dynamic"."""
+    rows, mean = dict(ROW.findall(text)), MEAN.search(text)
+    assert set(rows) == set(SCORES) and mean is not None and math.isfinite(float(mean.group(1))), text[-6000:]
+    rows["static"], rows["dynamic"] = mean.groups()
+    return {name: float(digits) for name, digits in rows.items()}
 
 
 def evaluated(scenes: Path, output: Path, *settings: str) -> Any:
@@ -148,16 +141,8 @@ def inputs(checkpoint: Path, folder: Path) -> list[str]:
 
 
 def test_eval_prints_the_scores_of_cflow_eval(harness: Harness, checkpoint: Path, data: Path, tmp_path: Path) -> None:
-    (scores,) = read_scores(harness.run("val", "eval.py", *inputs(checkpoint, data)))
+    scores = read_scores(harness.run("val", "eval.py", *inputs(checkpoint, data)))
     assert scores == evaluated(data / "val", tmp_path, *OURS)
-
-
-@pytest.mark.slow
-def test_a_sweep_over_settings(harness: Harness, checkpoint: Path, data: Path, tmp_path: Path) -> None:
-    text = harness.run("sweep", "eval.py", "-m", *inputs(checkpoint, data), "model.target.num_frames=2,4")
-    first, second = read_scores(text)
-    assert first == evaluated(data / "val", tmp_path / "0", *OURS, "model.num_history=0")
-    assert second == evaluated(data / "val", tmp_path / "2", *OURS, "model.num_history=2")
 
 
 def up_lidar(log_folder: Path) -> np.ndarray:
@@ -174,7 +159,7 @@ def test_eval_of_the_real_pair(harness: Harness, checkpoint: Path, av2_folder: P
     layout = {"points_frame": "sensor", "ego_T_lidar": up_lidar(av2_folder), "store_extrinsics": False}
     write_hdf5_scene(AV2Log(av2_folder), tmp_path / "val" / f"{av2_folder.name}.h5", **layout, pose_dtype="float32")
     write_index_files(tmp_path / "val")
-    (scores,) = read_scores(harness.run("real", "eval.py", *inputs(checkpoint, tmp_path)))
+    scores = read_scores(harness.run("real", "eval.py", *inputs(checkpoint, tmp_path)))
     assert scores == evaluated(tmp_path / "val", tmp_path / "out", *OURS)
 
 
@@ -182,7 +167,7 @@ def test_eval_of_the_real_pair(harness: Harness, checkpoint: Path, av2_folder: P
 def test_runner_without_checkpoint(harness: Harness, data: Path, tmp_path: Path) -> None:
     """The path of methods without training, whose history contains the ground."""
     overrides = ["model.iter_only=true", f"dataset_path={data}", "num_frames=6", "+num_workers=0"]
-    (scores,) = read_scores(harness.run("runner", "eval.py", *THEIRS, *overrides))
+    scores = read_scores(harness.run("runner", "eval.py", *THEIRS, *overrides))
     assert scores == evaluated(data / "val", tmp_path, *OURS)
 
 

@@ -11,9 +11,9 @@ from typing import Any, Sequence
 import numpy as np
 import pytest
 import torch
-from scenes import needs_gpu, pose
+from scenes import needs_gpu
 from torch import Tensor
-from turning_drive import SETTINGS, YAW_STEP, drive, expected, relative_to, speeds
+from turning_drive import SETTINGS, drive, expected, relative_to, speeds
 
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.integrations.scene_flow_zoo import CorrelationFlowModel, register
@@ -88,9 +88,7 @@ def test_causal_gives_one_flow_in_the_axes_of_t_with_nan_in_padding_rows() -> No
     assert output.ego_flows.shape == (1, 640, 3) and output.ego_flows.dtype == torch.float32
     rotated = expected(sweeps, 0, 0)
     np.testing.assert_allclose(output.flow(0), rotated, rtol=0, atol=1e-6)
-    moving = speeds(rotated) > 0.3
-    assert 100 < moving.sum() <= 150
-    assert np.abs(rotated[moving] @ pose(0, 0, -YAW_STEP)[:3, :3].T - rotated[moving]).max() > 0.03
+    assert 100 < (speeds(rotated) > 0.3).sum() <= 150
     assert torch.isnan(sequence.full_pc[0, :rows]).any() and torch.isfinite(output.ego_flows[0, :rows]).all()
     assert torch.isnan(output.ego_flows[0, rows:]).all() and torch.isnan(output.valid_flow_mask[0, rows:]).all()
     np.testing.assert_array_equal(output.mask(0), ~np.asarray(sweeps[0].is_ground))
