@@ -15,7 +15,6 @@ from cflow_torch import (
     CFlowError,
     CorrelationFlow,
     CorrelationFlowKeypoints,
-    FlowStream,
     Sweep,
     VerifiedFlow,
     Window,
@@ -181,13 +180,6 @@ def test_ground_left_in_is_warned_of_once(street):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model([Window(now, later)])
-
-
-def test_a_stream_warns_of_inverted_poses():
-    stream, drive = FlowStream("paper"), make_drive(seed=1, num_sweeps=2, profile="demo")
-    with pytest.warns(CFlowWarning, match="inverted"):
-        for sweep in drive:
-            stream.push(sweep.points, np.linalg.inv(sweep.pose), sweep.timestamp_ns, sweep.is_ground)
 
 
 # ------------------------------------------------------------------------------------------------------- the module

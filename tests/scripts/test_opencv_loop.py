@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scenes import RANGE
+from preset_windows import small
+from scenes import RANGE, assert_same
 
-from cflow_torch import Config, CorrelationFlow, FlowResult, Sweep, Window, make_config
+from cflow_torch import CorrelationFlow, Sweep, Window, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 
@@ -22,11 +23,6 @@ OBJECTS = [((5, 5, 9, 6), (0, 1)), ((5, 30, 5, 9), (1, -1)), ((32, 8, 7, 7), (-1
 @pytest.fixture()
 def loop(script: Any) -> Any:
     return script("benchmarks", "opencv_loop")
-
-
-def config(**overrides: Any) -> Config:
-    small = {"pixel_sizes": (S,), "point_cloud_range": RANGE, "max_extent": 5.0}
-    return make_config("paper", **{**small, **overrides})
 
 
 def ell(row: int, col: int, height: int, width: int) -> np.ndarray:
@@ -49,13 +45,6 @@ def true_flow() -> np.ndarray:
     return np.concatenate([np.tile([u * S, v * S, 0.0], (h + w - 1, 1)) for (_, _, h, w), (v, u) in OBJECTS])
 
 
-def assert_same(result: FlowResult, expected: FlowResult) -> None:
-    for name in ("residual_flow", "pose_flow", "flow", "score"):
-        torch.testing.assert_close(getattr(result, name), getattr(expected, name), rtol=0, atol=1e-6)
-    assert torch.equal(result.cluster_id, expected.cluster_id)
-    assert torch.equal(result.is_valid, expected.is_valid)
-
-
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -67,7 +56,7 @@ def assert_same(result: FlowResult, expected: FlowResult) -> None:
     ids=str,
 )
 def test_the_loop_finds_shifts_by_whole_pixels(loop: Any, overrides: dict) -> None:
-    settings = config(**overrides)
+    settings = small("paper", **{"num_history": 0, **overrides})
     sweeps = moving_ells(settings.num_history)
     result = loop.opencv_flow(sweeps, settings)
     assert_same(result, CorrelationFlow(settings, "cpu")([sweeps])[0])

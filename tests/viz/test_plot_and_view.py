@@ -90,10 +90,8 @@ def test_an_animation_has_a_picture_for_every_pair(
     [
         (["pair=3"], "pair=3"),
         (["truth=perhaps"], "truth=perhaps"),
-        (["picture=correlation", "model=default"], "model=paper"),
         (["picture=keypoints", "model=paper"], "model=keypoints"),
         (["picture=correlation", "cluster=100000"], "cluster=100000"),
-        (["picture=scales", "cluster=100000"], "cluster=100000"),
         (["picture=animation", "first=9"], "first=9"),
         (["picture=animation", "legend=middle", "count=1", "model=paper"], "legend"),
     ],

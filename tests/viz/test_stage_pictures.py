@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from oracle import compensate, in_range, ncc_map, occupancy, project_bev
-from scenes import RANGE, ell, scene
+from preset_windows import small
+from scenes import ell, scene
 
 from cflow_torch import CFlowError, Config, Sweep, Window, make_config, make_model
 from cflow_torch.viz import plot_correlation, plot_keypoints, plot_scales, stages
 
 SIZE = 0.25
 TWO_SIZES = {"pixel_sizes": (0.5, 0.25)}
+paper, keypoints = partial(small, "paper", num_history=0), partial(small, "keypoints", patch_size=7)
 EMPTY = Window(Sweep(np.zeros((0, 3))), Sweep(np.zeros((0, 3))))
-
-
-def paper(**overrides: Any) -> Config:
-    return make_config("paper", **{"pixel_sizes": (SIZE,), "point_cloud_range": RANGE, "max_extent": 5.0, **overrides})
-
-
-def keypoints(**overrides: Any) -> Config:
-    changes = {"pixel_sizes": (SIZE,), "point_cloud_range": RANGE, "max_extent": 5.0, "patch_size": 7, **overrides}
-    return make_config("keypoints", **changes)
 
 
 def one_object() -> Window:
@@ -91,21 +85,16 @@ def test_matches_of_one_object_are_its_motion() -> None:
 # --- the pictures
 
 
-def images_of(axes: Any) -> list[np.ndarray]:
-    return [np.asarray(image.get_array()) for image in axes.images]
-
-
 def test_scales_and_correlation_draw_the_stages() -> None:
     sweeps, settings = scene(8), paper(**TWO_SIZES)
     (coarse, fine), _ = stages.scales(sweeps, settings)
     panels = plot_scales(sweeps, settings).axes
     for axes, images in zip(panels, (coarse.seen(), fine.seen(), fine.result())):
-        (drawn,) = images_of(axes)
-        assert np.array_equal(drawn, images.rgb())
+        assert np.array_equal(axes.images[0].get_array(), images.rgb())
         assert np.allclose(axes.images[0].get_extent()[::2], images.lower)
     one = stages.cluster_correlation(sweeps, settings)
     figure = plot_correlation(sweeps, settings)
-    t, t1, both, ncc = (images_of(axes)[0] for axes in figure.axes[:4])
+    t, t1, both, ncc = (np.asarray(axes.images[0].get_array()) for axes in figure.axes[:4])
     assert np.array_equal(ncc, one.ncc)
     assert ((t != 255).any(axis=2) == one.images.t).all() and ((t1 != 255).any(axis=2) == one.images.t1).all()
     row, col = np.argwhere(one.images.t).T + one.shift[:, None]

@@ -60,7 +60,7 @@ def test_sweeps_without_matches_give_zero_flow(pc0, pc1, others, preset):
     assert result.is_valid.tolist() == [bool(((p >= low) & (p <= high)).all()) for p in pc0]
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", ["default", "paper", "keypoints"])
 def test_finite_points_beyond_all_bounds_change_nothing(preset):
     """Their squares are infinite, and their height slices and pixels do not fit an integer."""
     settings = small(preset, point_cloud_range=(*RANGE[:2], -math.inf, *RANGE[3:5], math.inf))
