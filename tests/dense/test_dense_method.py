@@ -135,28 +135,6 @@ def test_flow_has_the_axes_of_t1():
     np.testing.assert_allclose(result.residual_flow, [[0, -0.5, 0]] * 400, atol=1e-6)
 
 
-def test_max_speed_bounds_the_flow():
-    pc0 = street(5)[1]
-    assert (estimate_flow(pc0, pc0 + [1.0, 0, 0], **PAPER).residual_flow[:, 0] == 1.0).all()
-    # 5 m/s in 0.1 s are 2 pixels; one more is allowed, the fourth is not.
-    slow = estimate_flow(pc0, pc0 + [1.0, 0, 0], max_speed=5.0, **PAPER).residual_flow
-    assert 0 < slow.norm(dim=1).max() <= 0.75
-    assert (estimate_flow(pc0, pc0 + [0.75, 0, 0], max_speed=5.0, **PAPER).residual_flow[:, 0] == 0.75).all()
-
-
-def test_ground_never_moves_and_joins_nothing():
-    car = street(6)[1]
-    floor = np.stack(np.meshgrid(np.arange(-7, 7, 0.2), np.arange(-7, 7, 0.2), [0.0]), -1).reshape(-1, 3)
-    pc0, pc1 = np.concatenate([car, floor]), np.concatenate([car + [0.5, 0, 0], floor])
-    ground = np.repeat([False, True], [400, len(floor)])
-    result = estimate_flow(pc0, pc1, gm0=ground, gm1=ground, **PAPER)
-    assert (result.residual_flow[:400, 0] == 0.5).all()
-    assert not result.residual_flow[400:].any() and not result.is_valid[400:].any()
-    assert (result.cluster_id[400:] == -1).all() and not result.score[400:].any()
-    joined = estimate_flow(pc0, pc1, ground=None, **PAPER)
-    assert joined.is_valid.all() and (joined.residual_flow[:400, 0] != 0.5).all()  # the mask was necessary
-
-
 # ---------------------------------------------------------------------------------- history and scales, by hand
 
 METRE = config(pixel_size=1.0, point_cloud_range=(0.0, 0.0, -math.inf, 40.0, 40.0, math.inf), max_extent=1000.0)

@@ -22,49 +22,32 @@ def refused(*sweeps: Sweep, match: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "points, complaint",
+    "column, values, complaint",
     [
-        (P0[:, :2], r"shape \(50, 2\).*\(N, 3\+\)"),
-        (np.zeros((3, 1001)), "give its transpose"),
-        (P0.astype(np.int64), "dtype int64.*float"),
-        (P0.astype(complex), "dtype complex128"),
-        (torch.from_numpy(P0).int(), "dtype torch.int32"),
-        (np.ma.masked_greater(P0, 0.5), "masked array"),
-        (torch.from_numpy(P0).to_sparse(), "layout"),
-        (P0.tolist(), "is list"),
+        ("points", P0[:, :2], r"shape \(50, 2\).*\(N, 3\+\)"),
+        ("points", np.zeros((3, 1001)), "give its transpose"),
+        ("points", P0.astype(np.int64), "dtype int64.*float"),
+        ("points", P0.astype(complex), "dtype complex128"),
+        ("points", torch.from_numpy(P0).int(), "dtype torch.int32"),
+        ("points", np.ma.masked_greater(P0, 0.5), "masked array"),
+        ("points", torch.from_numpy(P0).to_sparse(), "layout"),
+        ("points", P0.tolist(), "is list"),
+        ("is_ground", np.zeros(3, dtype=bool), r"shape \(3,\)"),
+        ("is_ground", np.zeros(50, dtype=np.uint8), "dtype uint8.*bool"),
+        ("is_ground", torch.zeros(50), "dtype torch.float32.*bool"),
+        ("is_ground", [False] * 50, "is list"),
+        ("point_times", np.zeros(3), r"shape \(3,\)"),
+        ("point_times", np.zeros(50, np.int64), "dtype int64.*seconds"),
     ],
 )
-def test_invalid_points_are_named(points, complaint):
-    with pytest.raises(CFlowError, match="Sweep.points.*" + complaint):
-        Sweep(points)
-    with pytest.raises(CFlowError, match="pc1 .*" + complaint):
-        estimate_flow(P0, points)
-    with pytest.raises(CFlowError, match=r"pch\[1\] .*" + complaint):
-        estimate_flow(P0, P1, pch=[P0, points])
-
-
-@pytest.mark.parametrize(
-    "mask, complaint",
-    [
-        (np.zeros(3, dtype=bool), r"shape \(3,\)"),
-        (np.zeros(50, dtype=np.uint8), "dtype uint8.*bool"),
-        (torch.zeros(50), "dtype torch.float32.*bool"),
-        ([False] * 50, "is list"),
-    ],
-)
-def test_invalid_ground_masks_are_named(mask, complaint):
-    with pytest.raises(CFlowError, match="Sweep.is_ground .*" + complaint):
-        Sweep(P0, mask)
-    with pytest.raises(CFlowError, match="gm0 .*" + complaint):
-        estimate_flow(P0, P1, gm0=mask)
-
-
-@pytest.mark.parametrize(
-    "times, complaint", [(np.zeros(3), r"shape \(3,\)"), (np.zeros(50, np.int64), "dtype int64.*seconds")]
-)
-def test_invalid_times_of_points_are_named(times, complaint):
-    with pytest.raises(CFlowError, match="Sweep.point_times .*" + complaint):
-        Sweep(P0, point_times=times)
+def test_invalid_columns_are_named(column, values, complaint):
+    with pytest.raises(CFlowError, match=f"Sweep.{column} .*{complaint}"):
+        Sweep(**{"points": P0, column: values})
+    name, older = {"points": ("pc0", "pch"), "is_ground": ("gm0", "gmh"), "point_times": ("dt0", "dth")}[column]
+    with pytest.raises(CFlowError, match=f"{name} .*{complaint}"):
+        estimate_flow(**{"pc0": P0, "pc1": P1, name: values})
+    with pytest.raises(CFlowError, match=rf"{older}\[1\] .*{complaint}"):
+        estimate_flow(P0, P1, **{"pch": [P0, P0], older: [P0 if older == "pch" else None, values]})
 
 
 def test_invalid_windows_are_refused():
