@@ -112,13 +112,18 @@ def test_scales_and_correlation_draw_the_stages() -> None:
 def test_scales_show_the_longest_mover_or_the_chosen_cluster() -> None:
     """The close-up shows the cluster that the correlation shows, whatever coarse to fine changes."""
     sweeps, settings = scene(8), paper(**TWO_SIZES)
-    _, result = stages.scales(sweeps, settings)
+    found, result = stages.scales(sweeps, settings)
     of_point, speed = result.cluster_id.numpy(), result.residual_flow.numpy()
     lengths = {n: np.linalg.norm(np.median(speed[of_point == n], 0)) for n in set(of_point) - {-1}}
     longest = max(lengths, key=lambda n: lengths[n] * (of_point == n).sum())
     assert stages.cluster_correlation(sweeps, settings).cluster_id == longest
+    start = np.asarray(sweeps.pc0.points) + result.pose_flow.numpy()
     for chosen, number in ((None, longest), (int(min(lengths)), min(lengths))):
-        assert f"cluster {number}" in plot_scales(sweeps, settings, cluster_id=chosen).texts[0].get_text()
+        figure = plot_scales(sweeps, settings, cluster_id=chosen)
+        assert f"cluster {number}" in figure.texts[0].get_text()
+        ends = np.concatenate([start, start + found[-1].flow])[np.tile(of_point == number, 2), :2]
+        limits = np.array([figure.axes[0].get_xlim(), figure.axes[0].get_ylim()])
+        assert np.allclose(limits.mean(axis=1), (ends.min(axis=0) + ends.max(axis=0)) / 2)
     with pytest.raises(CFlowError, match="cluster=100000 is not a cluster"):
         plot_scales(sweeps, settings, cluster_id=100000)
 
