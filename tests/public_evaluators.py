@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Dict, Iterable, Sequence, Tuple
 
 import numpy as np
@@ -147,6 +148,13 @@ def write_log(root: Path, made: Sequence[MadeUp]) -> Path:
 
 
 # ---------------------------------------------------------------------------------------------- BucketedSceneFlowEval
+
+
+def bsfe_data_set(bsfe: ModuleType, raw: Path, truth: Path, kind: str, output: Path, with_ground: bool = False) -> Any:
+    """Its data set of a raw log, with truth of `write_bsfe_truth`, for the evaluator `kind`, which writes `output`."""
+    settings = {"with_ground": with_ground, "use_gt_flow": True, "cache_root": output, "use_cache": False}
+    evaluation = {"eval_type": kind, "eval_args": {"output_path": output}}
+    return bsfe.Argoverse2CausalSceneFlow(raw, flow_data_path=truth, **settings, **evaluation)
 
 
 def bucket_numbers(ours: dict[str, Any], evaluator: Any, output: Path, distance: float = 35) -> Comparison:

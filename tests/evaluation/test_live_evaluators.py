@@ -22,6 +22,7 @@ from public_evaluators import (
     TIME,
     Comparison,
     MadeUp,
+    bsfe_data_set,
     bucket_numbers,
     check,
     score,
@@ -162,16 +163,10 @@ def test_av2_on_made_up_frames(av2_tools: ModuleType, seed: int) -> None:
 # ---------------------------------------------------------------------------------------------- BucketedSceneFlowEval
 
 
-def run_bsfe(
-    bsfe: ModuleType, kind: str, raw: Path, truth: Path, predictions: Sequence[np.ndarray], output: Path, ground: bool
-) -> Any:
+def run_bsfe(data_set: Any, predictions: Sequence[np.ndarray]) -> Any:
     """Score the predictions of a log with its evaluator."""
     from bucketed_scene_flow_eval.datastructures import EgoLidarFlow
 
-    settings = {"with_ground": ground, "use_gt_flow": True, "cache_root": output, "use_cache": False}
-    data_set = bsfe.Argoverse2CausalSceneFlow(
-        raw, flow_data_path=truth, eval_type=kind, eval_args={"output_path": output}, **settings
-    )
     assert len(data_set) == len(predictions)
     evaluator = data_set.evaluator()
     for number, flow in enumerate(predictions):
@@ -185,9 +180,8 @@ def check_bsfe(
     """Compare both metrics, inside 35 m and in the whole crop, without and with ground."""
     for ground in (False, True):
         output = Path(tempfile.mkdtemp(dir=truth.parent))
-        run = [
-            run_bsfe(bsfe, kind, raw, truth, predictions, output, ground) for kind in ("bucketed_epe", "threeway_epe")
-        ]
+        kinds = ("bucketed_epe", "threeway_epe")
+        run = [run_bsfe(bsfe_data_set(bsfe, raw, truth, kind, output, ground), predictions) for kind in kinds]
         for distance, region in ((35, "box"), (math.inf, "all")):
             definition = DEFINITIONS["bucketed_scene_flow_eval"]
             ours = score(replace(definition, region=region, exclude_ground=not ground), frames)

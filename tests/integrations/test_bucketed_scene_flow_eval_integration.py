@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, List, Sequence
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from public_evaluators import (
     LOG,
+    bsfe_data_set,
     bucket_numbers,
     check,
     read_pair,
@@ -29,24 +29,7 @@ from cflow_torch.data.log import window
 from cflow_torch.evaluation import EvalFrame
 from cflow_torch.integrations.bucketed_scene_flow_eval import CorrelationFlowEstimator
 
-# ------------------------------------------------------------------------------------------- without the package
-
-
-@dataclass
-class Flow:
-    """Replacement of `EgoLidarFlow`."""
-
-    full_flow: np.ndarray
-    mask: np.ndarray
-
-
-@pytest.fixture
-def package(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace `bucketed_scene_flow_eval.datastructures` by a module with the class that is returned."""
-    module = ModuleType("bucketed_scene_flow_eval.datastructures")
-    module.EgoLidarFlow = Flow  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "bucketed_scene_flow_eval", ModuleType("bucketed_scene_flow_eval"))
-    monkeypatch.setitem(sys.modules, "bucketed_scene_flow_eval.datastructures", module)
+# --------------------------------------------------------------------------------------------- frames made by hand
 
 
 def make_frame(number: int, sweep: Sweep, ego_to_global: np.ndarray, sensor_to_ego: Any = None) -> SimpleNamespace:
@@ -76,7 +59,7 @@ def check_flow(flow: Any, rotated: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("origin", [-1, 0, 1])
-def test_flow_is_in_the_axes_of_t(package: None, origin: int) -> None:
+def test_flow_is_in_the_axes_of_t(bsfe: ModuleType, origin: int) -> None:
     """Poses may be relative to any sweep: a causal loader takes the last, a non-causal one that in the middle."""
     sweeps = drive(3)
     frames = make_frames(sweeps, origin)
@@ -98,7 +81,7 @@ def test_flow_is_in_the_axes_of_t(package: None, origin: int) -> None:
         assert np.isnan(frames[number].pc.full_pc.points).any() and not flow.full_flow[~flow.mask].any()
 
 
-def test_earlier_frames_are_the_history(package: None) -> None:
+def test_earlier_frames_are_the_history(bsfe: ModuleType) -> None:
     sweeps = drive(5)
     flows = estimator(2)(make_frames(sweeps))
     assert len(flows) == 4
@@ -108,7 +91,7 @@ def test_earlier_frames_are_the_history(package: None) -> None:
     np.testing.assert_array_equal(estimator(2).last(make_frames(sweeps)).full_flow, flows[3].full_flow)
 
 
-def test_a_sensor_with_a_frame_of_its_own(package: None) -> None:
+def test_a_sensor_with_a_frame_of_its_own(bsfe: ModuleType) -> None:
     """In nuScenes, points and true flow are in the axes of the sensor."""
     sweeps = drive(2)
     sensor_to_ego = pose(1.0, 0.2, math.radians(-90), 1.8)
@@ -139,13 +122,13 @@ class DataSet(List[List[SimpleNamespace]]):
         return SimpleNamespace(name=self.loader)
 
     def evaluator(self) -> Any:
-        flows: dict[tuple[str, int], Flow] = {}
+        flows: dict[tuple[str, int], Any] = {}
         store = lambda flow, frame: flows.__setitem__((frame.log_id, frame.log_idx), flow)  # noqa: E731
         return SimpleNamespace(flows=flows, eval=store)
 
 
 @pytest.mark.parametrize("length", [2, 3])
-def test_overlapping_items_share_their_history(package: None, length: int) -> None:
+def test_overlapping_items_share_their_history(bsfe: ModuleType, length: int) -> None:
     logs = [drive(5), drive(4, velocity=0.7)]
     flows = estimator(2).evaluate(DataSet(logs, length, "CAUSAL")).flows
     assert sorted(flows) == [(f"log {n}", i) for n, log in enumerate(logs) for i in range(length - 2, len(log) - 1)]
@@ -153,7 +136,7 @@ def test_overlapping_items_share_their_history(package: None, length: int) -> No
         check_flow(flow, expected(logs[int(name[-1])], index, 2))
 
 
-def test_one_warning_about_ground_which_can_be_found(package: None) -> None:
+def test_one_warning_about_ground_which_can_be_found(bsfe: ModuleType) -> None:
     """With with_ground=True the masks do not mark the ground."""
     rng = np.random.default_rng(0)
     ground = np.concatenate([rng.uniform(-30, 30, (20000, 2)), 0.02 * rng.standard_normal((20000, 1))], 1)
@@ -179,7 +162,7 @@ def test_one_warning_about_ground_which_can_be_found(package: None) -> None:
         ("log_idx", 2, r"frames\[1\]\.log_id, log_idx.* 2 after 'log', 0"),
     ],
 )
-def test_the_error_names_the_bad_field_of_a_frame(package: None, path: str, value: Any, complaint: str) -> None:
+def test_the_error_names_the_bad_field_of_a_frame(bsfe: ModuleType, path: str, value: Any, complaint: str) -> None:
     frames = make_frames(drive(2))
     *holders, last = path.split(".")
     holder: Any = frames[1]
@@ -192,20 +175,7 @@ def test_the_error_names_the_bad_field_of_a_frame(package: None, path: str, valu
         estimator()(frames[:1])
 
 
-# ---------------------------------------------------------------------------------------------- with the package
-
-
-def make_data_set(bsfe: ModuleType, raw: Path, truth: Path) -> Any:
-    return bsfe.Argoverse2CausalSceneFlow(
-        raw,
-        subsequence_length=2,
-        flow_data_path=truth,
-        with_ground=False,
-        eval_type="bucketed_epe",
-        eval_args={"output_path": truth},
-        cache_root=truth,
-        use_cache=False,
-    )
+# --------------------------------------------------------------------------------------------------- its data sets
 
 
 @pytest.mark.parametrize("preset", ["paper", "default"])
@@ -215,7 +185,8 @@ def test_real_pair_through_their_evaluator(bsfe: ModuleType, av2_folder: Path, t
     sweeps = Window(*(replace(sweep, point_times=None) for sweep in (stored.pc0, stored.pc1)))  # frames have no times
     T, labels = pair.T_float64, pair.labels
     truth = write_bsfe_truth(tmp_path, [(residual_at_t(pair), labels.category, labels.is_valid)])
-    (item,) = make_data_set(bsfe, raw, truth)
+    data_set = bsfe_data_set(bsfe, raw, truth, "bucketed_epe", truth)
+    (item,) = data_set
     cropped = [replace(sweep, is_ground=~frame.pc.mask) for sweep, frame in zip((sweeps.pc0, sweeps.pc1), item)]
     estimate = CorrelationFlowEstimator(preset)
     (result,) = estimate.sequence_flow.model([Window(*cropped)])
@@ -228,10 +199,10 @@ def test_real_pair_through_their_evaluator(bsfe: ModuleType, av2_folder: Path, t
     assert not (item[0].pc.mask & pair.bsfe_ground).any() and (flow.mask == item[0].pc.mask).all()
     parts = {"residual_flow": result.residual_flow, "T_ego1_ego0": T, "is_ground": pair.bsfe_ground}
     ours = score("bucketed_scene_flow_eval", [EvalFrame(pair.points, labels, **parts)])
-    evaluator = estimate.evaluate(make_data_set(bsfe, raw, truth))
+    evaluator = estimate.evaluate(data_set)
     check("estimator, buckets", bucket_numbers(ours["bucketed"], evaluator, truth))
     # In `load_frame_list` the ground is known and nothing is cropped, so the flow is that of the method on our window.
-    pairs = make_data_set(bsfe, raw, truth).sequence_loader.load_sequence(LOG).load_frame_list(relative_to_idx=0)
+    pairs = data_set.sequence_loader.load_sequence(LOG).load_frame_list(relative_to_idx=0)
     (whole,), (result,) = estimate(pairs), estimate.sequence_flow.model([sweeps])
     check_flow(whole, result.residual_flow.double().numpy() @ T[:3, :3])
     assert whole.mask.all()
