@@ -5,8 +5,6 @@
 set -euo pipefail
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 PYTHON="$ROOT/.venv/bin/python"
-# Python keeps what it has compiled, also where the environment says otherwise: else each process compiles torch again.
-export PYTHONDONTWRITEBYTECODE="" PYTHONPYCACHEPREFIX="$ROOT/.venv/bytecode"
 WANTED="$(cat "$ROOT"/scripts/{constraints,evaluators}.txt "$ROOT/pyproject.toml" | cksum)"
 
 if [ "$(cat "$ROOT/.venv/installed-$STAMP" 2>/dev/null || true)" != "$WANTED" ]; then

@@ -1,4 +1,8 @@
-"""Fixtures: where the real data lies. Tests that need it are skipped, with the reason, where it is absent."""
+"""Fixtures: where the real data lies. Tests that need it are skipped, with the reason, where it is absent.
+
+Where the environment forbids bytecode, each worker and each process that a test starts would compile torch and kornia
+again, a third of the time of the tests. So bytecode goes into the cache of pytest then.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,11 @@ from typing import Iterator
 from unittest.mock import MagicMock
 
 import pytest
+
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "bytecode")
+    os.environ.update(PYTHONDONTWRITEBYTECODE="", PYTHONPYCACHEPREFIX=sys.pycache_prefix)
 
 
 @pytest.fixture(scope="session")

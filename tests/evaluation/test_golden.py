@@ -1,12 +1,11 @@
 """Scores of the real Argoverse 2 pair compared with the numbers that the public evaluators printed for it.
 
-The numbers were measured with av2 0.3.6, OpenSceneFlow 848bf86 and bucketed-scene-flow-eval 2.0.25. "npz" is the ego
-motion that the test log stores in float32 (0.8 mm off the float64 poses, which moves 23 points across a bucket edge).
+The numbers were measured with av2 0.3.6 and OpenSceneFlow 848bf86. "npz" is the ego motion that the test log stores in
+float32 (0.8 mm off the float64 poses, which moves 23 points across a bucket edge).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -14,9 +13,7 @@ import numpy as np
 import pytest
 from public_evaluators import TOLERANCE, Pair, noise, official_mask, read_pair, score
 
-from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.log import FlowLabels
-from cflow_torch.evaluation import DEFINITIONS, EvalFrame
+from cflow_torch.evaluation import EvalFrame
 from cflow_torch.evaluation.frame import ego_motion_flow
 
 CLASSES = ("BACKGROUND", "CAR", "PEDESTRIAN", "WHEELED_VRU", "OTHER_VEHICLES", "mean")
@@ -39,19 +36,6 @@ def scores(pair: Pair, definition: Any, **parts: Any) -> dict[str, Any]:
         "residual_flow": np.zeros_like(pair.points),
     }
     return score(definition, [EvalFrame(pair.points, **{**defaults, **parts})])
-
-
-@pytest.fixture(scope="module")
-def from_boxes(av2_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> FlowLabels:
-    """Truth from the boxes and the float64 poses, as BucketedSceneFlowEval computes it."""
-    folder = tmp_path_factory.mktemp("log") / "without_labels"
-    folder.mkdir()
-    for entry in av2_folder.iterdir():
-        if entry.name != "flow_labels.feather":
-            (folder / entry.name).symlink_to(entry)
-    labels = AV2Log(folder).labels(0)
-    assert labels is not None
-    return labels
 
 
 def check_three_way(results: dict[str, Any], **expected: float) -> None:
@@ -105,20 +89,6 @@ def test_opensceneflow_range_wise(pair: Pair) -> None:
     expected = [0.00091971, 0.00036213, 1.825e-06, 0.00042789]
     assert measured == pytest.approx(expected, abs=1e-8, rel=0)  # every digit that was printed
     assert ranges["0-35"]["dynamic_epe"] == pytest.approx(0.74473900, abs=TOLERANCE, rel=0)
-
-
-def test_bucketed_scene_flow_eval(pair: Pair, from_boxes: FlowLabels) -> None:
-    parts = {"labels": from_boxes, "T_ego1_ego0": pair.T_float64, "is_ground": pair.bsfe_ground, "eval_mask": None}
-    results = scores(pair, "bucketed_scene_flow_eval", **parts)
-    check_three_way(results, epe_fd=0.664467, epe_fs=0.005682, epe_bs=0.0)
-    check_classes(results, [0.0, 0.005598, 0.005120, 0.003867, NAN, 0.003646], STATIC)
-    assert filled(results, "CAR", "count") == {0: 5729, 1: 21, 3: 208, 10: 21, 11: 216, 20: 1032, 26: 142}
-    assert filled(results, "PEDESTRIAN", "count") == {0: 152, 2: 90}
-    assert filled(results, "WHEELED_VRU", "count") == {0: 183}
-    with_ground = replace(DEFINITIONS["bucketed_scene_flow_eval"], exclude_ground=False)
-    classes = scores(pair, with_ground, **parts)["bucketed"]["classes"]
-    found = [classes[name]["static_epe"] for name in ("CAR", "PEDESTRIAN", "WHEELED_VRU")]
-    assert found == pytest.approx([0.006029, 0.005703, 0.004034], abs=TOLERANCE, rel=0)
 
 
 def test_noise(pair: Pair) -> None:

@@ -84,7 +84,7 @@ class TinyNetwork(nn.Module):
 
 if __name__ == "__main__":
     add_replacements()
-    sys.dont_write_bytecode = True  # in the checkout
+    sys.dont_write_bytecode = sys.pycache_prefix is None  # nothing is written into the checkout
     sys.argv = sys.argv[1:]
     sys.path[0] = os.getcwd()  # as if the script had been started itself
     if not torch.cuda.is_available():

@@ -1,4 +1,4 @@
-"""The comparison with peers scores every method on the same points."""
+"""The comparison with peers scores every method on the same points; the ablation can leave out every step."""
 
 from __future__ import annotations
 
@@ -70,3 +70,12 @@ def test_true_and_false_labels_are_counted(script: Any, scene: Path) -> None:
     assert (found, false) == (0, 0) and missed > missed_walkers
     found, false, *_ = labels.counts(log, [~each for each in none])
     assert found == missed and false > missed
+
+
+def test_every_step_can_be_left_out(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the ablation replaces exists under the name that the script uses."""
+    script("figures", "drives")
+    steps = script("ablation", "steps")
+    monkeypatch.setattr(steps, "score_preset", lambda scored, preset, changes: changes)
+    for name in (*steps.STEPS, *steps.SETTINGS):
+        assert steps.score_without(None, name) == steps.SETTINGS.get(name, {})
