@@ -32,11 +32,6 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-def names_in(wheel: Path) -> set[str]:
-    with zipfile.ZipFile(wheel) as archive:
-        return {name for name in archive.namelist() if ".dist-info/" not in name}
-
-
 def test_the_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     """No oracle, no benchmark's targets, no test, no script."""
     kept = [
@@ -46,7 +41,9 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     ]
     expected = {re.sub("^configs/", "cflow_torch/configs/", file.relative_to(ROOT).as_posix()) for file in kept}
     files = ("py.typed", "verified/confidence.json", "viz/page.html")
-    assert names_in(wheel) == expected | {f"cflow_torch/{file}" for file in files}
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    assert names == expected | {f"cflow_torch/{file}" for file in files}
     assert wheel.name.endswith("-py3-none-any.whl")
     assert wheel.stat().st_size < 2**20, "under 1 MiB: no picture, no data"
 
