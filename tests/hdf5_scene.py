@@ -12,11 +12,7 @@ STAMPS = (1_533_279_682_150_532, 1_533_279_682_250_532, 1_533_279_682_350_532)  
 
 
 def write_scene(
-    file: Path,
-    stamps: Sequence[int] = STAMPS,
-    growth: int = 0,
-    masked: Any = None,
-    **replaced: Any,
+    file: Path, stamps: Sequence[int] = STAMPS, growth: int = 0, masked: Any = None, **replaced: Any
 ) -> Path:
     """Write sweeps of 50 points, each with `growth` more than the one before; the last one has no flow.
 

@@ -58,8 +58,9 @@ def scene(
     stamps: bool = False,
     num_objects: int = 9,
     num_points: int = 70,
+    turn: float | None = None,
 ) -> Window:
-    """Boxes, L-shapes and a wall, moving at constant velocity, seen by a sensor that drives and turns.
+    """Boxes, L-shapes and a wall, moving at constant velocity, seen by a sensor that drives and turns (rad per sweep).
 
     Every sweep has new noise and new points, ground points with a mask, a few points out of range, NaN and infinite
     points. Some objects are missing in some sweeps, so clusters with gaps in their history occur.
@@ -70,7 +71,8 @@ def scene(
         size = rng.uniform((0.3, 0.3, 0.5), (4.5, 2.0, 2.0))
         velocity = np.array([*rng.normal(0, 0.35, 2), rng.normal(0, 0.1)]) * (rng.random() < 0.7)
         objects.append(("box" if i % 2 else "ell", size, rng.uniform(-3, 3), rng.uniform((-7, -6), (7, 6)), velocity))
-    turn, speed = rng.normal(0, 0.02), rng.normal(0.5, 0.2)
+    drawn, speed = rng.normal(0, 0.02), rng.normal(0.5, 0.2)
+    turn = drawn if turn is None else turn
     sweeps = []
     for k in [*range(num_history + 2), *range(-1, -1 - num_future, -1)]:  # sweeps t+1, t, t-1, ..., then t+2, t+3, ...
         clouds = []

@@ -89,14 +89,7 @@ def while_training(config: Config, windows: list[Window]) -> Results:
 
 
 CALLS: dict[str, Call] = {
-    call.__name__: call
-    for call in (
-        backwards_and_again,
-        among_others,
-        in_pieces,
-        shuffled,
-        while_training,
-    )
+    call.__name__: call for call in (backwards_and_again, among_others, in_pieces, shuffled, while_training)
 }
 
 

@@ -1,37 +1,24 @@
-"""Sweeps with a turning vehicle, a wall, a parked and a moving box, and the flow that a harness must get."""
+"""Sweeps of a vehicle that turns, and the flow that a harness must get."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from scenes import RANGE, box, pose
+from scenes import RANGE, scene
 
 from cflow_torch import CorrelationFlow, Sweep, Window, make_config
 
-YAW_STEP = 0.1  # rad, 5.7 degrees between two sweeps
 SETTINGS: dict[str, Any] = {"preset": "paper", "pixel_sizes": (0.25,), "point_cloud_range": RANGE, "max_extent": 5.0}
 
 
-def drive(num_sweeps: int, velocity: float = 0.5, yaw_step: float = YAW_STEP, noise: float = 0.02) -> list[Sweep]:
-    """Sweeps, oldest first. Numbers of points differ, order is shuffled, a tenth is ground, one row is NaN."""
-    rng = np.random.default_rng(7)
-    wall = np.stack([np.linspace(-8, 8, 200), np.full(200, 5.0), rng.uniform(0, 2, 200)], 1)
-    parked = box(rng, 3.0, 1.6, 1.5, 150) + [-2.0, -4.0, 0.0]
-    moving = box(rng, 2.0, 1.0, 1.5, 150) + [1.0, 1.0, 0.0]
-    ground = np.stack([rng.uniform(-7, 7, 60), rng.uniform(-6, 6, 60), np.full(60, -0.1)], 1)
-    sweeps = []
-    for k in range(num_sweeps):
-        solid = np.concatenate([wall, parked, moving + [0.6 * velocity * k, 0.8 * velocity * k, 0.0]])
-        solid = solid + noise * rng.standard_normal(solid.shape)
-        T_world_ego = pose(0.3 * k, 0.05 * k, yaw_step * k)
-        points = np.concatenate([solid, ground[: 60 - k]])
-        points = ((points - T_world_ego[:3, 3]) @ T_world_ego[:3, :3]).astype(np.float32)
-        points[3] = np.nan
-        order = rng.permutation(len(points))
-        sweeps.append(Sweep(points[order], (np.arange(len(points)) >= len(solid))[order], T_world_ego, 10**8 * k))
-    return sweeps
+def drive(num_sweeps: int, seed: int = 7, turn: float = 0.2) -> list[Sweep]:
+    """Sweeps of a vehicle that turns (rad per sweep), oldest first."""
+    made = scene(seed, num_history=num_sweeps - 2, num_objects=6, turn=turn)
+    sweeps = [*made.pch[::-1], made.pc0, made.pc1]
+    return [replace(sweep, timestamp_ns=10**8 * k) for k, sweep in enumerate(sweeps)]
 
 
 def expected(sweeps: list[Sweep], index: int, num_history: int) -> np.ndarray:

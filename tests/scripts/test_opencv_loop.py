@@ -46,14 +46,7 @@ def true_flow() -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "overrides",
-    [
-        {},
-        {"connectivity": 4},
-        {"num_history": 2},
-        {"num_history": 1, "pixel_sizes": (0.5, 0.25)},
-    ],
-    ids=str,
+    "overrides", [{}, {"connectivity": 4}, {"num_history": 2}, {"num_history": 1, "pixel_sizes": (0.5, 0.25)}], ids=str
 )
 def test_the_loop_finds_shifts_by_whole_pixels(loop: Any, overrides: dict) -> None:
     settings = small("paper", **{"num_history": 0, **overrides})
