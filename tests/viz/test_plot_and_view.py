@@ -38,7 +38,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cflow(monkeypatch: pytest.MonkeyPatch, drive: Path, tmp_path: Path) -> Callable[..., int]:
     """A call of a command on that log, which writes to `out` and gives its exit status."""
     monkeypatch.chdir(tmp_path)
-    given = ("data=av2", f"data.root={drive}", f"output={tmp_path / 'out'}")
+    given = ("data=av2", f"data.root={drive}", "data.check=false", f"output={tmp_path / 'out'}")
     return lambda command, *arguments: command_line.cflow(command, *given, *arguments)
 
 
