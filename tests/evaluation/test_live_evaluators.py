@@ -53,10 +53,16 @@ METRIC_KEYS = {
 }
 
 
-def compare_av2(ours: dict[str, Any], totals: dict[str, float]) -> Comparison:
-    """Every number of `results_to_dict`."""
+def compare_av2(ours: dict[str, Any], table: Any, totals: dict[str, float]) -> Comparison:
+    """Every number of `evaluate_directories` (counts, hits and misses per subset) and of `results_to_dict`."""
     whole = {"Dynamic IoU": "dynamic_iou", "EPE 3-Way Average": "epe_3way"}
     numbers: Comparison = {name: (ours[whole[name]], totals[name]) for name in whole}
+    for (name, motion, distance), rows in table.groupby(["Class", "Motion", "Distance"]):
+        cell = ours["breakdown"][name.lower()][motion.lower()][distance.lower()]
+        hit, miss = cell["num_predicted"], cell["count"] - cell["num_predicted"]
+        expected = (hit, 0, 0, miss) if motion == "Dynamic" else (0, hit, miss, 0)
+        for key, value in zip(("Count", "TP", "FP", "TN", "FN"), (cell["count"], *expected)):
+            numbers[f"{key}/{name}/{motion}/{distance}"] = value, rows[key].sum()
     for name in set(totals) - set(whole):
         metric, group, motion, *distance = name.split("/")
         cells = ours["breakdown"][group.lower()][motion.lower()]
@@ -65,8 +71,8 @@ def compare_av2(ours: dict[str, Any], totals: dict[str, float]) -> Comparison:
     return {**numbers, **{key: (ours[key], totals[f"EPE/{name}"]) for key, name in sets.items()}}
 
 
-def run_av2(av2: Any, truths: Sequence[dict[str, Any]], predictions: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Write the files of the challenge with av2's own writers and evaluate them."""
+def run_av2(av2: Any, truths: Sequence[dict[str, Any]], predictions: Sequence[dict[str, Any]]) -> Any:
+    """Write the files of the challenge with av2's own writers and evaluate them: per-frame table, totals."""
     with tempfile.TemporaryDirectory() as root:
         folders = Path(root) / "truth", Path(root) / "prediction"
         for folder in folders:
@@ -75,7 +81,8 @@ def run_av2(av2: Any, truths: Sequence[dict[str, Any]], predictions: Sequence[di
             sweep = {"sweep_uuid": (LOG, TIME + number)}
             av2.make_annotation_files.write_annotation(**truth, **sweep, output_dir=folders[0])
             av2.utils.write_output_file(**prediction, **sweep, output_dir=folders[1])
-        return av2.eval.results_to_dict(av2.eval.evaluate_directories(*folders))
+        table = av2.eval.evaluate_directories(*folders)
+    return table, av2.eval.results_to_dict(table)
 
 
 def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
@@ -141,7 +148,7 @@ def test_av2_on_made_up_frames(av2_tools: ModuleType, seed: int) -> None:
         truths.append(truth_for_av2(made.points, labels, is_long(labels.flow - pose_flow), mask))
         predicted.append({"flow": total[mask], "is_dynamic": is_long(total - pose_flow)[mask]})
         frames.append(EvalFrame(made.points, labels, flow=total, T_ego1_ego0=made.T, is_ground=made.is_ground))
-    numbers = compare_av2(score("av2", frames)["three_way"], run_av2(av2_tools, truths, predicted))
+    numbers = compare_av2(score("av2", frames)["three_way"], *run_av2(av2_tools, truths, predicted))
     check(f"av2, made up {seed}", numbers)
 
 
