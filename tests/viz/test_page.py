@@ -13,6 +13,7 @@ from typing import Any, Iterator
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from toy_street import CAR, CAR_FLOW, FLOOR, STEP, WALL, Street, result_of
 
@@ -94,31 +95,25 @@ def test_frames_have_poses_times_and_arrows(street: dict[str, Any]) -> None:
     assert street["north"] == pytest.approx(np.pi / 2)
 
 
-def test_the_colours_of_speed_error_and_directions(tmp_path: Path) -> None:
+def test_the_colours_of_speed_error_and_directions() -> None:
     """Eight directions and a wrong flow: hue, ramp, and the level of flow that is too fast."""
     log = Street()
     for k in range(8):
         flow = np.array([np.cos(k * np.pi / 4 + 0.02), np.sin(k * np.pi / 4 + 0.02), 0]) * 1.49
         result = result_of()
-        result.residual_flow[CAR] = torch_row(flow)
-        shown = show(window(log, 0), result, labels=log.labels(0))
-        position, entries = points_of(content_of(shown.html), 0)
+        result.residual_flow[CAR] = torch.from_numpy(flow)
+        data = content_of(show(window(log, 0), result, labels=log.labels(0)).html)
+        entries = points_of(data, 0)[1]
         (entry,) = set(entries["flow"][entries["flow"] >= FIRST])
-        assert np.abs(color_of(content_of(shown.html), "flow", entry) - flow_to_rgb(flow, 1.5)).max() < 50, k
+        assert np.abs(color_of(data, "flow", entry) - flow_to_rgb(flow, 1.5)).max() < 50, k
         error = np.linalg.norm(flow - CAR_FLOW)
         step = min(int(error / 0.35 * 64), 63)
         assert set(entries["error"]) <= {STATIC, GROUND, UNKNOWN, FIRST + step} and FIRST + step in entries["error"]
         assert set(entries["speed"]) == {STATIC, GROUND, FIRST + 63}
-    result.residual_flow[CAR] = torch_row(flow * 2)
+    result.residual_flow[CAR] = torch.from_numpy(flow * 2)
     data = content_of(show(window(log, 0), result).html)
     (entry,) = set(points_of(data, 0)[1]["flow"]) - {STATIC, GROUND}
     assert color_of(data, "flow", entry).max() < 220, "darker"
-
-
-def torch_row(flow: np.ndarray) -> Any:
-    import torch
-
-    return torch.from_numpy(flow).float()
 
 
 def test_only_static_points_are_thinned_and_the_page_says_so() -> None:

@@ -118,7 +118,6 @@ def test_invalid_transforms_are_named(matrix, complaint):
         (np.float32, 1e5, False),  # 8 mm
         (np.float32, 2e5, True),  # 16 mm
         (torch.bfloat16, 0.0, True),  # 31 mm at the end of a region of 8 m
-        (torch.float64, 1e7, False),
     ],
 )
 def test_too_coarse_types_of_poses_are_refused(dtype, x, refused):
