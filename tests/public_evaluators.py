@@ -76,11 +76,6 @@ def official_mask(pair: Pair) -> np.ndarray:
     return ~pair.is_ground & (np.abs(pair.points[:, :2]) <= 50).all(axis=1)
 
 
-def noise(pair: Pair) -> np.ndarray:
-    """A prediction: residuals in the axes of t+1."""
-    return np.random.default_rng(0).normal(0, 0.05, pair.points.shape).astype(np.float32)
-
-
 # ---------------------------------------------------------------------------------------------- made-up frames
 
 

@@ -8,6 +8,7 @@ from typing import Iterator
 import numpy as np
 import pytest
 import torch
+from kornia import contrib
 from oracle import reference_flow
 
 from cflow_torch.config import CONFIGS, Config, VerifiedConfig
@@ -172,17 +173,8 @@ def assert_zeros(result: FlowResult, num_points: int) -> None:
     assert result.is_valid.dtype == torch.bool and result.is_valid.shape == (num_points,)
 
 
-def has_kornia_labelling() -> bool:
-    """kornia >= 0.9 has exact union-find labelling."""
-    try:
-        from kornia.contrib import connected_components_union_find  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
 needs_kornia_labelling = pytest.mark.skipif(
-    not has_kornia_labelling(), reason="kornia < 0.9 has no exact union-find labelling"
+    not hasattr(contrib, "connected_components_union_find"), reason="kornia < 0.9 has no exact union-find labelling"
 )
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
 # For parametrize: every labelling engine, kornia's visibly skipped where it cannot label.
