@@ -19,7 +19,7 @@ _FAR = 2  # pixels, in y or in x
 _COVERED = 65  # per cent
 _CHANGED_Z = 4.0
 # A motion must gain so many slices for each sweep besides t and t+1, or one for so many pixels, whichever is less.
-_LEAST_GAIN, _LEAST_SHARE = 5, 12
+_LEAST_GAIN, _LEAST_SHARE = 2, 12
 
 
 def verify(

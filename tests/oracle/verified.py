@@ -182,14 +182,14 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
 
 def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: VerifiedConfig) -> tuple[Vector, int]:
     """The candidate of most evidence, and its evidence. What moves by its changed pixels alone needs more standard
-    deviations. All must gain five slices for each sweep besides t and t+1, or one for twelve pixels."""
+    deviations. All must gain two slices for each sweep besides t and t+1, or one for twelve pixels."""
     z = CHANGED_Z if node.level == num_levels else config.significance
     slides = [False] * len(candidates)
     if not node.travels:
         slides = slides_along_itself(node.sweeps, node.members, candidates)
     counts = [count_wins(node.sweeps, node.members, motion) for motion in candidates]
     evidence = [0 if slid else evidence_of(*own, z) for own, slid in zip(counts, slides)]
-    least = min(16 * 5 * (len(node.sweeps.images) - 2), 16 * len(node.members) // 12)
+    least = min(16 * 2 * (len(node.sweeps.images) - 2), 16 * len(node.members) // 12)
     return best_candidate([own if own > least else 0 for own in evidence], candidates)
 
 
