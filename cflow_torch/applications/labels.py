@@ -50,20 +50,20 @@ class DynamicPoints(NamedTuple):
 
 
 def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", overwrite: bool = False) -> int:
-    """Estimate the flow of a scene, and write its labels into the scene.
+    """Estimate the flow of a scene, and write labels into its file.
 
     Args:
         file: `<scene>.h5` in OpenSceneFlow's layout.
         model: a `VerifiedFlow`; the preset `offline` is the most accurate.
         find_ground: "grid" or "patchwork", how to find the ground of sweeps without a mask.
-        overwrite: replace labels that the scene has already.
+        overwrite: replace labels that the scene already has.
 
     Returns:
         Number of labelled sweeps: all sweeps of the scene.
 
     Raises:
-        CFlowError: the scene cannot be read or written, has labels already, or the model gives no confidence. The scene
-            is then unchanged.
+        CFlowError: the scene cannot be read or written, it already has labels, or the model gives no confidence. The
+            file is then unchanged.
     """
     log = open_log("hdf5", file, find_ground=find_ground)
     flows = (model([each])[0] for each in windows(log, model.config.num_history, model.config.num_future))

@@ -36,10 +36,10 @@ class AV2Log(BoxLog):
             masks. A log whose map has no raster has no ground masks either.
 
     Convention:
-        - Points are in the ego frame of their sweep (stored as float16). The world is the city.
+        - Points are in the ego frame of their sweep (stored as float16). The world frame is that of the city.
         - Truth comes from the first of these sources that the log has: `flow_labels/<ns of sweep t>.feather` (if that
           folder exists, a pair without a file has no truth); `flow_labels.feather`, for the first pair;
-          `annotations.feather`, for pairs inside the annotated time. As in av2-api, a box without points is absent.
+          `annotations.feather`, for pairs inside the annotated time. Boxes without points are dropped, as in av2-api.
     """
 
     def __init__(self, folder: PathLike, ground: str | None = "av2-api") -> None:

@@ -34,11 +34,11 @@ class StaticResidual:
 
     Args:
         index, later: the two sweeps.
-        shift: (2,) float64 metres by which structure of `index`, moved by the poses, misses that of `later`; x, y of
-            the later sweep's frame.
-        rotation: radians about z by which it is rotated.
-        agreement: 0 ... 1, how well the structure of both coincides under the poses; 0.3 to 0.5 for two sweeps of a
-            street. NaN if too little can be compared.
+        shift: (2,) float64 metres, x and y of the later sweep's frame: offset between the structure of `index`, after
+            the poses have moved it, and that of `later`.
+        rotation: radians about z, between the same two.
+        agreement: 0 ... 1, how well the two coincide under the poses; 0.3 to 0.5 for two sweeps of a street. NaN if
+            too little can be compared.
         aligned: agreement after `shift` and `rotation` are removed.
         verdict: the likely mistake, "" = none.
     """

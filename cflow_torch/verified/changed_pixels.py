@@ -88,8 +88,9 @@ class RangeImages:
     Args:
         sweeps: points that are active, without ground.
 
-    Convention: angles are measured without trigonometry, so that every device finds the same bins: around by
-    y / (|x| + |y|), which makes bins of .32 to .64 degrees, and up by height over distance. Distances are float32.
+    Convention: angles are measured without trigonometry, so that every device finds the same bins. The azimuth is
+    measured by y / (|x| + |y|), in bins of .32 to .64 degrees; the elevation by height over distance. Distances are
+    float32.
     """
 
     def __init__(self, sweeps: HeightSlicedSweeps) -> None:
@@ -106,8 +107,8 @@ class RangeImages:
         self._farthest = farthest
 
     def farther(self, sweep: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """(K,) float32, metres: by how much the farthest return in the direction of each position is farther away than
-        the position; -infinity = there is no return.
+        """(K,) float32, metres: distance of the farthest return in the direction of each position, minus that of the
+        position; -infinity = no return.
 
         Args:
             sweep: (K,) int64, window * S + step.

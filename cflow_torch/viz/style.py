@@ -124,7 +124,7 @@ def draw_scale(axes: Axes) -> None:
 
 
 def color_bar(axes: Axes, dots: Any, label: str, position: np.ndarray, is_important: np.ndarray) -> Any:
-    """Draw the colour bar of some dots in a corner of their panel, see `legend_box`."""
+    """Draw the colour bar of scattered dots into a corner of their panel (chosen by `legend_box`)."""
     box = legend_box(axes, position, is_important, (1.8, 0.66))
     bar: Any = axes.figure.colorbar(dots, cax=box.inset_axes((0.1, 0.7, 0.8, 0.18)), orientation="horizontal")
     bar.set_label(label, fontsize=10, color=INK, labelpad=1)

@@ -124,16 +124,16 @@ def read_ground(sweep: Sweep, device: torch.device) -> Tensor:
 
 
 def read_point_times(sweep: Sweep, name: str, interval: float | None, device: torch.device) -> Tensor:
-    """(N,) float64 times of the points, sweep intervals, multiples of 2^-20.
+    """Return the times of the points, (N,) float64, in sweep intervals, rounded to multiples of 2^-20.
 
     Args:
         sweep: a sweep, checked.
-        name: as users know it.
+        name: its name in messages.
         interval: seconds from t to t+1; None = the times are not used, and the result is 0.
         device: device of the result.
 
     Raises:
-        CFlowError: a time is not finite, or too long for a time within a sweep.
+        CFlowError: a time is not finite, or too far from the sweep's time stamp.
     """
     if interval is None:
         return torch.zeros(sweep.points.shape[0], dtype=torch.float64, device=device)

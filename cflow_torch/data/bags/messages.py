@@ -17,18 +17,18 @@ _SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 
 
 
 def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points of a cloud, without "no return" points, which are not finite or at the origin.
+    """Return the points of a cloud. Points that are not finite or at the origin are left out: they mean "no return".
 
     Args:
         message: PointCloud2 as rosbags reads it.
         stamp_ns: time of the sweep.
 
     Returns:
-        (N, 3) float64 metres in the frame of the message; (N,) float64 seconds after the stamp, see `seconds_after`,
-        None = unknown.
+        (N, 3) float64 metres in the frame of the message; (N,) float64 seconds after the stamp (see `seconds_after`),
+        or None if they are unknown.
 
     Raises:
-        ValueError: no fields x, y, z, an unknown type, or less data than the message states.
+        ValueError: a field x, y or z is missing, a type is unknown, or there is less data than the message states.
     """
     fields = {field.name: field for field in message.fields}
     names = [*"xyz", *[name for name in _TIME_FIELDS if name in fields][:1]]
