@@ -140,9 +140,10 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 
 def _is_beside(sweeps: HeightSlicedSweeps, moves: Tensor) -> Tensor:
     """(P,) bool: one of the 3 x 3 pixels around each pixel moves, in the same sweep; (P,) bool."""
-    some = sweeps.pixels.take(flat_nonzero(moves))
-    dy, dx = constant(((-1, -1, -1, 0, 0, 0, 1, 1, 1), (-1, 0, 1) * 3), torch.int64, moves.device)
-    index = sweeps.index(some.window[:, None], some.step[:, None], some.row[:, None] + dy, some.col[:, None] + dx)
+    line, width = (-1, 0, 1), sweeps.grid.width  # lines wrap around, but the border has no results
+    around = constant(tuple(dy * width + dx for dy in line for dx in line), torch.int64, moves.device)
+    index = sweeps.pixels.index.index_select(0, flat_nonzero(moves))[:, None] + around
+    index.clamp_(0, sweeps.image.numel() - 1)
     is_beside = lazy_zeros(sweeps.image.numel(), torch.bool, moves.device).index_fill_(0, index.view(-1), True)
     return is_beside.index_select(0, sweeps.pixels.index)
 
