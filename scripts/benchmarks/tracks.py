@@ -3,9 +3,9 @@
 python scripts/benchmarks/tracks.py DATA/pandaset-002 DATA/kitti-0000/kitti-0000-c2.h5     scenes, or folders of them
 python scripts/benchmarks/tracks.py --simulated av2 nuscenes --num-sweeps 12               a street and a crossing each
 
-The drives have the seeds 300 and 301; we chose settings of the tracker on 400, 401 and 700 to 703. Ground masks are exact where
-the data set has masks, and estimated by grid elsewhere. nuScenes is read at 10 Hz. We score confirmed tracks. A moving
-object has a labelled speed of 0.5 m/s or more.
+The drives have the seeds 300 and 301; we chose settings of the tracker on 400, 401 and 700 to 703. Ground masks are
+exact where the data set has masks, and estimated by grid elsewhere. nuScenes is read at 10 Hz. We score confirmed
+tracks. A moving object has a labelled speed of 0.5 m/s or more.
 
 Columns: moving objects with 20 active points or more, over all sweeps; the share of them that the flow moves in part,
 and of which a track has a point (coverage); changes of the track that has most points of an object; moving boxes a
