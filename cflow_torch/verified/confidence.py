@@ -139,8 +139,9 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 
 
 def _is_beside(sweeps: HeightSlicedSweeps, moves: Tensor) -> Tensor:
-    """(P,) bool: one of the 3 x 3 pixels around each pixel moves, in the same sweep; (P,) bool."""
-    line, width = (-1, 0, 1), sweeps.grid.width  # lines wrap around, but the border has no results
+    """(P,) bool: whether one of the 3 x 3 pixels around each pixel moves in the same sweep. `moves` is (P,) bool."""
+    # Offsets wrap around at the border of the image, where no point has a result.
+    line, width = (-1, 0, 1), sweeps.grid.width
     around = constant(tuple(dy * width + dx for dy in line for dx in line), torch.int64, moves.device)
     index = sweeps.pixels.index.index_select(0, flat_nonzero(moves))[:, None] + around
     index.clamp_(0, sweeps.image.numel() - 1)

@@ -209,9 +209,14 @@ class HeightSlicedSweeps:
         return self.batch.elapsed
 
     @property
+    def num_more(self) -> Tensor:
+        """(B,) int64, number of sweeps of a window besides t and t+1."""
+        return (self.batch.elapsed != 0).sum(1) - 1
+
+    @property
     def has_history(self) -> Tensor:
         """(B,) bool, whether a window has more sweeps than t and t+1."""
-        return (self.batch.elapsed != 0).sum(1) > 1
+        return self.num_more > 0
 
     def index(self, window: Tensor, step: Tensor, row: Tensor, col: Tensor) -> Tensor:
         """Flat index into `image` of pixels that may lie outside it.

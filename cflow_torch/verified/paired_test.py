@@ -35,7 +35,7 @@ def verify(
         significance: z of all other nodes.
 
     Returns:
-        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant, or gains enough.
+        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant and gains enough.
         evidence: (N,) int64, of that motion, sixteenths of a slice.
     """
     tested = flat_nonzero((candidates != 0).any(2).any(1))  # other nodes are static and cost nothing
@@ -47,7 +47,7 @@ def verify(
     evidence, strict = (evidence_of(wins.won, wins.lost, z) for z in (significance, _CHANGED_Z))
     slides = slides_along_itself(sweeps, members, node, candidates_of, wins.is_covered & ~travels)
     evidence = torch.where((level == num_levels)[:, None], strict, evidence).masked_fill_(slides, 0)
-    num_more = (sweeps.elapsed != 0).sum(1).index_select(0, window) - 1
+    num_more = sweeps.num_more.index_select(0, window)
     least = torch.minimum(16 * _LEAST_GAIN * num_more, 16 * scatter_count(node, len(tested)) // _LEAST_SHARE)
     evidence = evidence.masked_fill_(evidence <= least[:, None], 0)
     motion, evidence = best_candidate(evidence, candidates_of)
