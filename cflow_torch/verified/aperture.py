@@ -7,7 +7,8 @@ position, and its front comes to a new one.
 
 What is longer than other objects moves only if both of its ends do, as those of a tram. The ends of a wall do not: one
 stays, or each goes where the view of it ends. The ends of a guard rail may keep pace with the ego vehicle, since its
-few beams meet it at positions that are fixed in the vehicle's frame; but no vehicle is as low as a rail.
+few beams meet it at positions that are fixed in the vehicle's frame; but no vehicle is as low as a rail, nor as long as
+a noise barrier.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ _ALONG = 0.04
 _LEAST_TRAVEL = 1.2
 # The displacements of two ends that move together differ by at most this share of their sum.
 _ALIKE = 0.1
+# Metres: no road vehicle is longer. The ends of a longer noise barrier are where the view of it ends.
+_LONGEST = 60.0
 # Height slices in a pixel at t+1, on average: guard rails have one or, across a slice's border, two.
 _TALL = 2
 
@@ -105,8 +108,8 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
 
     Returns:
         (V,) bool: from the sweep that is farthest in time to t+1 (or back), both ends have moved in one direction along
-        the component, at least 1.2 m, alike to a tenth of their sum; and its pixels at t+1 have two slices on average.
-        False for all others.
+        the component, at least 1.2 m, alike to a tenth of their sum; and its pixels at t+1 have two slices on average
+        and are at most 60 m long. False for all others.
 
     Convention:
         A component lies along y, x or one of the diagonals: along the one in which its pixels at t+1 reach farthest.
@@ -136,8 +139,8 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     high = (-infinite).scatter_reduce(1, of_sweep.expand(4, -1), along, "amax")[:, :-1].view(4, 2, count)
     metres = tuple(scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))
     unit = constant(metres, torch.float64, along.device)[:, None]
-    direction = ((high[:, 0] - low[:, 0]) * unit).argmax(0)[None]
-    low, high = (((ends[:, 0] - ends[:, 1]) * unit).gather(0, direction)[0] for ends in (low, high))
+    length, direction = ((high[:, 0] - low[:, 0]) * unit).max(0)
+    low, high = (((ends[:, 0] - ends[:, 1]) * unit).gather(0, direction[None])[0] for ends in (low, high))
     both = (low + high).abs()  # infinite or NaN where the component is not seen
-    moves = is_tall & (both >= 2 * _LEAST_TRAVEL) & ((low - high).abs() <= _ALIKE * both)
+    moves = is_tall & (length <= _LONGEST) & (both >= 2 * _LEAST_TRAVEL) & ((low - high).abs() <= _ALIKE * both)
     return torch.zeros_like(is_long).index_copy_(0, name, moves)

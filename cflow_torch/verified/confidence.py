@@ -39,8 +39,9 @@ class MotionMargin(NamedTuple):
     Args:
         z: (G,) float64, slices matched by the motion less those matched by the best displaced one, in standard
             deviations of noise; 0 = it is not better, or the object is static.
-        is_dynamic: (G,) bool, it moves: its motion is better by one standard deviation, or is better at all and more
-            of it is matched by the motion than in index, and is not a line: beams meet a rail at positions that move.
+        is_dynamic: (G,) bool, it moves: z is at least 1, or the object is not a line, more of it is matched by the
+            motion than where it is, and the motion is better than displaced ones or at least twice the displacement,
+            because then the displaced ones move as well. Lines need z, because beams meet a rail at positions that move.
     """
 
     z: Tensor
@@ -73,7 +74,8 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     newest = flat_nonzero(members.step == 0)
     component, row, col = gather(newest, which, members.row, members.col)
     is_line, _, _ = principal_axes(component, row, col, objects.count, size)
-    return MotionMargin(z, (z >= _Z) | ((gain > 0) & (surplus[:, 0] > in_place) & ~is_line))
+    is_fast = rigid.flow.square().sum(1) >= (2 * _DISPLACEMENT) ** 2
+    return MotionMargin(z, (z >= _Z) | ((gain > 0) | is_fast) & (surplus[:, 0] > in_place) & ~is_line)
 
 
 def _groups_of_one_motion(

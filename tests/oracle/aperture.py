@@ -62,8 +62,8 @@ def is_covered(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
 def both_ends_move(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
     """Whether both ends of a component have gone the same way along it since the sweep that is farthest from t+1.
 
-    Convention: at least 1.2 m, alike to a tenth of their sum; and the pixels at t+1 have two height slices on average.
-        It lies along y, x or a diagonal, the one in which it reaches farthest at t+1; of equals the first, and of
+    Convention: at least 1.2 m, alike to a tenth of their sum; and the pixels at t+1 have two height slices on average
+        and are at most 60 m long. It lies along y, x or a diagonal, the one in which it reaches farthest at t+1; of equals the first, and of
         sweeps equally far the first.
     """
     newest = [(r, c) for m, r, c in members if m == 0]
@@ -77,7 +77,7 @@ def both_ends_move(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
         now, then = ([a * r + b * c for r, c in cells] for cells in (newest, oldest))
         low, high = min(now) - min(then), max(now) - max(then)
         ways.append(((max(now) - min(now)) * unit, low * unit, high * unit))
-    _, low_way, high_way = max(ways, key=lambda way: way[0])
+    length, low_way, high_way = max(ways, key=lambda way: way[0])
     both = abs(low_way + high_way)
     is_tall = sum(count(sweeps.at(0, *cell)) for cell in newest) >= 2 * len(newest)
-    return is_tall and both >= 2 * LEAST_TRAVEL and abs(low_way - high_way) <= 0.1 * both
+    return is_tall and length <= 60.0 and both >= 2 * LEAST_TRAVEL and abs(low_way - high_way) <= 0.1 * both

@@ -23,8 +23,8 @@ def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], rigid: RigidMotion) -
     """What an object's motion loses by being displaced by 0.4 m per interval, the best of four ways, in standard
     deviations of what it finds; and whether it is dynamic. 0 for what is static.
 
-    What loses at least one standard deviation is dynamic; of the rest that which loses something, is found less in
-    place than where it moves to, and is no line.
+    An object that loses at least one standard deviation is dynamic. So is one that is not a line and is found less in
+    place than where it moves to, if it loses something or moves at least twice as far as it is displaced.
     """
     off = DISPLACEMENT / sweeps.size
     surpluses = [0] * 5
@@ -35,11 +35,12 @@ def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], rigid: RigidMotion) -
             surpluses[i] += won - lost
     surplus, *displaced = surpluses
     gain, stays = surplus - max(displaced), count_in_place(sweeps, members)
-    if not any(rigid.flow) or gain <= 0:
+    if not any(rigid.flow):
         return 0.0, False
     is_line, _, _ = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.size)
-    z = gain / math.sqrt(surplus + stays)
-    return z, z >= 1 or (surplus > stays and not is_line)
+    z = gain / math.sqrt(surplus + stays) if gain > 0 else 0.0
+    is_fast = rigid.flow[0] * rigid.flow[0] + rigid.flow[1] * rigid.flow[1] >= (2 * DISPLACEMENT) ** 2
+    return z, z >= 1 or ((gain > 0 or is_fast) and surplus > stays and not is_line)
 
 
 def motion_of_pixel(sweeps: SlicedSweeps, pixel: Pixel, rigid: RigidMotion) -> Vector:

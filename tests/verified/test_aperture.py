@@ -177,16 +177,16 @@ TALL, LOW = (-1.5, 1.5), (-1.4, -1.2)
 def side(ends: tuple[float, float], heights: tuple[float, float], seed: int) -> Sweep:
     """The side of something long, sampled anew each time."""
     rng = np.random.default_rng(seed)
-    x = np.concatenate((ends, rng.uniform(*ends, 3000)))
+    x = np.concatenate((ends, rng.uniform(*ends, round(100 * (ends[1] - ends[0])))))
     z = rng.choice(np.arange(heights[0], heights[1] + 0.1, 0.4), len(x))
     return Sweep(np.column_stack((x, 5 + rng.normal(0, 0.02, len(x)), z)).astype(np.float32))
 
 
-def mean_flow(low_speed: float, high_speed: float, heights=TALL) -> float:
+def mean_flow(low_speed: float, high_speed: float, heights=TALL, length: float = LENGTH) -> float:
     """Mean flow along x of what has these speeds at its ends, metres per sweep."""
-    ends = [(-15 - low_speed * k, -15 + LENGTH - high_speed * k) for k in range(-1, 5)]
+    ends = [(-length / 2 - low_speed * k, length / 2 - high_speed * k) for k in range(-1, 5)]
     newest, own, *older = (side(end, heights, 50 + k) for k, end in enumerate(ends))
-    region = (-25.0, -5.0, -np.inf, 25.0, 15.0, np.inf)
+    region = (-45.0, -5.0, -np.inf, 45.0, 15.0, np.inf)
     (result,) = VerifiedFlow(make_config("default", point_cloud_range=region))([Window(own, newest, tuple(older))])
     assert not result.residual_flow[:, 1].abs().max() > 0.1
     return float(result.residual_flow[:, 0].mean())
@@ -200,6 +200,11 @@ def test_a_tram_moves():
 def test_a_wall_whose_ends_do_not_go_together_is_static():
     for low, high in ((0.0, 0.0), (SPEED, 0.0), (0.0, SPEED), (SPEED, -SPEED), (SPEED, 0.5 * SPEED)):
         assert mean_flow(low, high) == 0.0
+
+
+def test_a_noise_barrier_that_seems_to_keep_pace_is_static():
+    assert mean_flow(SPEED, SPEED, length=65.0) == 0.0
+    assert mean_flow(SPEED, SPEED, length=55.0) > 0.5 * SPEED
 
 
 def test_a_rail_that_seems_to_keep_pace_is_static():

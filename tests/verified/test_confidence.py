@@ -102,6 +102,17 @@ def test_what_could_nearly_as_well_be_displaced_moves_if_it_left_its_place_and_i
     assert np.allclose(result.residual_flow[:, 0], 5.0 if width else 0.0, atol=0.2)
 
 
+@pytest.mark.parametrize(("speed", "moves"), [(6.0, True), (0.7, False)])
+def test_what_could_as_well_be_displaced_moves_only_if_it_is_fast(speed, moves):
+    # Its front and its rear come into sight: t+1 has 1 m more of it on both sides, so all displacements fit as well.
+    x, y = np.meshgrid(np.arange(-7.95, 0.0, 0.1), (3.05, 3.55, 4.05))
+    longer, more = np.meshgrid(np.arange(-8.95, 1.0, 0.1), (3.05, 3.55, 4.05))
+    points = np.stack((x.ravel(), y.ravel(), np.full(x.size, 0.1)), 1)
+    newer = np.stack((longer.ravel() + speed, more.ravel(), np.full(longer.size, 0.1)), 1)
+    result = flow_as_oracle(Window(Sweep(points), Sweep(newer)), MODEL.replace(max_speed=60.0))
+    assert bool(result.residual_flow.any()) == moves
+
+
 def test_the_margin_of_a_bus_that_turns_follows_its_rotation():
     # 5 m from the centre, 5 degrees are 0.44 m: more than a pixel, and than the displacement of the margin.
     x = np.arange(-5.5, 5.5, 0.1)
