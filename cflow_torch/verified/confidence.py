@@ -41,7 +41,7 @@ class MotionMargin(NamedTuple):
             deviations of noise; 0 = it is not better, or the object is static.
         is_dynamic: (G,) bool, it moves: z is at least 1, or the object is not a line, more of it is matched by the
             motion than where it is, and the motion is better than displaced ones or at least twice the displacement,
-            because then the displaced ones move as well. Lines need z, because beams meet a rail at positions that move.
+            because then the displaced ones move as well. Lines need z: beams meet a rail at positions that move.
     """
 
     z: Tensor

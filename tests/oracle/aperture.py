@@ -63,8 +63,8 @@ def both_ends_move(sweeps: SlicedSweeps, members: Sequence[Pixel]) -> bool:
     """Whether both ends of a component have gone the same way along it since the sweep that is farthest from t+1.
 
     Convention: at least 1.2 m, alike to a tenth of their sum; and the pixels at t+1 have two height slices on average
-        and are at most 60 m long. It lies along y, x or a diagonal, the one in which it reaches farthest at t+1; of equals the first, and of
-        sweeps equally far the first.
+        and are at most 60 m long. It lies along y, x or a diagonal, the one in which it reaches farthest at t+1. Ties:
+        the first direction; of sweeps equally far the first.
     """
     newest = [(r, c) for m, r, c in members if m == 0]
     farthest = max(range(len(sweeps.images)), key=lambda m: abs(sweeps.elapsed[m]))
