@@ -45,8 +45,8 @@ class SceneSource:
     Args:
         root: data root, to which `sample_data.filename` is relative.
         version: folder of the tables, for example "v1.0-mini".
-        name: of the scene.
-        tables: of that version, shared by its scenes so that they are read once; None = read them again.
+        name: name of the scene.
+        tables: the tables of `version`. Scenes share them, so they are read once; None = read them again.
     """
 
     root: Path

@@ -151,10 +151,10 @@ def check_submission(path: str | Path, version: SubmissionVersion, expected: Map
     """Compare an archive with what it must contain. Nothing is extracted.
 
     Args:
-        path: a zip, or the folder that it is made from. Hidden files of a folder are skipped: an interrupted writer
-            leaves some, and `pack` takes none.
+        path: a zip, or the folder that it is made from. Hidden files of a folder are skipped, because an interrupted
+        writer leaves some and `pack` does not pack them.
         version: the format.
-        expected: name -> number of rows of every file that the archive must contain. It may contain no other.
+        expected: name -> number of rows of each file. The archive must contain exactly these files.
 
     Returns:
         All problems, one line each; empty if there are none.
