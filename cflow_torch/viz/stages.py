@@ -226,7 +226,7 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
     """Run the key-point method and return its key points and matches.
 
     Raises:
-        CFlowError: it is another method, or the input is invalid.
+        CFlowError: the model has another method, or the input is invalid.
     """
     if not isinstance(config, KeypointsConfig):
         raise _not_drawable(config, "key points", "keypoints")
