@@ -99,9 +99,9 @@ class Drive(Log):
         """Ground truth of the pair (index, index + 1), None for the last sweep.
 
         A point belongs to the body that its ray hit. It moves with the body's track from one time stamp to the next,
-        also if it was measured before or after the time stamp; legs do not swing in the truth. Points of a body that is
-        not annotated in both sweeps (its middle is beyond the LiDAR's range) are invalid. They have category 0 if it
-        is not annotated at `index`.
+        even if it was measured before or after the time stamp; legs do not swing in the truth. Points of a body that is
+        not annotated in both sweeps (its middle is beyond the LiDAR's range) are invalid. They have category 0 if the
+            body is not annotated at `index`.
 
         Source: p' = inv(pose1) B1 inv(B0) pose0 p with the body's poses B0, B1 in the world, in float64.
         """
