@@ -46,7 +46,7 @@ class FeatherFile:
         """Return K floating-point columns as (rows, K).
 
         Raises:
-            CFlowError: a column is missing, occurs twice, has another type or an empty entry; so do the other methods.
+            CFlowError: a column is missing, occurs twice, has another type or an empty entry.
         """
         check_columns(self.file, self.names, columns)
         values: np.ndarray = np.empty((self.num_rows, len(columns)), dtype)

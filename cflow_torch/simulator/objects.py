@@ -179,7 +179,7 @@ def cyclist(rng: np.random.Generator, route: Route) -> Body:
 
 
 def wall(x: float, y: float, length: float, depth: float, height: float, albedo: float = 0.45) -> Body:
-    """A box along the world axes (building, garden wall or hoarding), which reaches a metre into the ground."""
+    """A box aligned with the world axes (building, garden wall or hoarding) that reaches a metre into the ground."""
     return Body([box(-length / 2, length / 2, -depth / 2, depth / 2, -1.0, height, albedo)], Route(x, y))
 
 
