@@ -54,7 +54,7 @@ class SizeClass(NamedTuple):
 
     Args:
         templates, targets: number of templates and of targets.
-        height, width: Y, X, samples.
+        height, width: Y, X, size of an image in samples.
         searched: number of leading samples that hold the search range.
         max_energy: largest number of set pixels of an image.
     """

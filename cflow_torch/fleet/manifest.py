@@ -61,10 +61,10 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
 
     Args:
         output: folder of the run.
-        identity: of `make_identity`.
+        identity: what `make_identity` returned.
         resume: continue an earlier run of the same identity.
         overwrite: remove the results of earlier runs.
-        alone: no other shard works in this folder.
+        alone: True = no other shard works in this folder.
 
     Raises:
         CFlowError: the folder has results that must not be mixed with these.

@@ -50,8 +50,8 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
         (N,) bool, True = ground. An array for an array, a tensor on the same device for a tensor.
 
     Convention:
-        All False if there is no ground: fewer than 20 pairs of flat spots (2 m x 2 m) 4 m apart within 32 m. NaN and
-        infinite points and points with |x| or |y| >= 131 m are not ground. The order of points, the other sweeps of
+        All False if no ground is found, because there are fewer than 20 pairs of flat spots (2 m x 2 m) 4 m apart within
+        32 m. NaN and infinite points and points with |x| or |y| >= 131 m are not ground. The order of points, the other sweeps of
         the batch and shifts by whole millimetres in z do not change the result.
 
     Raises:
