@@ -26,7 +26,7 @@ _MAX_VOXELS = 1 << 20  # of a map in each direction from its first sweep
 
 
 class CleanLog(Log):
-    """A log without its moving points. Every command, writer and loader takes it like any other log.
+    """A log without its moving points. Every command, writer and loader accepts it like any other log.
 
     A point moves if its residual flow is at least 0.05 m per sweep. The last sweep has no flow: there, points are
     removed that lie in a box which a moving object of the sweep before has reached.
@@ -37,7 +37,7 @@ class CleanLog(Log):
         flow: index -> flow of that pair, in place of a model; with residual_flow, and cluster_id and is_valid for
             `remove_stopped`.
         remove_stopped: also remove objects that have stopped or not yet started, such as cars at a light, by their
-            tracks. This takes a pass over the log before the first sweep is returned, and a bit of memory per point.
+            tracks. This takes a pass over the log before the first sweep is returned, and 1 bit of memory per point.
 
     Attributes:
         log_id, timestamps: those of the log.

@@ -248,10 +248,9 @@ def track(
         `is_moving`: False = it has moved, and is static now;
         `cluster_id`: of this sweep's flow, -1 while it is static; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;
-        `is_confirmed`: True from the sweep on in which the track has shown enough motion: confidence, and a net
-        displacement of both ends of its box that fits the flow, of 0.3 m and a tenth of its length or more; or without
-        confidence a displacement of 1.5 m and its length or more that fits closely. Tracks that are never confirmed are
-        left out.
+        `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must have
+        moved by 0.3 m plus a tenth of its length, and as the flow says. Otherwise the box must have moved by 1.5 m and
+        its length, closely as the flow says. Tracks that are never confirmed are left out.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.

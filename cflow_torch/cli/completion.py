@@ -42,7 +42,7 @@ def task(arguments: list[str]) -> None:
 
 
 def completions(line: str) -> list[str]:
-    """Complete the last word of a line up to the next dot or equals sign, or to its end, with a space behind it."""
+    """Complete the last word of a line: up to its next dot or equals sign, or as a whole word with a space after it."""
     *before, last = line.split(" ")
     found = set()
     for word in _candidates(before[1:]):

@@ -161,7 +161,7 @@ class AevaScenesLog(BoxLog):
 
 
 class Cloud:
-    """One .npz file in memory. A file or an array that is missing or damaged is a `CFlowError`.
+    """One .npz file in memory. If a file or an array is missing or damaged, a `CFlowError` says so.
 
     Attributes:
         keys: names of its arrays.

@@ -129,8 +129,8 @@ def _describe_log(log: Log, run: str) -> dict[str, Any]:
 def complete_frames(folder: Path) -> set[int]:
     """Return the time stamps whose flow is in a log's folder.
 
-    Files without the log's manifest do not count, because their input is unknown. Neither do incomplete ones, for
-    example of a copy that was cut off.
+    Files without the log's manifest do not count, because their input is unknown. Incomplete files, such as
+    those of an interrupted copy, do not count either.
 
     Cost: reads the last bytes of every local file.
     """

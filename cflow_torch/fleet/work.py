@@ -81,8 +81,8 @@ class Worker:
             stop: called before each batch. Once it returns True, computed frames are written and no others begin.
 
         Yields:
-            `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something else than a frame
-            fails, `Failed` without a time stamp.
+            `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something other than a
+            frame fails, `Failed` has no time stamp.
 
         Raises:
             DeviceLost: the GPU can no longer be used.

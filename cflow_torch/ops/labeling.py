@@ -95,7 +95,8 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
     """Label several sets of padded images with one union-find.
 
     Args:
-        images: for each set (padded, reach): (B, H', W') bool from `pad`; 1 (plain) or 3 (as after a 3 x 3 dilation).
+        images: a pair for each set: (B, H', W') bool from `pad`, and the reach, 1 (plain) or 3 (as after a 3 x 3
+            dilation).
         connectivity: 4 or 8.
 
     Returns:

@@ -100,7 +100,7 @@ def find_ground_batch(
 
 @one_thread()
 def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any = "auto") -> list[bool]:
-    """Test whether each of several sweeps contains ground, on a part of its points.
+    """Test whether each of several sweeps contains ground, from some of its points.
 
     Args:
         clouds: B clouds, (N, 3+) each; tensors must be on one device.

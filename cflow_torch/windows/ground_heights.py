@@ -27,7 +27,7 @@ _UNKNOWN = -(1 << 40)
 
 
 class GroundHeights:
-    """Sums of heights in blocks of 2 m x 2 m. Integers, so the order of points and pieces does not matter.
+    """Sums of heights in blocks of 2 m x 2 m. They are integers, so the order of points and pieces does not matter.
 
     Args:
         num_windows: B.

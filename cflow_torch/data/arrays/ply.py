@@ -34,7 +34,7 @@ def ply_fields(content: bytes) -> dict[str, np.ndarray]:
         Property name -> (N,) array of the type that the header states, in the byte order of the machine.
 
     Raises:
-        Exception: nearly any, if it is not a PLY file, has an invalid header, or less data than that states.
+        Exception: of any type, if it is not a PLY file, has an invalid header, or has less data than the header states.
 
     Source: G. Turk, "The PLY Polygon File Format".
     """
