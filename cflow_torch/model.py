@@ -70,7 +70,7 @@ class Motion:
 
 
 class SceneFlowModel(nn.Module):
-    """Base class of the methods. They set the class attributes and implement `motion`. No parameters, no state.
+    """Base class of the methods. They set the class attributes and implement `motion`, and have no state.
 
     Args:
         config: settings of the method; `from_preset` makes them from a preset.

@@ -28,8 +28,8 @@ _MAX_VOXELS = 1 << 20  # of a map in each direction from its first sweep
 class CleanLog(Log):
     """A log without its moving points. Every command, writer and loader accepts it like any other log.
 
-    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep has no flow: there, points are
-    removed that lie in a box which a moving object of the sweep before has reached.
+    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep has no flow. There, the moving
+    objects of the sweep before are moved by their flow, and the points inside their boxes are removed.
 
     Args:
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
@@ -113,7 +113,9 @@ class CleanLog(Log):
             return self._reached(sweep, index)
         moves = (self._flow(index).residual_flow.norm(dim=1) >= MOVING).cpu().numpy()
         if len(moves) != len(sweep.points):
-            raise CFlowError(f"sweep {index} has {len(sweep.points)} points, its flow {len(moves)} rows")
+            raise CFlowError(
+                f"sweep {index} has {len(sweep.points)} points, but its flow {len(moves)} rows: give both of one log"
+            )
         return moves
 
     def _reached(self, sweep: Sweep, index: int) -> np.ndarray:
@@ -161,7 +163,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
     """Accumulate the points of a log in the world, one per voxel.
 
     Args:
-        log: with poses. Pass a `CleanLog`, or the files written of one, for a map of the static world.
+        log: has poses. For a map of the static world, pass a `CleanLog`, or the files written from one.
         voxel_size: metres.
 
     Returns:

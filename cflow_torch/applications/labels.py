@@ -106,8 +106,8 @@ def find_labels(
         sweep, other = log.sweep(index), log.sweep(_neighbour(log, index))
         if result.confidence is None or len(result.cluster_id) != len(sweep.points):
             raise CFlowError(
-                f"flow {index} of log {log.log_id} has no confidence or rows of another sweep: labels need the flow of "
-                "each of its pairs by the preset offline or default"
+                f"flow {index} of log {log.log_id} has no confidence, or rows of another sweep: labels need the flow "
+                "of each of its pairs by the preset offline or default"
             )
         groups.append(as_numpy(result.cluster_id, np.int32))
         dynamic.append(_dynamic_points(sweep, other, result))

@@ -45,7 +45,9 @@ class MovingGroups:
         flow = result.residual_flow.double()
         points = torch.as_tensor(as_numpy(sweeps.pc0.points, np.float64)[:, :3].copy(), device=flow.device)
         if len(points) != len(flow):
-            raise CFlowError(f"the flow has {len(flow)} rows, its sweep {len(points)} points: give its own window")
+            raise CFlowError(
+                f"the flow has {len(flow)} rows, its sweep {len(points)} points: give the flow of this window"
+            )
         row = (result.is_valid & points.isfinite().all(1)).nonzero()[:, 0]
         pose0, pose1 = (torch.tensor(pose_of(sweep), device=flow.device) for sweep in (sweeps.pc0, sweeps.pc1))
         point, step = points[row] @ pose0[:3, :3].T + pose0[:3, 3], flow[row] @ pose1[:3, :3].T

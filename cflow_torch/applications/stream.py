@@ -38,9 +38,9 @@ class FlowStream:
         window: the sweeps of the last result, None before the first one. Rows of the result belong to `window.pc0`.
 
     Convention:
-        A repeated time stamp, and one that is older by up to `max_gap` (a late packet), are skipped with a warning. If
-        the time stamp is older by more (the clock was set back) or newer by more (sweeps were lost), the stream starts
-        again. Without time stamps, sweeps are `sweep_interval` apart.
+        A sweep with a repeated time stamp, or one older by up to `max_gap` (a late packet), is skipped with a warning.
+        If the time stamp is older by more (the clock was set back) or newer by more (sweeps were lost), the stream
+        starts again. Without time stamps, sweeps are `sweep_interval` apart.
 
     Raises:
         CFlowError: a setting is unknown, or asks for sweeps after t+1.
@@ -96,7 +96,7 @@ class FlowStream:
         """Add the sweep t+1 and return the flow of sweep t.
 
         Args:
-            points: (N, 3+) float, metres, ego frame of this sweep; copied. Or a `Sweep`, alone: it has all of these.
+            points: (N, 3+) float, metres, ego frame of this sweep; copied. Or a `Sweep`, which has all of these.
             pose: (4, 4) `T_world_ego`; None = estimate it by KISS-ICP (extra `odometry`). Give poses for all sweeps of
                 the stream, or for none.
             time: nanoseconds (int) or seconds (float); None = unknown. Give times for all sweeps, or for none.

@@ -8,7 +8,7 @@ from typing import Any, Callable, NamedTuple
 import torch
 from torch import Tensor
 
-# A track is confirmed by the motion that it has shown: most groups that do not last are noise of the static world.
+# A track is confirmed by the motion that it has shown, because most short-lived groups are noise of the static world.
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
 _NO_CONFIDENCE = 0.7  # log-odds of a method without confidence
 _THIN = 0.12  # metres; we do not trust narrower boxes: posts, and slices of fronts along which a shadow moves
@@ -110,7 +110,7 @@ class Tracks(NamedTuple):
             getattr(self, name)[index] = values
 
     def states(self) -> States:
-        """Their filtered states."""
+        """The filtered states."""
         return States(self.position, self.velocity, self.covariance)
 
     def start_again(self, index: Tensor, length: Tensor) -> None:
@@ -125,8 +125,8 @@ class Tracks(NamedTuple):
     def have_shown_motion(self) -> Tensor:
         """(K,) bool: the box of the track has moved about as its flow predicts, and far enough for its confidence.
 
-        If the confidence suffices, both ends of the box have moved at least a little: a piece of a wall has flow, too,
-        but its box grows, shrinks or jumps. Otherwise, the box has moved far, and very nearly as predicted.
+        If the confidence suffices, both ends of the box must have moved at least a little: a piece of a wall has flow,
+        too, but its box grows, shrinks or jumps. Otherwise, the box must have moved far, and very nearly as predicted.
         """
         predicted, length = self.travel.norm(dim=1), self.size[:, 0]
         moved = self.box - self.start

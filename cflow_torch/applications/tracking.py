@@ -126,7 +126,7 @@ class Tracker:
         if last is None or due is None:
             return _Times(now, interval, interval, 0.0)
         if now <= last:
-            raise CFlowError(f"a sweep {last - now:.3f} s before the last one: push sweeps in the order of time")
+            raise CFlowError(f"this sweep is {last - now:.3f} s before the last one: push sweeps in the order of time")
         return _Times(now, interval, now - last, now - due)
 
     def _predict(self, device: torch.device, times: _Times) -> tuple[Tracks, Tensor, Tensor]:
@@ -248,9 +248,9 @@ def track(
         `is_moving`: False = it has moved, and is static now;
         `cluster_id`: of this sweep's flow, -1 while it is static; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;
-        `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must have
-        moved by 0.3 m plus a tenth of its length, and as the flow says. Otherwise the box must have moved by 1.5 m and
-        its length, closely as the flow says. Tracks that are never confirmed are left out.
+        `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must
+        have moved by 0.3 m plus a tenth of its length, and as the flow says. Otherwise the box must have moved by 1.5 m
+        and its length, closely as the flow says. Tracks that are never confirmed are left out.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.

@@ -87,6 +87,6 @@ def _claim(cfg: DictConfig, output: Path) -> None:
 
 
 def _own_suffix(log: Log) -> str:
-    """Suffix of the log's own point clouds; ".npy" if it does not consist of such."""
+    """Suffix of the log's own point clouds; ".npy" if the log has other files."""
     inner = log.unwrapped
     return str(inner.files[0].suffix.lower()) if isinstance(inner, ArraysLog) else ".npy"

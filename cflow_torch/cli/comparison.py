@@ -73,7 +73,7 @@ def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
 
 
 def _order(cell: str) -> tuple[bool, float, str]:
-    """Numbers by size, and before everything else."""
+    """Sort key: numbers by size, before all other values."""
     try:
         return False, float(cell), ""
     except ValueError:

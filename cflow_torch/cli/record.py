@@ -27,7 +27,7 @@ _PATHS = ("config.output", "config.overwrite", "config.data.cache")
 
 
 class Scores:
-    """Computes the scores of a run by `cfg.definition`, and a digest of all scored points and labels."""
+    """The scores of a run by `cfg.definition`, and a digest of all scored points and labels."""
 
     def __init__(self, cfg: DictConfig) -> None:
         self.metrics = SceneFlowMetrics(cfg.definition)

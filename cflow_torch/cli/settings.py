@@ -3,7 +3,7 @@
 With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
 
 --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-cflow_paper.yaml and cflow_keypoints.yaml. They are those of the package.
+cflow_paper.yaml and cflow_keypoints.yaml. The package contains the same files.
 
 examples:
   cflow settings max_speed          default, allowed values and meaning of a setting

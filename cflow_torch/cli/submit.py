@@ -1,6 +1,6 @@
 """Write the archive for a public leaderboard: OUTPUT/v<version>.zip, from the files in OUTPUT/v<version>/.
 
-The archive is checked and stays only if it passes. The same command again resumes. OUTPUT/config.yaml contains the
+The archive is checked and stays only if it passes. Run the command again to resume. OUTPUT/config.yaml contains the
 settings and versions.
 
 version=1: Argoverse 2 scene flow 2023, total flow of the points of the evaluation masks.

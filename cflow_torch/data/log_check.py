@@ -19,8 +19,8 @@ from cflow_torch.windows.structure import FEWEST_IN_PLACE, Patches, is_better_in
 BASELINE = 5  # sweeps between the two that are compared: the error of a wrong frame grows with the vehicle's rotation
 _PAIRS = 2  # compared per log
 _MOST_POINTS = 8000
-# Tolerances. Correct poses gave at most 13 mm on a real drive without de-skewing and 7 mm on simulated ones; sweeps
-# at the beginning of a turn, not de-skewed, 58 mm together with 0.7 degrees.
+# Tolerances. With correct poses, the shift was at most 13 mm on a real drive without de-skewing and 7 mm on simulated
+# drives. At the beginning of a turn, without de-skewing, it was 58 mm, together with 0.7 degrees.
 _SHIFT, _SHIFT_PER_METRE, _SHIFT_PER_RADIAN = 0.03, 0.01, 10.0
 _ROTATION = np.radians(1.5)
 _BETTER, _GOOD = 2.0, 0.15  # factor by which no motion must fit better, and its least agreement, to be suggested

@@ -80,7 +80,7 @@ class Packing:
         samples: (A,) bool, all images.
         classes: size classes, in order.
         target: (J,) int64, target of each packed pair, counted through the targets of its class.
-        target_on_host: the same as an array.
+        target_on_host: `target` as a NumPy array.
         search: search range of each packed pair.
         pairs: (J,) int64, index of each packed pair among the pairs given.
         clusters: (J,) int64, target of each packed pair, counted through the targets given.

@@ -39,7 +39,7 @@ def run_ray(
 
     The driver and the workers exchange units and events, a few kB each; workers read and write files themselves. On a
     cluster, all machines must reach data and output under the same names (a shared file system, an object store) and
-    have the same versions of cflow_torch, torch and numpy. A node that does not is refused.
+    have the same versions of cflow_torch, torch and numpy. A node that differs is refused.
 
     Args:
         job, units, stop: as for `run_local`.

@@ -116,7 +116,7 @@ class Counters:
             "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
             "complete_before", "computed", "failed", "failed_logs" (or parts of logs), "waiting" (of opened logs) and
             "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
-            workers, that overlap in time; "failures", "waiting"; "notes": log, message and how often.
+            workers, although these work at the same time; "failures", "waiting"; "notes": log, message and how often.
         """
         computed = self.total - self.num_before - self.num_failed - len(self._waiting)
         return {

@@ -54,7 +54,7 @@ class Motion:
             poses.append(torch.from_numpy(ego @ unit.T_ego_sensor))
             times.append(torch.from_numpy(shots))
         route = self._scene.ego
-        # Acceleration changes the speed by little within a sweep.
+        # Acceleration changes the speed only a little within a sweep.
         speed = abs(route.speed) + abs(route.acceleration) * (seconds + 1)
         yaw_rate = speed * (1 / route.radius + abs(self._scene.ground.curvature))
         return EgoMotion(torch.from_numpy(stamped), poses, times, (1.1 * speed + 6 * yaw_rate, 1.1 * yaw_rate))

@@ -67,7 +67,7 @@ _NUSCENES = LidarProfile(
 
 
 def _truckscenes() -> LidarProfile:
-    """Chosen: all mountings but that of TOP_FRONT, the fans, the reaches, and the time stamp at the begin of a sweep.
+    """Chosen: all mountings but that of TOP_FRONT, the fans, the reaches, and the time stamp at the start of a sweep.
 
     The azimuth offsets between the beams of the 64-beam units are left out.
     """

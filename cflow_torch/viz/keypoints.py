@@ -40,7 +40,7 @@ def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
     Convention: metres, frame of t+1; a key point lies in the middle of its pixel.
 
     Raises:
-        CFlowError: matplotlib is not installed, it is another method, or the input is invalid.
+        CFlowError: matplotlib is not installed, the config is of another method, or the input is invalid.
     """
     figure = style.blank_figure((16.0, 6.9), 100)
     if config is None:

@@ -98,7 +98,7 @@ def inches_of(axes: Axes) -> np.ndarray:
 
 
 def draw_wheel(axes: Axes, position: np.ndarray, moves: np.ndarray, max_flow: float, corner: str | None = None) -> None:
-    """Draw the colour wheel in a corner of the panel, see `legend_box`. Moving points are important."""
+    """Draw the colour wheel in a corner of the panel, see `legend_box`. It avoids moving points most."""
     fill_wheel(legend_box(axes, position, moves, WHEEL_INCHES, corner), max_flow)
 
 

@@ -50,9 +50,9 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
         (N,) bool, True = ground. An array for an array, a tensor on the same device for a tensor.
 
     Convention:
-        All False if no ground is found, because there are fewer than 20 pairs of flat spots (2 m x 2 m) 4 m apart within
-        32 m. NaN and infinite points and points with |x| or |y| >= 131 m are not ground. The order of points, the other sweeps of
-        the batch and shifts by whole millimetres in z do not change the result.
+        All False if there are fewer than 20 pairs of flat spots (2 m x 2 m) 4 m apart within 32 m. NaN and infinite
+        points and points with |x| or |y| >= 131 m are not ground. The order of points, the other sweeps of the batch
+        and shifts by whole millimetres in z do not change the result.
 
     Raises:
         CFlowError: wrong shape, dtype, method or threshold; Patchwork++ is not installed.
@@ -123,7 +123,7 @@ def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any =
 
 @one_thread()
 def is_upside_down(cloud: Array, most_points: int = 30_000, device: Any = "auto") -> bool:
-    """Test whether z points down: there is ground, and nearly all points farther from it than half a metre are below.
+    """Test whether z points down: nearly all points more than half a metre from the ground are below it.
 
     Args:
         cloud: (N, 3+).

@@ -27,14 +27,14 @@ BACKWARD = (
     "two sweeps in a row fit better if the motion between them is inverted: are poses inverted (they must be "
     "T_world_ego, and T_ego1_ego0 maps from t to t+1), or are sweeps interchanged?"
 )
-_FEWEST_REPEATED = 100  # equal points that are no coincidence
+_FEWEST_REPEATED = 100  # so many equal points are not a coincidence
 _MOST_POINTS = 20_000  # of a sweep, for the comparison of two sweeps
 _LEAST_MOTION, _REACH = 0.3, 30.0  # metres at this distance, ego motion over one interval whose direction we judge
 
 
 class Inspection:
-    """Inspects the windows of a model, most of it only once: the points of its first window, and the direction of the
-    ego motion in the first window in which the sensor moves.
+    """Inspects the windows of a model. It checks the points of the first window only, and the direction of the ego
+    motion only in the first window in which the sensor moves.
 
     Warns:
         CFlowWarning: z points down; ground without a mask; pc1 repeats pc0; inverted poses or interchanged sweeps.
@@ -71,7 +71,7 @@ def repeats(pc0: Sweep, pc1: Sweep) -> bool:
         return False
     if any(isinstance(points, torch.Tensor) and points.device.type != "cpu" for points in (a, b)):
         return False
-    few = slice(_FEWEST_REPEATED)  # sweeps that differ, differ there
+    few = slice(_FEWEST_REPEATED)  # different sweeps mostly differ in these points already
     return all(np.array_equal(as_numpy(a[rows]), as_numpy(b[rows]), equal_nan=True) for rows in (few, slice(None)))
 
 
@@ -102,7 +102,7 @@ def _thinned(sweep: Sweep) -> Sweep:
 
 
 def warn_of_inactive(windows: Sequence[Window], results: Sequence[FlowResult], config: Config) -> None:
-    """Warn about points in millimetres, in another place or all on the ground: legal, but rarely meant.
+    """Warn about points that are allowed, but likely a mistake: in millimetres, far away, or all on the ground.
 
     Cost: one wait for the device.
     """

@@ -45,7 +45,7 @@ def move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
 
 
 def is_better_inverted(given: float, none: float, inverted: float) -> bool:
-    """Whether agreements say that the motion between two sweeps is inverted.
+    """Test by agreements whether the motion between two sweeps is inverted.
 
     The agreement must grow from the given motion over none to the inverted one. Where most structure belongs to
     vehicles that keep pace, as on a highway, it is largest without motion.

@@ -16,7 +16,7 @@ from cflow_torch.windows.validation import keep_nearest
 
 # Largest plausible distance between two poses of a window, metres: 2 s at 50 m/s.
 _FARTHEST_POSE = 100.0
-# Sweeps that differ at all differ in their first points, so we compare those before the whole clouds.
+# Different sweeps mostly differ in their first points already, so we compare those before the whole clouds.
 _FIRST_POINTS = 64
 
 

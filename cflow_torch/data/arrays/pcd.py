@@ -24,7 +24,7 @@ def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
 
     Raises:
         CFlowError: pypcd4 is missing.
-        Exception: nearly any, if it is not a PCD file of version 0.7, or has less data than its header states.
+        Exception: of any type, if it is not a PCD file of version 0.7, or has less data than its header states.
     """
     cloud = _pypcd4().PointCloud.from_fileobj(io.BytesIO(content))
     header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)

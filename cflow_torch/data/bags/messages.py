@@ -122,7 +122,7 @@ class Frames:
         return self.chain(frame)[-1] == self.chain(other)[-1]
 
     def change_times(self, frame: str) -> np.ndarray:
-        """Return (K,) int64 nanoseconds, ascending, at which the moving transforms from the root to a frame are known."""
+        """Return the (K,) int64 nanoseconds, ascending, of all moving transforms between the root and a frame."""
         times = [self._links[child][0] for child in self.chain(frame)[:-1]]
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t for t in times if len(t) > 1)]))
 

@@ -33,9 +33,9 @@ class Tracks:
             The K boxes, and (K,) bool whether each is known. A box between two samples of which only one has the object
             is a guess. Guesses come first.
 
-        Convention: at a sample, its own boxes. Between two samples the centre and the size change linearly, the
-            rotation at a constant rate. An object that only one of the two samples has continues its motion between
-            that sample and the next one beyond; if that one lacks it too, the object stays where it is.
+        Convention: at a sample, we return its own boxes. Between two samples the centre and the size change linearly,
+            and the rotation at a constant rate. If only one of the two samples has an object, we continue its motion
+            between that sample and the next one beyond; if that one lacks it too, the object stays where it is.
         """
         times = self._times
         if not len(self._annotations.time) or not times[0] <= time <= times[-1]:

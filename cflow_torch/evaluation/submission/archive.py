@@ -152,7 +152,7 @@ def check_submission(path: str | Path, version: SubmissionVersion, expected: Map
 
     Args:
         path: a zip, or the folder that it is made from. Hidden files of a folder are skipped, because an interrupted
-        writer leaves some and `pack` does not pack them.
+            writer leaves some and `pack` does not pack them.
         version: the format.
         expected: name -> number of rows of each file. The archive must contain exactly these files.
 
