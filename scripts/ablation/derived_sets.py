@@ -125,10 +125,10 @@ def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, insta
     label0, label1 = (labels[tuple(row_and_col)] for row_and_col in pixels)
     found = []
     for label in np.setdiff1d(label0[static & (label0 > 0)], label0[instance > 0]):
-        part = Component(points0[(label0 == label) & static], points1[label1 == label])
-        longer = np.ptp(part.at0[:, :2], 0).max()
-        if min(map(len, part)) >= STATIC_POINTS and LONGER_SIDE[0] <= longer <= LONGER_SIDE[1]:
-            found.append(part)
+        pasted = Component(points0[(label0 == label) & static], points1[label1 == label])
+        longer = np.ptp(pasted.at0[:, :2], 0).max()
+        if min(map(len, pasted)) >= STATIC_POINTS and LONGER_SIDE[0] <= longer <= LONGER_SIDE[1]:
+            found.append(pasted)
     return found
 
 

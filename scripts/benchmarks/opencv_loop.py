@@ -160,9 +160,9 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     too_large[label[group.first]] = np.maximum(down, right) * pixel_size > config.max_extent
     if too_large.any():
         # A 3 x 3 square of foreground is in one component, so all components can be eroded together.
-        parts, part = cv2.connectedComponents(cv2.erode(dilated, _SQUARE), connectivity=config.connectivity)
-        label = np.where(too_large[label], count + part.ravel()[pixel], label)
-        count += parts
+        num_pieces, piece = cv2.connectedComponents(cv2.erode(dilated, _SQUARE), connectivity=config.connectivity)
+        label = np.where(too_large[label], count + piece.ravel()[pixel], label)
+        count += num_pieces
 
     at_t1 = images[0].ravel()[pixel].view(bool)
     before = np.zeros_like(at_t1)

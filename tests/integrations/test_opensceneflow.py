@@ -124,7 +124,7 @@ def test_every_layout_gives_the_flow_of_the_method(
     variant: str, num_frames: int, index: int, drive: list[Sweep]
 ) -> None:
     expected = residual_of_method(drive, variant, index, num_frames)
-    if (variant, index) != ("verified", 0):  # two sweeps with so few points are no evidence of motion
+    if (variant, index) != ("verified", 0):  # two sweeps with so few points are not enough evidence of motion
         assert (expected.norm(dim=1) > 0.05).sum() > 50, "there is motion to find"
     model = CFlow(**{**VARIANTS[variant], "num_frames": num_frames})
     full = make_batch(drive, index, num_frames)
