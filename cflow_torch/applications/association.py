@@ -68,7 +68,7 @@ def settle(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
 
 
 def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> Matches:
-    """Match tracks, with (P, 3) points and the track of each, to the moving groups and static points of a sweep."""
+    """Match tracks to the groups and static points of a sweep, by the (P, 3) points of tracks and the track of each."""
     moves = groups.group >= 0
     track, group = link(points, track_of_point, groups.point[moves], groups.group[moves], _MIN_SHARE)
     may_have_stopped = tracks.is_confirmed.clone()
@@ -177,7 +177,7 @@ def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tenso
 
 
 def rotate(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-    """x, y rotated by `angle` radians to the left."""
+    """Rotate x, y by `angle` radians to the left."""
     cos, sin = angle.cos(), angle.sin()
     return cos * x - sin * y, sin * x + cos * y
 

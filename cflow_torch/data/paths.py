@@ -110,7 +110,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def source_for_random_access(path: Path) -> Any:
-    """Return what a library that reads parts of a large file should open: its name, or an open file if it is remote.
+    """Return a large file for a library that reads parts of it: its name, or an open file if it is remote.
 
     Cost: one request per block of 1 MiB that holds wanted bytes; the last 32 blocks of each file are kept.
     """
@@ -120,7 +120,7 @@ def source_for_random_access(path: Path) -> Any:
 
 
 def source_for_mmap(path: Path) -> Any:
-    """Return what pyarrow should open to read a large file repeatedly: its name, or a local copy if it is remote.
+    """Return a large file for pyarrow to read repeatedly: its name, or a local copy if it is remote.
 
     The last four copies stay in unnamed files of the folder for temporary files (TMPDIR), which vanish with the
     process however it ends.

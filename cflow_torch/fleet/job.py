@@ -43,7 +43,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Unit:
-    """Consecutive frames of one log, which one worker does at a time.
+    """Consecutive frames of one log: the work that a worker gets at once.
 
     Args:
         number: index among the units of a run.

@@ -78,7 +78,7 @@ def benchmark_logs(
     Returns:
         One source per drive.
 
-    Convention: a drive appears in the cache whole or not at all, also when several processes make it at once.
+    Convention: a drive appears in the cache whole or not at all, even when several processes make it at once.
 
     Raises:
         CFlowError: a profile, scene or seed does not exist.

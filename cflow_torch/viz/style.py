@@ -87,7 +87,7 @@ def name_axes(axes: Axes, x: str, y: str, size: int = 9) -> None:
 
 
 def round_length(most: float) -> float:
-    """The largest of ... 1, 2, 5, 10, 20, 50 ... that is at most `most`, > 0."""
+    """Round `most` (above 0) down to a number of the series 1, 2, 5, 10, 20, 50 ..., which also goes below 1."""
     power = 10.0 ** math.floor(math.log10(most))
     return max(power * digit for digit in (1, 2, 5) if power * digit <= most * (1 + 1e-9))
 

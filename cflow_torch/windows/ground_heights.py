@@ -76,7 +76,7 @@ class GroundHeights:
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
 
     def slopes(self, centre: Tensor, window: Tensor) -> Tensor:
-        """Slope of the ground around objects: of a plane through the mean heights of the blocks around them.
+        """Slope of the ground around objects, from a plane through the mean heights of the blocks around them.
 
         Args:
             centre: (G, 2) float64, x and y, metres, frame of t+1; anywhere.

@@ -26,7 +26,7 @@ data. You can compare whether a change helps, but not the numbers. The tables ha
 CSV files next to the pictures have each class. A table that names no run uses the run of the table before it.
 docs/settings.md has the commands.
 """
-ABOUT_OTHERS = "The pictures across data sets also show the paper's other methods (numbers: scripts/paper/figures.yaml)."
+ABOUT_OTHERS = "pictures across data sets also show the paper's other methods (numbers: scripts/paper/figures.yaml)"
 Cells = List[List[str]]
 
 

@@ -1,4 +1,4 @@
-"""Which frames and which points an archive must contain: frame lists, evaluation masks, and the official rules."""
+"""The frames and the points that an archive must contain: frame lists, evaluation masks, and the official rules."""
 
 from __future__ import annotations
 
