@@ -46,7 +46,7 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
 def read_flow(path: PathLike) -> FlowResult:
     """Read a result that `write_flow` wrote; fields that the file does not hold are None.
 
-    Another file, or one that cannot be read, is a `CFlowError`.
+    A file that is not a flow file, or cannot be read, raises a `CFlowError`.
     """
     path = as_path(path)
     fields = {}

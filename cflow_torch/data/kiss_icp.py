@@ -24,7 +24,7 @@ class KissICPLog(Log):
     Args:
         root: file or folder for the loader.
         loader: its name: kitti, kitti_raw, helipr, mulran, ncd, nclt, boreas, apollo, ouster, generic, ...
-        sequence: of the data set, for loaders that need one: "00".
+        sequence: name of the sequence, such as "00", for loaders that need one.
 
     Attributes:
         log_id: name of the file or folder, and the sequence.
