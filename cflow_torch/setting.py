@@ -56,11 +56,7 @@ def describe(f: Any) -> str:
 
 
 def checked(f: Any, value: Any) -> Any:
-    """The value of a field in its plain type.
-
-    Raises:
-        CFlowError: it is not allowed.
-    """
+    """Return the value of a field in its plain type; one that is not allowed is a `CFlowError`."""
     limits = f.metadata
     kind = limits["kind"]
     if value is None and limits["optional"]:

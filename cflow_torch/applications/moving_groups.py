@@ -37,11 +37,7 @@ class MovingGroups:
 
     @classmethod
     def of(cls, sweeps: Window, result: FlowResult) -> MovingGroups:
-        """Find the moving groups of sweep t of a window.
-
-        Raises:
-            CFlowError: the result has another number of rows.
-        """
+        """Find the moving groups of sweep t of a window; a flow of another window is a `CFlowError`."""
         flow = result.residual_flow.double()
         points = torch.as_tensor(as_numpy(sweeps.pc0.points, np.float64)[:, :3].copy(), device=flow.device)
         if len(points) != len(flow):

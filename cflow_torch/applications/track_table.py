@@ -47,11 +47,7 @@ def write_tracks(path: PathLike, table: Table) -> None:
 
 
 def read_tracks(path: PathLike) -> Table:
-    """Read a table that `write_tracks` wrote.
-
-    Raises:
-        CFlowError: the file does not exist, or is not a table of tracks.
-    """
+    """Read a table that `write_tracks` wrote; a missing or another file is a `CFlowError`."""
     path = as_path(path)
     with file_errors(path, "give a table that `cflow flow tracks=true` wrote"):
         table = parquet.read_table(pa.BufferReader(read_bytes(path)), use_threads=False)

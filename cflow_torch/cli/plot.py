@@ -70,11 +70,7 @@ def task(cfg: DictConfig) -> None:
 
 
 def find_log(cfg: DictConfig) -> Log:
-    """Open the log `cfg.log` of `cfg.data`, or the first one.
-
-    Raises:
-        CFlowError: there is no such log, or it cannot be opened.
-    """
+    """Open the log `cfg.log` of `cfg.data`, or the first one."""
     sources = run.find_logs(cfg)
     if cfg.log is None:
         return sources.open(sources.logs[0])

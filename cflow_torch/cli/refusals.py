@@ -23,11 +23,7 @@ class UnfinishedJob(RuntimeError):
 
 
 def check_settings(cfg: Any) -> None:
-    """Check the settings of a method and the path of the data, before torch is imported.
-
-    Raises:
-        CFlowError: an invalid setting of the method, or a path that is missing or does not exist.
-    """
+    """Check the settings of a method and the path of the data, before torch is imported."""
     config_from(OmegaConf.to_container(cfg.model, resolve=True))  # type: ignore[arg-type]
     if "_target_" in cfg.data:
         return
@@ -62,13 +58,7 @@ def explain(error: Exception, command: str) -> str:
 
 
 def _unknown_setting(key: str, method: str | None, command: str) -> str:
-    """The message for an unknown setting: it belongs to another method or picture, was removed, or is mistyped.
-
-    Args:
-        key: the setting, in dotted form.
-        method: the chosen method; None = not known.
-        command: the command.
-    """
+    """The message for a setting (in dotted form) that is of another method or picture, was removed, or is mistyped."""
     group, _, name = key.rpartition(".")
     if group == "model" and method is not None and name != "pixel_size":
         try:

@@ -57,11 +57,7 @@ def machine() -> dict[str, Any]:
 
 
 def make_model(cfg: DictConfig) -> SceneFlowModel:
-    """The method that `cfg.model` and `cfg.device` describe.
-
-    Raises:
-        CFlowError: an unknown or invalid setting.
-    """
+    """Make the method that `cfg.model` and `cfg.device` describe."""
     settings: dict[str, Any] = OmegaConf.to_container(cfg.model, resolve=True)  # type: ignore[assignment]
     model = estimate.make_model(config_from(settings), cfg.device)
     model.inspect = None  # the logs are checked when they are opened
@@ -90,11 +86,7 @@ def output_folder(cfg: DictConfig) -> Path:
 
 
 def local_folder(cfg: DictConfig) -> Path:
-    """The output folder of a command that writes to this machine only.
-
-    Raises:
-        CFlowError: it is remote.
-    """
+    """Return the output folder of a command that writes to this machine only; a remote one is a `CFlowError`."""
     output = output_folder(cfg)
     if is_remote(output):
         raise CFlowError(f"output={output}: give a folder of this machine, and copy the files from there")
@@ -102,11 +94,7 @@ def local_folder(cfg: DictConfig) -> Path:
 
 
 def complete_data(data: DictConfig) -> DictConfig:
-    """Replace data=auto by the settings of the recognised format, which is printed, and add defaults for own readers.
-
-    Raises:
-        CFlowError: the format is not recognised.
-    """
+    """Replace data=auto by the settings of the recognised format, and print it; add defaults for own readers."""
     if "_target_" in data:
         defaults = {"label": HydraConfig.get().runtime.choices["data"], "first": 0, "step": 1}
         return OmegaConf.merge(defaults, data)  # type: ignore[return-value]
@@ -140,11 +128,7 @@ def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
 
 
 def whole_number(cfg: DictConfig, key: str, least: int) -> int:
-    """The setting of a dotted name, checked.
-
-    Raises:
-        CFlowError: it is not a whole number of at least `least`.
-    """
+    """Return the setting of a dotted name; what is not a whole number of at least `least` is a `CFlowError`."""
     value = OmegaConf.select(cfg, key)
     if type(value) is not int or value < least:
         raise CFlowError(f"{key}={value}: give a whole number of at least {least}")
@@ -171,11 +155,7 @@ class Sources(NamedTuple):
 
 
 def find_logs(cfg: DictConfig) -> Sources:
-    """Find the logs of `cfg.data`. Simulated ones are generated first, if they are not in the cache.
-
-    Raises:
-        CFlowError: there is no log.
-    """
+    """Find the logs of `cfg.data`; none is a `CFlowError`. Simulated ones that are not in the cache are generated."""
     data = cfg.data
     given: dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
     settings = {str(key): value for key, value in given.items() if key not in _NOT_OF_READER}
@@ -197,11 +177,7 @@ def find_logs(cfg: DictConfig) -> Sources:
 
 
 def open_logs(cfg: DictConfig) -> tuple[list[Log], Failures]:
-    """Open the logs of `cfg.data`. Those that cannot be opened are reported and skipped.
-
-    Raises:
-        CFlowError: there is no log.
-    """
+    """Open the logs of `cfg.data`. Those that cannot be opened are reported and skipped."""
     sources = find_logs(cfg)
     logs: list[Log] = []
     failures: Failures = []

@@ -109,11 +109,7 @@ def _sections() -> Iterator[tuple[list[str], str, list[str]]]:
 
 
 def _about(name: str) -> list[str]:
-    """The sections of this name, the first lines of the choices of a group, and the lines of a setting.
-
-    Raises:
-        CFlowError: nothing has this name.
-    """
+    """The sections of this name, the first lines of the choices of a group, and the lines of a setting."""
     group, _, setting = name.rpartition(".")
     own_line = re.compile(rf"(\| `model\.| *){re.escape(setting)}(`|:)")
     found: list[str] = []

@@ -38,11 +38,7 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
 
 
 def poses_from_json(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
-    """Build (K, 4, 4) float64 poses from K JSON objects with members {x, y, z} and {w, x, y, z} of the given names.
-
-    Raises:
-        CFlowError: as `poses_from_quaternions`.
-    """
+    """Make (K, 4, 4) float64 poses of K JSON objects with {x, y, z} and {w, x, y, z}, see `poses_from_quaternions`."""
     shifts = [[node[translation][axis] for axis in "xyz"] for node in nodes]
     quaternions = [[node[rotation][axis] for axis in "wxyz"] for node in nodes]
     return poses_from_quaternions(shifts, quaternions, lambda row: f"{what} {row}")

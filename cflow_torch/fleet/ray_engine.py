@@ -85,13 +85,7 @@ def run_ray(
 
 
 class _Actor:
-    """A worker in a process of Ray, perhaps on another machine.
-
-    Args:
-        folder: working folder of the driver.
-        job: the run.
-        device: where to compute.
-    """
+    """A worker of the job in a process of Ray, perhaps on another machine; `folder` is the driver's working folder."""
 
     def __init__(self, folder: str, job: Job, device: str) -> None:
         self._folder, self._job, self._device, self._stops = folder, job, device, False

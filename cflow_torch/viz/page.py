@@ -120,11 +120,7 @@ def save_page(
 
 
 def load_k3d() -> str:
-    """Read the JavaScript of k3d, packed for a page, without importing the package.
-
-    Raises:
-        CFlowError: k3d is not installed, or too old.
-    """
+    """Read the JavaScript of k3d, packed for a page, without importing the package; a missing k3d is a `CFlowError`."""
     found = find_spec("k3d")
     script = Path(found.origin or "").parent / "static" / "standalone.js" if found else None
     if script is None or not script.is_file():

@@ -93,11 +93,7 @@ def record_log(
 
 
 def load_rerun() -> Any:
-    """Import rerun.
-
-    Raises:
-        CFlowError: rerun-sdk is not installed.
-    """
+    """Import rerun; a missing package is a `CFlowError`."""
     try:
         import rerun as rr
     except ImportError as error:

@@ -45,11 +45,7 @@ class Scene:
 
     @classmethod
     def of(cls, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> Scene:
-        """Gather the scene of sweeps t and t+1, a flow and, if there are any, labels.
-
-        Raises:
-            CFlowError: the flow and the sweep differ in length.
-        """
+        """Gather the scene of sweeps t and t+1, a flow of as many rows as t and, if there are any, labels."""
         points, rows = as_numpy(pc0.points, np.float64)[:, :3], len(result.residual_flow)
         if rows != len(points):
             raise CFlowError(f"pair {index}: the flow has {rows} rows, its sweep {len(points)} points")

@@ -134,11 +134,7 @@ class KeyPointMatches:
 
 
 def scales(window: Window, config: Config) -> tuple[list[Scale], FlowResult]:
-    """Run the method on the CPU and return every scale, coarse to fine, and the result.
-
-    Raises:
-        CFlowError: the method does not process one scale after the other, or the input is invalid.
-    """
+    """Run a method of the paper on the CPU and return every scale, coarse to fine, and the result."""
     if config.method == "verified":
         raise _not_drawable(config, "scales one after the other", "paper")
     model: Any = make_model(config, "cpu")
@@ -223,11 +219,7 @@ def choose_cluster(of_point: np.ndarray, flow: np.ndarray, cluster_id: int | Non
 
 @torch.inference_mode()
 def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
-    """Run the key-point method and return its key points and matches.
-
-    Raises:
-        CFlowError: the model has another method, or the input is invalid.
-    """
+    """Run the key-point method and return its key points and matches."""
     if not isinstance(config, KeypointsConfig):
         raise _not_drawable(config, "key points", "keypoints")
     (*_, last), _ = scales(window, config)

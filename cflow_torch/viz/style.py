@@ -22,11 +22,7 @@ _TITLE = 7.2  # characters of a heading per inch
 
 
 def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
-    """Create an empty white figure without touching pyplot's state.
-
-    Raises:
-        CFlowError: matplotlib is not installed.
-    """
+    """Create an empty white figure without touching pyplot's state; a missing matplotlib is a `CFlowError`."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

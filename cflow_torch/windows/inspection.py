@@ -102,10 +102,7 @@ def _thinned(sweep: Sweep) -> Sweep:
 
 
 def warn_of_inactive(windows: Sequence[Window], results: Sequence[FlowResult], config: Config) -> None:
-    """Warn about points that are allowed, but likely a mistake: in millimetres, far away, or all on the ground.
-
-    Cost: one wait for the device.
-    """
+    """Warn about points in millimetres, far away, or all on the ground. This waits for the device once."""
     given = [(window, result) for window, result in zip(windows, results) if len(result.is_valid) > 0]
     has_active = torch.stack([result.is_valid.any() for _, result in given]).tolist() if given else []
     for (window, _), is_used in zip(given, has_active):

@@ -136,11 +136,7 @@ class Frames:
         return result
 
     def between(self, target: str, source: str, times_ns: np.ndarray) -> np.ndarray:
-        """Return (K, 4, 4) float64 `T_target_source`.
-
-        Raises:
-            CFlowError: no transforms connect the two frames.
-        """
+        """Return (K, 4, 4) float64 `T_target_source`; a `CFlowError` if no transforms connect the two frames."""
         if not self.are_joined(target, source):
             known = shortened(", ".join(sorted({*self._parents, *self._parents.values()})))
             raise CFlowError(f"no transforms connect {source} to {target}; the frames are {known or 'none'}")

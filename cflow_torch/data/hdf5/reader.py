@@ -25,11 +25,7 @@ EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` stores
 
 
 def find_hdf5_scenes(root: PathLike) -> list[Path]:
-    """Return the scene files of a folder, sorted, or the given file.
-
-    Raises:
-        CFlowError: `root` does not exist.
-    """
+    """Return the scene files of a folder, sorted, or the given file; a missing path is a `CFlowError`."""
     root = as_path(root)
     if root.is_file():
         return [root]

@@ -50,11 +50,7 @@ class MaskArchive:
             raise CFlowError(f"{self.file} contains no masks: give a zip of <log>/<time stamp>.feather")
 
     def mask(self, log_id: str, timestamp: int) -> np.ndarray:
-        """Read the (N,) bool mask of a sweep.
-
-        Raises:
-            CFlowError: there is no mask for this sweep, or it cannot be read.
-        """
+        """Read the (N,) bool mask of a sweep; a missing or damaged one is a `CFlowError`."""
         name = f"{log_id}/{timestamp}.feather"
         with file_errors(f"{self.file}: {name}"):
             file = FeatherFile(name, self._zip.read(name))
