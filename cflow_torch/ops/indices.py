@@ -103,18 +103,17 @@ def index_in_group(group: Tensor) -> Tensor:
     return torch.arange(group.numel(), device=group.device) - torch.searchsorted(group, group)
 
 
-def concat_ranges(start: Tensor, count: Tensor, total: int | None = None) -> Tensor:
+def concat_ranges(start: Tensor, count: Tensor) -> Tensor:
     """Concatenate ranges: start[0], start[0] + 1, ... (count[0] of them), start[1], start[1] + 1, ...
 
     Args:
         start: (R,) int64.
         count: (R,) int64, not negative.
-        total: sum of `count`, if the host knows it; saves a synchronisation.
 
     Returns:
-        (total,) int64.
+        (sum of `count`,) int64.
     """
-    offset = torch.repeat_interleave(start + count - count.cumsum(0), count, output_size=total)
+    offset = torch.repeat_interleave(start + count - count.cumsum(0), count)
     return offset.add_(torch.arange(offset.numel(), device=offset.device))
 
 

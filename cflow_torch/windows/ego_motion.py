@@ -68,9 +68,9 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def relative_transform(pose1: Any, pose: Any, name: str = "pose") -> np.ndarray:
+def relative_transform(pose1: Any, pose: Any) -> np.ndarray:
     """T_ego1_ego = inv(T_world_ego1) T_world_ego, (4, 4) float64, of two poses. Errors as in `rigid_transform`."""
-    return np.linalg.inv(rigid_transform(pose1, "pose1")) @ rigid_transform(pose, name)
+    return np.linalg.inv(rigid_transform(pose1, "pose1")) @ rigid_transform(pose, "pose")
 
 
 def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -> Tensor:

@@ -30,9 +30,10 @@ THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster
 _CELL_BITS, _CELLS = 10, 256  # 1.024 m
 
 _HIGHEST = 1 << 28  # heights are clamped to this, mm
-# Within 32 m, of the points farther than half a metre from the ground less than 1.5 % lie below it on four real drives
-# and 15 simulated ones, and more than 97 % if z points down.
+# Of the points within 32 m and farther than half a metre from the ground, less than 1.5 % lie below it on four real
+# drives and 15 simulated ones, but more than 97 % if z points down.
 _NEAR, _FAR, _SHARE_BELOW, _FEWEST_BELOW = 32_000, 500, 0.8, 200
+_MOST_POINTS = 30_000  # of a sweep, for tests of the ground; of larger ones every second, third, ... point is taken
 _PATCHWORK_HEIGHT = 1.723  # metres, sensor height that Patchwork++'s default settings assume
 
 
@@ -99,13 +100,11 @@ def find_ground_batch(
 
 
 @one_thread()
-def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any = "auto") -> list[bool]:
+def has_ground(clouds: Sequence[Array]) -> list[bool]:
     """Test whether each of several sweeps contains ground, from some of its points.
 
     Args:
         clouds: B clouds, (N, 3+) each; tensors must be on one device.
-        most_points: larger clouds are thinned to every second, third, ... point.
-        device: as in `find_ground`.
 
     Returns:
         B bools.
@@ -113,25 +112,24 @@ def has_ground(clouds: Sequence[Array], most_points: int = 30_000, device: Any =
     Raises:
         CFlowError: wrong shape or dtype, tensors on several devices.
 
-    Cost: the first third of `find_ground`, on at most `most_points` points a sweep.
+    Cost: the first third of `find_ground`, on at most 30,000 points a sweep.
     """
     if not clouds:
         return []
-    points, sweep, inside = _thinned(clouds, most_points, device)
+    points, sweep, inside = _thinned(clouds)
     return list(near_plane(points, sweep, inside, len(clouds)).is_there.tolist())
 
 
 @one_thread()
-def is_upside_down(cloud: Array, most_points: int = 30_000, device: Any = "auto") -> bool:
+def is_upside_down(cloud: Array) -> bool:
     """Test whether z points down: nearly all points more than half a metre from the ground are below it.
 
     Args:
         cloud: (N, 3+).
-        most_points, device: as in `has_ground`.
 
     Raises, Cost: as `has_ground`.
     """
-    points, sweep, inside = _thinned([cloud], most_points, device)
+    points, sweep, inside = _thinned([cloud])
     plane = near_plane(points, sweep, inside, 1)
     above = points[2] - plane.at(points[0], points[1], sweep)
     is_far = inside & (above.abs() > _FAR) & (points[:2].abs() < _NEAR).all(0)
@@ -139,11 +137,11 @@ def is_upside_down(cloud: Array, most_points: int = 30_000, device: Any = "auto"
     return bool(plane.is_there) and num_below >= max(_FEWEST_BELOW, _SHARE_BELOW * num_far)
 
 
-def _thinned(clouds: Sequence[Array], most_points: int, device: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _thinned(clouds: Sequence[Array]) -> tuple[Tensor, Tensor, Tensor]:
     """(3, N) mm, sweep and `inside` of every k-th point of each cloud."""
     for number, cloud in enumerate(clouds):
         check_points(cloud, f"points of sweep {number}")
-    positions, sweep = _stack([cloud[:: max(1, -(-cloud.shape[0] // most_points))] for cloud in clouds], device)
+    positions, sweep = _stack([cloud[:: max(1, -(-cloud.shape[0] // _MOST_POINTS))] for cloud in clouds], "auto")
     points, inside = millimetres(positions)
     return points, sweep, inside
 
