@@ -46,7 +46,7 @@ def fixed_settings(overrides: list[str]) -> list[str]:
 
 
 def unknown_options(options: list[str]) -> list[str]:
-    """Those of `split`'s options that Hydra does not have."""
+    """Options from `split` that Hydra does not have."""
     from hydra._internal.utils import get_args_parser
 
     return get_args_parser().parse_known_args(options)[1]

@@ -14,7 +14,7 @@ _SHOWN = 80  # characters of a name in a message
 
 
 def is_safe_name(name: Any) -> bool:
-    """Whether a value from data can name one file or folder that stays in its folder."""
+    """Test whether a value from data can name one file or folder that stays in its folder."""
     return isinstance(name, str) and name.isprintable() and _NAME.fullmatch(name) is not None
 
 
@@ -42,5 +42,5 @@ def path_inside(folder: Path, relative: Any, what: str) -> Path:
 
 
 def is_timestamp(name: str) -> bool:
-    """Whether a name is a time stamp: digits 0 to 9 that an int64 can hold."""
+    """Test whether a name is a time stamp: digits 0 to 9 that an int64 can hold."""
     return name.isascii() and name.isdigit() and len(name) < 20 and int(name) < 1 << 63

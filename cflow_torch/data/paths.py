@@ -68,12 +68,12 @@ def as_path(path: PathLike) -> Path:
 
 
 def is_remote(path: Any) -> bool:
-    """Whether a path is one of fsspec's, which `open` and memory mapping do not support."""
+    """Test whether a path is one of fsspec's, which `open` and memory mapping do not support."""
     return hasattr(path, "storage_options") and not isinstance(path, (PosixPath, WindowsPath))
 
 
 def is_path_like(value: Any) -> bool:
-    """Whether a setting is a path."""
+    """Test whether a setting is a path."""
     return isinstance(value, (str, Path)) or is_remote(value)
 
 

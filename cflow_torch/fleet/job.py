@@ -18,7 +18,7 @@ _UNITS_PER_WORKER = 2
 
 @dataclass(frozen=True)
 class Job:
-    """What a worker needs to know besides its units.
+    """The description of a run that every worker gets, without its units.
 
     Args:
         config: settings of the method.

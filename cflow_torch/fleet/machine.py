@@ -24,7 +24,7 @@ CPU_BATCH, GPU_BATCH = 4, 32
 
 @dataclass(frozen=True)
 class Layout:
-    """How a run uses its machine.
+    """The use of a machine by a run.
 
     Args:
         devices: one per worker.

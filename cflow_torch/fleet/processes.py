@@ -131,7 +131,7 @@ def _serve(pipe: Any, make: Callable[..., Any], arguments: Any) -> None:
 
 
 def _how(status: int | None) -> str:
-    """How a process with this exit status has ended."""
+    """Describe in words how a process with this exit status has ended."""
     if status is None or status >= 0:  # None: another thread has just received it
         return f"with status {status}"
     return f"by signal {-status}, {signal.strsignal(-status)}" + " (out of memory?)" * (-status == signal.SIGKILL)

@@ -77,7 +77,7 @@ class Counters:
         return not (self.failures or self._unopened or self._waiting)
 
     def times_noted(self, message: str) -> int:
-        """How often a message was noted, for any log."""
+        """Count how often a message was noted, for any log."""
         return sum(count for (_, text), count in self.notes.items() if text == message)
 
     def add(self, event: Event) -> int:

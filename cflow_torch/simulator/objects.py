@@ -62,7 +62,7 @@ class Body:
 
     @property
     def is_static(self) -> bool:
-        """Whether the body never moves."""
+        """True if the body never moves."""
         return isinstance(self.trajectory, Route) and self.trajectory.is_static
 
 

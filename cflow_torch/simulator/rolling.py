@@ -71,7 +71,7 @@ class MovingSolids:
 
     @cached_property
     def radius(self) -> Tensor:
-        """(P,) float64 of the bounding spheres, metres."""
+        """(P,) float64 radius of the bounding spheres, metres."""
         return torch.where(self.kind == ELLIPSOID, self.half_size.amax(1), self.half_size.norm(dim=1))
 
     @property

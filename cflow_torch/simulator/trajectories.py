@@ -46,7 +46,7 @@ class Route:
 
     @property
     def is_static(self) -> bool:
-        """Whether the body never moves."""
+        """True if the body never moves."""
         return self.speed == 0 and self.acceleration == 0
 
     def at(self, distance: np.ndarray) -> np.ndarray:

@@ -101,7 +101,7 @@ class PackedDrive:
                     entries["object"][cluster == number] = FIRST + track % len(PALETTE)
 
     def content(self) -> dict[str, Any]:
-        """What the page's script reads: frames, colourings, and the points of each frame, compressed."""
+        """The input of the page's script: frames, colourings, and the points of each frame, compressed."""
         interval = float(np.median([frame["interval"] for frame in self.frames]))
         present = set().union(*(entries for _, entries, _ in self.points))
         chosen = [row for row in colorings.make_colorings(self.max_flow, interval) if row["name"] in present]

@@ -1,4 +1,4 @@
-"""What the viewers show of a pair of sweeps: `recording` and `page` draw the same points, arrows and boxes."""
+"""The content of a viewer for a pair of sweeps: `recording` and `page` draw the same points, arrows and boxes."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _interval(begin: int | None, end: int | None) -> float:
 
 
 class ViewerFrame:
-    """The frame of a viewer: the ego vehicle at the end of the first pair with a pose. Viewers use float32, so the
+    """The frame of a viewer: the ego frame at the end of the first pair that has a pose. Viewers use float32, so the
     origin must be near."""
 
     def __init__(self) -> None:

@@ -65,7 +65,7 @@ class Inspection:
 
 
 def repeats(pc0: Sweep, pc1: Sweep) -> bool:
-    """Whether two sweeps have the same points. Tensors on a GPU are not compared, because that would wait for it."""
+    """Test whether two sweeps have the same points. Tensors on a GPU are not compared: that would wait for it."""
     a, b = pc0.points, pc1.points
     if a.shape != b.shape or len(a) < _FEWEST_REPEATED:
         return False
@@ -76,7 +76,7 @@ def repeats(pc0: Sweep, pc1: Sweep) -> bool:
 
 
 def has_moved(pc0: Sweep, pc1: Sweep) -> bool:
-    """Whether the sensor moves enough, by the poses, to judge the direction of its motion."""
+    """Test whether the sensor moves enough, by the poses, to judge the direction of its motion."""
     if pc0.pose is None or pc1.pose is None:
         return False
     T = relative_transform(pc1.pose, pc0.pose)
@@ -84,7 +84,7 @@ def has_moved(pc0: Sweep, pc1: Sweep) -> bool:
 
 
 def is_backward(pc0: Sweep, pc1: Sweep) -> bool:
-    """Whether the structure of two sweeps coincides best if the ego motion by their poses is inverted."""
+    """Test whether the structure of two sweeps coincides best if the ego motion by their poses is inverted."""
     T_ego1_ego0 = relative_transform(pc1.pose, pc0.pose)
     older, newer = (structure(_thinned(sweep)) for sweep in (pc0, pc1))
     patches = Patches(newer[:, :2])

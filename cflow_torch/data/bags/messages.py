@@ -118,7 +118,7 @@ class Frames:
         return chain
 
     def are_joined(self, frame: str, other: str) -> bool:
-        """Whether transforms connect the two frames."""
+        """Test whether transforms connect the two frames."""
         return self.chain(frame)[-1] == self.chain(other)[-1]
 
     def change_times(self, frame: str) -> np.ndarray:

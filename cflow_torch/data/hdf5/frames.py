@@ -33,7 +33,7 @@ class StoredMotion(NamedTuple):
 
 
 def is_argoverse2(timestamp: int) -> bool:
-    """Whether the time stamp of a sweep is one of Argoverse 2."""
+    """Test whether the time stamp of a sweep is one of Argoverse 2."""
     low, high = _ARGOVERSE2_STAMPS
     return low <= timestamp < high
 
