@@ -203,7 +203,8 @@ def _resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what:
     if setting == "auto":
         found = [parent for parent in (*(folder / name for name in names), *elsewhere) if parent.exists()]
         if len(found) > 1:
-            raise CFlowError(f"{folder} has several: {', '.join(p.name for p in found)}; choose one with {what}=...")
+            several = ", ".join(path.name for path in found)
+            raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with {what}=...")
         return found[0] if found else None
     path = as_path(setting)
     path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
