@@ -27,7 +27,7 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
     Args:
         window: sweeps.
         config: of the dense method, clusters by components; None = the preset "paper", without older sweeps.
-        cluster_id: as in `FlowResult`; None = the cluster with the largest number of points times metres of flow.
+        cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
 
     Returns:
         Figure, 1600 pixels wide: the cluster at t, at t+1, and both with t moved by the chosen shift, in metres, frame

@@ -29,7 +29,7 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
         window: sweeps.
         config: of one of the paper's methods; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, without
             older sweeps.
-        cluster_id: as in `FlowResult`; None = the cluster with the largest number of points times metres of flow.
+        cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
 
     Returns:
         Figure, 1600 pixels wide. Above, close up on one cluster: sweep t moved by the flow of the coarser scales, and

@@ -161,7 +161,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
     Args:
         window: sweeps.
         config: a `DenseConfig`, clusters by components.
-        cluster_id: as in `FlowResult`; None = the cluster with the largest number of points times metres of flow.
+        cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
 
     Raises:
         CFlowError: the method has no such map, there is no such cluster, or the input is invalid.
@@ -196,7 +196,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
 
 
 def choose_cluster(of_point: np.ndarray, flow: np.ndarray, cluster_id: int | None = None) -> int | None:
-    """The given cluster, or else that with the largest number of points times metres of flow; None = there is none.
+    """The given cluster, or else that with the largest product of points and metres of flow; None = there is none.
 
     Args:
         of_point: (N,) int64 cluster of each point, -1 = none.
