@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lazy_zeros, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lookup, scatter_count
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
@@ -142,13 +143,8 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 
 def _is_beside(sweeps: HeightSlicedSweeps, moves: Tensor) -> Tensor:
     """(P,) bool: whether one of the 3 x 3 pixels around each pixel moves in the same sweep. `moves` is (P,) bool."""
-    # Offsets wrap around at the border of the image, where no point has a result.
-    line, width = (-1, 0, 1), sweeps.grid.width
-    around = constant(tuple(dy * width + dx for dy in line for dx in line), torch.int64, moves.device)
-    index = sweeps.pixels.index.index_select(0, flat_nonzero(moves))[:, None] + around
-    index.clamp_(0, sweeps.image.numel() - 1)
-    is_beside = lazy_zeros(sweeps.image.numel(), torch.bool, moves.device).index_fill_(0, index.view(-1), True)
-    return is_beside.index_select(0, sweeps.pixels.index)
+    around = sweeps.around(flat_nonzero(moves), 1).view(-1)
+    return F.pad(torch.zeros_like(moves), (0, 1)).index_fill_(0, around, True)[:-1]
 
 
 def _bin(values: Tensor, bounds: list[float]) -> Tensor:

@@ -233,6 +233,22 @@ class HeightSlicedSweeps:
         flat = ((window * self.num_steps + step) * height + row) * width + col
         return torch.where(inside, flat, self.image.numel() - 1)
 
+    def around(self, pixel: Tensor, reach: int) -> Tensor:
+        """Return the occupied pixels around some pixels, in the same sweep.
+
+        Args:
+            pixel: (K,) int64, positions in the list.
+            reach: r, pixels each way.
+
+        Returns:
+            (K, (2 r + 1)^2) int64, in raster order; P where a pixel is empty or lies outside the image.
+        """
+        window, step, row, col = (values[:, None] for values in take_columns(self.pixels.table[1:], pixel))
+        line = torch.arange(-reach, reach + 1, device=pixel.device)
+        down, right = line.repeat_interleave(len(line)), line.repeat(len(line))
+        rank = self.rank[self.index(window, step, row + down, col + right)].long()
+        return (rank - 1).remainder_(self.num_pixels + 1)
+
     def point(self, index: Tensor) -> Tensor:
         """(L,) int64, rows of the batch of some points or copies, (L,) int64 below N + K."""
         num_points = self.batch.image.numel()

@@ -21,7 +21,7 @@ from cflow_torch.verified.confidence import confidence_of, motion_margin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.offline import best_nearby, choose_side
 from cflow_torch.verified.overhangs import add_overhung
-from cflow_torch.verified.paired_test import verify
+from cflow_torch.verified.paired_test import add_unchanged, verify
 from cflow_torch.verified.refinement import refine
 from cflow_torch.verified.rigid_motion import RotatingMotion, motion_by_pixel
 from cflow_torch.windows.bev_grid import Grid
@@ -88,6 +88,7 @@ class VerifiedFlow(SceneFlowModel):
             candidates = propose(nodes, components, sweeps, config)
         with stage("verify"):
             motion, evidence = verify(sweeps, nodes, candidates.motion, components.num_levels, config.significance)
+            nodes = add_unchanged(sweeps, nodes, motion, components.num_levels)
         with stage("select"):
             objects, node = select_objects(nodes, components, evidence, sweeps.num_pixels)
             motion = lookup(motion, node)

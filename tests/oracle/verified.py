@@ -158,6 +158,7 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
     nodes = [*tree.nodes, *overhung]
     candidates, scores = propose(nodes, config)
     proven = [verify(node, motions, num_levels, config) for node, motions in zip(nodes, candidates)]
+    nodes = add_unchanged(sweeps, nodes, [motion for motion, _ in proven], num_levels)
 
     parts = []
     for of_part, plain in ((sweeps, tree.levels[-1]), (copies, [])):
@@ -191,6 +192,27 @@ def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: Ve
     evidence = [0 if slid else evidence_of(*own, z) for own, slid in zip(counts, slides)]
     least = min(16 * 2 * (len(node.sweeps.images) - 2), 16 * len(node.members) // 12)
     return best_candidate([own if own > least else 0 for own in evidence], candidates)
+
+
+def add_unchanged(
+    sweeps: SlicedSweeps, nodes: Sequence[Node], motions: Sequence[Vector], num_levels: int
+) -> list[Node]:
+    """The nodes; those of changed pixels that move, with the pixels within two rows and columns for which the motion
+    wins more than it loses, in the 3 x 3 pixels there that are not of such nodes."""
+    growing = [i for i, node in enumerate(nodes) if node.level == num_levels and any(motions[i])]
+    free = set(sweeps.pixels()) - {pixel for i in growing for pixel in nodes[i].members}
+    number: dict[Pixel, int] = {}
+    for i in growing:
+        for (m, r, c), (dy, dx) in product(nodes[i].members, product(range(-2, 3), repeat=2)):
+            if (m, r + dy, c + dx) in free:
+                number.setdefault((m, r + dy, c + dx), i)
+    counts = {pixel: count_wins(sweeps, [pixel], motions[i]) for pixel, i in number.items()}
+    found = list(nodes)
+    for (m, r, c), i in number.items():
+        around = [counts.get((m, r + dy, c + dx), (0, 0)) for dy, dx in product((-1, 0, 1), repeat=2)]
+        if sum(won - lost for won, lost in around) > 0:
+            found[i] = found[i]._replace(members=(*found[i].members, (m, r, c)))
+    return found
 
 
 def best_nearby(
