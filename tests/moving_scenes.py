@@ -8,8 +8,6 @@ import numpy as np
 import torch
 from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, SlicedSweeps, SweepPoint, Vector
 from oracle.registration import LAYER_HEIGHT, NUM_LAYERS
-from oracle.voxels import Point
-from oracle.voxels import points_of_objects as listed_points
 
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.verified.component_tree import Objects
@@ -50,7 +48,6 @@ class OracleWindow:
     def __init__(self, scene: Scene, window: int) -> None:
         sweeps, objects = scene.sweeps, scene.objects
         mine = sweeps.pixels.window[objects.first] == window
-        size, grid = sweeps.grid.pixel_size, sweeps.grid
         self.sweeps = for_oracle(sweeps, window)
         owners = objects.of_pixel[sweeps.pixels.window == window] - int((~mine).cumprod(0).sum())
         self.num_objects = int(mine.sum())
@@ -58,35 +55,20 @@ class OracleWindow:
             pixel: owner for pixel, owner in zip(self.sweeps.pixels(), owners.tolist()) if 0 <= owner < self.num_objects
         }
         self.flow: list[Vector] = [(x, y) for x, y in scene.flow[mine].tolist()]
-        self.config = VerifiedConfig(pixel_sizes=(size,), point_cloud_range=(*grid.lower, *grid.upper))
-
-    def members(self) -> list[list[Pixel]]:
-        """Pixels of each object."""
-        return [[pixel for pixel, own in self.object_of.items() if own == i] for i in range(self.num_objects)]
-
-    def points(self) -> list[Point]:
-        """Of all objects."""
-        return listed_points(self.sweeps, self.object_of, [True] * self.num_objects, LAYER_HEIGHT, NUM_LAYERS)
 
 
 def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:
     """One window of some sweeps; sweeps that it lacks are left out."""
-    batch, pixels, grid = sweeps.batch, sweeps.pixels, sweeps.grid
-    elapsed = sweeps.elapsed[window].tolist()
+    batch, grid = sweeps.batch, sweeps.grid
+    elapsed, seconds = sweeps.elapsed[window].tolist(), batch.seconds[window].tolist()
     steps = [step for step, k in enumerate(elapsed) if step == 0 or k != 0]
-    clouds, images = [], []
     times = torch.zeros(batch.image.numel()) if batch.point_times is None else batch.point_times
-    for step in steps:
-        drawn = sweeps.pixel_of_point[: batch.image.numel()] < sweeps.num_pixels
-        mine = drawn & (batch.image == window * sweeps.num_steps + step)
-        table = torch.cat((batch.positions, times.double()[None]))[:, mine]
-        clouds.append([SweepPoint(*row) for row in table.T.tolist()])
-        mine = (pixels.window == window) & (pixels.step == step)
-        cells = zip(pixels.row[mine].tolist(), pixels.col[mine].tolist())
-        images.append(dict(zip(cells, pixels.slices[mine].tolist())))
-    seconds, shape = batch.seconds[window].tolist(), (grid.height, grid.width)
-    given = [elapsed[step] for step in steps], [seconds[step] for step in steps]
-    return SlicedSweeps(clouds, images, *given, grid.pixel_size, grid.lower[:2], shape)
+    table = torch.cat((batch.positions, times.double()[None])).T
+    is_drawn = sweeps.pixel_of_point[: batch.image.numel()] < sweeps.num_pixels
+    rows = [is_drawn & (batch.image == window * sweeps.num_steps + step) for step in steps]
+    clouds = [[SweepPoint(*point) for point in table[mine].tolist()] for mine in rows]
+    config = VerifiedConfig(pixel_sizes=(grid.pixel_size,), point_cloud_range=(*grid.lower, *grid.upper))
+    return SlicedSweeps(clouds, [elapsed[step] for step in steps], [seconds[step] for step in steps], config)
 
 
 def from_images(images: np.ndarray, pixel_size: float = 0.25, elapsed: np.ndarray | None = None) -> HeightSlicedSweeps:

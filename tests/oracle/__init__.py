@@ -46,8 +46,7 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
     """
     clouds, cloud1 = compensate(window, config)
     if config.method == "verified":
-        ground = [ground_points(window.pc0, clouds[0])]
-        found = verified_flow(clouds, cloud1, ground, config)  # type: ignore[arg-type]
+        found = verified_flow(clouds, cloud1, ground_points(window.pc0, clouds[0]), config)  # type: ignore[arg-type]
     else:
         found = coarse_to_fine(clouds, cloud1, config)
     is_valid = clouds[0].is_active & in_range(clouds[0].points, config)

@@ -33,48 +33,43 @@ def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: 
     if len(sweeps.images) == 2:
         return change
     lowest: dict[Pixel, float] = {}
-    for m, cloud in enumerate(sweeps.clouds):
-        for x, y, z, _ in cloud:
-            pixel = (m, *sweeps.pixel(x, y))
-            lowest[pixel] = min(z, lowest.get(pixel, math.inf))
+    for pixel, point in sweeps.points():
+        lowest[pixel] = min(point.z, lowest.get(pixel, math.inf))
     height = sensor_height(in_sight[0])
     for other, (cloud, origin) in enumerate(zip(in_sight, origins)):
-        sensor = np.array([*origin]) + (0, 0, height)
-        pixels: list[Pixel] = []
-        places: list[tuple[float, float, float]] = []
-        for pixel in sweeps.pixels():
-            missing = sweeps.at(*pixel) & ~sweeps.around(other, *pixel[1:])
-            for part in range(NUM_SLICES):
-                if missing >> part & 1:
-                    pixels.append(pixel)
-                    places.append(middle_of(sweeps, pixel, part, lowest[pixel]))
-        farthest: dict[Cell, float] = {}
+        sensor, farthest = np.array(origin) + (0, 0, height), {}  # type: ignore[var-annotated]
         for direction, distance in zip(*directions(cloud, sensor)):
             farthest[direction] = max(distance, farthest.get(direction, 0.0))
-        for pixel, direction, distance in zip(pixels, *directions(np.array(places).reshape(-1, 3), sensor)):
-            if direction not in farthest:
-                change.is_missing.add(pixel)  # nobody knows
-            elif farthest[direction] >= distance:
+        pixels, middles = [], []
+        for pixel in lowest:
+            missing = sweeps.at(*pixel) & ~sweeps.around(other, *pixel[1:])
+            for number in range(NUM_SLICES):
+                if missing >> number & 1:
+                    pixels.append(pixel)
+                    middles.append(middle_of(sweeps, pixel, number, lowest[pixel]))
+        for pixel, direction, distance in zip(pixels, *directions(np.array(middles).reshape(-1, 3), sensor)):
+            if farthest.get(direction, math.inf) >= distance:
                 change.is_missing.add(pixel)
-                change.has_changed.add(pixel)
+                if direction in farthest:
+                    change.has_changed.add(pixel)
     return change
 
 
-def middle_of(sweeps: SlicedSweeps, pixel: Pixel, part: int, lowest: float) -> tuple[float, float, float]:
+def middle_of(sweeps: SlicedSweeps, pixel: Pixel, number: int, lowest: float) -> tuple[float, float, float]:
     """x, y, z of the middle of a slice, the first one at or above the lowest point of its pixel."""
     _, row, col = pixel
     first = math.floor(lowest / SLICE_HEIGHT)
-    height = first + (part - first) % NUM_SLICES + 0.5
+    height = first + (number - first) % NUM_SLICES + 0.5
     x, y = (col + 0.5) * sweeps.size + sweeps.lower[0], (row + 0.5) * sweeps.size + sweeps.lower[1]
     return x, y, height * SLICE_HEIGHT
 
 
-def directions(places: np.ndarray, sensor: np.ndarray) -> tuple[list[Cell], list[float]]:
-    """Bin of the range image and distance over ground of places (N, 3), as a sensor sees them; in float32.
+def directions(points: np.ndarray, sensor: np.ndarray) -> tuple[list[Cell], list[float]]:
+    """Bin of the range image and distance over ground of points (N, 3), as a sensor sees them; in float32.
 
     Convention: azimuth is y / (|x| + |y|), elevation is height over distance.
     """
-    x, y, z = (places - sensor).astype(np.float32).T
+    x, y, z = (points - sensor).astype(np.float32).T
     distance = np.sqrt(x * x + y * y)
     around = y / np.maximum(np.abs(x) + np.abs(y), np.float32(1e-3))
     around = np.where(x >= 0, around + np.float32(1), np.float32(3) - around)  # 0 ... 4

@@ -10,7 +10,7 @@ from oracle.aperture import both_ends_move
 from oracle.changed_pixels import Change
 from oracle.height_slices import Pixel, SlicedSweeps
 
-PRICE = 16 * 4  # what every part costs, sixteenths of a slice
+PRICE = 16 * 4  # what every child costs, sixteenths of a slice
 
 Cells = Tuple[Pixel, ...]
 
@@ -34,13 +34,8 @@ class Node(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """What is found in a window.
-
-    Attributes:
-        levels: components of each level; dilated ones coarse to fine, then plain ones.
-        nodes: coarse to fine, then those of changed pixels.
-        may_move: pixels of the finest dilated components that may move, long ones included.
-    """
+    """Components of each level, dilated ones coarse to fine, then plain ones; nodes coarse to fine, then those of
+    changed pixels; pixels of the finest dilated components that may move, long ones included."""
 
     levels: list[list[Cells]]
     nodes: list[Node]
@@ -65,7 +60,7 @@ def join(cells: Iterable[tuple[int, ...]], reach: int) -> dict[Any, int]:
     return result
 
 
-def components(pixels: Sequence[Pixel], block: int, reach: int) -> list[Cells]:
+def components(pixels: Iterable[Pixel], block: int, reach: int) -> list[Cells]:
     """Components of pixels of all sweeps together, at pixels of `block` x `block` finest ones.
 
     Dilation by a 3 x 3 square is reach 3: two dilated squares touch if their pixels are at most three apart.
@@ -92,7 +87,7 @@ def grow(sweeps: SlicedSweeps, change: Change, config: VerifiedConfig) -> Tree:
     scales = [(round(size / sweeps.size), 3) for size in config.pixel_sizes]
     levels = [components(pixels, block, reach) for block, reach in [*scales, (1, 1)]]
     tree, node_of = Tree(levels, [], set()), {}  # type: ignore[var-annotated]
-    for level, found in enumerate([*levels, components(list(change.has_changed), 1, 1)]):
+    for level, found in enumerate([*levels, components(change.has_changed, 1, 1)]):
         in_tree = level < len(levels)
         known = set(levels[level - 1]) if level == len(levels) - 1 else set()
         first = len(tree.nodes)
@@ -112,7 +107,7 @@ def grow(sweeps: SlicedSweeps, change: Change, config: VerifiedConfig) -> Tree:
     return tree
 
 
-def length(members: Cells) -> int:
+def length(members: Iterable[Pixel]) -> int:
     """Longer side, in pixels, of the box of those at t+1; 0 without any."""
     cells = [(r, c) for m, r, c in members if m == 0]
     return max((max(line) - min(line) + 1 for line in zip(*cells)), default=0)
@@ -121,18 +116,18 @@ def length(members: Cells) -> int:
 def cut(nodes: Sequence[Node], evidence: Sequence[int]) -> list[int | None]:
     """The node whose motion each node takes, None = it has none.
 
-    A node wins if it has more evidence than its parts together; the coarsest winner around a node counts. A part counts
-    with its evidence, or with that of its own parts if that is more, less `PRICE`, at least 0.
+    A node wins if it has more evidence than its children together; the coarsest winner around a node counts. A child
+    counts with its evidence, or with that of its own children if that is more, less `PRICE`, at least 0.
     """
-    parts = [0] * len(nodes)
+    of_children = [0] * len(nodes)
     for i in reversed(range(len(nodes))):
         parent = nodes[i].parent
         if parent is not None:
-            parts[parent] += max(max(evidence[i], parts[i]) - PRICE, 0)
+            of_children[parent] += max(max(evidence[i], of_children[i]) - PRICE, 0)
     winner: list[int | None] = []
     for i, node in enumerate(nodes):
         around = None if node.parent is None else winner[node.parent]
-        winner.append(around if around is not None else i if evidence[i] > parts[i] else None)
+        winner.append(around if around is not None else i if evidence[i] > of_children[i] else None)
     return winner
 
 
@@ -154,11 +149,11 @@ def select_objects(
     evidence; else it is static with its plain component, if that is linked.
     """
     winner = cut(nodes, evidence)
-    of_finest: dict[Pixel, int | None] = {}
     number_of = {node.members: i for i, node in enumerate(nodes) if node.level == num_levels - 1}
     name: dict[Pixel, Any] = {}
     for members in filter(is_linked, plain):
         name.update(dict.fromkeys(members, number_of.get(members, members)))
+    of_finest: dict[Pixel, int | None] = {}
     for i, node in enumerate(nodes):
         if node.sweeps is sweeps and node.level < num_levels:
             of_finest.update(dict.fromkeys(node.members, winner[i]))

@@ -28,42 +28,52 @@ class SweepPoint(NamedTuple):
     time: float = 0.0
 
 
-class SlicedSweeps(NamedTuple):
+class SlicedSweeps:
     """One window as the verified method sees it, sweep by sweep: t+1, t, t-1, ..., then t+2, ...
 
-    Attributes:
+    Args:
         clouds: the points that are drawn.
-        images: slices of the occupied pixels, bit c = a point of slice c lies there.
         elapsed, seconds: from each sweep to t+1, in sweep intervals and in seconds.
+        config: `pixel_sizes`, `point_cloud_range`.
+
+    Attributes:
+        images: slices of the occupied pixels, bit c = a point of slice c lies there.
         size: s, metres.
         lower: (x, y), metres, corner of the region.
         shape: rows and columns.
     """
 
-    clouds: list[list[SweepPoint]]
-    images: list[dict[Cell, int]]
-    elapsed: list[float]
-    seconds: list[float]
-    size: float
-    lower: Vector
-    shape: Cell
+    def __init__(
+        self,
+        clouds: Sequence[Sequence[SweepPoint]],
+        elapsed: Sequence[float],
+        seconds: Sequence[float],
+        config: VerifiedConfig,
+    ) -> None:
+        self.clouds, self.elapsed, self.seconds, self.config = clouds, elapsed, seconds, config
+        self.size, self.lower = config.pixel_sizes[-1], config.point_cloud_range[:2]
+        self.shape = bev_dims(config, self.size)
+        self.images: list[dict[Cell, int]] = [{} for _ in clouds]
+        for image, cloud in zip(self.images, clouds):
+            for x, y, z, _ in cloud:
+                cell = self.cell(x, y)
+                image[cell] = image.get(cell, 0) | 1 << slice_of(z)
 
-    def pixel(self, x: float, y: float) -> Cell:
+    def with_points(self, clouds: Sequence[Sequence[SweepPoint]]) -> SlicedSweeps:
+        """The same window with other points."""
+        return SlicedSweeps(clouds, self.elapsed, self.seconds, self.config)
+
+    def cell(self, x: float, y: float) -> Cell:
         """Eq. 3d_to_bev."""
         return math.floor((y - self.lower[1]) / self.size), math.floor((x - self.lower[0]) / self.size)
-
-    def drawn(self, clouds: list[list[SweepPoint]]) -> SlicedSweeps:
-        """The same window with other points."""
-        images: list[dict[Cell, int]] = [{} for _ in clouds]
-        for image, cloud in zip(images, clouds):
-            for x, y, z, _ in cloud:
-                cell = self.pixel(x, y)
-                image[cell] = image.get(cell, 0) | 1 << slice_of(z)
-        return self._replace(clouds=clouds, images=images)
 
     def pixels(self) -> list[Pixel]:
         """The occupied pixels, sweep by sweep, in raster order."""
         return [(m, *cell) for m, image in enumerate(self.images) for cell in sorted(image)]
+
+    def points(self) -> list[tuple[Pixel, SweepPoint]]:
+        """All points, and their pixels."""
+        return [((m, *self.cell(p.x, p.y)), p) for m, cloud in enumerate(self.clouds) for p in cloud]
 
     def others(self, m: int) -> Iterable[int]:
         """The sweeps that a sweep is compared with: t+1 with all others, the others with t+1."""
@@ -74,18 +84,15 @@ class SlicedSweeps(NamedTuple):
         return self.images[m].get((row, col), 0)
 
     def around(self, m: int, row: int, col: int) -> int:
-        """The slices that any of the 3 x 3 pixels around a place has; none if the place lies outside the image."""
+        """The slices that any of the 3 x 3 pixels around a pixel has; none if the pixel lies outside the image."""
         slices = 0
         if 0 <= row < self.shape[0] and 0 <= col < self.shape[1]:
-            for cell in product((row - 1, row, row + 1), (col - 1, col, col + 1)):
-                slices |= self.at(m, *cell)
+            for dy, dx in NEAR:
+                slices |= self.at(m, row + dy, col + dx)
         return slices
 
 
-def empty_sweeps(elapsed: list[float], seconds: list[float], config: VerifiedConfig) -> SlicedSweeps:
-    """A window without points."""
-    size, (x0, y0) = config.pixel_sizes[-1], config.point_cloud_range[:2]
-    return SlicedSweeps([], [], elapsed, seconds, size, (x0, y0), bev_dims(config, size))
+NEAR = tuple(product((-1, 0, 1), repeat=2))  # a pixel and the eight around it
 
 
 def slice_of(z: float, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES) -> int:
@@ -103,36 +110,42 @@ def shift(motion: Vector, intervals: float) -> Cell:
     return math.floor(motion[0] * intervals + 0.5), math.floor(motion[1] * intervals + 0.5)
 
 
-def vertex(low: float, middle: float, high: float) -> float:
-    """Where the parabola through three counts, one step apart, is largest: at most half a step from the middle one."""
-    curve = 2 * middle - low - high
-    return min(max((high - low) / (2 * curve), -0.5), 0.5) if curve > 0 else 0.0
+# ------------------------------------------------------------------------------------------------ ground
 
 
-def ground_heights(ground: Sequence[np.ndarray], config: VerifiedConfig) -> dict[Cell, int]:
-    """Mean height, centimetres, of the ground around each block of 2 m x 2 m, from ground points of some sweeps.
-
-    Convention: heights of the points of a block and of the eight around it are rounded down, then their mean is rounded
-        down. Blocks with less than five such points are missing.
-    """
-    means, heights = {}, _listed_heights(ground, config)
-    for row, col in {(r + dr, c + dc) for r, c in heights for dr, dc in product((-1, 0, 1), repeat=2)}:
-        near = [h for dr, dc in product((-1, 0, 1), repeat=2) for h in heights.get((row + dr, col + dc), [])]
-        if len(near) >= 5:
-            means[row, col] = sum(near) // len(near)
-    return means
-
-
-def _listed_heights(ground: Sequence[np.ndarray], config: VerifiedConfig) -> dict[Cell, list[int]]:
-    """Heights, centimetres, rounded down, of the ground points of each block."""
+def block_heights(ground: np.ndarray, config: VerifiedConfig) -> dict[Cell, list[int]]:
+    """Heights, centimetres, rounded down, of the ground points (N, 3) of each block of 2 m x 2 m."""
     heights: dict[Cell, list[int]] = {}
-    for points in ground:
-        for x, y, z in points[in_range(points, config)].tolist():
-            heights.setdefault(_block(x, y, config), []).append(math.floor(z * 100))
+    for x, y, z in ground[in_range(ground, config)].tolist():
+        heights.setdefault(block_of(x, y, config), []).append(math.floor(z * 100))
     return heights
 
 
-def ground_slope(ground: Sequence[np.ndarray], centre: Vector, config: VerifiedConfig) -> Vector:
+def block_of(x: float, y: float, config: VerifiedConfig) -> Cell:
+    x0, y0 = config.point_cloud_range[:2]
+    return math.floor((y - y0) / GROUND_BLOCK), math.floor((x - x0) / GROUND_BLOCK)
+
+
+def is_residue(points: np.ndarray, ground: np.ndarray, config: VerifiedConfig) -> np.ndarray:
+    """(N,) bool: which of the points (N, 3) of a sweep stand on pixels that are ground.
+
+    Convention: a pixel is not ground if a point of it, or of a pixel at most two rows and two columns away, lies
+        `min_height` or more above the ground of its own block, or if no ground is known there. That is the mean of the
+        block and of the eight around it, rounded down, if these have five ground points.
+    """
+    assert config.min_height is not None
+    pixel_of, heights = SlicedSweeps([], [], [], config).cell, block_heights(ground, config)
+    tall = set()
+    for x, y, z in points.tolist():
+        row, col = block_of(x, y, config)
+        near = [height for dr, dc in NEAR for height in heights.get((row + dr, col + dc), [])]
+        if len(near) < 5 or math.floor(z * 100) - sum(near) // len(near) >= round(100 * config.min_height):
+            tall.add(pixel_of(x, y))
+    kept = {(r + dr, c + dc) for r, c in tall for dr, dc in product(range(-2, 3), repeat=2)}
+    return np.array([pixel_of(x, y) not in kept for x, y, _ in points.tolist()], dtype=bool)
+
+
+def ground_slope(ground: np.ndarray, centre: Vector, config: VerifiedConfig) -> Vector:
     """Slope in x and y of a plane through the ground of the 5 x 5 blocks around a centre; (0, 0) = not known.
 
     Convention: a block counts with its mean height, whole millimetres, rounded down, if it has five ground points. The
@@ -140,40 +153,19 @@ def ground_slope(ground: Sequence[np.ndarray], centre: Vector, config: VerifiedC
         variances in x and y must not be small: a determinant of a quarter. A slope of more than 0.3 is not ground.
     """
     x0, y0, _, x1, y1, _ = config.point_cloud_range
-    x, y = min(max(centre[0], x0), x1), min(max(centre[1], y0), y1)
-    row, col = _block(x, y, config)
-    known = []
-    for (r, c), heights in _listed_heights(ground, config).items():
-        if abs(r - row) <= 2 and abs(c - col) <= 2 and len(heights) >= 5:
-            known.append((c - col, r - row, 10 * sum(heights) // len(heights)))
+    row, col = block_of(min(max(centre[0], x0), x1), min(max(centre[1], y0), y1), config)
+    known = np.array(
+        [
+            (c - col, r - row, 1, 10 * sum(heights) // len(heights))
+            for (r, c), heights in block_heights(ground, config).items()
+            if abs(r - row) <= 2 and abs(c - col) <= 2 and len(heights) >= 5
+        ]
+    ).reshape(-1, 4)
     used = known
     for _ in range(3):
-        if len(used) < 5 or np.linalg.det(np.cov(np.array(used).T[:2], bias=True)) < 0.25 - 1e-9:
+        if len(used) < 5 or np.linalg.det(np.cov(used.T[:2], bias=True)) < 0.25 - 1e-9:
             return 0.0, 0.0
-        design = np.array([(dx, dy, 1.0) for dx, dy, _ in used])
-        a, b, c = np.linalg.lstsq(design, np.array([h for *_, h in used]), rcond=None)[0]
-        used = [(dx, dy, h) for dx, dy, h in known if abs(h - a * dx - b * dy - c) <= 100 + 1e-6]
-    slope = float(a) / 1000 / GROUND_BLOCK, float(b) / 1000 / GROUND_BLOCK
-    return slope if math.hypot(*slope) <= 0.3 else (0.0, 0.0)
-
-
-def is_residue(points: np.ndarray, means: dict[Cell, int], config: VerifiedConfig) -> np.ndarray:
-    """(N,) bool: which of the points (N, 3) of a sweep stand on pixels that are ground.
-
-    Convention: a pixel is not ground if a point of it, or of a pixel at most two rows and two columns away, lies
-        `min_height` or more above the ground of its own block, or if no ground is known there.
-    """
-    assert config.min_height is not None
-    sweeps = empty_sweeps([], [], config)
-    tall = set()
-    for x, y, z in points.tolist():
-        block = _block(x, y, config)
-        if block not in means or math.floor(z * 100) - means[block] >= round(100 * config.min_height):
-            tall.add(sweeps.pixel(x, y))
-    near = {(r + dr, c + dc) for r, c in tall for dr, dc in product(range(-2, 3), repeat=2)}
-    return np.array([sweeps.pixel(x, y) not in near for x, y, _ in points.tolist()], dtype=bool)
-
-
-def _block(x: float, y: float, config: VerifiedConfig) -> Cell:
-    x0, y0 = config.point_cloud_range[:2]
-    return math.floor((y - y0) / GROUND_BLOCK), math.floor((x - x0) / GROUND_BLOCK)
+        plane = np.linalg.lstsq(used[:, :3], used[:, 3], rcond=None)[0]
+        used = known[np.abs(known[:, 3] - known[:, :3] @ plane) <= 100 + 1e-6]
+    x, y = (plane[:2] / 1000 / GROUND_BLOCK).tolist()
+    return (x, y) if math.hypot(x, y) <= 0.3 else (0.0, 0.0)

@@ -17,7 +17,7 @@ def count_wins(sweeps: SlicedSweeps, members: Iterable[Pixel], motion: Vector) -
 
     Convention: every sweep is compared with t+1, and t+1 with every other sweep, all of whose pixels count, not the
         component's alone. Of a motion that takes a pixel two pixels or more, in rows or in columns, "not" means that
-        none of the 3 x 3 pixels there has the slice. A place outside the image has nothing around it either.
+        none of the 3 x 3 pixels there has the slice. A pixel outside the image has nothing around it either.
     """
     won = lost = 0
     for m, r, c in members:
@@ -47,6 +47,6 @@ def evidence_of(won: int, lost: int, z: float) -> int:
 
 
 def best_candidate(evidence: Sequence[int], candidates: Sequence[Vector]) -> tuple[Vector, int]:
-    """The candidate with most evidence, and how much; of equals the first; no motion if none has any."""
+    """The candidate with most evidence, and how much; no motion if none has any. Ties: the first."""
     best = evidence.index(max(evidence))
     return (candidates[best], evidence[best]) if evidence[best] > 0 else ((0.0, 0.0), 0)

@@ -12,9 +12,8 @@ from typing import NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.config import VerifiedConfig
-from oracle.height_slices import SlicedSweeps, Vector
-from oracle.voxels import LAYERS, UNITS, Point, Voxel, Voxels, centroids, nearest, whole
+from oracle.height_slices import Pixel, SlicedSweeps, SweepPoint, Vector
+from oracle.voxels import LAYERS, UNITS, Voxel, Voxels, nearest, voxels_of, whole
 
 LAYER_HEIGHT, NUM_LAYERS = 0.1, LAYERS  # of voxels, metres; their number, then they repeat
 FARTHEST = 0.2  # metres, between the voxels of a pair
@@ -48,38 +47,53 @@ class Pair(NamedTuple):
     error, metres; (3, 3) weight; how much longer than between the sweeps it is between the points, in intervals."""
 
     time: float
-    arm: tuple[float, float]
+    arm: Vector
     error: np.ndarray
     weight: np.ndarray
     late: float
 
 
-def register(points: Sequence[Point], flow: Sequence[Vector], sweeps: SlicedSweeps) -> list[RigidMotion]:
-    """Refine the motion of every object, from (x, y) metres per interval. One without points at t keeps its flow."""
-    voxels, lower = voxels_near_t(points, sweeps), sweeps.lower
-    spreads = spread_of(voxels, sweeps)
-    result = []
-    for object_id, start in enumerate(flow):
-        at_t = [voxel for voxel in voxels.values() if voxel.object_id == object_id and voxel.step == 1]
-        if not at_t:
-            result.append(RigidMotion(start, 0.0, lower))
-            continue
-        centre = (sum(v.x for v in at_t) // len(at_t), sum(v.y for v in at_t) // len(at_t))
-        v_x, v_y, rotation = *start, 0.0
-        for _ in range(NUM_STEPS):
-            found = find_pairs(object_id, voxels, spreads, sweeps, centre, (v_x, v_y), rotation)
-            dx, dy, angle = (STEP_LENGTH * change for change in gauss_newton(found, start, (v_x, v_y), rotation))
-            v_x = limit(v_x + dx, start[0], LONGEST_CORRECTION)
-            v_y = limit(v_y + dy, start[1], LONGEST_CORRECTION)
-            rotation = limit(rotation + angle / 2, 0.0, LARGEST_ROTATION)
-        corner = (centre[0] / UNITS + lower[0], centre[1] / UNITS + lower[1])
-        result.append(RigidMotion((v_x, v_y), rotation, corner))
-    return result
+class Surfaces:
+    """Voxels of the moving objects of the sweeps that are not far in time from t+1, and their covariances."""
 
+    def __init__(self, sweeps: SlicedSweeps, object_of: dict[Pixel, int], flow: Sequence[Vector]) -> None:
+        near = {pixel: own for pixel, own in object_of.items() if abs(sweeps.elapsed[pixel[0]]) <= MOST_TIME}
+        self.voxels = voxels_of(sweeps, near, [any(of_object) for of_object in flow], LAYER_HEIGHT, NUM_LAYERS)
+        self.sweeps, self.spreads = sweeps, spread_of(self.voxels, sweeps)
 
-def voxels_near_t(points: Sequence[Point], sweeps: SlicedSweeps) -> Voxels:
-    """Voxels of the sweeps that are not far in time from t+1."""
-    return centroids([p for p in points if abs(sweeps.elapsed[p.step]) <= MOST_TIME], sweeps)
+    def at_t(self, object_id: int) -> list[Voxel]:
+        return [voxel for voxel in self.voxels.values() if voxel.object_id == object_id and voxel.step == 1]
+
+    def pairs(self, object_id: int, centre: tuple[int, int], velocity: Vector, rotation: float) -> list[Pair]:
+        """Voxels of an object and the nearest ones at t+1 under its motion, metres per interval. If the nearest one is
+        far, or of another object, there is no pair."""
+        found = []
+        v_x, v_y = velocity[0] * UNITS, velocity[1] * UNITS
+        for voxel in self.voxels.values():
+            if voxel.object_id != object_id or voxel.step == 0:
+                continue
+            # Intervals from t to t+1, and from the voxel to t+1. The centre is that of t; it moves on, and the voxel
+            # rotates about it.
+            end, elapsed = self.sweeps.elapsed[1], self.sweeps.elapsed[voxel.step]
+            start = end - elapsed
+            arm = voxel.x - centre[0] - v_x * start, voxel.y - centre[1] - v_y * start
+            arm_x, arm_y = rotate(rotation * elapsed, *arm)
+            x, y = whole(centre[0] + v_x * end + arm_x), whole(centre[1] + v_y * end + arm_y)
+            partner = nearest(self.voxels, 0, voxel.layer, x, y, voxel.z, self.sweeps)
+            if partner is None or partner.object_id != object_id:
+                continue
+            error = np.array([partner.x - x, partner.y - y, partner.z - voxel.z])
+            if (error**2).sum() > round((FARTHEST * UNITS) ** 2):
+                continue
+            error = error / UNITS
+            inverse = np.linalg.inv(self.spreads[voxel] + self.spreads[partner] + NOISE**2 * np.eye(3))
+            weight = (FAR / (FAR + error @ inverse @ error)) ** 2 * NOISE**2 * inverse
+            weight = np.floor(256 * weight + 0.5) / 256
+            late = whole((partner.time - voxel.time) * UNITS) / UNITS
+            found.append(
+                Pair(whole(elapsed * 16) / 16, (whole(arm_x / 16) / 64, whole(arm_y / 16) / 64), error, weight, late)
+            )
+        return found
 
 
 def spread_of(voxels: Voxels, sweeps: SlicedSweeps) -> dict[Voxel, np.ndarray]:
@@ -90,64 +104,21 @@ def spread_of(voxels: Voxels, sweeps: SlicedSweeps) -> dict[Voxel, np.ndarray]:
     """
     spreads: dict[Voxel, np.ndarray] = {}
     for side in (2, 4):
-        lists: dict[tuple[int, ...], list[tuple[int, ...]]] = {}
-        blocks = {}
-        for v in voxels.values():
-            sizes = (sweeps.size * UNITS * side, sweeps.size * UNITS * side, LAYER_HEIGHT * UNITS * side)
-            blocks[v] = tuple(math.floor(at / size) for at, size in zip((v.x, v.y, v.z), sizes))
-            lists.setdefault((v.step, v.object_id, *blocks[v]), []).append((v.x // 4, v.y // 4, v.z // 4))
+        sizes = (sweeps.size * UNITS * side, sweeps.size * UNITS * side, LAYER_HEIGHT * UNITS * side)
+        blocks = {v: tuple(math.floor(at / size) for at, size in zip(v[3:6], sizes)) for v in voxels.values()}
+        inside: dict[tuple[int, ...], list[tuple[int, ...]]] = {}
+        for v, block in blocks.items():
+            inside.setdefault((v.step, v.object_id, *block), []).append((v.x // 4, v.y // 4, v.z // 4))
         for v, (c, r, h) in blocks.items():
             if v in spreads:
                 continue
-            near = [
-                position
-                for dc, dr, dh in product((-1, 0, 1), repeat=3)
-                for position in lists.get((v.step, v.object_id, c + dc, r + dr, h + dh), [])
-            ]
-            n, sums = len(near), [sum(values) for values in zip(*near)]
-            scaled = [[n * sum(p[i] * p[j] for p in near) - sums[i] * sums[j] for j in range(3)] for i in range(3)]
-            trace = sum(scaled[i][i] for i in range(3))
-            minors = sum(scaled[i][i] * scaled[j][j] - scaled[i][j] ** 2 for i, j in ((0, 1), (0, 2), (1, 2)))
-            if (n >= 3 and 5 * minors >= trace * trace) or side == 4:
-                spreads[v] = np.array(scaled) / (256 * n) ** 2 + (n < 3) * UNKNOWN**2 * np.eye(3)
+            around = [(v.step, v.object_id, c + x, r + y, h + z) for x, y, z in product((-1, 0, 1), repeat=3)]
+            near = np.array([position for block in around for position in inside.get(block, [])])
+            n, sums = len(near), near.sum(0)
+            scaled = (n * near.T @ near - np.outer(sums, sums)).astype(float)
+            if (n >= 3 and 3 * scaled.trace() ** 2 >= 5 * (scaled**2).sum()) or side == 4:
+                spreads[v] = scaled / (256 * n) ** 2 + (n < 3) * UNKNOWN**2 * np.eye(3)
     return spreads
-
-
-def find_pairs(
-    object_id: int,
-    voxels: Voxels,
-    spreads: dict[Voxel, np.ndarray],
-    sweeps: SlicedSweeps,
-    centre: tuple[int, int],
-    velocity: Vector,
-    rotation: float,
-) -> list[Pair]:
-    """Voxels of an object and the nearest ones at t+1 under its motion, metres per interval. If the nearest one is far,
-    or of another object, there is no pair."""
-    found = []
-    v_x, v_y = velocity[0] * UNITS, velocity[1] * UNITS
-    for voxel in voxels.values():
-        if voxel.object_id != object_id or voxel.step == 0:
-            continue
-        end, elapsed = sweeps.elapsed[1], sweeps.elapsed[voxel.step]  # intervals from t to t+1, from the voxel to t+1
-        # The centre is that of t; it moves on, and the voxel rotates about it.
-        start = end - elapsed
-        arm_x, arm_y = rotate(rotation * elapsed, voxel.x - centre[0] - v_x * start, voxel.y - centre[1] - v_y * start)
-        x, y = whole(centre[0] + v_x * end + arm_x), whole(centre[1] + v_y * end + arm_y)
-        partner = nearest(voxels, 0, voxel.layer, x, y, voxel.z, sweeps)
-        if partner is None or partner.object_id != object_id:
-            continue
-        error = np.array([partner.x - x, partner.y - y, partner.z - voxel.z])
-        if (error**2).sum() > round((FARTHEST * UNITS) ** 2):
-            continue
-        error = error / UNITS
-        inverse = np.linalg.inv(spreads[voxel] + spreads[partner] + NOISE**2 * np.eye(3))
-        weight = (FAR / (FAR + error @ inverse @ error)) ** 2 * NOISE**2 * inverse
-        weight = np.floor(256 * weight + 0.5) / 256
-        late = whole((partner.time - voxel.time) * UNITS) / UNITS
-        arm = (whole(arm_x / 16) / 64, whole(arm_y / 16) / 64)
-        found.append(Pair(whole(elapsed * 16) / 16, arm, error, weight, late))
-    return found
 
 
 def rotate(rotation: float, x: float, y: float) -> Vector:
@@ -155,6 +126,28 @@ def rotate(rotation: float, x: float, y: float) -> Vector:
     n = 1 + rotation * rotation
     cos, sin = (1 - rotation * rotation) / n, 2 * rotation / n
     return cos * x - sin * y, sin * x + cos * y
+
+
+def register(sweeps: SlicedSweeps, object_of: dict[Pixel, int], flow: Sequence[Vector]) -> list[RigidMotion]:
+    """Refine the motion of every object, from (x, y) metres per interval. One without points at t keeps its flow."""
+    surfaces, lower = Surfaces(sweeps, object_of, flow), sweeps.lower
+    result = []
+    for object_id, start in enumerate(flow):
+        at_t = surfaces.at_t(object_id)
+        if not at_t:
+            result.append(RigidMotion(start, 0.0, lower))
+            continue
+        centre = (sum(v.x for v in at_t) // len(at_t), sum(v.y for v in at_t) // len(at_t))
+        v_x, v_y, rotation = *start, 0.0
+        for _ in range(NUM_STEPS):
+            found = surfaces.pairs(object_id, centre, (v_x, v_y), rotation)
+            dx, dy, angle = (STEP_LENGTH * change for change in gauss_newton(found, start, (v_x, v_y), rotation))
+            v_x = limit(v_x + dx, start[0], LONGEST_CORRECTION)
+            v_y = limit(v_y + dy, start[1], LONGEST_CORRECTION)
+            rotation = limit(rotation + angle / 2, 0.0, LARGEST_ROTATION)
+        corner = (centre[0] / UNITS + lower[0], centre[1] / UNITS + lower[1])
+        result.append(RigidMotion((v_x, v_y), rotation, corner))
+    return result
 
 
 def gauss_newton(found: Sequence[Pair], given: Vector, velocity: Vector, rotation: float) -> np.ndarray:
@@ -178,36 +171,32 @@ def limit(value: float, middle: float, most: float) -> float:
     return min(max(value, middle - most), middle + most)
 
 
+# ------------------------------------------------------------------------------------------------ times of points
+
+
 def register_deskewed(
-    points: Sequence[Point],
-    start: Sequence[Vector],
-    seen: Sequence[RigidMotion],
-    sweeps: SlicedSweeps,
-    config: VerifiedConfig,
+    sweeps: SlicedSweeps, object_of: dict[Pixel, int], start: Sequence[Vector], seen: Sequence[RigidMotion]
 ) -> list[RigidMotion]:
     """The motion of every object per interval: `seen`, which `register` found from `start`, divided by how much longer
     the time between its points is than that between the sweeps; with more than two sweeps registered once more."""
-    stretch = stretch_of(points, seen, sweeps)
+    stretch = stretch_of(sweeps, object_of, seen)
     divided = [m._replace(flow=(m.flow[0] / s, m.flow[1] / s)) for m, s in zip(seen, stretch)]
     if len(sweeps.images) == 2:
         return divided
-    sharp = deskew(points, divided, sweeps, config)
-    again = register(sharp, [(x / s, y / s) for (x, y), s in zip(start, stretch)], sweeps)
-    present = {point.object_id for point in points}
-    return [again[object_id] if object_id in present else motion for object_id, motion in enumerate(divided)]
+    sharp, sharp_object_of = deskew(sweeps, object_of, divided)
+    return register(sharp, sharp_object_of, [(x / s, y / s) for (x, y), s in zip(start, stretch)])
 
 
-def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: SlicedSweeps) -> list[float]:
+def stretch_of(sweeps: SlicedSweeps, object_of: dict[Pixel, int], seen: Sequence[RigidMotion]) -> list[float]:
     """Of each object: sum of w k (k + late) over the sum of w k^2, over its pairs of voxels, with the weight in x plus
     that in y; 1 without any."""
-    voxels, (x0, y0) = voxels_near_t(points, sweeps), sweeps.lower
-    spreads = spread_of(voxels, sweeps)
+    surfaces, (x0, y0) = Surfaces(sweeps, object_of, [motion.flow for motion in seen]), sweeps.lower
     result = []
     for object_id, motion in enumerate(seen):
         centre = (round((motion.centre[0] - x0) * UNITS), round((motion.centre[1] - y0) * UNITS))
         total = late = 0.0
-        if any(voxel.object_id == object_id and voxel.step == 1 for voxel in voxels.values()):
-            for pair in find_pairs(object_id, voxels, spreads, sweeps, centre, motion.flow, motion.rotation):
+        if surfaces.at_t(object_id):
+            for pair in surfaces.pairs(object_id, centre, motion.flow, motion.rotation):
                 weight = pair.weight[0, 0] + pair.weight[1, 1]
                 total, late = total + weight * pair.time**2, late + weight * pair.time * pair.late
         stretch = 1 + late / total if total > 0 else 1.0
@@ -216,20 +205,28 @@ def stretch_of(points: Sequence[Point], seen: Sequence[RigidMotion], sweeps: Sli
 
 
 def deskew(
-    points: Sequence[Point], motions: Sequence[RigidMotion], sweeps: SlicedSweeps, config: VerifiedConfig
-) -> list[Point]:
-    """Points where they were at the instant of their sweep; of those in one pixel, those of the first object."""
-    x0, y0, _, x1, y1, _ = config.point_cloud_range
-    moved, object_of = [], {}  # type: ignore[var-annotated]
-    for point in points:
-        (f_x, f_y), rotation, (c_x, c_y) = motions[point.object_id]
-        since_t = sweeps.elapsed[1] - sweeps.elapsed[point.step]
+    sweeps: SlicedSweeps, object_of: dict[Pixel, int], motions: Sequence[RigidMotion]
+) -> tuple[SlicedSweeps, dict[Pixel, int]]:
+    """Points of moving objects where they were at the instant of their sweep, and the objects of their pixels; of the
+    points in one pixel, those of the first object."""
+    x0, y0, _, x1, y1, _ = sweeps.config.point_cloud_range
+    moved, sharp_object_of = [], {}  # type: ignore[var-annotated]
+    for pixel, point in sweeps.points():
+        number = object_of.get(pixel)
+        if number is None or not any(motions[number].flow):
+            continue
+        (f_x, f_y), rotation, (c_x, c_y) = motions[number]
+        since_t = sweeps.elapsed[1] - sweeps.elapsed[pixel[0]]
         x, y = point.x - f_x * point.time, point.y - f_y * point.time
         arm_x, arm_y = x - c_x - f_x * since_t, y - c_y - f_y * since_t
         turned_x, turned_y = rotate(-point.time * rotation, arm_x, arm_y)
         x, y = x + (turned_x - arm_x), y + (turned_y - arm_y)
         if x0 <= x <= x1 and y0 <= y <= y1:
-            pixel = (point.step, *sweeps.pixel(x, y))
-            object_of[pixel] = min(object_of.get(pixel, point.object_id), point.object_id)
-            moved.append((pixel, point._replace(x=x, y=y)))
-    return [point for pixel, point in moved if object_of[pixel] == point.object_id]
+            pixel = (pixel[0], *sweeps.cell(x, y))
+            sharp_object_of[pixel] = min(sharp_object_of.get(pixel, number), number)
+            moved.append((number, pixel, point._replace(x=x, y=y)))
+    clouds: list[list[SweepPoint]] = [[] for _ in sweeps.clouds]
+    for number, pixel, point in moved:
+        if sharp_object_of[pixel] == number:
+            clouds[pixel[0]].append(point)
+    return sweeps.with_points(clouds), sharp_object_of

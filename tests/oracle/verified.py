@@ -18,70 +18,56 @@ from oracle.candidates import propose
 from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, length, select_objects
 from oracle.confidence import TABLE, confidences, margin
-from oracle.height_slices import (
-    Pixel,
-    SlicedSweeps,
-    SweepPoint,
-    Vector,
-    empty_sweeps,
-    ground_heights,
-    ground_slope,
-    is_residue,
-)
+from oracle.height_slices import Pixel, SlicedSweeps, SweepPoint, Vector, ground_slope, is_residue
 from oracle.overhangs import find_overhung
 from oracle.paired_test import best_candidate, count_wins, evidence_of
 from oracle.pixels import in_range
-from oracle.registration import LAYER_HEIGHT, NUM_LAYERS, RigidMotion, register, register_deskewed
+from oracle.registration import RigidMotion, register, register_deskewed
 from oracle.subpixel_motion import subpixel_motion
 from oracle.sweeps import Cloud, PointMotion
-from oracle.voxels import points_of_objects
 
 CHANGED_Z = 4.0  # standard deviations for what moves by its changed pixels alone
 
 
-class Part(NamedTuple):
+class Found(NamedTuple):
     """What is found of the pixels of a window, or of its copies of what lies under something.
 
     Attributes:
-        sweeps: the pixels.
         object_of: object of each pixel that has one.
         rigid, scores: of each object.
-        is_weak: of each object, whether it is that of changed pixels.
         confidence: of each pixel of t.
+        moving, strong: objects that move; those of them that are not of changed pixels alone.
     """
 
-    sweeps: SlicedSweeps
     object_of: dict[Pixel, int]
     rigid: list[RigidMotion]
     scores: list[float]
-    is_weak: list[bool]
     confidence: dict[Pixel, float]
-
-    def moves(self, pixel: Pixel, surely: bool = False) -> bool:
-        """Has it an object that moves, surely = and that is not weak?"""
-        number = self.object_of.get(pixel)
-        if number is None or (surely and self.is_weak[number]):
-            return False
-        return any(self.rigid[number].flow) or self.rigid[number].rotation != 0
+    moving: set[int]
+    strong: set[int]
 
 
-class Found(NamedTuple):
-    """What is found of the points by the sweeps of one side.
+class Side(NamedTuple):
+    """What is found by the sweeps of one side: of the window and of its copies; of each sweep, 0 for the window or 1
+    for the copies, and the pixel, of each point that is drawn; which points of t are drawn, (N,) bool."""
 
-    Attributes:
-        parts: the window and its copies.
-        drawn: of each sweep (N,) bool, points that are drawn.
-        which: of each sweep, part and pixel of each point that is drawn.
-    """
+    found: tuple[Found, Found]
+    pixels: list[list[tuple[int, Pixel]]]
+    is_drawn: np.ndarray
 
-    parts: tuple[Part, Part]
-    drawn: list[np.ndarray]
-    which: list[list[tuple[int, Pixel]]]
+    def object_of(self, which: int, pixel: Pixel) -> tuple[int, int] | None:
+        """Of a pixel: 0 or 1, and the number of its object; None = it has none."""
+        number = self.found[which].object_of.get(pixel)
+        return None if number is None else (which, number)
+
+    def times_shown(self) -> list[int]:
+        """Of each point of t that is drawn, how many sweeps besides t and t+1 show its object; 0 without one."""
+        shows = [{self.object_of(*at) for at in of_sweep} for of_sweep in self.pixels[2:]]
+        own = [self.object_of(*at) for at in self.pixels[1]]
+        return [0 if name is None else sum(name in of_sweep for of_sweep in shows) for name in own]
 
 
-def verified_flow(
-    clouds: Sequence[Cloud], cloud1: Cloud, ground: Sequence[np.ndarray], config: VerifiedConfig
-) -> PointMotion:
+def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, config: VerifiedConfig) -> PointMotion:
     """The motion of every point of sweep t.
 
     Args:
@@ -92,66 +78,55 @@ def verified_flow(
     Convention: where sweeps after t+1 may be given, points go by them if they show their object more than twice as
         often as those before t do. Ids: objects of both windows, then of both copies.
     """
-    is_inside = in_range(clouds[0].points, config)
+    points, is_inside = clouds[0].points, in_range(clouds[0].points, config)
     wide = math.ceil(4.0 / config.pixel_sizes[0]) * config.pixel_sizes[0]
     x0, y0, z0, x1, y1, z1 = config.point_cloud_range
     config = config.replace(point_cloud_range=(x0 - wide, y0 - wide, z0, x1 + wide, y1 + wide, z1))
-    past = [cloud for cloud in clouds if cloud.intervals > 0]
-    sides = [estimate([cloud1, *past], ground, config)]
+    sides = [estimate([cloud1, *(cloud for cloud in clouds if cloud.intervals > 0)], ground, config)]
     if config.num_future > 0:
         future = [cloud for cloud in clouds if cloud.intervals < 0]
         sides.append(estimate([cloud1, clouds[0], *future], ground, config))
-    before, after = sides[0], sides[-1]
-    shown = [number_shown(side) for side in sides]
+    shown = [side.times_shown() for side in sides]
     first_id, start = {}, 0
-    for part in (0, 1):
-        for side in range(len(sides)):
-            first_id[side, part] = start
-            start += len(sides[side].parts[part].rigid)
+    for which, side in product((0, 1), range(len(sides))):
+        first_id[which, side] = start
+        start += len(sides[side].found[which].rigid)
 
-    num_points, slopes = len(is_inside), {}  # type: ignore[var-annotated]
-    flow, ids = np.zeros((num_points, 3)), np.full(num_points, -1, dtype=np.int64)
-    scores, confidence = np.zeros(num_points), np.full(num_points, TABLE["probabilities"][0])
-    for row, i in enumerate(np.flatnonzero(before.drawn[1]).tolist()):
-        if is_inside[i]:
-            side = int(after is not before and shown[-1][row] > 2 * shown[0][row])
-            which, pixel = sides[side].which[1][row]
-            part = sides[side].parts[which]
-            number = part.object_of.get(pixel)
-            confidence[i] = part.confidence[pixel]
-            if number is not None:
-                x, y = part.rigid[number].flow_at(*clouds[0].points[i, :2].tolist())
-                centre = part.rigid[number].centre
-                if (x or y) and centre not in slopes:
-                    slopes[centre] = ground_slope(ground, centre, config)
-                slope_x, slope_y = slopes.get(centre, (0.0, 0.0))
-                flow[i] = x, y, slope_x * x + slope_y * y
-                ids[i], scores[i] = first_id[side, which] + number, part.scores[number]
+    flow, ids = np.zeros(points.shape), np.full(len(points), -1, dtype=np.int64)
+    scores, confidence = np.zeros(len(points)), np.full(len(points), TABLE["probabilities"][0])
+    slopes: dict[Vector, Vector] = {}
+    for row, i in enumerate(np.flatnonzero(sides[0].is_drawn).tolist()):
+        if not is_inside[i]:
+            continue
+        side = int(len(sides) > 1 and shown[-1][row] > 2 * shown[0][row])
+        which, pixel = sides[side].pixels[1][row]
+        found = sides[side].found[which]
+        confidence[i] = found.confidence[pixel]
+        if pixel in found.object_of:
+            number = found.object_of[pixel]
+            x, y = found.rigid[number].flow_at(*points[i, :2].tolist())
+            centre = found.rigid[number].centre
+            if (x or y) and centre not in slopes:
+                slopes[centre] = ground_slope(ground, centre, config)
+            slope_x, slope_y = slopes.get(centre, (0.0, 0.0))
+            flow[i] = x, y, slope_x * x + slope_y * y
+            ids[i], scores[i] = first_id[which, side] + number, found.scores[number]
     return PointMotion([flow], ids, scores, confidence)
 
 
-def number_shown(found: Found) -> list[int]:
-    """Of each point of t that is drawn, how many sweeps beside t and t+1 show its object; 0 without one."""
-    objects = [[(part, found.parts[part].object_of.get(pixel)) for part, pixel in of_sweep] for of_sweep in found.which]
-    shows = [set(of_sweep) for of_sweep in objects[2:]]
-    return [sum(own in of_sweep for of_sweep in shows) if own[1] is not None else 0 for own in objects[1]]
-
-
-def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: VerifiedConfig) -> Found:
+def estimate(every: Sequence[Cloud], ground: np.ndarray, config: VerifiedConfig) -> Side:
     """What is found by some sweeps, t+1 and t first."""
-    in_sight = [cloud.is_active & in_range(cloud.points, config) for cloud in every]
-    drawn = [keep.copy() for keep in in_sight]
-    if config.min_height is not None:
-        means = ground_heights(ground, config)
-        for cloud, keep in zip(every, drawn):
-            keep[keep] = ~is_residue(cloud.points[keep], means, config)
-    points: list[list[SweepPoint]] = []
-    for cloud, keep in zip(every, drawn):
-        times = np.zeros(len(keep)) if cloud.times is None else cloud.times
-        points.append([SweepPoint(*row) for row in np.column_stack([cloud.points, times])[keep].tolist()])
-    elapsed, seconds = [cloud.intervals for cloud in every], [cloud.seconds for cloud in every]
-    sweeps = empty_sweeps(elapsed, seconds, config).drawn(points)
-    seen = [cloud.points[keep] for cloud, keep in zip(every, in_sight)]
+    seen, clouds = [], []
+    for cloud in every:
+        is_drawn = cloud.is_active & in_range(cloud.points, config)
+        seen.append(cloud.points[is_drawn])
+        if config.min_height is not None:
+            is_drawn[is_drawn] = ~is_residue(seen[-1], ground, config)
+        times = np.zeros(len(is_drawn)) if cloud.times is None else cloud.times
+        clouds.append([SweepPoint(*row) for row in np.column_stack([cloud.points, times])[is_drawn].tolist()])
+        if len(clouds) == 2:
+            is_drawn_at_t = is_drawn
+    sweeps = SlicedSweeps(clouds, [cloud.intervals for cloud in every], [cloud.seconds for cloud in every], config)
     tree = grow(sweeps, find_changed(sweeps, seen, [cloud.origin for cloud in every]), config)
     num_levels = len(tree.levels)
     copies, overhung = find_overhung(sweeps, tree.may_move, num_levels + 1)
@@ -160,38 +135,40 @@ def estimate(every: Sequence[Cloud], ground: Sequence[np.ndarray], config: Verif
     proven = [verify(node, motions, num_levels, config) for node, motions in zip(nodes, candidates)]
     nodes = add_unchanged(sweeps, nodes, [motion for motion, _ in proven], num_levels)
 
-    parts = []
-    for of_part, plain in ((sweeps, tree.levels[-1]), (copies, [])):
-        object_of, chosen = select_objects(nodes, [found[1] for found in proven], num_levels, plain, of_part)
+    found = []
+    for drawn, plain in ((sweeps, tree.levels[-1]), (copies, [])):
+        object_of, chosen = select_objects(nodes, [evidence for _, evidence in proven], num_levels, plain, drawn)
         motions = [(0.0, 0.0) if i is None else proven[i][0] for i in chosen]
-        if min(elapsed) < 0:
-            motions = [best_nearby(of_part, object_of, number, *at, config) for number, at in enumerate(motions)]
-        rigid, confidence = settle(of_part, object_of, motions, every[0].times is not None, config)
+        if min(sweeps.elapsed) < 0:
+            motions = [best_nearby(drawn, object_of, number, *at, config) for number, at in enumerate(motions)]
+        rigid, confidence = settle(drawn, object_of, motions, every[0].times is not None, config)
         of_objects = [0.0 if i is None else scores[i] for i in chosen]
-        is_weak = [i is not None and nodes[i].level == num_levels for i in chosen]
-        parts.append(Part(of_part, object_of, rigid, of_objects, is_weak, confidence))
-    window_part, copied = parts
-    which = []
-    for m, of_sweep in enumerate(points):
+        moving = {number for number, motion in enumerate(rigid) if any(motion.flow) or motion.rotation}
+        weak = {number for number, i in enumerate(chosen) if i is not None and nodes[i].level == num_levels}
+        found.append(Found(object_of, rigid, of_objects, confidence, moving, moving - weak))
+    window, copied = found
+    pixels: list[list[tuple[int, Pixel]]] = []
+    for m, cloud in enumerate(clouds):
+        pixels.append([])
         under = set(copies.clouds[m])
-        pixels = [(point, (m, *sweeps.pixel(point.x, point.y))) for point in of_sweep]
-        which.append(
-            [(int(p in under and copied.moves(at) and not window_part.moves(at, True)), at) for p, at in pixels]
-        )
-    return Found((window_part, copied), drawn, which)
+        for point in cloud:
+            pixel = (m, *sweeps.cell(point.x, point.y))
+            is_copy = point in under and copied.object_of.get(pixel) in copied.moving
+            pixels[m].append((int(is_copy and window.object_of.get(pixel) not in window.strong), pixel))
+    return Side((window, copied), pixels, is_drawn_at_t)
 
 
 def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: VerifiedConfig) -> tuple[Vector, int]:
     """The candidate of most evidence, and its evidence. What moves by its changed pixels alone needs more standard
     deviations. All must gain two slices for each sweep besides t and t+1, or one for twelve pixels."""
     z = CHANGED_Z if node.level == num_levels else config.significance
-    slides = [False] * len(candidates)
-    if not node.travels:
-        slides = slides_along_itself(node.sweeps, node.members, candidates)
-    counts = [count_wins(node.sweeps, node.members, motion) for motion in candidates]
-    evidence = [0 if slid else evidence_of(*own, z) for own, slid in zip(counts, slides)]
     least = min(16 * 2 * (len(node.sweeps.images) - 2), 16 * len(node.members) // 12)
-    return best_candidate([own if own > least else 0 for own in evidence], candidates)
+    evidence = []
+    for motion in candidates:
+        slides = not node.travels and slides_along_itself(node.sweeps, node.members, motion)
+        own = 0 if slides else evidence_of(*count_wins(node.sweeps, node.members, motion), z)
+        evidence.append(own if own > least else 0)
+    return best_candidate(evidence, candidates)
 
 
 def add_unchanged(
@@ -218,12 +195,14 @@ def add_unchanged(
 def best_nearby(
     sweeps: SlicedSweeps, object_of: dict[Pixel, int], number: int, y: float, x: float, config: VerifiedConfig
 ) -> Vector:
-    """The motion of most evidence within two pixels of that of an object; of equals the nearest, then the first."""
+    """The motion of most evidence within two pixels of that of an object. Ties: the nearest, then the first."""
+    if not (y or x):
+        return y, x
     offsets = sorted(product(range(-2, 3), repeat=2), key=lambda offset: offset[0] ** 2 + offset[1] ** 2)
-    found = [(y + dy, x + dx) for dy, dx in offsets] if y or x else [(y, x)]
+    found = [(y + dy, x + dx) for dy, dx in offsets]
     members = [pixel for pixel, own in object_of.items() if own == number]
-    counts = [count_wins(sweeps, members, motion) for motion in found]
-    best, most = best_candidate([evidence_of(*of_motion, config.significance) for of_motion in counts], found)
+    evidence = [evidence_of(*count_wins(sweeps, members, motion), config.significance) for motion in found]
+    best, most = best_candidate(evidence, found)
     return best if most > 0 else (y, x)
 
 
@@ -249,14 +228,12 @@ def settle(
         members[number].append(pixel)
     start = [(x * size, y * size) for y, x in motions]
     if len(sweeps.images) == 2:
-        may_be_slow = [longest is None or length(tuple(own)) * size <= longest for own in members]
+        may_be_slow = [longest is None or length(own) * size <= longest for own in members]
         start = subpixel_motion(sweeps, object_of, motions, may_be_slow)
-    points = points_of_objects(sweeps, object_of, [any(flow) for flow in start], LAYER_HEIGHT, NUM_LAYERS)
-    apparent = register(points, start, sweeps)
-    rigid = register_deskewed(points, start, apparent, sweeps, config) if has_times else list(apparent)
-    shown = [(motion.flow[1] / size, motion.flow[0] / size) for motion in apparent]
+    apparent = register(sweeps, object_of, start)
+    rigid = register_deskewed(sweeps, object_of, start, apparent) if has_times else apparent
     margins = [margin(sweeps, own, motion) for own, motion in zip(members, apparent)]
-    rigid = [
-        m if is_dynamic else m._replace(flow=(0.0, 0.0), rotation=0.0) for m, (_, is_dynamic) in zip(rigid, margins)
-    ]
+    static = [motion._replace(flow=(0.0, 0.0), rotation=0.0) for motion in rigid]
+    rigid = [motion if is_dynamic else stays for motion, stays, (_, is_dynamic) in zip(rigid, static, margins)]
+    shown = [(motion.flow[1] / size, motion.flow[0] / size) for motion in apparent]
     return rigid, confidences(sweeps, object_of, shown, [z for z, _ in margins])

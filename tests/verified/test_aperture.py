@@ -84,7 +84,7 @@ def answers(scenes: Sequence[Scene], size: float = 0.1) -> list[list[bool]]:
     for window, scene in enumerate(scenes):
         for component, motions in zip(scene.components, scene.candidates.tolist()):
             members = [(m, r, c) for m, pixels in component.items() for r, c in pixels]
-            expected.append(oracle.slides_along_itself(for_oracle(sweeps, window), members, motions))
+            expected.append([oracle.slides_along_itself(for_oracle(sweeps, window), members, m) for m in motions])
     assert found == expected
     return found
 

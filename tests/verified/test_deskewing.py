@@ -11,6 +11,7 @@ import pytest
 import torch
 from moving_scenes import Scene, moving_scene, one_object
 from oracle import registration as oracle
+from oracle.height_slices import slice_of
 from preset_windows import changed
 from scenes import assert_same_bits, flow_as_oracle
 from turning_car import MODEL, turning_car
@@ -63,14 +64,14 @@ def test_motion_and_points_equal_the_oracle(num_past, num_future):
     positions: list[tuple[int, ...]] = []
     stretched = 0
     for number, window in enumerate(scene.windows()):
-        of_window = oracle.register(window.points(), window.flow, window.sweeps)
-        stretch = oracle.stretch_of(window.points(), of_window, window.sweeps)
-        stretched += sum(s not in (0.0, 1.0) for s in stretch)
-        moved = oracle.deskew(window.points(), of_window, window.sweeps, window.config)
-        positions += [
-            (number, p.step, p.object_id + len(expected), p.layer, round(1e6 * p.x), round(1e6 * p.y)) for p in moved
-        ]
-        expected += oracle.register_deskewed(window.points(), window.flow, of_window, window.sweeps, window.config)
+        given = window.sweeps, window.object_of
+        of_window = oracle.register(*given, window.flow)
+        stretched += sum(s not in (0.0, 1.0) for s in oracle.stretch_of(*given, of_window))
+        moved, object_of = oracle.deskew(*given, of_window)
+        for pixel, p in moved.points():
+            layer, object_id = slice_of(p.z, oracle.LAYER_HEIGHT, oracle.NUM_LAYERS), object_of[pixel] + len(expected)
+            positions.append((number, pixel[0], object_id, layer, round(1e6 * p.x), round(1e6 * p.y)))
+        expected += oracle.register_deskewed(*given, window.flow, of_window)
     assert stretched > 10
     x, y = (torch.round(1e6 * values).long().tolist() for values in sharp.position[:2])
     names = zip(sharp.window.tolist(), sharp.step.tolist(), sharp.object_id.tolist(), sharp.layer.tolist(), x, y)

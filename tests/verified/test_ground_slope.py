@@ -32,7 +32,7 @@ def test_slopes_equal_the_oracle_in_any_order():
         points = points[(np.abs(points[:, 2] - 1) <= 4) & (points[:, 0] < rng.uniform(-4, 9))]
         centres = rng.uniform(-9, 9, (5, 2))
         found = ground_of(points).slopes(torch.from_numpy(centres), torch.zeros(5, dtype=torch.int64))
-        expected = [ground_slope([points], (x, y), MODEL) for x, y in centres.tolist()]
+        expected = [ground_slope(points, (x, y), MODEL) for x, y in centres.tolist()]
         np.testing.assert_allclose(found, expected, atol=1e-9)
         mixed = ground_of(rng.permutation(points)).slopes(torch.from_numpy(centres), torch.zeros(5, dtype=torch.int64))
         assert torch.equal(found, mixed)
@@ -48,7 +48,7 @@ def test_what_fits_no_plane_has_no_slope_whatever_is_left_of_it():
         points[:, 2] = rng.normal(0, 0.2, (9, 9))[tuple((points[:, :2] // 2).astype(int).T)] - 1.7
         centres = rng.uniform(-6, 6, (5, 2))
         found = ground_of(points).slopes(torch.from_numpy(centres), torch.zeros(5, dtype=torch.int64))
-        expected = [ground_slope([points], (x, y), MODEL) for x, y in centres.tolist()]
+        expected = [ground_slope(points, (x, y), MODEL) for x, y in centres.tolist()]
         np.testing.assert_allclose(found, expected, atol=1e-9)
 
 

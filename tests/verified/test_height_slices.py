@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 from moving_scenes import for_oracle, from_images
-from oracle.height_slices import NUM_SLICES, empty_sweeps, ground_heights, is_residue, slice_of
+from oracle.height_slices import NUM_SLICES, SlicedSweeps, SweepPoint, is_residue, slice_of
+from oracle.pixels import in_range
 from oracle.sweeps import compensate, ground_points
 from scenes import RANGE, config, same_bits, scene, sweeps_of
 
@@ -27,13 +28,14 @@ def test_pixels_equal_the_oracle_in_a_batch():
     windows = [scene(seed, num_history=seed % 4) for seed in range(6)]
     sweeps, found = sweeps_of(windows, PLAIN), set()
     for window, given in enumerate(windows):
-        drawn, (clouds, cloud1) = for_oracle(sweeps, window), compensate(given, PLAIN)
-        assert len(drawn.images) == len(clouds) + 1
-        for image, cloud in zip(drawn.images, (cloud1, *clouds)):
-            inside = cloud.is_active & ((cloud.points >= LOW) & (cloud.points <= HIGH)).all(1)
-            points = [(*row, 0.0) for row in cloud.points[inside].tolist()]
-            assert image == empty_sweeps([], [], PLAIN).drawn([points]).images[0]
-            found |= set(image.values())
+        clouds, cloud1 = compensate(given, PLAIN)
+        inside = [cloud.points[cloud.is_active & in_range(cloud.points, PLAIN)] for cloud in (cloud1, *clouds)]
+        drawn = SlicedSweeps([[SweepPoint(*row) for row in points.tolist()] for points in inside], [], [], PLAIN)
+        assert for_oracle(sweeps, window).images == drawn.images
+        own = sweeps.pixels.take((sweeps.pixels.window == window).nonzero()[:, 0])
+        assert list(zip(own.step.tolist(), own.row.tolist(), own.col.tolist())) == drawn.pixels()
+        assert own.slices.tolist() == [drawn.at(*pixel) for pixel in drawn.pixels()]
+        found |= set(own.slices.tolist())
     assert found == set(range(1, 16))
 
 
@@ -104,10 +106,10 @@ def test_ground_residue_equals_the_oracle_in_a_batch(seed):
     batch, is_drawn = sweeps.batch, sweeps.pixel_of_point < sweeps.num_pixels
     for number, window in enumerate(windows):
         clouds, cloud1 = compensate(window, SETTINGS)
-        means = ground_heights([ground_points(window.pc0, clouds[0])], SETTINGS)
+        ground = ground_points(window.pc0, clouds[0])
         for step, cloud in enumerate((cloud1, *clouds)):
-            inside = cloud.is_active & ((cloud.points >= LOW) & (cloud.points <= HIGH)).all(1)
-            expected = ~is_residue(cloud.points[inside], means, SETTINGS)
+            inside = cloud.is_active & in_range(cloud.points, SETTINGS)
+            expected = ~is_residue(cloud.points[inside], ground, SETTINGS)
             rows = (batch.image == number * batch.num_steps + step) & batch.is_active
             assert is_drawn[rows].tolist() == expected.tolist()
             dropped += int((~expected).sum())

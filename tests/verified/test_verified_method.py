@@ -14,7 +14,7 @@ from cflow_torch import Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
-from cflow_torch.verified import confidence, paired_test
+from cflow_torch.verified import candidates, confidence, paired_test
 
 # The whole takes the oracle many minutes.
 NEAR = (-9.0, -5.0, -math.inf, -3.0, 1.0, math.inf)
@@ -25,7 +25,10 @@ WIDER = (-35.0, -25.0, -math.inf, 25.0, 25.0, math.inf)
 
 
 @pytest.mark.parametrize("seed", range(18))
-def test_equals_the_oracle_on_random_scenes(seed):
+def test_equals_the_oracle_on_random_scenes(seed, monkeypatch):
+    if seed % 4 == 2:  # most nodes are correlated at a coarser scale
+        monkeypatch.setattr(candidates, "_LARGEST_BOX", 60)
+        monkeypatch.setattr("oracle.candidates.LARGEST_BOX", 60)
     settings = config(
         "verified",
         num_history=seed % 4,
