@@ -91,35 +91,31 @@ def from_images(images: np.ndarray, pixel_size: float = 0.25, elapsed: np.ndarra
 
 def moving_scene(
     seeds: Sequence[int],
-    num_past: int = 2,
+    num_steps: int = 2,
     pixel_size: float = 0.1,
     snap: float = 0.0,
     num_points: int = 40,
     speed: float = 0.4,
     size: tuple[float, float] = (0.2, 1.5),
-    num_future: int = 0,
 ) -> Scene:
     """Objects that translate and turn, seen anew in every sweep, some at the border, some missing in some sweeps.
 
     Args:
         seeds: one per window, which depends on nothing else.
-        num_past: sweeps up to t+1.
+        num_steps: sweeps, t+1 first.
         pixel_size: metres.
         snap: metres, places are rounded to multiples of it: equal distances and shared voxels; 0 = they are not.
         num_points: of an object and sweep.
         speed: metres per interval, standard deviation.
         size: metres, shortest and longest side of an object.
-        num_future: sweeps after t+1.
     """
-    places = np.array([*range(num_past), *range(-1, -1 - num_future, -1)])
-    num_steps = len(places)
     clouds: list[list[np.ndarray]] = []
     owners: list[list[np.ndarray]] = []
     flows: list[np.ndarray] = []
     elapsed = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        times = places * (1.0 if rng.random() < 0.5 else rng.uniform(0.8, 1.2))
+        times = np.arange(num_steps) * (1.0 if rng.random() < 0.5 else rng.uniform(0.8, 1.2))
         elapsed.append(times)
         parts: list[list[np.ndarray]] = [[] for _ in range(num_steps)]
         of_parts: list[list[np.ndarray]] = [[] for _ in range(num_steps)]

@@ -9,9 +9,7 @@ from typing import Sequence
 import numpy as np
 import pytest
 import torch
-from moving_scenes import Scene, moving_scene, one_object
-from oracle import registration as oracle
-from oracle.height_slices import slice_of
+from moving_scenes import Scene, one_object
 from preset_windows import changed
 from scenes import assert_same_bits, flow_as_oracle
 from turning_car import MODEL, turning_car
@@ -45,45 +43,6 @@ def at_once(window: Window) -> Window:
 
 
 # ------------------------------------------------------------------------------------------- equal to the oracle
-
-
-@pytest.mark.parametrize("num_past, num_future", [(2, 0), (4, 0), (2, 3)])
-def test_motion_and_points_equal_the_oracle(num_past, num_future):
-    scene = moving_scene(range(8), num_past, snap=1 / 16, speed=0.8, num_future=num_future)
-    rng, num_steps = np.random.default_rng(num_past), num_past + num_future
-    times = np.floor(rng.choice([-0.4, 0.1, 0.3], scene.sweeps.batch.image.numel()) * 2**20) / 2**20
-    age = np.array([*range(num_past), *range(-1, -1 - num_future, -1)])
-    times -= age[scene.sweeps.batch.image.numpy() % num_steps] * 0.125  # what is older was measured earlier
-    scene = with_times(scene, torch.from_numpy(times))
-    points = scene.points()
-    seen = register(points, scene.sweeps, scene.flow)
-    found = register_deskewed(points, scene.sweeps, scene.flow, seen)
-    sharp, drawn = deskew(points, scene.sweeps, seen)
-    assert len(sharp.object_id) < len(points.object_id), "some leave the region or meet another object"
-    expected: list[oracle.RigidMotion] = []
-    positions: list[tuple[int, ...]] = []
-    stretched = 0
-    for number, window in enumerate(scene.windows()):
-        given = window.sweeps, window.object_of
-        of_window = oracle.register(*given, window.flow)
-        stretched += sum(s not in (0.0, 1.0) for s in oracle.stretch_of(*given, of_window))
-        moved, object_of = oracle.deskew(*given, of_window)
-        for pixel, p in moved.points():
-            layer, object_id = slice_of(p.z, oracle.LAYER_HEIGHT, oracle.NUM_LAYERS), object_of[pixel] + len(expected)
-            positions.append((number, pixel[0], object_id, layer, round(1e6 * p.x), round(1e6 * p.y)))
-        expected += oracle.register_deskewed(*given, window.flow, of_window)
-    assert stretched > 10
-    x, y = (torch.round(1e6 * values).long().tolist() for values in sharp.position[:2])
-    names = zip(sharp.window.tolist(), sharp.step.tolist(), sharp.object_id.tolist(), sharp.layer.tolist(), x, y)
-    assert sorted(names) == sorted(positions)
-    image = drawn.pixels.window * num_steps + drawn.pixels.step
-    index = (image * drawn.grid.height + drawn.pixels.row) * drawn.grid.width + drawn.pixels.col
-    assert torch.equal(index, drawn.pixels.index)
-    assert torch.equal(drawn.rank[index], torch.arange(1, len(index) + 1).int())
-    assert int((drawn.rank > 0).sum()) == len(index)
-    for name in ("flow", "rotation", "centre"):
-        values = np.array([getattr(motion, name) for motion in expected])
-        np.testing.assert_allclose(getattr(found, name), values.reshape(getattr(found, name).shape), atol=1e-6)
 
 
 @pytest.mark.parametrize("num_history", [0, 2])

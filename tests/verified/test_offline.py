@@ -1,4 +1,4 @@
-"""Sweeps after t+1: equal to the oracle, what they mend, what they leave alone, what is refused."""
+"""Sweeps after t+1: equal to the oracle, what they change, what they leave alone, times of points, what is refused."""
 
 from __future__ import annotations
 
@@ -8,18 +8,15 @@ from typing import Sequence
 import numpy as np
 import pytest
 import torch
-from scenes import assert_same_bits, config, flow_as_oracle, scene
+from preset_windows import changed
+from scenes import assert_same_bits, config, flow_as_oracle, reordered, rows_of, scene
 from turning_car import MODEL, upright_box
 
-from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, estimate_flow, make_model
+from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, estimate_flow, make_config, make_model
 from cflow_torch.data.log import window as window_of
 
 OFFLINE = MODEL.replace(num_history=4, num_future=4)
 SPEED = 0.9  # metres per sweep, along -x
-
-
-def bare(points: np.ndarray, **values) -> Sweep:
-    return Sweep(points.astype(np.float32), **values)
 
 
 TIMES = (-4, -3, -2, -1, 0, 1, 2, 3, 4, 5)  # of sweeps; t = 0, t+1 = 1
@@ -43,10 +40,10 @@ def drive(is_hidden: bool, times: Sequence[float] = TIMES, seen: Sequence[int] =
     return sweeps
 
 
-def error_of_car(window: Window, result: FlowResult) -> float:
+def error_of_car(window: Window, result: FlowResult, speed: float = SPEED) -> float:
     is_car = np.abs(window.pc0.points[:, 1]) < 2
     assert is_car.sum() > 50
-    return float((result.residual_flow[is_car] - torch.tensor([-SPEED, 0.0, 0.0])).norm(dim=1).mean())
+    return float((result.residual_flow[is_car] - torch.tensor([-speed, 0.0, 0.0])).norm(dim=1).mean())
 
 
 def window_at_t(sweeps: Sequence[Sweep], num_history: int, num_future: int) -> Window:
@@ -117,6 +114,57 @@ def test_repeated_sweeps_after_t1_are_left_out():
     assert_same_bits(model([replace(window, pcf=(later, later, later))])[0], expected)
     (without,) = model([replace(window, pcf=())])
     assert_same_bits(model([replace(window, pcf=(window.pc1, window.pc1))])[0], without)
+
+
+# --------------------------------------------------------------------------------------------- times of points
+
+SMALL = make_config("offline", point_cloud_range=(-5.0, -3.0, -3.0, 4.0, 6.0, 3.0))  # small enough for the oracle
+ROLLING = 0.8  # metres per sweep, along -x
+LATER = 0.12  # sweep intervals by which the car is met later in each sweep than in the one before
+
+
+def rolling_drive(num_history: int = 1, num_future: int = 4) -> Window:
+    """A car and a post, met by two units half a turn apart; the car comes out from behind something: a corner of its
+    front is first seen at t. Seen as it stands, it seems to go LATER farther in each interval than it goes."""
+    rng, sweeps = np.random.default_rng(3), []
+    for k in range(-num_history, 2 + num_future):
+        clouds, times = [upright_box((-2.0, 5.0), (0.4, 0.4), 0.0, rng, 60)], [rng.uniform(0, 1, 60)]
+        for unit in (0.0, 0.5):
+            time = LATER * k + unit - 0.4
+            car = upright_box((3.0 - ROLLING * (k + time), 0.0), (4.4, 1.8), 0.0, rng, 1000)
+            clouds.append(car[car[:, 0] + 0.7 * car[:, 1] < 0.35])
+            times.append(np.full(len(clouds[-1]), time))
+        sweeps.append(Sweep(np.concatenate(clouds).astype(np.float32), point_times=0.1 * np.concatenate(times)))
+    t = num_history
+    return Window(sweeps[t], sweeps[t + 1], tuple(sweeps[:t][::-1]), tuple(sweeps[t + 2 :]))
+
+
+def untimed(window: Window) -> Window:
+    return changed(window, lambda sweep: replace(sweep, point_times=None))
+
+
+@pytest.mark.parametrize("num_history", [0, 1])
+def test_a_mover_that_comes_out_and_is_stretched_has_its_motion(num_history):
+    window, model = rolling_drive(num_history), VerifiedFlow(SMALL)
+    windows = window, untimed(window), replace(window, pcf=())
+    error, without_times, without_future = (error_of_car(w, model([w])[0], ROLLING) for w in windows)
+    assert error < 0.03
+    assert without_times == pytest.approx(LATER * ROLLING, abs=0.03) and without_future > 0.5
+
+
+def test_times_of_points_equal_the_oracle():
+    window = rolling_drive(1, 3)
+    found = flow_as_oracle(window, SMALL)
+    assert not torch.equal(found.residual_flow, VerifiedFlow(SMALL)([untimed(window)])[0].residual_flow)
+
+
+def test_alone_or_in_a_batch_in_any_order_of_points():
+    model = VerifiedFlow(SMALL)
+    windows: list[Window] = [rolling_drive(), untimed(rolling_drive(0)), rolling_drive(1, 0), rolling_drive(0, 2)]
+    for window, result in zip(windows, model(windows)):
+        assert_same_bits(model([window])[0], result)
+        mixed, order = reordered(window)
+        assert_same_bits(model([mixed])[0], rows_of(result, order))
 
 
 # ------------------------------------------------------------------------------------------------- ways to give it

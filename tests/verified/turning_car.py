@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scenes import box, pose
 
 from cflow_torch import Sweep, Window
 from cflow_torch.config import VerifiedConfig
@@ -13,13 +14,8 @@ MODEL = VerifiedConfig(pixel_sizes=(0.4, 0.2, 0.1), point_cloud_range=REGION, ma
 
 def upright_box(centre, size, angle: float, rng: np.random.Generator, num_points: int = 250) -> np.ndarray:
     """Points on the sides of a box, standing 0.2 m above z = -1.7."""
-    side = rng.integers(0, 4, num_points)
-    along = rng.uniform(-0.5, 0.5, num_points)
-    x = np.where(side < 2, along, np.where(side == 2, -0.5, 0.5)) * size[0]
-    y = np.where(side >= 2, along, np.where(side == 0, -0.5, 0.5)) * size[1]
-    cos, sin = np.cos(angle), np.sin(angle)
-    xy = np.stack((cos * x - sin * y, sin * x + cos * y), 1) + centre
-    return np.concatenate((xy, rng.uniform(-1.5, 0.0, (num_points, 1))), 1)
+    points = box(rng, *size, 1.5, num_points) @ pose(0, 0, angle)[:3, :3].T
+    return points + (*centre, -1.5)
 
 
 def car_of(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
