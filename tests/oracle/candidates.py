@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from statistics import median
 from typing import Sequence
 
 import numpy as np
@@ -10,7 +11,6 @@ from cflow_torch.config import VerifiedConfig
 from oracle.component_tree import Node
 from oracle.dense import scene_flow_in_1view
 from oracle.height_slices import NUM_SLICES, Cell, Vector, count
-from oracle.history import median
 from oracle.pixels import bounding_box, occupancy, search_radius
 
 LARGEST_BOX = 1 << 12  # pixels: a node whose box is larger is correlated at a coarser scale

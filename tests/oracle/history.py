@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from statistics import median
 from typing import Sequence
 
 import numpy as np
@@ -33,15 +34,6 @@ def pool(estimates: Sequence[np.ndarray]) -> np.ndarray:
     magnitude = median(magnitudes)
     u_x, u_y = median_direction(directions) if directions else (0.0, 0.0)
     return np.array([magnitude * u_x, magnitude * u_y, median([float(estimate[2]) for estimate in estimates])])
-
-
-def median(values: Sequence[float]) -> float:
-    """Median. Even number: the mean of the middle two."""
-    ordered = sorted(values)
-    middle = len(ordered) // 2
-    if len(ordered) % 2 == 1:
-        return ordered[middle]
-    return (ordered[middle - 1] + ordered[middle]) / 2
 
 
 def median_direction(directions: Sequence[tuple[float, float]]) -> tuple[float, float]:

@@ -7,13 +7,13 @@ correlation_flow_keypoints multiplies them by s.
 
 from __future__ import annotations
 
+from statistics import median
 from typing import NamedTuple, Sequence
 
 import numpy as np
 
 from cflow_torch.config import KeypointsConfig
 from oracle.clustering import cluster, connected_components
-from oracle.history import median
 from oracle.matching import Match, match_keypoints
 from oracle.pixels import bev_dims, in_range, occupancy, project_bev, search_radius
 from oracle.sweeps import Cloud, PointMotion
