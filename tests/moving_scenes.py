@@ -89,15 +89,7 @@ def from_images(images: np.ndarray, pixel_size: float = 0.25, elapsed: np.ndarra
     return HeightSlicedSweeps.of(_batch(torch.from_numpy(places), image, torch.from_numpy(times)), grid)
 
 
-def moving_scene(
-    seeds: Sequence[int],
-    num_steps: int = 2,
-    pixel_size: float = 0.1,
-    snap: float = 0.0,
-    num_points: int = 40,
-    speed: float = 0.4,
-    size: tuple[float, float] = (0.2, 1.5),
-) -> Scene:
+def moving_scene(seeds: Sequence[int], num_steps: int = 2, pixel_size: float = 0.1, snap: float = 0.0) -> Scene:
     """Objects that translate and turn, seen anew in every sweep, some at the border, some missing in some sweeps.
 
     Args:
@@ -105,9 +97,6 @@ def moving_scene(
         num_steps: sweeps, t+1 first.
         pixel_size: metres.
         snap: metres, places are rounded to multiples of it: equal distances and shared voxels; 0 = they are not.
-        num_points: of an object and sweep.
-        speed: metres per interval, standard deviation.
-        size: metres, shortest and longest side of an object.
     """
     clouds: list[list[np.ndarray]] = []
     owners: list[list[np.ndarray]] = []
@@ -121,13 +110,13 @@ def moving_scene(
         of_parts: list[list[np.ndarray]] = [[] for _ in range(num_steps)]
         for _ in range(int(rng.integers(1, 5))):
             centre = rng.uniform(LOWER, UPPER)[:2] * 0.9
-            sides, angle, velocity = rng.uniform(*size, 2), rng.uniform(-0.1, 0.1), rng.normal(0, speed, 2)
-            shape = rng.uniform(-0.5, 0.5, (num_points, 2)) * sides
+            sides, angle, velocity = rng.uniform(0.2, 1.5, 2), rng.uniform(-0.1, 0.1), rng.normal(0, 0.4, 2)
+            shape = rng.uniform(-0.5, 0.5, (40, 2)) * sides
             gone = rng.random(num_steps) < 0.15
             for step in range(num_steps):
                 turn, way = -angle * times[step], centre - velocity * times[step]
                 rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-                kept = shape[rng.random(num_points) < (0.0 if gone[step] else 0.8)]
+                kept = shape[rng.random(40) < (0.0 if gone[step] else 0.8)]
                 xy = kept @ rotation.T + way + rng.normal(0, 0.01, kept.shape)
                 xy = np.round(xy / snap) * snap if snap else xy
                 parts[step].append(np.concatenate([xy, rng.uniform(-1.5, 2.0, (len(xy), 1))], 1))
