@@ -1,4 +1,4 @@
-"""Changed pixels: the oracle's on random scenes; what is missing, seen or hidden, by hand."""
+"""Changed pixels: what is missing, seen or hidden, by hand."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ from typing import Sequence
 
 import numpy as np
 import torch
-from moving_scenes import for_oracle
-from oracle import changed_pixels as oracle
-from scenes import config, pose, scene, sweeps_of
+from scenes import pose, scene, sweeps_of
 
 from cflow_torch import Sweep, Window
 from cflow_torch.config import VerifiedConfig
@@ -16,31 +14,6 @@ from cflow_torch.verified.changed_pixels import RangeImages, find_changed
 
 REGION = (-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)
 SETTINGS = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION, num_history=3, num_future=2, min_height=None)
-
-
-def test_pixels_equal_the_oracle_in_a_batch():
-    """Windows of other lengths side by side, one with ground residue that is seen but not drawn, some without poses."""
-    settings, counts = config("verified", num_history=3, num_future=2, min_height=0.3), np.zeros(3, dtype=int)
-    for seed in range(4):
-        windows = [
-            scene(70 + 5 * seed + i, num_history=(seed + i) % 4, num_future=2 * (i == 1), poses=seed % 4 > 0)
-            for i in range(1 + seed % 3)
-        ]
-        sweeps = sweeps_of(windows, settings)
-        found, batch = find_changed(sweeps), sweeps.batch
-        for window in range(len(windows)):
-            steps = [step for step, k in enumerate(batch.elapsed[window].tolist()) if step == 0 or k != 0]
-            rows = [(batch.image == window * batch.num_steps + step) & batch.is_active for step in steps]
-            clouds = [batch.positions[:, row].T.numpy() for row in rows]
-            drawn, origins = for_oracle(sweeps, window), batch.origin[window, steps].tolist()
-            expected, mine = oracle.find_changed(drawn, clouds, origins), sweeps.pixels.window == window
-            for values, truth in zip(found, expected):
-                assert values[mine].tolist() == [pixel in truth for pixel in drawn.pixels()]
-            counts += (len(drawn.pixels()), len(expected.is_missing), len(expected.has_changed))
-    assert counts[0] > 1.2 * counts[1] and counts[1] > 1.2 * counts[2] and counts[2] > 100
-
-
-# --------------------------------------------------------------------------------------------------- hand-made truth
 
 
 def screen(distance: float, half: float = 2.0, top: float = 0.0) -> np.ndarray:
