@@ -37,24 +37,16 @@ class Scene(NamedTuple):
         every = torch.ones(len(self.flow), dtype=torch.bool)
         return points_of_objects(self.sweeps, self.objects, every, LAYER_HEIGHT, NUM_LAYERS)
 
-    def windows(self) -> list[OracleWindow]:
-        """The same for the oracle, window by window."""
-        return [OracleWindow(self, window) for window in range(self.sweeps.batch.num_windows)]
-
-
-class OracleWindow:
-    """One window of a scene as the oracle takes it; its objects are numbered from 0."""
-
-    def __init__(self, scene: Scene, window: int) -> None:
-        sweeps, objects = scene.sweeps, scene.objects
-        mine = sweeps.pixels.window[objects.first] == window
-        self.sweeps = for_oracle(sweeps, window)
-        owners = objects.of_pixel[sweeps.pixels.window == window] - int((~mine).cumprod(0).sum())
-        self.num_objects = int(mine.sum())
-        self.object_of: dict[Pixel, int] = {
-            pixel: owner for pixel, owner in zip(self.sweeps.pixels(), owners.tolist()) if 0 <= owner < self.num_objects
-        }
-        self.flow: list[Vector] = [(x, y) for x, y in scene.flow[mine].tolist()]
+    def windows(self) -> list[tuple[SlicedSweeps, dict[Pixel, int], list[Vector]]]:
+        """Sweeps, object of each pixel and flow of each object for the oracle, window by window; objects from 0."""
+        result, pixels = [], self.sweeps.pixels
+        for window in range(self.sweeps.batch.num_windows):
+            sweeps = for_oracle(self.sweeps, window)
+            numbers = (pixels.window[self.objects.first] == window).nonzero()[:, 0].tolist()
+            of_pixel = zip(sweeps.pixels(), self.objects.of_pixel[pixels.window == window].tolist())
+            object_of = {pixel: numbers.index(own) for pixel, own in of_pixel if own in numbers}
+            result.append((sweeps, object_of, [(x, y) for x, y in self.flow[numbers].tolist()]))
+        return result
 
 
 def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:

@@ -20,7 +20,7 @@ def registered(scene: Scene) -> RigidMotion:
 
 def assert_equals_oracle(scene: Scene) -> RigidMotion:
     found = registered(scene)
-    expected = [motion for w in scene.windows() for motion in oracle.register(w.sweeps, w.object_of, w.flow)]
+    expected = [motion for window in scene.windows() for motion in oracle.register(*window)]
     for name in ("flow", "rotation", "centre"):
         values = np.array([getattr(motion, name) for motion in expected])
         np.testing.assert_allclose(getattr(found, name), values.reshape(getattr(found, name).shape), atol=1e-6)
