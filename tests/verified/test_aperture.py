@@ -55,6 +55,8 @@ def test_what_stands_there_need_not_belong_to_the_component():
 def test_a_diagonal_slides_along_itself_and_a_square_does_not_slide():
     diagonal, square = {(r, r + 9) for r in range(5, 55)}, {(r, c) for r in range(9, 40) for c in range(9, 40)}
     assert slides({0: diagonal, 1: diagonal}, (9, 9)) and not slides({0: diagonal, 1: diagonal}, (9, -9))
+    flat = {(r, 2 * r) for r in range(5, 40)}  # at 27 degrees, the motions at 36 and 12
+    assert slides({0: flat, 1: flat}, (7.6, 10.5)) and not slides({0: flat, 1: flat}, (2.5, 12))
     assert not any(slides({0: square, 1: square}, motion) for motion in ((0, 12), (12, 0), (9, 9)))
 
 
