@@ -52,6 +52,7 @@ def _nothing_is_slow(sweeps: Any, objects: Any, motion: Any, may_be_slow: Any) -
 STEPS: dict[str, list[Callable[[], Any]]] = {
     "all steps": [],
     "no changed pixels": [lambda: patch.object(method, "find_changed", _without_changed)],
+    "no unchanged pixels": [lambda: patch.object(method, "add_unchanged", lambda sweeps, nodes, *_: nodes)],
     "no static test": [lambda: patch.object(component_tree, "_MISSING", 1 << 40)],
     "no objects under overhangs": [
         lambda: patch.object(method, "add_overhung", lambda sweeps, _, nodes: (sweeps, nodes))
