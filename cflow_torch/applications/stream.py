@@ -162,7 +162,7 @@ class FlowStream:
         points = read_positions([sweep], device).t()
         is_ground, pose, times = sweep.is_ground, sweep.pose, sweep.point_times
         if is_ground is not None:
-            is_ground = read_ground(sweep, device).clone()
+            is_ground = read_ground([sweep], device)
         elif self._ground is not None:
             is_ground = find_ground_batch([points], "grid" if self._ground == "auto" else self._ground)[0]
         if times is not None:

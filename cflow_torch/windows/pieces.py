@@ -113,18 +113,17 @@ class PieceReader:
             matrix = torch.as_tensor(np.stack(given, 2)[:3], device=self.device)  # the last row is known
         if len(group) == 1:
             return group[0].window, group[0].window * num_steps + group[0].step, matrix
-        sizes = [entry.sweep.points.shape[0] for entry in group]
-        count = torch.as_tensor(sizes, device=self.device)
-        entry_of_point = torch.arange(len(sizes), device=self.device).repeat_interleave(count, output_size=sum(sizes))
-        known = torch.as_tensor([(e.window, e.window * num_steps + e.step) for e in group], device=self.device)
-        window, image = known.index_select(0, entry_of_point).unbind(1)
-        return window, image.int(), None if matrix is None else matrix.index_select(2, entry_of_point)
+        known = [(e.window, e.window * num_steps + e.step, e.sweep.points.shape[0]) for e in group]
+        window, image, count = torch.as_tensor(known, device=self.device).unbind(1)
+        entry = torch.repeat_interleave(count, output_size=sum(size for *_, size in known))
+        window, image = window.index_select(0, entry), image.int().index_select(0, entry)
+        return window, image, None if matrix is None else matrix.index_select(2, entry)
 
     def _ground(self, group: Sequence[Entry]) -> Tensor | None:
         """(N,) bool, False in sweeps without a mask; None = no sweep has one."""
         if all(entry.sweep.is_ground is None for entry in group):
             return None
-        return torch.cat([read_ground(entry.sweep, self.device) for entry in group])
+        return read_ground([entry.sweep for entry in group], self.device)
 
     def _times(self, group: Sequence[Entry]) -> Tensor | None:
         """(N,) float64 sweep intervals, 0 in windows whose times are not used; None = no window uses them."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
-from cflow_torch.types import CFlowError, Sweep, Window, named_sweeps
+from cflow_torch.types import Array, CFlowError, Sweep, Window, named_sweeps
 
 _ALL_ROWS = slice(None)
 # Largest time of a point, seconds from the instant of its sweep. Larger numbers have another unit.
@@ -99,28 +99,29 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
 
 def read_positions(sweeps: Sequence[Sweep], device: torch.device, rows: slice = _ALL_ROWS) -> Tensor:
     """(3, N) float64 copy of x, y and z of some rows of each sweep, one sweep after the other."""
-    parts = []
-    for sweep in sweeps:
-        columns = sweep.points[rows, :3].T
-        if not isinstance(columns, Tensor):
-            # A GPU receives float32 where the input is no wider. Both types are in native byte order.
-            narrow = device.type != "cpu" and columns.dtype.itemsize <= 4
-            columns = torch.from_numpy(np.array(columns, np.float32 if narrow else np.float64, order="C"))
-        parts.append(columns.detach().to(device))
-    if len(parts) > 1:
-        return torch.cat(parts, 1).double()
-    if not isinstance(sweeps[0].points, Tensor):
-        return parts[0].double()
-    # copy_ transposes and widens in one pass, about six times faster on the CPU than contiguous().
-    return torch.empty(parts[0].shape, dtype=torch.float64, device=device).copy_(parts[0])
+    columns = [sweep.points[rows, :3].T for sweep in sweeps]
+    if len(columns) == 1 and isinstance(columns[0], Tensor):
+        # copy_ transposes and widens in one pass, about six times faster on the CPU than contiguous().
+        return torch.empty(columns[0].shape, dtype=torch.float64, device=device).copy_(columns[0].detach())
+    # A GPU receives float32 where the input is no wider. Both types are in native byte order.
+    widths = [values.dtype.itemsize for values in columns if not isinstance(values, Tensor)]
+    narrow = device.type != "cpu" and max(widths, default=0) <= 4
+    return _together(columns, np.float32 if narrow else np.float64, device).double()
 
 
-def read_ground(sweep: Sweep, device: torch.device) -> Tensor:
-    """(N,) bool ground mask, True = ground; all False for a sweep without a mask."""
-    mask = sweep.is_ground
-    if mask is None:
-        return torch.zeros(sweep.points.shape[0], dtype=torch.bool, device=device)
-    return (torch.from_numpy(np.array(mask)) if isinstance(mask, np.ndarray) else mask).to(device)
+def read_ground(sweeps: Sequence[Sweep], device: torch.device) -> Tensor:
+    """(N,) bool copy of the ground masks, one sweep after the other, True = ground; False in sweeps without a mask."""
+    masks = [np.zeros(len(sweep.points), bool) if sweep.is_ground is None else sweep.is_ground for sweep in sweeps]
+    return _together(masks, np.bool_, device)
+
+
+def _together(columns: Sequence[Array], dtype: Any, device: torch.device) -> Tensor:
+    """Concatenate (..., N) arrays or tensors on the device. Arrays have one upload, because the host waits for each."""
+    if not any(isinstance(values, Tensor) for values in columns):
+        shape = (*columns[0].shape[:-1], sum(values.shape[-1] for values in columns))
+        return torch.from_numpy(np.concatenate(columns, -1, out=np.empty(shape, dtype))).to(device)
+    given = [values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, dtype)) for values in columns]
+    return torch.cat([values.detach().to(device) for values in given], -1)
 
 
 def read_point_times(sweep: Sweep, name: str, interval: float | None, device: torch.device) -> Tensor:
