@@ -30,8 +30,8 @@ _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _GRAIN, _FREE = 12, 4
 # We read one row of a block as one number; rows of three pixels get an empty fourth.
 _WORD = {1: torch.int8, 2: torch.int16, 3: torch.int32, 4: torch.int32}
-# Rounds of union-find before each test for convergence, and jumps per round. Four of five LiDAR images are labelled
-# after three rounds, and on a GPU a round costs less than a test.
+# Rounds of union-find before the first test for convergence, and jumps per round. LiDAR images are labelled after three
+# to five rounds, and further ones are tested one by one.
 _ROUNDS, _JUMPS = 3, 3
 
 
@@ -187,19 +187,21 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
     Returns:
         (V,) int64: the smallest node of the same component.
 
-    Cost: a few rounds (about log V), each linear in V + E, with one host synchronisation per three rounds. A node only
-    moves to smaller nodes of its component. Once both ends of every edge have the same parent, this is the root.
+    Cost: a few rounds (about log V), each linear in V + E, with one host synchronisation after three rounds and after
+    each further one. A node only moves to smaller nodes of its component. Once both ends of every edge have the same
+    parent, this is the root.
     """
     parent = torch.arange(num_nodes, device=sources.device)
-    low, high = sources, targets
+    low, high, num_rounds = sources, targets, _ROUNDS
     while True:
-        for _ in range(_ROUNDS):
+        for _ in range(num_rounds):
             parent.scatter_reduce_(0, torch.maximum(low, high), torch.minimum(low, high), "amin")
             for _ in range(_JUMPS):
                 parent = parent.index_select(0, parent)
             low, high = parent.index_select(0, sources), parent.index_select(0, targets)
         if torch.equal(low, high):
             return parent
+        num_rounds = 1
 
 
 @lru_cache(maxsize=256)
