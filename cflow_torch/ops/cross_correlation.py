@@ -79,6 +79,4 @@ def parabola_vertex(low: Tensor, middle: Tensor, high: Tensor) -> Tensor:
         (...) float64 within half a step; 0 where the parabola is not concave.
     """
     curve = (2 * middle - low - high).double()
-    is_peak = curve > 0
-    offset = (high - low).double() / torch.where(is_peak, 2 * curve, torch.ones_like(curve))
-    return torch.where(is_peak, offset, torch.zeros_like(offset)).clamp(-0.5, 0.5)
+    return ((high - low) / (2 * curve)).masked_fill_(curve <= 0, 0.0).clamp_(-0.5, 0.5)

@@ -197,8 +197,5 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     meets = count_slices(own[:, None] & target) * inside
     of_beside = pair[:, None] * 5 + torch.arange(5, device=shift.device)
     sums = scatter_count(of_beside.view(-1), len(shift) * 5, meets.view(-1).long()).view(-1, 5)
-    middle, above, below, left, right = sums.unbind(1)
-    return (
-        torch.stack((parabola_vertex(above, middle, below), parabola_vertex(left, middle, right)), 1)
-        * is_moved[:, None]
-    )
+    # Before and after the peak: above and below it, then left and right of it.
+    return parabola_vertex(sums[:, 1::2], sums[:, :1], sums[:, 2::2]) * is_moved[:, None]
