@@ -37,7 +37,7 @@ def pool(estimates: Tensor, available: Tensor) -> Tensor:
     safe = torch.where(oriented, magnitude, torch.ones_like(magnitude))
     unit = torch.stack((x / safe, y / safe), 2).masked_fill(~oriented[:, :, None], 0.0)
     direction = _angular_median(unit, oriented)
-    length, height = masked_median(torch.cat((magnitude, z)), available.repeat(2, 1)).view(2, -1, 1)
+    length, height = masked_median(torch.stack((magnitude, z), 2), available).split(1, 1)
     pooled = torch.cat((length * direction, height), 1)
     return torch.where(available.sum(1, keepdim=True) == 1, single, pooled)
 

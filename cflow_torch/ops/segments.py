@@ -71,23 +71,23 @@ def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int)
 
 
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:
-    """Median of the masked entries of each row.
+    """Median of the masked rows of each matrix, column by column.
 
     Args:
-        values: (M, K) float.
+        values: (M, K, C) float.
         mask: (M, K) bool, False = ignored.
 
     Returns:
-        (M,) float; 0 for a row without entries.
+        (M, C) float; 0 for a matrix without masked rows.
 
     Convention:
         Even count: mean of the middle two, (a + b) / 2.
     """
-    ordered = values.masked_fill(~mask, float("inf")).sort(dim=1).values
-    count = mask.sum(dim=1)
-    low = ordered.gather(1, ((count - 1).clamp(min=0) // 2)[:, None])[:, 0]
-    high = ordered.gather(1, (count // 2).clamp(max=values.shape[1] - 1)[:, None])[:, 0]
-    return _median(low, high, count)
+    ordered = values.masked_fill(~mask[:, :, None], float("inf")).sort(dim=1).values
+    count = mask.sum(dim=1)[:, None, None]
+    middle = torch.cat((count - 1, count), 1).clamp_(min=0) >> 1  # an odd count has the same row twice
+    median = ordered.gather(1, middle.expand(-1, -1, values.shape[2])).mean(1)
+    return median.masked_fill_(count[:, 0] == 0, 0)
 
 
 def segment_median(values: Tensor, index: Tensor, num_segments: int) -> Tensor:
@@ -116,10 +116,4 @@ def segment_median(values: Tensor, index: Tensor, num_segments: int) -> Tensor:
     last = values.numel() - 1  # only empty segments point beyond it
     low = ordered.index_select(0, (start + (count - 1).clamp(min=0) // 2).clamp(max=last))
     high = ordered.index_select(0, (start + count // 2).clamp(max=last))
-    return _median(low, high, count)
-
-
-def _median(low: Tensor, high: Tensor, count: Tensor) -> Tensor:
-    """Median of `count` values from the middle two; 0 without values."""
-    median = torch.where(count % 2 == 1, low, (low + high) / 2)
-    return median.masked_fill_(count == 0, 0)
+    return ((low + high) / 2).masked_fill_(count == 0, 0)

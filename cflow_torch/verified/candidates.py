@@ -82,9 +82,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
     per_interval = (estimates / divisor[:, :, None]).masked_fill(~available[:, :, None], 0.0)
     if estimates.shape[1] == 1:
         return per_interval + 0.0  # turns -0.0 into 0.0
-    by_axis = per_interval.transpose(1, 2).reshape(-1, estimates.shape[1])
-    middle = masked_median(by_axis, available.repeat_interleave(2, 0, output_size=len(by_axis)))
-    return torch.cat((middle.view(-1, 1, 2), per_interval), 1) + 0.0
+    return torch.cat((masked_median(per_interval, available)[:, None], per_interval), 1) + 0.0
 
 
 def _find_peaks(

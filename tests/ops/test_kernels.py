@@ -19,9 +19,9 @@ from cflow_torch.ops.segments import masked_median, segment_median
 def test_medians_are_numpys():
     rng = np.random.default_rng(6)
     for width in (1, 2, 3, 6):
-        values, mask = rng.normal(size=(40, width)).round(1), rng.random((40, width)) < 0.6
+        values, mask = rng.normal(size=(40, width, 2)).round(1), rng.random((40, width)) < 0.6
         found = masked_median(torch.from_numpy(values), torch.from_numpy(mask)).tolist()
-        assert found == [float(np.median(v[m])) if m.any() else 0.0 for v, m in zip(values, mask)]
+        assert found == [np.median(v[m], 0).tolist() if m.any() else [0.0, 0.0] for v, m in zip(values, mask)]
     for num_segments in (1, 5, 40):
         values, index = rng.integers(-4, 5, 60).astype(np.float64), rng.integers(0, num_segments, 60)
         median = segment_median(torch.from_numpy(values), torch.from_numpy(index), num_segments)
