@@ -208,12 +208,12 @@ class HeightSlicedSweeps:
         """(B, S) float64, sweep intervals from each sweep to t+1."""
         return self.batch.elapsed
 
-    @property
+    @cached_property
     def num_more(self) -> Tensor:
         """(B,) int64, number of sweeps of a window besides t and t+1."""
         return (self.batch.elapsed != 0).sum(1) - 1
 
-    @property
+    @cached_property
     def has_history(self) -> Tensor:
         """(B,) bool, whether a window has more sweeps than t and t+1."""
         return self.num_more > 0
