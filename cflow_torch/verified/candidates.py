@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple, Sequence
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import VerifiedConfig
@@ -56,12 +57,13 @@ def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, co
     estimates, scores, available = _find_peaks(nodes, components, sweeps, config)
     intervals = sweeps.elapsed.index_select(0, nodes.window)[:, 1:]
     own = list_motions(estimates, available, intervals)
-    others, around = [], nodes.parent
-    for _ in range(components.num_levels - 1):
-        others.append(lookup(own[:, 0], around))
-        around = lookup(nodes.parent, around, nodes.count)
+    parent = F.pad(nodes.parent, (0, 1), value=nodes.count)
+    around = [nodes.parent]
+    for _ in range(components.num_levels - 2):
+        around.append(parent.index_select(0, around[-1]))
+    others = lookup(own[:, 0], torch.cat(around)).view(len(around), nodes.count, 2).transpose(0, 1)
     newest = available.int().argmax(1, keepdim=True)
-    return Candidates(torch.cat((own, torch.stack(others, 1)), 1), scores.gather(1, newest)[:, 0])
+    return Candidates(torch.cat((own, others), 1), scores.gather(1, newest)[:, 0])
 
 
 def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Tensor:
@@ -78,8 +80,8 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
 
     Source: after Sec. leverage_past_pcs, which takes the median of magnitudes and that of orientations.
     """
-    divisor = torch.where(available, intervals, torch.ones_like(intervals))
-    per_interval = (estimates / divisor[:, :, None]).masked_fill(~available[:, :, None], 0.0)
+    unknown = ~available
+    per_interval = (estimates / intervals.masked_fill(unknown, 1.0)[:, :, None]).masked_fill_(unknown[:, :, None], 0.0)
     if estimates.shape[1] == 1:
         return per_interval + 0.0  # turns -0.0 into 0.0
     return torch.cat((masked_median(per_interval, available)[:, None], per_interval), 1) + 0.0
