@@ -10,10 +10,11 @@ import math
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, scatter_count, split_index
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, scatter_count, split_index, take_columns
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps
 
 # Range images: bins of about half a degree around, and of one degree up and down, half of them below level.
@@ -58,10 +59,11 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     comparison, bit = _bits(missing)
     pixel, step = split_index(comparison, num_steps)
     sweep = pixels.window.index_select(0, pixel) * num_steps + step
-    farther = RangeImages(sweeps).farther(sweep, *_centre(sweeps, pixel, bit))
+    farther = RangeImages(sweeps).farther(sweep, _centre(sweeps, pixel, bit))
+    is_seen, none = farther >= 0, len(nothing)
     is_missing, has_changed = (
-        nothing.index_fill(0, pixel.index_select(0, flat_nonzero(of)), True)
-        for of in ((farther >= 0) | farther.isinf(), farther >= 0)
+        F.pad(nothing, (0, 1)).index_fill_(0, torch.where(of, pixel, none), True)[:-1]
+        for of in (is_seen | farther.isinf(), is_seen)
     )
     return ChangedPixels(is_missing, has_changed)
 
@@ -74,12 +76,12 @@ def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
     return some.index_select(0, entry), bit
 
 
-def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, bit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """x, y and z, (K,) float64, metres, of the middle of slices, by their pixels and bits, (K,) int64 each."""
-    row, col, lowest = gather(pixel, sweeps.pixels.row, sweeps.pixels.col, sweeps.lowest)
-    first = torch.floor(lowest / SLICE_HEIGHT)
+def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, bit: Tensor) -> Tensor:
+    """(3, K) float64, metres, of the middle of slices, by their pixels and bits, (K,) int64 each."""
+    first = torch.floor(sweeps.lowest.index_select(0, pixel) / SLICE_HEIGHT)
     height = first + torch.remainder(bit - first, NUM_SLICES) + 0.5
-    return (*sweeps.grid.centre(row, col), height * SLICE_HEIGHT)
+    y, x = sweeps.grid.centre(take_columns(sweeps.pixels.row_col, pixel))
+    return torch.stack((x, y, height * SLICE_HEIGHT))
 
 
 class RangeImages:
@@ -101,30 +103,30 @@ class RangeImages:
         size = origin[:, :, 0].numel() * _ELEVATIONS * _AZIMUTHS
         farthest = torch.full((size,), -math.inf, dtype=torch.float32, device=device)
         for points in chunks(0, batch.image.numel(), device):
-            direction, distance = self._direction(batch.image[points].long(), *batch.positions[:, points].unbind(0))
+            direction, distance = self._direction(batch.image[points].long(), batch.positions[:, points])
             distance.masked_fill_(~batch.is_active[points], -math.inf)
             farthest.scatter_reduce_(0, direction, distance, "amax")
         self._farthest = farthest
 
-    def farther(self, sweep: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    def farther(self, sweep: Tensor, positions: Tensor) -> Tensor:
         """(K,) float32, metres: distance of the farthest return in the direction of each position, minus that of the
         position; -infinity = no return.
 
         Args:
             sweep: (K,) int64, window * S + step.
-            x, y, z: (K,) float64, metres, frame of t+1.
+            positions: (3, K) float64, metres, frame of t+1.
         """
-        direction, distance = self._direction(sweep, x, y, z)
+        direction, distance = self._direction(sweep, positions)
         return self._farthest.index_select(0, direction).sub_(distance)
 
-    def _direction(self, sweep: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+    def _direction(self, sweep: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Bin of the range images, (K,) int64, and distance over ground, (K,) float32, metres."""
-        x, y, z = (a.sub(o.index_select(0, sweep)).float() for a, o in zip((x, y, z), self._origin))
+        x, y, z = positions.sub(take_columns(self._origin, sweep)).float().unbind(0)
         distance, sum_of_sides = torch.sqrt(x * x + y * y), x.abs().add_(y.abs()).clamp_(min=1e-3)
         around = y.div_(sum_of_sides)
         around = torch.where(x >= 0, around + 1, 3 - around).nan_to_num_(0.0)  # 0 ... 4
         azimuth = around.mul_(_AZIMUTHS / 4).long().clamp_(max=_AZIMUTHS - 1)
-        rise = z.div_(distance.clamp(min=0.1).mul_(_RISE)).add_(_ELEVATIONS // 2).floor_().nan_to_num_(0.0)
+        rise = z.div_(distance.clamp(min=0.1).mul_(_RISE)).add_(_ELEVATIONS // 2).nan_to_num_(0.0)
         elevation = rise.clamp_(0, _ELEVATIONS - 1).long()
         return elevation.add_(sweep, alpha=_ELEVATIONS).mul_(_AZIMUTHS).add_(azimuth), distance
 
@@ -132,11 +134,11 @@ class RangeImages:
     def _sensor_height(sweeps: HeightSlicedSweeps) -> Tensor:
         """(B,) float64, metres, above the origin of t+1."""
         batch, (x, y, z) = sweeps.batch, sweeps.batch.positions.unbind(0)
-        window, step = split_index(batch.image.long(), batch.num_steps)
-        is_near = (step == 0) & (x * x + y * y <= _NEAR**2) & batch.is_active
+        is_near = (x * x + y * y <= _NEAR**2) & batch.is_active
         height = (z * _PER_METRE).floor_().nan_to_num_(0.0).clamp_(-_HIGHEST, _HIGHEST - 1).long().add_(_HIGHEST)
-        height.add_(window, alpha=2 * _HIGHEST)
-        below = scatter_count(height, batch.num_windows * 2 * _HIGHEST, is_near.long()).view(-1, 2 * _HIGHEST).cumsum(1)
+        height.add_(batch.image, alpha=2 * _HIGHEST)
+        count = scatter_count(height, batch.num_windows * batch.num_steps * 2 * _HIGHEST, is_near.long())
+        below = count.view(batch.num_windows, batch.num_steps, -1)[:, 0].cumsum(1)  # of t+1
         low = (below <= floor_divide(below[:, -1:], _OUTLIERS)).sum(1)
         # Without near points it is 0.
         return torch.where(below[:, -1] > 0, (low - _HIGHEST).double() / _PER_METRE + _ABOVE_LOWEST, 0.0)

@@ -98,7 +98,7 @@ def _groups_of_one_motion(
     size, motion = sweeps.grid.pixel_size, rigid.pixels_per_interval(sweeps.grid.pixel_size)
     elapsed = sweeps.elapsed.index_select(0, pixels.window)
     since_t = elapsed[:, 1] - elapsed.gather(1, pixels.step[:, None])[:, 0]
-    (x, y), (flow_x, flow_y) = sweeps.grid.centre(pixels.row, pixels.col), rigid.flow.index_select(0, which).unbind(1)
+    (y, x), (flow_x, flow_y) = sweeps.grid.centre(pixels.row_col), rigid.flow.index_select(0, which).unbind(1)
     flow_x, flow_y = rigid.flow_at(which, x - flow_x * since_t, y - flow_y * since_t)  # by where the pixel was at t
     flow = torch.stack((flow_y, flow_x), 1) / size
     rotates = flat_nonzero(((flow - motion.index_select(0, which)).abs() >= 1).any(1))
@@ -129,7 +129,7 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     static = 2 + len(crowd) + sum(10 * matched >= bound * number for bound in share)
     static = torch.where(_is_beside(sweeps, moves), 3 + len(crowd) + len(share), static)
 
-    x, y = sweeps.grid.centre(pixels.row, pixels.col)
+    y, x = sweeps.grid.centre(pixels.row_col)
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
     kind = 2 * sweeps.has_history.index_select(0, pixels.window) + is_far.long()
     first = 4 + len(crowd) + len(share)

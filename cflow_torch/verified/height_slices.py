@@ -66,6 +66,11 @@ class Pixels:
         return self.table[2]
 
     @property
+    def row_col(self) -> Tensor:
+        """(2, K) int64."""
+        return self.table[3:]
+
+    @property
     def row(self) -> Tensor:
         """(K,) int64."""
         return self.table[3]

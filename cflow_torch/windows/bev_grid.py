@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.indices import constant
 from cflow_torch.types import CFlowError
 
 # int64 indices allow more pixels, but images of this size already take minutes.
@@ -50,10 +51,10 @@ class Grid:
         """W of Eq. bev_dims."""
         return math.floor((self.upper[0] - self.lower[0]) / self.pixel_size) + 1
 
-    def centre(self, row: Tensor, col: Tensor) -> tuple[Tensor, Tensor]:
-        """x and y of the centres of pixels, (K,) float64, metres, by their rows and columns, (K,) int64."""
-        x, y = (at.double().add_(0.5).mul_(self.pixel_size) for at in (col, row))
-        return x.add_(self.lower[0]), y.add_(self.lower[1])
+    def centre(self, pixel: Tensor) -> Tensor:
+        """(2, K) float64, metres, y and x of the centres of pixels, (2, K) int64, row and column."""
+        lower = constant(self.lower[1::-1], torch.float64, pixel.device)
+        return pixel.double().add_(0.5).mul_(self.pixel_size).add_(lower[:, None])
 
     def contains(self, positions: Tensor) -> Tensor:
         """Test whether positions are finite and inside the region, both ends included.

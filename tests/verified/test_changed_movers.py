@@ -73,5 +73,5 @@ def test_shadows_of_a_parked_car_do_not_move_the_wall(speed, monkeypatch):
     if speed != 0.18:
         return
     # If every sweep saw everything, the edges of the shadow would be changed pixels, which move.
-    monkeypatch.setattr(changed_pixels.RangeImages, "farther", lambda self, image, x, y, z: torch.ones_like(x).float())
+    monkeypatch.setattr(changed_pixels.RangeImages, "farther", lambda self, image, at: torch.ones_like(at[0]).float())
     assert model([window])[0].residual_flow.any()

@@ -33,8 +33,8 @@ def farther(clouds: Sequence[np.ndarray], places: Sequence[Sequence[float]], way
     pc1, pc0 = (np.concatenate((cloud, floor())) for cloud in clouds)
     window = Window(Sweep(pc0 - T_world_ego[:3, 3], pose=T_world_ego), Sweep(pc1, pose=np.eye(4)))
     images = RangeImages(sweeps_of([window], SETTINGS))
-    columns = torch.from_numpy(np.array(places, dtype=np.float64)).T
-    return [images.farther(torch.full((len(places),), step), *columns).tolist() for step in (0, 1)]
+    positions = torch.from_numpy(np.array(places, dtype=np.float64)).T
+    return [images.farther(torch.full((len(places),), step), positions).tolist() for step in (0, 1)]
 
 
 def test_places_before_a_screen_are_seen_and_those_behind_are_hidden():
