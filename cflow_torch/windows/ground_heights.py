@@ -21,6 +21,8 @@ _FEWEST_BLOCKS = 5  # of a plane
 # than this from it (millimetres; at a tie a block stays), such as a pavement. A steeper plane is not ground.
 _REACH, _NUM_FITS, _FARTHEST = 2, 3, 100 + 1e-6
 _STEEPEST = 0.3
+# Those blocks: 1, column and row, counted from the middle one.
+_AROUND = tuple((1, dx, dy) for dy in range(-_REACH, _REACH + 1) for dx in range(-_REACH, _REACH + 1))
 # Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies below every point.
 _HIGHEST = 10**10
 _UNKNOWN = -(1 << 40)
@@ -89,30 +91,32 @@ class GroundHeights:
         Convention: block heights are whole millimetres, rounded down. So all sums are exact.
         """
         num_windows, rows, cols = self._heights.shape
-        sums = F.pad(torch.stack((self._heights, self._counts)), (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
-        line = torch.arange(-_REACH, _REACH + 1, device=window.device)
-        dy, dx = torch.cartesian_prod(line, line).unbind(1)
+        blocks = F.pad(torch.stack((self._heights, self._counts)), (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
+        stride = cols + 2 * _REACH
+        around = constant(
+            tuple((dy + _REACH) * stride + dx + _REACH for _, dx, dy in _AROUND), torch.int64, window.device
+        )
         ends = constant(((0, 0), (cols - 1, rows - 1)), torch.int64, window.device)
         lower = constant(self._lower[:2], torch.float64, window.device)
         col, row = torch.floor((centre - lower) / _BLOCK).clamp_(*ends).long().unbind(1)
-        line_of_block = (window % num_windows * (rows + 2 * _REACH) + row + _REACH)[:, None] + dy
-        block = line_of_block * (cols + 2 * _REACH) + (col + _REACH)[:, None] + dx
-        height, count = sums.index_select(1, block.view(-1)).view(2, *block.shape)
+        line = window % num_windows * (rows + 2 * _REACH) + row
+        block = torch.add(col, line, alpha=stride)[:, None] + around
+        height, count = blocks.index_select(1, block.view(-1)).view(2, *block.shape)
         height = torch.div(10 * height, count.clamp(min=1), rounding_mode="floor").double()
         is_used = is_known = count >= _FEWEST_POINTS
-        design = torch.stack((torch.ones_like(dx), dx, dy)).double()
-        products = (design[:, None] * design).view(9, -1)
-        is_flat = torch.ones_like(window, dtype=torch.bool)
-        for _ in range(_NUM_FITS):
-            used = is_used.double()
-            normal, force = (used @ products.t()).t().view(3, 3, -1), ((height * used) @ design.t()).t()
-            inverse, det = adjugate(normal)
-            n = normal[0, 0]
-            is_flat &= (n >= _FEWEST_BLOCKS) & (4 * det >= n * n * n)
-            plane = (inverse * force).sum(1) / torch.where(is_flat, det, 1.0)
-            is_used = is_known & ((height - (plane[:, :, None] * design[:, None]).sum(0)).abs() <= _FARTHEST)
+        design = constant(_AROUND, torch.float64, window.device)
+        terms = torch.cat((design.t().expand(len(window), 3, -1), height[:, None]), 1)
+        is_flat, plane = torch.ones_like(window, dtype=torch.bool), design.new_empty((3, len(window)))
+        for fit in range(_NUM_FITS):
+            if fit > 0:
+                is_used = is_known & ((height - (plane[:, :, None] * design.t()[:, None]).sum(0)).abs() <= _FARTHEST)
+            sums = ((terms * is_used[:, None]) @ design).permute(1, 2, 0)
+            n, force, (inverse, det) = sums[0, 0], sums[3], adjugate(sums[:3])
+            is_flat &= (n >= _FEWEST_BLOCKS) & (4 * det >= n**3)
+            plane = (inverse * force).sum(1) / det  # undefined where it is not flat
         slope = plane[1:] / (1000 * _BLOCK)
-        return (slope * (is_flat & (slope.square().sum(0) <= _STEEPEST**2))).t().contiguous()
+        is_ground = is_flat & (slope.square().sum(0) <= _STEEPEST**2)
+        return torch.where(is_ground, slope, 0.0).t().contiguous()
 
     def _block(self, positions: Tensor) -> Tensor:
         """(N,) int32 block of positions inside the region, where int() rounds down."""
