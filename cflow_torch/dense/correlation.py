@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Iterator, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import DenseConfig
@@ -214,7 +215,7 @@ def _best_of_each_pair(
     Args:
         windows: the targets. The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels
             under the H x W window at that shift.
-        pair, target, count: (K,) int64, of each candidate.
+        pair, target, count: (K,) int64, of each candidate. Those of a pair are in order of dy, then of dx.
         shift: (2, K) int64, dy and dx of each candidate.
         num_pairs: J.
 
@@ -230,11 +231,10 @@ def _best_of_each_pair(
     energy = windows.count(target, torch.stack((dy, dx)))
     value = square.index_select(0, kept) / energy
     best_value = value.new_zeros(num_pairs).scatter_reduce_(0, pair, value, "amax")
-    # One number orders shifts by length, then dy, then dx. It fits, as images have at most 2^15 pixels a side.
-    span, last = 1 << 16, torch.iinfo(torch.int64).max
-    order = ((dy * dy + dx * dx) * span + dy + span // 2) * span + dx + span // 2
-    order.masked_fill_(value < best_value.index_select(0, pair), last)
-    first = segment_amin(order, pair, num_pairs, last)
-    best = torch.zeros((4, num_pairs + 1), dtype=torch.int64, device=pair.device)  # the last column takes the losers
-    best[:, torch.where(order == first.index_select(0, pair), pair, num_pairs)] = torch.stack((dy, dx, count, energy))
-    return best[:, :num_pairs]
+    # One number orders shifts by length, then by position: candidates of a pair are in order of dy, then of dx. It fits,
+    # as images have at most 2^15 pixels a side.
+    mask, none = (1 << 31) - 1, (1 << 62) + len(kept)
+    order = torch.add(torch.arange(len(kept), device=pair.device), dy * dy + dx * dx, alpha=1 << 31)
+    order.masked_fill_(value < best_value.index_select(0, pair), none)
+    best = segment_amin(order, pair, num_pairs, none) & mask
+    return take_columns(F.pad(torch.stack((dy, dx, count, energy)), (0, 1)), best)
