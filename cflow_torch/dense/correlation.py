@@ -231,8 +231,8 @@ def _best_of_each_pair(
     energy = windows.count(target, torch.stack((dy, dx)))
     value = square.index_select(0, kept) / energy
     best_value = value.new_zeros(num_pairs).scatter_reduce_(0, pair, value, "amax")
-    # One number orders shifts by length, then by position: candidates of a pair are in order of dy, then of dx. It fits,
-    # as images have at most 2^15 pixels a side.
+    # One number orders shifts by length, then as they are given, which is by dy, then by dx. It fits, as images have at
+    # most 2^15 pixels a side.
     mask, none = (1 << 31) - 1, (1 << 62) + len(kept)
     order = torch.add(torch.arange(len(kept), device=pair.device), dy * dy + dx * dx, alpha=1 << 31)
     order.masked_fill_(value < best_value.index_select(0, pair), none)

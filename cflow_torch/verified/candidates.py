@@ -24,7 +24,7 @@ from cflow_torch.ops.indices import (
     scatter_count,
     take_columns,
 )
-from cflow_torch.ops.segments import bounding_boxes, masked_median
+from cflow_torch.ops.segments import masked_median, segment_minmax
 from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, count_slices
 
@@ -143,34 +143,33 @@ class _NodeImages(NamedTuple):
             scale at which it is not, or the coarsest.
         """
         members, node, device = nodes.members, nodes.node, nodes.node.device
-        corner, extent = bounding_boxes(members.row, members.col, node, nodes.count)
+        (top, bottom), (left, right) = (segment_minmax(at, node, nodes.count) for at in members.row_col)
         block = constant(tuple(blocks), torch.int64, device)
-        tops = torch.div(corner[:, None], block[:, None], rounding_mode="floor")  # (N, scales, 2)
-        sizes = torch.div((corner + extent - 1)[:, None], block[:, None], rounding_mode="floor") - tops + 1
+        ends = torch.stack((top, left, bottom, right), 1)[:, None]
+        ends = torch.div(ends, block[:, None], rounding_mode="floor")  # (N, scales, 4)
+        sizes = ends[:, :, 2:] - ends[:, :, :2] + 1
         num_small = (sizes.prod(2) <= _LARGEST_BOX).sum(1)  # they come first, as scales are coarse to fine
         scale = torch.minimum(nodes.level.clamp(max=len(blocks) - 1), (num_small - 1).clamp(min=0))
         at = (torch.arange(nodes.count, device=device), scale)
-        block, first, size = block[scale], tops[at], sizes[at]
+        block, first, size = block[scale], ends[at][:, :2], sizes[at]
         area = size.prod(1) * num_steps
         end = area.cumsum(0)
 
-        # Pixels that fall into one at their scale are found by drawing them.
+        # Pixels that fall into one at their scale are found by drawing them. It remembers one of them, whichever.
         table = torch.stack((end - area, block, *size.unbind(1), *first.unbind(1)))
-        start, side, height, width, top, left = take_columns(table, node)
-        row, col = (torch.div(values, side, rounding_mode="floor") for values in (members.row, members.col))
-        index = (members.step * height + row - top).mul_(width).add_(start).add_(col - left)
+        of_member = take_columns(table, node)
+        start, side, height, width = of_member[:4]
+        pixel = torch.div(members.row_col, side, rounding_mode="floor")
+        row, col = pixel - of_member[4:]
+        index = (members.step * height + row).mul_(width).add_(start).add_(col)
         total = int(end[-1]) if nodes.count else 0
         # Where several of the finest pixels fall into one, all slices are set.
         slices = torch.where(side == 1, members.slices, OWN)
         image = lazy_zeros(total, torch.uint8, device).index_copy_(0, index, slices)
-        node_at = lazy_empty(total, torch.int32, device).scatter_(0, index, node.int())
-        index = flat_nonzero(image)
-        node = node_at.index_select(0, index).long()
-        start, _, height, width, top, left = take_columns(table, node)
-        index -= start
-        line = torch.div(index, width, rounding_mode="floor")
-        step = torch.div(line, height, rounding_mode="floor")
-        pixels = ClusterPixels(node, step, line - step * height + top, index - line * width + left)
+        member = torch.arange(len(node), dtype=torch.int32, device=device)
+        member = lazy_empty(total, torch.int32, device).scatter_(0, index, member)
+        member = member.index_select(0, flat_nonzero(image)).long()
+        pixels = ClusterPixels(*gather(member, node, members.step, *pixel))
         return cls(block, first, size, end - area, image, pixels)
 
 
