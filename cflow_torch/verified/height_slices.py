@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import (
+    constant,
     flat_nonzero,
     floor_divide,
     lazy_zeros,
@@ -182,12 +183,13 @@ class HeightSlicedSweeps:
         pixel = flat_nonzero(is_copied)
         of_copy = renumber(pixel, count).index_select(0, of_row)
         # The same pixels, in the second half of the images and of the windows.
-        behind = [self.image.numel() // 2, self.batch.num_windows, 0, 0, 0]
-        table = take_columns(self.pixels.table, pixel) + torch.tensor(behind, device=rows.device)[:, None]
+        behind = constant((self.image.numel() // 2, self.batch.num_windows, 0, 0, 0), torch.int64, rows.device)
+        table = take_columns(self.pixels.table, pixel).add_(behind[:, None])
         pixels = Pixels(table, _slices(of_copy, height_slice, len(pixel)))
         _draw_neighbourhoods(self.image, pixels, self.grid)
         rank = torch.arange(count + 1, count + 1 + len(pixel), dtype=torch.int32, device=rows.device)
-        of_point = self.pixel_of_point + (self.pixel_of_point == count) * len(pixel)  # "none" is a larger number now
+        none = self.pixel_of_point == count
+        of_point = self.pixel_of_point.masked_fill(none, count + len(pixel))  # "none" is a larger number now
         return HeightSlicedSweeps(
             self.batch.with_empty_windows(),
             self.grid,

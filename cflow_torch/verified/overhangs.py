@@ -16,6 +16,7 @@ from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import (
+    constant,
     flat_nonzero,
     floor_divide,
     gather,
@@ -28,7 +29,7 @@ from cflow_torch.ops.indices import (
 from cflow_torch.ops.labeling import union_find
 from cflow_torch.ops.segments import segment_amin, segment_minmax
 from cflow_torch.verified.component_tree import Components, Nodes
-from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps
+from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, Pixels
 
 _CELL = 0.4  # metres, side of a cell; it is as high as a slice
 _NUM_SLICES = 32  # from the lowest cell of a window on; what lies higher counts as the highest one
@@ -67,7 +68,7 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     sweeps = sweeps.with_copies(rows)
     num_copies = sweeps.num_pixels - num_own
     component = segment_amin(component, sweeps.pixel_of_point[num_points:] - num_own, num_copies, num_names)
-    copies = sweeps.pixels.take(torch.arange(num_own, sweeps.num_pixels, device=rows.device))
+    copies = Pixels(sweeps.pixels.table[:, num_own:], sweeps.pixels.slices[num_own:])
     seen = torch.zeros(2 * num_names, dtype=torch.bool, device=rows.device)
     seen.index_fill_(0, component + num_names * (copies.step > 0), True)
     name = flat_nonzero(seen[:num_names] & seen[num_names:])  # at t+1 and before
@@ -102,13 +103,14 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     index = torch.empty_like(rows)
     lowest = torch.full((batch.num_windows,), 1 << 41, device=rows.device)
     height = torch.empty_like(rows)
-    size = torch.full((), _CELL, dtype=torch.float64, device=rows.device)  # see `Grid.pixel`
+    size = constant((_CELL,), torch.float64, rows.device)  # see `Grid.pixel`
+    corner = constant(grid.lower[:2], torch.float64, rows.device)
     for some in chunks(0, len(rows), rows.device):
-        x, y, z = batch.positions.index_select(1, rows[some]).unbind(0)
+        position = batch.positions.index_select(1, rows[some])
         window = floor_divide(batch.image.index_select(0, rows[some]).long(), batch.num_steps)
-        row, col = ((at - low).div_(size).long().add_(1) for at, low in ((y, grid.lower[1]), (x, grid.lower[0])))
+        col, row = (position[:2] - corner[:, None]).div_(size).long().add_(1)
         index[some] = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)
-        height[some] = (z / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
+        height[some] = (position[2] / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
         lowest.scatter_reduce_(0, window, height[some], "amin")
     window = floor_divide(index, num_rows * num_cols)
     height = height.sub_(lowest.index_select(0, window)).clamp_(max=_NUM_SLICES - 3).add_(1)
@@ -128,16 +130,16 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     column, height = split_index(cells, _NUM_SLICES)
     is_above = (height[1:] - height[:-1] >= _GAP) & (component[1:] != component[:-1]) & (column[1:] == column[:-1])
     pair = flat_nonzero(is_above)
-    is_under, is_over = (
-        torch.zeros(count, dtype=torch.bool, device=rows.device).index_fill_(0, component.index_select(0, at), True)
-        for at in (pair, pair + 1)
-    )
+    is_under = torch.zeros(count, dtype=torch.bool, device=rows.device)
+    is_under.index_fill_(0, component.index_select(0, pair), True)
+    is_under.index_fill_(0, component[1:].index_select(0, pair), False)  # that is above one
     foot, top = segment_minmax(height, component, count)
     rise = segment_amin(
         height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, _NUM_SLICES
     )
-    is_object = (rise <= _HIGHEST_FOOT) & (top - foot >= _SMALLEST) & (top - foot <= _LARGEST)
-    wanted = (is_under & ~is_over & is_object).index_select(0, component)
+    size = top - foot
+    is_object = (rise <= _HIGHEST_FOOT) & (size >= _SMALLEST) & (size <= _LARGEST)
+    wanted = (is_under & is_object).index_select(0, component)
     return torch.where(wanted, component, count).index_select(0, number.index_select(0, index).long()), count
 
 
@@ -160,5 +162,5 @@ def _ground(column: Tensor, height: Tensor, num_windows: int, num_rows: int, num
     rows, cols = num_rows // side + 1, num_cols // side + 1
     square = (window * rows + floor_divide(row, side)) * cols + floor_divide(col, side)
     lowest = segment_amin(height, square, num_windows * rows * cols, _NUM_SLICES).view(-1, 1, rows, cols)
-    around = -F.max_pool2d(-F.pad(lowest, (1, 1, 1, 1), value=_NUM_SLICES).float(), 3, 1)
+    around = -F.max_pool2d(-lowest.float(), 3, 1, padding=1)
     return around.view(-1).long().index_select(0, square)
