@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lazy_zeros, lookup, renumber, scatter_count
 from cflow_torch.ops.labeling import label_together, padded_size
-from cflow_torch.ops.segments import bounding_boxes, segment_amin
+from cflow_torch.ops.segments import segment_amin, segment_minmax
 from cflow_torch.verified.aperture import both_ends_move
 from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
@@ -228,7 +228,8 @@ def _length(sweeps: HeightSlicedSweeps, components: Components) -> Tensor:
     changed = flat_nonzero(step.index_select(0, components.changed) == 0)
     root = torch.cat((components.roots[:, newest].flatten(), components.changed_root[changed]))
     row, col = gather(torch.cat((newest.repeat(components.num_levels), components.changed[changed])), row, col)
-    return bounding_boxes(row, col, root, components.count)[1].amax(1).double()
+    (top, bottom), (left, right) = (segment_minmax(at, root, components.count) for at in (row, col))
+    return torch.maximum(bottom - top, right - left).add_(1).double()
 
 
 def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_pixels: int) -> tuple[Objects, Tensor]:
@@ -262,20 +263,19 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
     winner[-1:] = count
     parent = F.pad(nodes.parent, (0, 1), value=count)
     for _ in range(num_levels - 1):  # coarse winners spread to what they hold, a level at a time
-        around = winner.index_select(0, parent)
-        winner = torch.where(around < count, around, winner)
+        winner = torch.minimum(winner, winner.index_select(0, parent))  # nodes are numbered coarse to fine
 
-    # Nodes are numbered coarse to fine, so the largest number is that of the finest one.
-    in_tree = (nodes.level < num_levels).index_select(0, nodes.node)
-    finest, other = (
-        torch.full((num_pixels,), -1, dtype=torch.int64, device=own.device).scatter_reduce_(
-            0, nodes.pixel, torch.where(wanted, nodes.node, -1), "amax"
-        )
-        for wanted in (in_tree, ~in_tree)
+    # So the largest number is that of the finest node, or of the node of changed pixels or under an overhang.
+    is_other = nodes.level >= num_levels
+    last, finest = (
+        torch.full((num_pixels,), -1, dtype=torch.int64, device=own.device)
+        .scatter_reduce_(0, nodes.pixel, node, "amax")
+        .remainder_(count + 1)  # -1 becomes "none"
+        for node in (nodes.node, nodes.node.masked_fill(is_other.index_select(0, nodes.node), -1))
     )
-    moving = winner.index_select(0, finest.remainder(count + 1))  # -1 becomes "none"
-    other = torch.where(lookup(evidence > 0, other.remainder(count + 1)), other, count)
-    moving = torch.where(moving < count, moving, other)
+    moving = winner.index_select(0, finest)
+    other = torch.where(lookup(is_other & (evidence > 0), last), last, count)
+    moving = torch.minimum(moving, other)
     none, num_own = components.count + count, components.roots.shape[1]
     name = torch.full((num_pixels,), none, dtype=torch.int64, device=own.device)
     name[:num_own] = torch.where(components.is_linked.index_select(0, components.roots[-1]), components.roots[-1], none)

@@ -103,12 +103,12 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     index = torch.empty_like(rows)
     lowest = torch.full((batch.num_windows,), 1 << 41, device=rows.device)
     height = torch.empty_like(rows)
-    size = constant((_CELL,), torch.float64, rows.device)  # see `Grid.pixel`
+    side = constant((_CELL,), torch.float64, rows.device)  # see `Grid.pixel`
     corner = constant(grid.lower[:2], torch.float64, rows.device)
     for some in chunks(0, len(rows), rows.device):
         position = batch.positions.index_select(1, rows[some])
         window = floor_divide(batch.image.index_select(0, rows[some]).long(), batch.num_steps)
-        col, row = (position[:2] - corner[:, None]).div_(size).long().add_(1)
+        col, row = (position[:2] - corner[:, None]).div_(side).long().add_(1)
         index[some] = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)
         height[some] = (position[2] / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
         lowest.scatter_reduce_(0, window, height[some], "amin")
