@@ -36,6 +36,7 @@ OWN = (1 << NUM_SLICES) - 1  # bits of the slices of the pixel itself
 _HIGHEST_SLICE = 2.0**56
 # A low pixel belongs to the object of a tall one that is at most so many rows and columns away.
 _RESIDUE_REACH = 2
+_BESIDE = (-1, 0, 1)  # rows or columns
 
 
 @dataclass(frozen=True)
@@ -271,7 +272,7 @@ class HeightSlicedSweeps:
 def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Tensor:
     """(N,) uint8: slice of heights (N,) float64, metres, floor(z / slice_height) mod n; 0 for NaN. n: a power of 2, at
     most 16."""
-    layer = (z / torch.full((), slice_height, dtype=z.dtype, device=z.device)).floor_()  # see `Grid.pixel`
+    layer = (z / constant((slice_height,), z.dtype, z.device)).floor_()  # see `Grid.pixel`
     layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
     return (layer.long() & (num_slices - 1)).to(torch.uint8)
 
@@ -301,13 +302,14 @@ def _pixels(pixel: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels
 
 def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:
     """Write the slices of pixels, and into the upper bits of the 3 x 3 pixels around each what lies there."""
-    image.index_copy_(0, pixels.index, pixels.slices)
-    above, outside, line = pixels.slices << NUM_SLICES, image.numel() - 1, torch.arange(-1, 2, device=image.device)
+    above, outside, line = pixels.slices << NUM_SLICES, image.numel() - 1, constant(_BESIDE, torch.int64, image.device)
+    image.index_copy_(0, pixels.index, pixels.slices | above)
     row, col = pixels.row + line[:, None], pixels.col + line[:, None]
-    inside = ((row >= 0) & (row < grid.height))[:, None] & ((col >= 0) & (col < grid.width))
+    inside = (row.clamp(0, grid.height - 1) == row)[:, None] & (col.clamp(0, grid.width - 1) == col)
     around = pixels.index + torch.add(line, line[:, None], alpha=grid.width)[..., None]
     # No two pixels have the same index in a round, but outside: there anything may be written.
-    for index in torch.where(inside, around, outside).view(9, -1).unbind():
+    rounds = torch.where(inside, around, outside).view(9, -1).unbind()
+    for index in rounds[:4] + rounds[5:]:  # without that of the pixels themselves
         image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(above))
     image[outside] = 0
 
@@ -319,7 +321,7 @@ def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
     low = flat_nonzero(~answer)
     line, col = split_index(pixel.index_select(0, low), grid.width)
     number, row = split_index(line, grid.height)
-    reach = torch.arange(-_RESIDUE_REACH, _RESIDUE_REACH + 1, device=pixel.device)
+    reach = constant(tuple(range(-_RESIDUE_REACH, _RESIDUE_REACH + 1)), torch.int64, pixel.device)
     # Beyond the border the border's pixel is looked up, which is as near.
     rows = (row[:, None] + reach).clamp_(0, grid.height - 1).add_(number[:, None], alpha=grid.height)
     cols = (col[:, None] + reach).clamp_(0, grid.width - 1)

@@ -89,7 +89,7 @@ class Grid:
             floor((p - p_lower) / s) with a true division in float64. The divisor is a tensor, because a GPU multiplies
             by the reciprocal of a plain number, which rounds differently.
         """
-        size = torch.full((), self.pixel_size, dtype=positions.dtype, device=positions.device)
+        size = constant((self.pixel_size,), positions.dtype, positions.device)
         # Inside the region nothing is below the lower end, so int() rounds down.
         col = (positions[0] - self.lower[0]).div_(size).int()
         row = (positions[1] - self.lower[1]).div_(size).int()
