@@ -185,12 +185,14 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     is_moved = shift.any(1)
     some = flat_nonzero(is_moved.index_select(0, pairs.template.image))
     pair, row, col = gather(some, pairs.template.image, pairs.template.row, pairs.template.col)
-    (dy, dx), node = shift.index_select(0, pair).unbind(1), pairs.cluster.index_select(0, pair)
-    (height, width), start = images.size.index_select(0, node).unbind(1), images.start.index_select(0, node)
+    node = pairs.cluster.index_select(0, pair)
+    size, start = images.size.index_select(0, node).t(), images.start.index_select(0, node)
     beside = constant(((0, -1, 1, 0, 0), (0, 0, 0, -1, 1)), torch.int64, shift.device)
-    y, x = (row + dy)[:, None] + beside[0], (col + dx)[:, None] + beside[1]
-    inside = (y >= 0) & (y < height[:, None]) & (x >= 0) & (x < width[:, None])
-    index = (start[:, None] + y * width[:, None] + x).mul_(inside)
+    peak = torch.stack((row, col)) + shift.index_select(0, pair).t()
+    at = peak[:, :, None] + beside[:, None]  # (2, pixels, 5)
+    inside = torch.logical_and(*((at >= 0) & (at < size[:, :, None])))
+    height, width = size
+    index = (start[:, None] + at[0] * width[:, None] + at[1]).mul_(inside)
     own = images.image.index_select(0, start + ((pairs.source.index_select(0, pair) + 1) * height + row) * width + col)
     target = images.image.index_select(0, index.view(-1)).view_as(index)
     meets = count_slices(own[:, None] & target) * inside

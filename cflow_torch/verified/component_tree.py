@@ -156,7 +156,7 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
     root = torch.cat((roots[-1], changed_root))
     # The first sum counts all pixels and, above 2^32, those at t+1; the second those that are missing, or may be.
     is_missing = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
-    codes = torch.stack((1 + ((pixels.step == 0).long() << 32), is_missing.long()))
+    codes = torch.stack((torch.where(pixels.step == 0, 1 + (1 << 32), 1), is_missing))
     sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
     # What the components of a level hold adds up to what those of the coarser level hold.
     for level in range(len(roots) - 1, 0, -1):
@@ -202,8 +202,9 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
     is_node[plain] &= size[plain] != size.index_select(0, parent[plain])
     name = flat_nonzero(is_node)
     number, around = renumber(name, count), parent.index_select(0, name)
+    nearest = torch.where(is_node, torch.arange(count + 1, device=parent.device), parent)
     for _ in range(components.num_levels - 2):
-        around = torch.where(is_node.index_select(0, around), around, parent.index_select(0, around))
+        around = nearest.index_select(0, around)
     pixel = torch.arange(roots.shape[1], device=roots.device).repeat(components.num_levels)
     node = number.index_select(0, torch.cat((roots.flatten(), components.changed_root)))
     kept = flat_nonzero(node < len(name))
@@ -277,9 +278,9 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
     other = torch.where(lookup(is_other & (evidence > 0), last), last, count)
     moving = torch.minimum(moving, other)
     none, num_own = components.count + count, components.roots.shape[1]
-    name = torch.full((num_pixels,), none, dtype=torch.int64, device=own.device)
-    name[:num_own] = torch.where(components.is_linked.index_select(0, components.roots[-1]), components.roots[-1], none)
-    name = torch.where(moving < count, lookup(nodes.component, moving), name)
+    static = torch.where(components.is_linked.index_select(0, components.roots[-1]), components.roots[-1], none)
+    static = F.pad(static, (0, num_pixels - num_own), value=none)
+    name = torch.where(moving < count, lookup(nodes.component, moving), static)
     objects = number_objects(name, none)
     return objects, renumber(nodes.component, none).index_select(0, objects.component)
 

@@ -260,8 +260,7 @@ class HeightSlicedSweeps:
     def point(self, index: Tensor) -> Tensor:
         """(L,) int64, rows of the batch of some points or copies, (L,) int64 below N + K."""
         num_points = self.batch.image.numel()
-        own = torch.where(index < num_points, index, 0)
-        return torch.where(index < num_points, own, lookup(self.copied, (index - num_points).clamp_(min=0)))
+        return torch.where(index < num_points, index, lookup(self.copied, (index - num_points).clamp_(min=0)))
 
     @cached_property
     def lowest(self) -> Tensor:
