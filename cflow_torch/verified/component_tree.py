@@ -135,9 +135,7 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
     images, positions = [], []
     for block in blocks:
         height, width = -(-grid.height // block), -(-grid.width // block)
-        row, col = pixels.row, pixels.col
-        if block > 1:
-            row, col = floor_divide(row, block), floor_divide(col, block)
+        row, col = floor_divide(pixels.row_col, block) if block > 1 else pixels.row_col
         positions.append((torch.add(row, pixels.window, alpha=padded_size(height)), col))
         images.append((_draw(*positions[-1], num_windows, height, width), 3))
     images.append((images[-1][0], 1))

@@ -155,11 +155,8 @@ class HeightSlicedSweeps:
         rank = lazy_zeros(len(image), torch.int32, device)
         if ground is not None:
             is_kept = _is_near_tall(image, pixel, grid)
-            left_out, pixel = (
-                pixel.index_select(0, flat_nonzero(~is_kept)),
-                pixel.index_select(0, flat_nonzero(is_kept)),
-            )
-            image.index_fill_(0, left_out, 0)
+            image.index_copy_(0, pixel, is_kept.byte())
+            pixel = pixel.index_select(0, flat_nonzero(is_kept))
         rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=device))
         pixel_of_point = (rank.index_select(0, index).long() - 1).remainder_(len(pixel) + 1)
         pixels = _pixels(pixel, _slices(pixel_of_point, height_slice, len(pixel)), grid, batch.num_steps)

@@ -101,7 +101,10 @@ class PieceReader:
                 row = flat_nonzero(is_active)
                 is_active = has_result = torch.ones_like(row, dtype=torch.bool)
                 positions = take_columns(moved[:num_axes], row)
-            of_point = _select(image, row) + torch.zeros_like(is_active, dtype=torch.int32)
+            if isinstance(image, Tensor):
+                of_point = _select(image, row)
+            else:
+                of_point = torch.full_like(is_active, image, dtype=torch.int32)
             point_times = None if times is None else _select(times[rows], row).float()
             yield Piece(step, positions, is_active, has_result, of_point, point_times, pose_flow)
 
