@@ -192,13 +192,14 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
     parent, this is the root.
     """
     parent = torch.arange(num_nodes, device=sources.device)
-    low, high, num_rounds = sources, targets, _ROUNDS
+    ends, low, high, num_rounds = torch.cat((sources, targets)), sources, targets, _ROUNDS
     while True:
         for _ in range(num_rounds):
-            parent.scatter_reduce_(0, torch.maximum(low, high), torch.minimum(low, high), "amin")
+            # Hook the larger parent of an edge to the smaller one; the other direction has no effect.
+            parent.scatter_reduce_(0, high, low, "amin").scatter_reduce_(0, low, high, "amin")
             for _ in range(_JUMPS):
                 parent = parent.index_select(0, parent)
-            low, high = parent.index_select(0, sources), parent.index_select(0, targets)
+            low, high = parent.index_select(0, ends).view(2, -1)
         if torch.equal(low, high):
             return parent
         num_rounds = 1
