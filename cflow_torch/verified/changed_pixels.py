@@ -71,8 +71,8 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
 def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
     """The set bits of (P, S) uint8 masks: flat index of the mask and number of the bit, (K,) int64 each."""
     some = flat_nonzero(missing.bool())
-    bits = missing.view(-1).index_select(0, some)[:, None] >> constant((0, 1, 2, 3), torch.uint8, missing.device)
-    entry, bit = split_index(flat_nonzero((bits & 1).bool()), NUM_SLICES)
+    bits = missing.view(-1).index_select(0, some)[:, None] & constant((1, 2, 4, 8), torch.uint8, missing.device)
+    entry, bit = split_index(flat_nonzero(bits.bool()), NUM_SLICES)
     return some.index_select(0, entry), bit
 
 
