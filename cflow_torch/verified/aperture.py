@@ -127,7 +127,7 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     some = flat_nonzero(number < count)
     pixels, component = sweeps.pixels.take(some % roots.shape[1]), number.index_select(0, some)
     is_new = pixels.step == 0
-    num_slices = torch.where(is_new, count_slices(pixels.slices).long() - _TALL, 0)
+    num_slices = torch.where(is_new, count_slices(pixels.slices) - _TALL, 0)
     is_tall = scatter_count(component, count, num_slices) >= 0
 
     # Ends in four directions, at t+1 and in the farthest sweep; pixels of other sweeps count for a component behind.

@@ -195,7 +195,7 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     index = (start[:, None] + at[0] * width[:, None] + at[1]).mul_(inside)
     own = images.image.index_select(0, start + ((pairs.source.index_select(0, pair) + 1) * height + row) * width + col)
     target = images.image.index_select(0, index.view(-1)).view_as(index)
-    meets = count_slices(own[:, None] & target).long() * inside
+    meets = count_slices(own[:, None] & target) * inside
     sums = scatter_count(pair, len(shift), meets.t())
     # Before and after the peak: above and below it, then left and right of it.
     return (parabola_vertex(sums[1::2], sums[:1], sums[2::2]) * is_moved).t()

@@ -21,7 +21,7 @@ from torch import Tensor
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lookup, scatter_count
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
+from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, Pixels, count_slices
 from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
@@ -171,6 +171,6 @@ def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, 
     row, col = (motion.index_select(0, source) * elapsed[:, None] + 0.5).floor_().long().unbind(1)
     index = sweeps.index(of_t.window, torch.zeros_like(row), of_t.row + row, of_t.col + col)
     matched = of_t.slices & sweeps.image.index_select(0, index)
-    both = count_slices(of_t.slices).long() + (count_slices(matched).long() << 32)
+    both = count_slices(of_t.slices | matched << NUM_SLICES)
     sums = scatter_count(block_of_t, sweeps.batch.num_windows * height * width, both).index_select(0, block)
     return sums & 0xFFFFFFFF, sums >> 32

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 from cflow_torch.ops.indices import flat_nonzero, gather, renumber, scatter_count
 from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Nodes
-from cflow_torch.verified.height_slices import NUM_SLICES, OWN, HeightSlicedSweeps, Pixels, count_slices
+from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, Pixels, count_slices
 
 # Comparisons (pixel x sweep x candidate) done at once: their temporaries take about 64 bytes each.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
@@ -147,7 +146,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     (count, num_candidates, _), num_steps, device = candidates.shape, sweeps.num_steps, component.device
     window = torch.zeros((count,), dtype=torch.int64, device=device).scatter_(0, component, members.window)
     moves = Moves.of(sweeps, window, candidates)
-    counts_of, column = _counts_of(device), torch.arange(num_candidates, device=device)
+    column = torch.arange(num_candidates, device=device)
     sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=device)
     in_place = torch.zeros(count, dtype=torch.int64, device=device)
     near_and_all = torch.zeros(2 * count, dtype=torch.int64, device=device)
@@ -167,13 +166,11 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         seen, far = sweeps.image.index_select(0, index.view(-1)).view_as(index), moves.is_far.index_select(0, which)
         won = seen & torch.where(far, left_far, left)  # no slice of the neighbourhood is left
         lost = in_both[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
-        counts = counts_of.index_select(0, (won | lost << NUM_SLICES).view(-1).int())
-        sums.index_add_(0, (of[:, None] * num_candidates + column).view(-1), counts)
-        in_place.index_add_(0, of, count_slices(in_both).long())
+        counts = count_slices(lost | won << NUM_SLICES)
+        sums.index_add_(0, (of[:, None] * num_candidates + column).view(-1), counts.view(-1))
+        in_place.index_add_(0, of, count_slices(in_both))
         is_given = moves.is_given.index_select(0, which)
-        near_and_all.index_add_(
-            0, of * 2 + (to > 0), counts_of.index_select(0, (near | own << NUM_SLICES).int()) * is_given
-        )
+        near_and_all.index_add_(0, of * 2 + (to > 0), count_slices(own | near << NUM_SLICES) * is_given)
     sums = sums.view(-1, num_candidates)
     near, total = near_and_all.view(-1, 2) >> 32, near_and_all.view(-1, 2) & 0xFFFFFFFF
     is_covered = ((total > 0) & (near * 100 >= total * _COVERED)).any(1)
@@ -244,14 +241,6 @@ def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
     every = torch.arange(1, num_steps, device=older.device)
     to = every[:, None].expand(-1, newest.numel()).reshape(-1)
     return torch.cat((older, newest.repeat(every.numel()))), torch.cat((torch.zeros_like(older), to))
-
-
-@lru_cache(maxsize=64)
-def _counts_of(device: torch.device) -> Tensor:
-    """(256,) int64: set bits of the lower half of a byte times 2^32, plus those of its upper half. Both counts are in
-    one number because sums cost more than lookups."""
-    byte = torch.arange(256, dtype=torch.uint8, device=device)
-    return (count_slices(byte & OWN).long() << 32) + count_slices(byte >> NUM_SLICES).long()
 
 
 def evidence_of(won: Tensor, lost: Tensor, z: float) -> Tensor:

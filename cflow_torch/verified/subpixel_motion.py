@@ -78,7 +78,7 @@ def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> 
     own = asked.slices[:, None]
     seen = own & sweeps.image.index_select(0, index.view(-1)).view_as(index)
     ahead, behind = seen[:, : len(sides)], seen[:, len(sides) :]
-    counts = count_slices(torch.cat((ahead & ~behind, behind & ~ahead, own), 1)).long()
+    counts = count_slices(torch.cat((ahead & ~behind, behind & ~ahead, own), 1))
     sums = scatter_count(of, objects.count, counts.t())
     a, b = sums[:-1].view(2, len(sides), -1)
     far = (a - b) * (a - b) >= _BIAS_Z**2 * (a + b)

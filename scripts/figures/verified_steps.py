@@ -84,7 +84,7 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
         return pixel, cluster_colors(corners[pixel], group.numpy(), STATIC)
 
     every, now = torch.arange(own), torch.where(pixels.step[:own] == 1)[0]
-    paint(panels[0], (now, SHADES[count_slices(pixels.slices[now]).long()]))
+    paint(panels[0], (now, SHADES[count_slices(pixels.slices[now])]))
     paint(panels[1], (every, PALE), (torch.where(change.has_changed)[0], PALETTE[0]))
     scales = torch.tensor((levels - 2, levels - 1))  # the finest, dilated and plain
     fine = torch.where(torch.isin(nodes.level[nodes.node], scales))[0].flip(0)  # dilated ones are drawn over plain ones
