@@ -75,13 +75,9 @@ def scatter_count(index: Tensor, size: int, weights: Tensor | None = None) -> Te
 
     Cost: one pass, without a synchronisation (`torch.bincount` has one).
     """
-    if weights is None or weights.dim() == 1:
-        weights = torch.ones_like(index) if weights is None else weights
-        return weights.new_zeros(size).index_add_(0, index, weights)
-    num_rows = len(weights)
-    row = torch.arange(num_rows, device=index.device) * size
-    # On the CPU index_add_ in one dimension is many times faster than in two.
-    return scatter_count((index + row[:, None]).view(-1), num_rows * size, weights.flatten()).view(num_rows, size)
+    weights = torch.ones_like(index) if weights is None else weights
+    sums = weights.new_zeros((*weights.shape[:-1], size))
+    return sums.scatter_add_(-1, index.expand_as(weights), weights)
 
 
 def renumber(index: Tensor, size: int) -> Tensor:
