@@ -13,7 +13,7 @@ from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
-from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, NUM_LAYERS, register, stretch_of
+from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, NUM_LAYERS, VoxelPairs, register
 from cflow_torch.verified.subpixel_motion import subpixel_motion
 from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 
@@ -38,43 +38,45 @@ def refine(
     start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
     moves = start.any(1)
     points = points_of_objects(sweeps, objects, moves, LAYER_HEIGHT, NUM_LAYERS)
-    apparent = register(points, sweeps, start)
-    return register_deskewed(points, sweeps, start, apparent), apparent
+    return register_deskewed(points, sweeps, start)
 
 
 def register_deskewed(
-    points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor, apparent: RigidMotion
-) -> RigidMotion:
-    """The motion of objects per sweep interval, from the apparent motion and the times of points.
+    points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor
+) -> tuple[RigidMotion, RigidMotion]:
+    """The motion of objects per sweep interval, by registration and the times of points.
 
     Args:
-        points: of the objects that move, of all sweeps. Without times, the apparent motion is returned.
+        points: of the objects that move, of all sweeps.
         sweeps: finest images.
-        start: (G, 2) float64, x and y, metres per sweep interval, what the registration started from.
-        apparent: what it found.
+        start: (G, 2) float64, x and y, metres per sweep interval, to start from.
 
     Returns:
-        The motion. With more than two sweeps, the points are de-skewed and registered again, from the start divided by
-        the same factor. For pairs the motion is only divided: de-skewed smooth sides would slide along the pattern of
-        the beams, and there is no third sweep to prevent it.
+        The motion, and the apparent motion, which registration finds. Without times they are the same. With more than
+        two sweeps, the points are de-skewed and registered again, from the start divided by the same factor. For pairs
+        the motion is only divided: de-skewed smooth sides would slide along the pattern of the beams, and there is no
+        third sweep to prevent it.
 
     Convention: times of 0 change nothing, to the last bit.
 
     Cost: twice that of `register`, and a sort of the points.
     """
+    pairs = VoxelPairs(points, sweeps, len(start))
+    apparent = pairs.register(start)
     if points.time is None:
-        return apparent
-    stretch = stretch_of(points, sweeps, apparent)[:, None]
+        return apparent, apparent
+    stretch = pairs.stretch(apparent)[:, None]
     divided = RigidMotion(apparent.flow / stretch, apparent.rotation, apparent.centre)
     is_pair = ~sweeps.has_history
     points = points.take(~is_pair.index_select(0, points.window))
     again = register(*deskew(points, sweeps, divided), start / stretch)
     is_again = torch.bincount(points.object_id, minlength=len(start)) > 0
-    return RigidMotion(
+    deskewed = RigidMotion(
         torch.where(is_again[:, None], again.flow, divided.flow),
         torch.where(is_again, again.rotation, divided.rotation),
         torch.where(is_again[:, None], again.centre, divided.centre),
     )
+    return deskewed, apparent
 
 
 def deskew(

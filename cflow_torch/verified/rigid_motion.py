@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion
-from cflow_torch.ops.indices import flat_nonzero, index_in_group, lookup
+from cflow_torch.ops.indices import constant, flat_nonzero, index_in_group, lookup
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
@@ -47,7 +47,7 @@ class RigidMotion:
 
 def rotate(rotation: Tensor, arm: Tensor) -> Tensor:
     """(K,) complex128: x + iy, rotated about the origin by the angle whose half has the tangent `rotation`, (K,)."""
-    half = torch.complex(torch.ones_like(rotation), rotation)
+    half = torch.complex(constant((1.0,), rotation.dtype, rotation.device), rotation)
     return half / half.conj() * arm
 
 

@@ -7,17 +7,19 @@ farther the voxels around extend in it (generalised ICP).
 
 from __future__ import annotations
 
+from typing import Iterator
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, scatter_count, take_columns
 from cflow_torch.ops.linear import adjugate
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
 from cflow_torch.verified.surface_spread import NOISE, spread_of
-from cflow_torch.verified.voxel_centroids import UNITS, ObjectPoints, Voxels, whole
+from cflow_torch.verified.voxel_centroids import UNITS, ObjectPoints, Voxels
 
 # We chose these on real pairs and windows with history (docs/benchmarks.md).
 LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels, metres
@@ -30,7 +32,7 @@ _STEP_LENGTH = 1.4  # of that of Gauss and Newton: nearest partners change with 
 _LARGEST_CHANGE = (0.15, 0.15, 0.1)
 # Pairs of points without a surface that the given translation is worth, and, at a distance of 1 m, no rotation.
 _HELD, _HELD_ROTATION = 2.0, 5.0
-_ARM = 64  # arms are whole 64ths of a metre, and weights whole 256ths: sums are exact in any order
+_WEIGHT, _ARM = 256, 16  # weights are whole 256ths, and arms whole 16 units: sums are exact in any order
 # An object that covers a quarter of a turn of the sensor in an interval would be nearer than its own length. Times that
 # differ by more are those of a direction that is measured at the end of one sweep and at the start of the next.
 _LEAST_STRETCH = 0.75
@@ -39,9 +41,6 @@ _LEAST_STRETCH = 0.75
 def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> RigidMotion:
     """Refine the motion of every object by the voxels that meet under it, and estimate its rotation.
 
-    Every voxel of another sweep is paired with the nearest one of its object at t+1. Each step minimises the errors
-    over translation and angle. Two more terms hold on to the given translation and to no rotation.
-
     Args:
         points: of the objects that move, of all sweeps.
         sweeps: finest images.
@@ -49,122 +48,150 @@ def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> 
 
     Returns:
         The motion. An object without points at t keeps its flow.
-
-    Cost: 27 lookups a step for each voxel and sweep, and twice 27 searches for each block of voxels.
     """
-    pairs, device = _VoxelPairs(points, sweeps, len(flow)), flow.device
-    # The motion: x, y and the tangent of half the angle, (3, G). The angle is twice its tangent, nearly.
-    given = motion = F.pad(flow, (0, 1)).t()
-    held = constant((_HELD, _HELD, 4 * _HELD_ROTATION), torch.float64, device)[:, None]
-    largest = constant(_LARGEST_CHANGE, torch.float64, device)[:, None]
-    lower, upper = given - largest, given + largest
-    for _ in range(_NUM_STEPS):
-        equations = pairs.normal_equations(motion)
-        force = equations[:, 3] + held * (given - motion)
-        inverse, scale = adjugate(equations[:, :3] + torch.diag(held[:, 0])[:, :, None])
-        change = (inverse * force).sum(1) / scale
-        motion = torch.clamp(torch.add(motion, change, alpha=_STEP_LENGTH), lower, upper)
-    corner = constant(sweeps.grid.lower[:2], torch.float64, device)
-    return RigidMotion(motion[:2].t().contiguous(), motion[2], torch.view_as_real(pairs.centre) / UNITS + corner)
+    return VoxelPairs(points, sweeps, len(flow)).register(flow)
 
 
-def stretch_of(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> Tensor:
-    """Ratio of the time between two measurements of an object to the time between the sweeps.
+class VoxelPairs:
+    """Voxels of G objects in the sweeps that are paired with t+1. Lengths are in units, in the plane complex numbers.
 
     Args:
-        points: of the objects that move, with times.
+        points: of the objects that move, of all sweeps.
         sweeps: finest images.
-        rigid: apparent motion of G objects: the result of `register`.
+        num_objects: G.
 
-    Returns:
-        (G,) float64: sum of w k (k + b - a) over the sum of w k^2, over all pairs of voxels; w is the weight of a pair
-        in x plus that in y, k the intervals between its sweeps, a and b the mean times of its voxels in intervals. The
-        motion divided by this ratio explains the pairs best. 1 for objects without pairs, and where it is below 0.75.
-
-    Convention: k is rounded to a 16th and b - a to a 1024th, halves up.
-    """
-    motion = torch.cat((rigid.flow.t(), rigid.rotation[None]))
-    equations = _VoxelPairs(points, sweeps, len(rigid.flow)).normal_equations(motion)
-    squares, late = equations[0, 0] + equations[1, 1], equations[0, 4]
-    stretch = torch.where(squares > 0, 1 + late / squares, torch.ones_like(squares))
-    return torch.where(stretch < _LEAST_STRETCH, torch.ones_like(stretch), stretch)
-
-
-class _VoxelPairs:
-    """Voxels of G objects in the sweeps that are paired with t+1. The plane is that of complex numbers, in units.
-
-    Attributes:
-        centre: (G,) complex128, mean of the centroids at t, whole units.
+    Cost: twice 27 searches for each block of voxels.
     """
 
     def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> None:
         elapsed = sweeps.elapsed.flatten()
         of_point = elapsed.index_select(0, points.window * sweeps.num_steps + points.step)
-        points = points.take((points.step == 0) | (of_point != 0) & (of_point.abs() <= _MOST_TIME))
-        voxels = Voxels(points, sweeps, NUM_LAYERS)
-        self._voxels, self._num_objects = voxels, num_objects
+        self._voxels = voxels = Voxels(points.take(of_point.abs() <= _MOST_TIME), sweeps, NUM_LAYERS)
+        device = of_point.device
         at_t = flat_nonzero(voxels.step == 1)
-        position = F.pad(torch.view_as_real(voxels.position[at_t]), (0, 1), value=1.0).t()
-        *sums, count = scatter_count(voxels.object_id[at_t], num_objects, position)
-        self.centre = torch.complex(*(torch.floor(total / count.clamp(min=1)) for total in sums))
-        self._voxel = flat_nonzero((voxels.step != 0) & (count > 0).index_select(0, voxels.object_id))
-        window, step, self._object = gather(self._voxel, voxels.window, voxels.step, voxels.object_id)
-        self._sweep = window * sweeps.num_steps  # t+1
-        self._elapsed = elapsed.index_select(0, self._sweep + step)
-        self._end = sweeps.elapsed[:, 1].index_select(0, window)
+        summed = F.pad(take_columns(voxels.position[:2], at_t), (0, 0, 0, 1), value=1.0)
+        *sums, count = scatter_count(voxels.object_id.index_select(0, at_t), num_objects, summed)
+        self._centre_of_object = torch.complex(*(torch.floor(total / count.clamp(min=1)) for total in sums))
         self._object_of_voxel = F.pad(voxels.object_id, (0, 1), value=-1)
-        noise = NOISE**2 / 2 * torch.eye(3, dtype=torch.float64, device=points.object_id.device)[:, :, None]
-        self._spread = F.pad(spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT), (0, 1)) + noise
+        self._spread = F.pad(spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT).view(9, -1), (0, 1))
+        self._corner = constant(sweeps.grid.lower[:2], torch.float64, device)
 
-    def normal_equations(self, motion: Tensor) -> Tensor:
-        """Sums over the pairs of each object under a motion.
+        # The voxels that look for a partner.
+        self._voxel = flat_nonzero((voxels.step != 0) & (count > 0).index_select(0, voxels.object_id))
+        of_voxel = (voxels.window, voxels.step, voxels.layer, voxels.object_id)
+        window, step, layer, self._object = gather(self._voxel, *of_voxel)
+        self._sweep = window * sweeps.num_steps  # t+1
+        self._layers = (layer + constant(((-1,), (0,), (1,)), torch.int64, device)) & (NUM_LAYERS - 1)
+        self._elapsed = elapsed.index_select(0, self._sweep + step)
+        self._k = (self._elapsed * 16).round_() / 16
+        self._end = sweeps.elapsed[:, 1].index_select(0, window)
+        self._since_t = self._end - self._elapsed
+        x, y, self._height = take_columns(voxels.position, self._voxel)
+        self._centre = self._centre_of_object.index_select(0, self._object)
+        self._arm = torch.complex(x, y) - self._centre
+        noise = (NOISE * UNITS) ** 2 * torch.eye(3, dtype=torch.float64, device=device)
+        self._own_spread = take_columns(self._spread, self._voxel) + noise.view(9, 1)
+
+    def register(self, flow: Tensor) -> RigidMotion:
+        """Refine the motion of every object from (G, 2) float64, x and y, metres per sweep interval.
+
+        Every voxel of another sweep is paired with the nearest one of its object at t+1. Each step minimises the
+        errors over translation and angle. Two more terms hold on to the given translation and to no rotation.
+
+        Cost: 27 lookups a step for each voxel and sweep.
+        """
+        # The motion: x, y and the tangent of half the angle, (3, G). The angle is twice its tangent, nearly.
+        given = motion = F.pad(flow * UNITS, (0, 1)).t()
+        held_in_units = tuple(_WEIGHT * held for held in (_HELD, _HELD, 4 * _HELD_ROTATION * UNITS**2))
+        held = constant(held_in_units, torch.float64, flow.device)[:, None]
+        x, y, rotation = _LARGEST_CHANGE
+        largest = constant((x * UNITS, y * UNITS, rotation), torch.float64, flow.device)[:, None]
+        lower, upper, hold = (
+            given - largest,
+            given + largest,
+            held[:, None] * torch.eye(3, device=flow.device)[..., None],
+        )
+        hold = hold.expand(-1, -1, len(flow))
+        for _ in range(_NUM_STEPS):
+            equations = torch.cat((hold, (held * (given - motion))[:, None]), 1)
+            for some in self._chunks():
+                self._add_equations(equations, motion, some)
+            inverse, scale = adjugate(equations[:, :3])
+            change = (inverse * equations[:, 3]).sum(1) / scale
+            motion = torch.clamp(torch.add(motion, change, alpha=_STEP_LENGTH), lower, upper)
+        centre = torch.view_as_real(self._centre_of_object) / UNITS + self._corner
+        return RigidMotion((motion[:2] / UNITS).t().contiguous(), motion[2], centre)
+
+    def stretch(self, rigid: RigidMotion) -> Tensor:
+        """Ratio of the time between two measurements of an object to the time between the sweeps.
 
         Args:
-            motion: (3, G) float64, x and y in metres per interval, and the tangent of half the angle.
+            rigid: apparent motion of the objects, whose points have times: the result of `register`.
 
         Returns:
-            (3, 4, G) float64: the normal matrix and, in column 3, the force. Where there are times, (3, 5, G), with
-            w k (b - a) as in `stretch_of` in column 4.
+            (G,) float64: sum of w k (k + b - a) over the sum of w k^2, over all pairs of voxels; w is the weight of a
+            pair in x plus that in y, k the intervals between its sweeps, a and b the mean times of its voxels in
+            intervals. The motion divided by this ratio explains the pairs best. 1 for objects without pairs, and where
+            it is below 0.75.
+
+        Convention: k is rounded to a 16th and b - a to a 1024th.
         """
-        speed = torch.complex(motion[0], motion[1]) * UNITS
-        state = torch.stack((self.centre, speed, motion[2].to(speed.dtype)))
-        num_columns = 4 if self._voxels.time is None else 5
-        total = motion.new_zeros(3 * num_columns * self._num_objects)
-        row = torch.arange(3 * num_columns, device=motion.device)[:, None] * self._num_objects
-        for some in chunks(0, self._voxel.numel(), motion.device, 27):
-            index = self._object[some]
-            terms = self._terms(some, index, *state.index_select(1, index).unbind(0))
-            total.index_add_(0, (index + row).view(-1), terms.view(-1))
-        return total.view(3, num_columns, self._num_objects)
+        assert self._voxels.time is not None
+        motion = torch.cat((rigid.flow.t() * UNITS, rigid.rotation[None]))
+        time, sums = F.pad(self._voxels.time, (0, 1)), motion.new_zeros(2, len(rigid.rotation))
+        for some in self._chunks():
+            other, weight, _, _ = self._pairs(motion, some)
+            late = time.index_select(0, other) - time.index_select(0, self._voxel[some])
+            times = torch.stack((self._k[some], (late * UNITS).round_() / UNITS))
+            terms = times * ((weight[0, 0] + weight[1, 1]) * self._k[some])
+            sums.scatter_add_(1, self._object[some].expand(2, -1), terms)
+        squares, late = sums
+        stretch = torch.where(squares > 0, 1 + late / squares, 1.0)
+        return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
 
-    def _terms(self, some: slice, index: Tensor, centre: Tensor, velocity: Tensor, rotation: Tensor) -> Tensor:
-        """(3, 4 or 5, K) summands of some voxels."""
-        voxels, voxel, elapsed, end = self._voxels, self._voxel[some], self._elapsed[some], self._end[some]
-        position, height, layer = gather(voxel, voxels.position, voxels.height, voxels.layer)
-        arm = rotate(rotation.real * elapsed, position - centre - velocity * (end - elapsed))
-        target = whole(centre + velocity * end + arm)
-        other = voxels.nearest(self._sweep[some], layer, target, height)
-        error = torch.view_as_real(voxels.position.index_select(0, other) - target).t()
-        error = torch.cat((error, (voxels.height.index_select(0, other) - height)[None]))
-        is_pair = self._object_of_voxel.index_select(0, other) == index
-        is_pair &= error.square().sum(0) <= round((_FARTHEST * UNITS) ** 2)
-        error = error * is_pair / UNITS
+    def _chunks(self) -> Iterator[slice]:
+        """Voxels that are paired at once."""
+        return chunks(0, len(self._voxel), self._voxel.device, 27)
 
-        inverse, scale = adjugate(self._spread.index_select(2, voxel) + self._spread.index_select(2, other))
-        square = ((inverse * error).sum(1) * error).sum(0) / scale
-        weight = (_FAR / (_FAR + square)).square_() * is_pair / scale * NOISE**2
-        weight = whole(256 * (inverse[:2] * weight)) / 256
+    def _add_equations(self, equations: Tensor, motion: Tensor, some: slice) -> None:
+        """Add the pairs of some voxels under a motion to the equations of their objects.
 
-        # Derivative of the position at t+1, (2, 3, K), whole 16ths times whole 64ths of a metre.
-        k, one = whole(16 * elapsed) / 16, torch.ones_like(elapsed)
-        r_x, r_y = torch.view_as_real(whole(arm / (UNITS / _ARM)) / (_ARM / 2)).unbind(1)
-        zero = torch.zeros_like(one)
-        change = torch.stack((one, zero, -r_y, zero, one, r_x)).view(2, 3, -1) * k
-        weighted = (weight[:, :2, None] * change).sum(1)
-        columns = torch.cat((weighted, (weight * error).sum(1)[:, None]), 1)
-        terms = (change[:, :, None] * columns[:, None]).sum(0)
-        if voxels.time is None:
-            return terms
-        late = (lookup(voxels.time, other) - voxels.time.index_select(0, voxel)) * is_pair
-        late = (weight[0, 0] + weight[1, 1]) * k * (whole(UNITS * late) / UNITS)
-        return torch.cat((terms, late.expand(3, 1, -1)), 1)
+        Args:
+            equations: (3, 4, G) float64, normal matrices and, in column 3, the force, in whole 256ths.
+            motion: (3, G) float64, x and y per interval, and the tangent of half the angle.
+            some: which voxels.
+        """
+        _, weight, error, arm = self._pairs(motion, some)
+        # Derivatives of the position at t+1 by x and y, k, and by the tangent: twice the arm, rotated by a right angle.
+        k = self._k[some]
+        lever = torch.view_as_real(arm * (1j / _ARM)).round().t() * (2 * _ARM * k)
+        columns = (weight[:, :2] * k, (weight[:, :2] * lever).sum(1, True), (weight * error).sum(1, True))
+        weighted = torch.cat(columns, 1)
+        terms = torch.cat((weighted * k, (weighted * lever[:, None]).sum(0, True)))
+        equations.view(12, -1).scatter_add_(1, self._object[some].expand(12, -1), terms.view(12, -1))
+
+    def _pairs(self, motion: Tensor, some: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pair some voxels with those of t+1 under a motion.
+
+        Returns:
+            other: (K,) int64, the voxel of t+1.
+            weight: (2, 3, K) float64, of the errors in x and y, whole 256ths; 0 = there is no pair.
+            error: (3, K) float64.
+            arm: (K,) complex128, from the centre at t+1 to the moved voxel.
+        """
+        voxels, index, end, height = self._voxels, self._object[some], self._end[some], self._height[some]
+        v_x, v_y, rotation = take_columns(motion, index)
+        velocity = torch.complex(v_x, v_y)
+        arm = rotate(rotation * self._elapsed[some], self._arm[some] - velocity * self._since_t[some])
+        at = torch.view_as_real(self._centre[some] + velocity * end + arm).round()
+        target = torch.cat((at.t(), height[None]))
+        other, square = voxels.nearest(self._sweep[some], self._layers[:, some], target)
+        is_pair = (square <= round((_FARTHEST * UNITS) ** 2)) & (self._object_of_voxel.index_select(0, other) == index)
+        error = take_columns(voxels.position, other) - target
+        spread = self._own_spread[:, some] + take_columns(self._spread, other)
+        inverse, scale = adjugate(spread.view(3, 3, -1))
+        square = ((inverse * error).sum(1) * error).sum(0)
+        # (f / (f + d^2))^2 / s^2 of the squared distance d^2 = square / scale in standard deviations.
+        weight = scale / torch.add(square, scale, alpha=_FAR).square_() * is_pair
+        factor = _WEIGHT * (_FAR * NOISE * UNITS) ** 2
+        return other, (inverse[:2] * (weight * factor)).round_(), error, arm

@@ -11,10 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count, take_columns
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
-from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_objects, whole
+from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_objects
 
 _SIDES = ((0, 1), (1, -1), (1, 0), (1, 1))  # (dy, dx), a pixel ahead; the opposite is behind
 _BIAS_Z, _LEAST_BIAS = 3, 0.1  # a directional bias, standard deviations of noise, and as a share of the object's slices
@@ -95,19 +95,18 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
         all meetings less that without a shift; it must exceed `_Z` standard deviations of noise.
     """
     some = flat_nonzero(voxels.step < 2)
-    window, step, layer, of, position = gather(
-        some, voxels.window, voxels.step, voxels.layer, voxels.object_id, voxels.position
-    )
-    near = voxels.around(window * voxels.num_steps + 1 - step, layer, position, _AROUND)
-    ahead = torch.view_as_real(voxels.position.index_select(0, near.view(-1)).view_as(near) - position).permute(2, 0, 1)
-    ahead = ahead.clamp(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # from t+1 all signs change
+    window, step, layer, of = gather(some, voxels.window, voxels.step, voxels.layer, voxels.object_id)
+    position = take_columns(voxels.position[:2], some)
+    near = voxels.around(window * voxels.num_steps + 1 - step, layer[None], position, _AROUND)
+    ahead = take_columns(voxels.position[:2], near.view(-1)).view(2, *near.shape) - position[:, None]
+    ahead = ahead.clamp_(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # from t+1 all signs change
 
-    weights, shift = _meeting_weights(_SIGMA, step.device), position.real.new_zeros((2, num_objects))
+    weights, shift = _meeting_weights(_SIGMA, step.device), position.new_zeros((2, num_objects))
     weight, error = _meet(ahead, weights)
     unshifted = weight
     for _ in range(_NUM_STEPS):
         total, *sums = scatter_count(of, num_objects, torch.cat((weight[None], weight * error)))
-        shift += whole(_STEP_LENGTH * torch.stack(sums) / total.clamp(min=1 / 256))  # no weight is smaller
+        shift += (_STEP_LENGTH * torch.stack(sums) / total.clamp(min=1 / 256)).round_()  # no weight is smaller
         shift.clamp_(-_FARTHEST, _FARTHEST)
         weight, error = _meet(ahead - shift.index_select(1, of)[:, None], weights)
     gain = weight - unshifted
@@ -136,4 +135,4 @@ def _meeting_weights(sigma: float, device: torch.device) -> Tensor:
     Convention: entry i stands for d^2 from 64 i to 64 (i + 1) square units; the last one, 0, for all that is farther.
     """
     square = 64 * torch.arange(2048, dtype=torch.float64) + 32
-    return F.pad(whole(256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))) / 256, (0, 1)).to(device)
+    return F.pad((256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))).round_() / 256, (0, 1)).to(device)

@@ -28,24 +28,24 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
         pixel_size, layer_height: metres, sides of a voxel.
 
     Returns:
-        (3, 3, V) float64, square metres.
+        (3, 3, V) float64, square units.
 
     Cost: twice 27 searches for each block.
     """
-    position = torch.cat((torch.view_as_real(voxels.position[:-1]).t(), voxels.height[None, :-1]))
-    xyz, device = torch.floor(position / _STEP), position.device
+    position, device = voxels.position[:, :-1], voxels.position.device
+    xyz = torch.floor(position / _STEP)
     first, second = (constant(axes, torch.int64, device) for axes in ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)))
     moments = torch.cat((torch.ones_like(xyz[:1]), xyz, xyz.index_select(0, first) * xyz.index_select(0, second)))
     size = constant((pixel_size, pixel_size, layer_height), torch.float64, device)[:, None] * UNITS
     image = voxels.object_id * voxels.num_steps + voxels.step
-    unknown = _UNKNOWN**2 * torch.eye(3, dtype=torch.float64, device=device)[:, :, None]
+    unknown = (_UNKNOWN * UNITS) ** 2 * torch.eye(3, dtype=torch.float64, device=device)[:, :, None]
     spread, is_known = position.new_zeros((3, 3, position.shape[1])), torch.zeros_like(image, dtype=torch.bool)
     for side in _SIDES:
         sums = _sums_around(torch.floor(position / (side * size)).long(), image, moments)
         n, total = sums[0], sums[1:4]
         squares = sums.index_select(0, constant((4, 5, 6, 5, 7, 8, 6, 8, 9), torch.int64, device)).view(3, 3, -1)
         scaled = n * squares - total[:, None] * total
-        here = scaled / (n * n) * (_STEP / UNITS) ** 2 + unknown * (n < _FEWEST)
+        here = scaled * _STEP**2 / (n * n) + unknown * (n < _FEWEST)
         spread = torch.where(is_known, spread, here)
         trace = scaled.diagonal(dim1=0, dim2=1).sum(-1)
         is_known |= (n >= _FEWEST) & (trace * trace >= _LINE * scaled.square().sum((0, 1)))

@@ -13,7 +13,7 @@ from typing import NamedTuple, Sequence
 import numpy as np
 
 from oracle.height_slices import Pixel, SlicedSweeps, SweepPoint, Vector
-from oracle.voxels import LAYERS, UNITS, Voxel, Voxels, nearest, voxels_of, whole
+from oracle.voxels import LAYERS, UNITS, Voxel, Voxels, nearest, voxels_of
 
 LAYER_HEIGHT, NUM_LAYERS = 0.1, LAYERS  # of voxels, metres; their number, then they repeat
 FARTHEST = 0.2  # metres, between the voxels of a pair
@@ -78,7 +78,7 @@ class Surfaces:
             start = end - elapsed
             arm = voxel.x - centre[0] - v_x * start, voxel.y - centre[1] - v_y * start
             arm_x, arm_y = rotate(rotation * elapsed, *arm)
-            x, y = whole(centre[0] + v_x * end + arm_x), whole(centre[1] + v_y * end + arm_y)
+            x, y = round(centre[0] + v_x * end + arm_x), round(centre[1] + v_y * end + arm_y)
             partner = nearest(self.voxels, 0, voxel.layer, x, y, voxel.z, self.sweeps)
             if partner is None or partner.object_id != object_id:
                 continue
@@ -88,10 +88,10 @@ class Surfaces:
             error = error / UNITS
             inverse = np.linalg.inv(self.spreads[voxel] + self.spreads[partner] + NOISE**2 * np.eye(3))
             weight = (FAR / (FAR + error @ inverse @ error)) ** 2 * NOISE**2 * inverse
-            weight = np.floor(256 * weight + 0.5) / 256
-            late = whole((partner.time - voxel.time) * UNITS) / UNITS
+            weight = np.round(256 * weight) / 256
+            late = round((partner.time - voxel.time) * UNITS) / UNITS
             found.append(
-                Pair(whole(elapsed * 16) / 16, (whole(arm_x / 16) / 64, whole(arm_y / 16) / 64), error, weight, late)
+                Pair(round(elapsed * 16) / 16, (round(arm_x / 16) / 64, round(arm_y / 16) / 64), error, weight, late)
             )
         return found
 

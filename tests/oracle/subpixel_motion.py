@@ -7,7 +7,7 @@ from itertools import product
 from typing import Sequence
 
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, count
-from oracle.voxels import UNITS, Voxel, Voxels, centre_pixel, voxels_of, whole
+from oracle.voxels import UNITS, Voxel, Voxels, centre_pixel, voxels_of
 
 SIDES = ((0, 1), (1, -1), (1, 0), (1, 1))  # (dy, dx), a pixel ahead; the opposite is behind
 BIAS_Z, LEAST_BIAS = 3, 10  # standard deviations of noise of a bias; and it must be a 10th of the object's slices
@@ -69,8 +69,8 @@ def significant_shift(cubes: Sequence[Sequence[tuple[int, int]]]) -> tuple[int, 
     at_rest = met = [meet(cube, x, y) for cube in cubes]
     for _ in range(NUM_STEPS):
         total = max(sum(weight for weight, _, _ in met), 1 / 256)
-        x += whole(STEP_LENGTH * (sum(weight * dx for weight, dx, _ in met) / total))
-        y += whole(STEP_LENGTH * (sum(weight * dy for weight, _, dy in met) / total))
+        x += round(STEP_LENGTH * (sum(weight * dx for weight, dx, _ in met) / total))
+        y += round(STEP_LENGTH * (sum(weight * dy for weight, _, dy in met) / total))
         x, y = (max(-FARTHEST, min(shift, FARTHEST)) for shift in (x, y))
         met = [meet(cube, x, y) for cube in cubes]
     gains = [now[0] - before[0] for now, before in zip(met, at_rest)]
@@ -89,5 +89,5 @@ def meet(cube: Sequence[tuple[int, int]], x: int, y: int) -> tuple[float, int, i
         return 0.0, 0, 0
     dx, dy = min(offsets, key=lambda offset: offset[0] ** 2 + offset[1] ** 2)
     step = (dx * dx + dy * dy) // 64
-    weight = whole(256 * math.exp(-(64 * step + 32) / (2 * (SIGMA * UNITS) ** 2))) / 256 if step < 2048 else 0.0
+    weight = round(256 * math.exp(-(64 * step + 32) / (2 * (SIGMA * UNITS) ** 2))) / 256 if step < 2048 else 0.0
     return weight, dx, dy

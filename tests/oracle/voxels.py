@@ -38,9 +38,9 @@ def voxels_of(
             inside.setdefault((*pixel, slice_of(p.z, height, num_slices)), []).append(p)
     voxels = {}
     for (m, row, col, layer), own in inside.items():
-        x = sum(whole((p.x - x0) * UNITS) for p in own) // len(own)
-        y = sum(whole((p.y - y0) * UNITS) for p in own) // len(own)
-        z = sum(min(max(whole(p.z * UNITS), -(2**24)), 2**24) for p in own) // len(own)
+        x = sum(round((p.x - x0) * UNITS) for p in own) // len(own)
+        y = sum(round((p.y - y0) * UNITS) for p in own) // len(own)
+        z = sum(min(max(round(p.z * UNITS), -(2**24)), 2**24) for p in own) // len(own)
         time = sum(p.time for p in own) / len(own)
         voxels[m, row, col, layer] = Voxel(m, layer, object_of[m, row, col], x, y, z, time)
     return voxels
@@ -60,8 +60,3 @@ def nearest(voxels: Voxels, step: int, layer: int, x: float, y: float, z: float,
     near = [(step, row + dy, col + dx, (layer + up) % LAYERS) for dy, dx in NEAR for up in (-1, 0, 1)]
     found = [voxels[index] for index in near if index in voxels]
     return min(found, key=lambda voxel: (voxel.x - x) ** 2 + (voxel.y - y) ** 2 + (voxel.z - z) ** 2, default=None)
-
-
-def whole(x: float) -> int:
-    """Nearest whole number, halves up."""
-    return math.floor(x + 0.5)

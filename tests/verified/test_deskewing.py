@@ -16,7 +16,6 @@ from turning_car import MODEL, turning_car
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window
 from cflow_torch.verified.refinement import deskew, register_deskewed
-from cflow_torch.verified.rigid_registration import register
 
 HISTORY = MODEL.replace(num_history=3)
 
@@ -78,9 +77,8 @@ def test_a_known_motion_under_known_times_is_found(elapsed):
     apparent = [1.1 * v for v in velocity]  # an interval and a tenth lie between two sightings
     scene = with_times(one_object(clouds, apparent, elapsed), torch.from_numpy(of_points))
     points = scene.points()
-    seen = register(points, scene.sweeps, scene.flow)
+    found, seen = register_deskewed(points, scene.sweeps, scene.flow)
     np.testing.assert_allclose(seen.flow[0], apparent, atol=1e-3)
-    found = register_deskewed(points, scene.sweeps, scene.flow, seen)
     np.testing.assert_allclose(found.flow[0], velocity, atol=1e-3)
     assert abs(float(found.rotation)) < 1e-3
 
@@ -95,8 +93,8 @@ def test_times_that_differ_by_a_turn_of_the_sensor_are_not_believed():
     clouds, of_points = seen_box((0.3, 0.0), [(0.0,), (0.0,)])
     of_points[len(clouds[0]) :] = 0.9
     scene = with_times(one_object(clouds, (0.3, 0.0)), torch.from_numpy(of_points))
-    seen = register(scene.points(), scene.sweeps, scene.flow)
-    assert torch.equal(register_deskewed(scene.points(), scene.sweeps, scene.flow, seen).flow, seen.flow)
+    found, seen = register_deskewed(scene.points(), scene.sweeps, scene.flow)
+    assert torch.equal(found.flow, seen.flow)
 
 
 # ------------------------------------------------------------------------------------------------ what must not matter
