@@ -168,8 +168,9 @@ def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, 
     source = flat_nonzero(pixels.step == 1)
     of_t, block_of_t = pixels.take(source), block.index_select(0, source)
     elapsed = sweeps.elapsed[:, 1].index_select(0, of_t.window)
-    row, col = (motion.index_select(0, source) * elapsed[:, None] + 0.5).floor_().long().unbind(1)
-    index = sweeps.index(of_t.window, torch.zeros_like(row), of_t.row + row, of_t.col + col)
+    shift = (motion.index_select(0, source).t() * elapsed + 0.5).floor_().long()
+    offset = torch.add(shift[1], shift[0], alpha=sweeps.grid.width) - sweeps.grid.height * sweeps.grid.width  # t+1
+    index = sweeps.or_outside(of_t.index + offset, of_t.table[3:] + shift)
     matched = of_t.slices & sweeps.image.index_select(0, index)
     both = count_slices(of_t.slices | matched << NUM_SLICES)
     sums = scatter_count(block_of_t, sweeps.batch.num_windows * height * width, both).index_select(0, block)

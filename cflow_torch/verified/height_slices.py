@@ -224,20 +224,19 @@ class HeightSlicedSweeps:
         """(B,) bool, whether a window has more sweeps than t and t+1."""
         return self.num_more > 0
 
-    def index(self, window: Tensor, step: Tensor, row: Tensor, col: Tensor) -> Tensor:
+    def or_outside(self, index: Tensor, at: Tensor) -> Tensor:
         """Flat index into `image` of pixels that may lie outside it.
 
         Args:
-            window, step: int64, of shapes that broadcast with each other and with those of row and col; valid.
-            row, col: int64, any value.
+            index: (...) int64, that of pixels inside.
+            at: (2, ...) int64, rows and columns, any value.
 
         Returns:
-            int64 of the broadcast shape; that of the last entry of `image` for pixels outside.
+            (...) int64; that of the last entry of `image` for pixels outside.
         """
-        height, width = self.grid.height, self.grid.width
-        inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
-        flat = ((window * self.num_steps + step) * height + row) * width + col
-        return torch.where(inside, flat, self.image.numel() - 1)
+        size = constant((self.grid.height, self.grid.width), torch.int64, at.device)
+        inside = (at >= 0) & (at < size.view(2, *(1,) * index.dim()))
+        return torch.where(inside[0] & inside[1], index, self.image.numel() - 1)
 
     def around(self, pixel: Tensor, reach: int) -> Tensor:
         """Return the occupied pixels around some pixels, in the same sweep.
@@ -249,10 +248,11 @@ class HeightSlicedSweeps:
         Returns:
             (K, (2 r + 1)^2) int64, in raster order; P where a pixel is empty or lies outside the image.
         """
-        window, step, row, col = (values[:, None] for values in take_columns(self.pixels.table[1:], pixel))
-        line = torch.arange(-reach, reach + 1, device=pixel.device)
-        down, right = line.repeat_interleave(len(line)), line.repeat(len(line))
-        rank = self.rank[self.index(window, step, row + down, col + right)].long()
+        line, table = range(-reach, reach + 1), take_columns(self.pixels.table, pixel)[..., None]
+        shifts = tuple(zip(*((down, right) for down in line for right in line)))
+        shift = constant(shifts, torch.int64, pixel.device)
+        index = table[0] + torch.add(shift[1], shift[0], alpha=self.grid.width)
+        rank = self.rank[self.or_outside(index, table[3:] + shift[:, None])].long()
         return (rank - 1).remainder_(self.num_pixels + 1)
 
     def point(self, index: Tensor) -> Tensor:

@@ -8,7 +8,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, gather, renumber, scatter_count
+from cflow_torch.ops.indices import (
+    constant,
+    flat_nonzero,
+    gather,
+    renumber,
+    scatter_count,
+    split_index,
+    take_columns,
+)
 from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Nodes
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, Pixels, count_slices
@@ -143,55 +151,61 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
 
     Cost: K (S - 1) C lookups at most.
     """
-    (count, num_candidates, _), num_steps, device = candidates.shape, sweeps.num_steps, component.device
+    count, num_candidates, num_steps = len(candidates), candidates.shape[1], sweeps.num_steps
+    area, device = sweeps.grid.height * sweeps.grid.width, component.device
     window = torch.zeros((count,), dtype=torch.int64, device=device).scatter_(0, component, members.window)
     moves = Moves.of(sweeps, window, candidates)
-    column = torch.arange(num_candidates, device=device)
+    first = torch.sub(members.index, members.step, alpha=area)
+    move = torch.add(members.step + (num_steps - 1), component, alpha=2 * num_steps - 1)
+    at = members.table[3:]
+    ends = constant((sweeps.grid.height - 1, sweeps.grid.width - 1), torch.int64, device)[:, None]
+    border = torch.minimum(*torch.minimum(at, ends - at))
+    # Slices that are lost and, times 2^32, won; slices in place; all slices and, times 2^32, those that stay within a
+    # pixel: of the sweeps before t+1, then of t+1.
     sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=device)
-    in_place = torch.zeros(count, dtype=torch.int64, device=device)
-    near_and_all = torch.zeros(2 * count, dtype=torch.int64, device=device)
-    border, first = moves.to_border(members), members.index - members.step * moves.area
-    pixel, step = comparisons(members.step, num_steps)
+    of_static = torch.zeros((2, 2 * count), dtype=torch.int64, device=device)
+    column = constant(tuple(range(num_candidates)), torch.int64, device)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
-    for at, to in zip(pixel.split(size), step.split(size)):
-        of, start, own, from_step, near_border = gather(at, component, first, members.slices, members.step, border)
-        start.add_(to, alpha=moves.area)
+    for to, pixel in zip(*(of_all.split(size) for of_all in comparisons(members.step, num_steps))):
+        of, start, own, which, near_border = gather(pixel, component, first, members.slices, move, border)
+        start.add_(to, alpha=area)
+        which -= to
         seen = sweeps.image.index_select(0, start)
         in_both, near = own & seen, own & (seen >> NUM_SLICES)
-        left, left_far = (own & ~in_both)[:, None], (own & ~near)[:, None]
-        which = of * (2 * num_steps) + torch.where(to > 0, to + num_steps, from_step)
+        left, left_far = (own ^ in_both)[:, None], (own ^ near)[:, None]
         index = moves.offset.index_select(0, which).add_(start[:, None])
         leaves = flat_nonzero(near_border < moves.longest.index_select(0, which))
-        index.index_copy_(0, leaves, moves.checked(members, *gather(leaves, at, to, which)))
+        shift = moves.shift.index_select(1, which.index_select(0, leaves))
+        shift += take_columns(at, pixel.index_select(0, leaves))[..., None]
+        index.index_copy_(0, leaves, sweeps.or_outside(index.index_select(0, leaves), shift))
         seen, far = sweeps.image.index_select(0, index.view(-1)).view_as(index), moves.is_far.index_select(0, which)
         won = seen & torch.where(far, left_far, left)  # no slice of the neighbourhood is left
         lost = in_both[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
         counts = count_slices(lost | won << NUM_SLICES)
-        sums.index_add_(0, (of[:, None] * num_candidates + column).view(-1), counts.view(-1))
-        in_place.index_add_(0, of, count_slices(in_both))
-        is_given = moves.is_given.index_select(0, which)
-        near_and_all.index_add_(0, of * 2 + (to > 0), count_slices(own | near << NUM_SLICES) * is_given)
-    sums = sums.view(-1, num_candidates)
-    near, total = near_and_all.view(-1, 2) >> 32, near_and_all.view(-1, 2) & 0xFFFFFFFF
+        sums.index_add_(0, torch.add(column, of[:, None], alpha=num_candidates).view(-1), counts.view(-1))
+        given = own * moves.is_given.index_select(0, which)
+        counts = count_slices(torch.stack((in_both, given | near << NUM_SLICES)))
+        of_static.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(2, -1), counts)
+    in_place, both = of_static.view(2, count, 2)
+    near, total = both >> 32, both & 0xFFFFFFFF
     is_covered = ((total > 0) & (near * 100 >= total * _COVERED)).any(1)
-    return Wins(sums >> 32, sums & 0xFFFFFFFF, in_place, is_covered)
+    sums = sums.view(count, num_candidates)
+    return Wins(sums >> 32, sums & 0xFFFFFFFF, in_place.sum(1), is_covered)
 
 
 class Moves(NamedTuple):
-    """Where C motions of T components lead, from each of S sweeps to t+1, then from t+1 to each: 2 S T rows.
+    """Where C motions of T components lead, from each of S sweeps to each other one by the difference of their steps,
+    from 1 - S to S - 1: R = (2 S - 1) T of them. One of the two sweeps is t+1.
 
     Args:
-        sweeps: images.
-        down, right: (2 S T, C) int64, whole pixels.
-        offset: (2 S T, C) int64, the same as an offset of flat indices.
-        longest: (2 S T,) int64, longest side of any of the moves of a row, pixels.
-        is_far: (2 S T, C) bool, a side is at least two pixels long.
-        is_given: (2 S T,) bool, the window has both sweeps.
+        shift: (2, R, C) int64, whole pixels down and to the right.
+        offset: (R, C) int64, the same as an offset of flat indices.
+        longest: (R,) float64, longest side of any of the C motions, pixels.
+        is_far: (R, C) bool, a side is at least two pixels long.
+        is_given: (R,) bool, the window has both sweeps.
     """
 
-    sweeps: HeightSlicedSweeps
-    down: Tensor
-    right: Tensor
+    shift: Tensor
     offset: Tensor
     longest: Tensor
     is_far: Tensor
@@ -201,30 +215,16 @@ class Moves(NamedTuple):
     def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> Moves:
         """Moves of components: their window, (T,) int64, and motion, (T, C, 2) float64 per sweep interval."""
         elapsed = sweeps.elapsed.index_select(0, window)
-        k = torch.cat((elapsed, -elapsed), 1)[:, :, None, None]
-        down, right = (motion[:, None] * k + 0.5).floor_().long().flatten(0, 1).unbind(2)
-        side = torch.maximum(down.abs(), right.abs())
-        # In float64, because the CPU finds the largest of int64 many times slower.
-        longest = side.double().amax(1).long()
-        offset, is_given = down * sweeps.grid.width + right, (k.flatten(1) != 0).flatten()
-        return cls(sweeps, down, right, offset, longest, side >= _FAR, is_given)
-
-    @property
-    def area(self) -> int:
-        """Pixels of an image."""
-        return self.sweeps.grid.height * self.sweeps.grid.width
-
-    def to_border(self, pixels: Pixels) -> Tensor:
-        """(K,) int64, pixels from each pixel to the nearest border."""
-        grid = self.sweeps.grid
-        y, x = torch.minimum(pixels.row, grid.height - 1 - pixels.row), grid.width - 1 - pixels.col
-        return torch.minimum(y, torch.minimum(pixels.col, x))
-
-    def checked(self, members: Pixels, at: Tensor, to: Tensor, which: Tensor) -> Tensor:
-        """(L, C) flat indices where moves take pixels, that of "outside" for those that leave the image."""
-        window, row, col = gather(at, members.window, members.row, members.col)
-        down, right = gather(which, self.down, self.right)
-        return self.sweeps.index(window[:, None], to[:, None], row[:, None] + down, col[:, None] + right)
+        k = torch.cat((-elapsed.flip(1), elapsed[:, 1:]), 1)[..., None]
+        shift = (motion.permute(2, 0, 1)[:, :, None] * k + 0.5).floor_().flatten(1, 2)
+        side, shift = torch.maximum(*shift.abs()), shift.long()
+        return cls(
+            shift,
+            torch.add(shift[1], shift[0], alpha=sweeps.grid.width),
+            side.amax(1),
+            side >= _FAR,
+            (k != 0).flatten(),
+        )
 
 
 def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
@@ -235,12 +235,10 @@ def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
         num_steps: S.
 
     Returns:
-        Position of the pixel, and step of the sweep that it is compared with, (L,) int64 each.
+        Step of the sweep that a pixel is compared with, and position of the pixel, (L,) int64 each.
     """
-    older, newest = flat_nonzero(step > 0), flat_nonzero(step == 0)
-    every = torch.arange(1, num_steps, device=older.device)
-    to = every[:, None].expand(-1, newest.numel()).reshape(-1)
-    return torch.cat((older, newest.repeat(every.numel()))), torch.cat((torch.zeros_like(older), to))
+    is_newest = constant(tuple(to == 0 for to in range(num_steps)), torch.bool, step.device)
+    return split_index(flat_nonzero((step == 0) != is_newest[:, None]), len(step))
 
 
 def evidence_of(won: Tensor, lost: Tensor, z: float) -> Tensor:

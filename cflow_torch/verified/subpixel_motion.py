@@ -16,7 +16,8 @@ from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_objects
 
-_SIDES = ((0, 1), (1, -1), (1, 0), (1, 1))  # (dy, dx), a pixel ahead; the opposite is behind
+# Rows and columns, a pixel ahead in four directions, then a pixel behind.
+_SIDES = ((0, 1, 1, 1, 0, -1, -1, -1), (1, -1, 0, 1, -1, 1, 0, -1))
 _BIAS_Z, _LEAST_BIAS = 3, 0.1  # a directional bias, standard deviations of noise, and as a share of the object's slices
 _NUM_LAYERS = 16  # layers of cubes are told apart by this many numbers, then they repeat
 # Steps to the best shift, and their length: cubes on the sides of an object hold it back.
@@ -71,16 +72,15 @@ def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> 
     pixels = sweeps.pixels
     some = flat_nonzero(lookup(wanted, objects.of_pixel) & (pixels.step < 2))
     of, asked = objects.of_pixel.index_select(0, some), pixels.take(some)
-    sides = constant(_SIDES, torch.int64, of.device)
-    offset = torch.cat((sides, -sides)) * (2 * asked.step - 1)[:, None, None]  # (K, 8, 2)
-    row, col = asked.row[:, None] + offset[..., 0], asked.col[:, None] + offset[..., 1]
-    index = sweeps.index(asked.window[:, None], 1 - asked.step[:, None], row, col)
-    own = asked.slices[:, None]
-    seen = own & sweeps.image.index_select(0, index.view(-1)).view_as(index)
-    ahead, behind = seen[:, : len(sides)], seen[:, len(sides) :]
-    counts = count_slices(torch.cat((ahead & ~behind, behind & ~ahead, own), 1))
-    sums = scatter_count(of, objects.count, counts.t())
-    a, b = sums[:-1].view(2, len(sides), -1)
+    grid, from_t = sweeps.grid, 2 * asked.step - 1  # the opposite from t+1
+    offsets = tuple(dy * grid.width + dx - grid.height * grid.width for dy, dx in zip(*_SIDES))
+    offset, at = (constant(values, torch.int64, of.device)[..., None] * from_t for values in (offsets, _SIDES))
+    index = sweeps.or_outside(asked.index + offset, asked.table[3:, None] + at)
+    own = asked.slices
+    ahead, behind = (own & sweeps.image.index_select(0, index.view(-1)).view_as(index)).view(2, 4, -1)
+    counts = count_slices(torch.cat((ahead & ~behind, behind & ~ahead, own[None])))
+    sums = scatter_count(of, objects.count, counts)
+    a, b = sums[:-1].view(2, 4, -1)
     far = (a - b) * (a - b) >= _BIAS_Z**2 * (a + b)
     return (far & ((a - b).abs() >= _LEAST_BIAS * sums[-1])).any(0) & (sums[-1] > 0)
 
