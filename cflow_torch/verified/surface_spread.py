@@ -38,18 +38,21 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
     moments = torch.cat((torch.ones_like(xyz[:1]), xyz, xyz.index_select(0, first) * xyz.index_select(0, second)))
     size = constant((pixel_size, pixel_size, layer_height), torch.float64, device)[:, None] * UNITS
     image = voxels.object_id * voxels.num_steps + voxels.step
+    (n, spread), (n_of_large, spread_of_large) = (
+        _scatter(_sums_around(torch.floor(position / (side * size)).long(), image, moments)) for side in _SIDES
+    )
+    trace = spread.diagonal(dim1=0, dim2=1).sum(-1)
+    is_known = (n >= _FEWEST) & (trace * trace >= _LINE * spread.square().sum((0, 1)))
+    n, spread = torch.where(is_known, n, n_of_large), torch.where(is_known, spread, spread_of_large)
     unknown = (_UNKNOWN * UNITS) ** 2 * torch.eye(3, dtype=torch.float64, device=device)[:, :, None]
-    spread, is_known = position.new_zeros((3, 3, position.shape[1])), torch.zeros_like(image, dtype=torch.bool)
-    for side in _SIDES:
-        sums = _sums_around(torch.floor(position / (side * size)).long(), image, moments)
-        n, total = sums[0], sums[1:4]
-        squares = sums.index_select(0, constant((4, 5, 6, 5, 7, 8, 6, 8, 9), torch.int64, device)).view(3, 3, -1)
-        scaled = n * squares - total[:, None] * total
-        here = scaled * _STEP**2 / (n * n) + unknown * (n < _FEWEST)
-        spread = torch.where(is_known, spread, here)
-        trace = scaled.diagonal(dim1=0, dim2=1).sum(-1)
-        is_known |= (n >= _FEWEST) & (trace * trace >= _LINE * scaled.square().sum((0, 1)))
-    return spread
+    return spread * _STEP**2 / (n * n) + unknown * (n < _FEWEST)
+
+
+def _scatter(sums: Tensor) -> tuple[Tensor, Tensor]:
+    """Number of voxels, (V,), and n^2 times their covariance, (3, 3, V), of sums of moments, (10, V)."""
+    n, total = sums[0], sums[1:4]
+    squares = sums.index_select(0, constant((4, 5, 6, 5, 7, 8, 6, 8, 9), torch.int64, sums.device)).view(3, 3, -1)
+    return n, n * squares - total[:, None] * total
 
 
 def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
@@ -60,13 +63,14 @@ def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
         image: (V,) int64, only voxels of one image are added.
         values: whole numbers.
     """
-    col, row, layer = block[0] + 1, block[1] + 1, block[2].clamp(2 - _LAYER // 2, _LAYER // 2 - 2) + _LAYER // 2
-    key, of_voxel = torch.unique(((image * _ROW + row) * _ROW + col) * _LAYER + layer, return_inverse=True)
+    column = torch.add(block[0], torch.add(block[1], image, alpha=_ROW), alpha=_ROW)
+    layer = block[2].clamp(2 - _LAYER // 2, _LAYER // 2 - 2)
+    key, of_voxel = torch.unique(torch.add(layer, column, alpha=_LAYER), return_inverse=True)
     rows = F.pad(scatter_count(of_voxel, len(key), values).t(), (0, 0, 0, 1))  # the last one is for no block
-    line = torch.arange(-1, 2, device=key.device)
     # The layers of a column follow each other: we search for the lowest of three and read on.
-    middle = (key + ((line[:, None] * _ROW + line) * _LAYER).view(-1, 1)).view(-1)
-    at = torch.searchsorted(key, middle - 1) + (line + 1)[:, None]
+    lowest = tuple((down * _ROW + right) * _LAYER - 1 for down in (-1, 0, 1) for right in (-1, 0, 1))
+    lowest = (key + constant(lowest, torch.int64, key.device)[:, None]).view(-1)
+    at = torch.searchsorted(key, lowest) + constant((0, 1, 2), torch.int64, key.device)[:, None]
     found = F.pad(key, (0, 3), value=1 << 62).index_select(0, at.view(-1)).view_as(at)
-    at = torch.where(found <= middle + 1, at, len(key)).view(-1)
+    at = torch.where(found <= lowest + 2, at, len(key)).view(-1)
     return rows.index_select(0, at).view(27, -1).sum(0).view(-1, len(values)).t().index_select(1, of_voxel)
