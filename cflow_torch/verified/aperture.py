@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, renumber, scatter_count
@@ -84,11 +85,11 @@ def principal_axes(
         num_components: A.
         pixel_size: s, metres.
     """
-    moments = torch.stack((torch.ones_like(row), row, col, row * row, col * col, row * col))
-    n, y, x, yy, xx, yx = scatter_count(component, num_components, moments)
+    one_y_x = F.pad(torch.stack((row, col)), (0, 0, 1, 0), value=1)
+    moments = scatter_count(component, num_components, (one_y_x[:, None] * one_y_x).view(9, -1)).view(3, 3, -1)
+    n, sums = moments[0, 0], moments[0, 1:]
     # Differences of large products, exact in whole numbers.
-    square = (n * n).clamp(min=1).double()
-    var_y, var_x, cov = torch.stack((n * yy - y * y, n * xx - x * x, n * yx - y * x)) / square
+    (var_y, cov), (_, var_x) = (n * moments[1:, 1:] - sums[:, None] * sums) / (n * n).clamp(min=1).double()
     # Eigenvalues of the 2 x 2 matrix; of the two ways to write the eigenvector, the one that does not vanish.
     mean, half = (var_y + var_x) / 2, (var_y - var_x) / 2
     root = torch.sqrt(half * half + cov * cov)

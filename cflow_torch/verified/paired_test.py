@@ -53,12 +53,12 @@ def verify(
     members, node = nodes.members.take(some), node.index_select(0, some)
     level, travels, window, candidates_of = gather(tested, nodes.level, nodes.travels, nodes.window, candidates)
     wins = count_wins(sweeps, members, node, candidates_of)
-    evidence, strict = (evidence_of(wins.won, wins.lost, z) for z in (significance, _CHANGED_Z))
+    z = constant((_CHANGED_Z, significance), torch.float64, level.device)
+    evidence = evidence_of(wins.won, wins.lost, torch.where(level == num_levels, z[0], z[1])[:, None])
     slides = slides_along_itself(sweeps, members, node, candidates_of, wins.is_covered & ~travels)
-    evidence = torch.where((level == num_levels)[:, None], strict, evidence).masked_fill_(slides, 0)
     num_more = sweeps.num_more.index_select(0, window)
     least = torch.minimum(16 * _LEAST_GAIN * num_more, 16 * scatter_count(node, len(tested)) // _LEAST_SHARE)
-    evidence = evidence.masked_fill_(evidence <= least[:, None], 0)
+    evidence.masked_fill_(slides | (evidence <= least[:, None]), 0)
     motion, evidence = best_candidate(evidence, candidates_of)
     return (
         torch.zeros_like(candidates[:, 0]).index_copy_(0, tested, motion),
@@ -241,12 +241,12 @@ def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
     return split_index(flat_nonzero((step == 0) != is_newest[:, None]), len(step))
 
 
-def evidence_of(won: Tensor, lost: Tensor, z: float) -> Tensor:
+def evidence_of(won: Tensor, lost: Tensor, z: float | Tensor) -> Tensor:
     """Return the evidence of each motion, (won - lost) - z sqrt(won + lost), in sixteenths of a slice.
 
     Args:
         won, lost: int64 of one shape, below 2^31.
-        z: standard deviations that noise is granted; 0 = every surplus counts.
+        z: standard deviations that noise is granted, of all or one each; 0 = every surplus counts.
 
     Returns:
         int64, same shape, rounded down; 0 = not significant.
