@@ -126,7 +126,8 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     crowd, share, bounds = (TABLE[name] for name in ("crowd", "share", "margin"))
     unlinked = 1 + _bin(number, crowd)
     moves = lookup(motion.any(1), objects.of_pixel)
-    static = 2 + len(crowd) + sum(10 * matched >= bound * number for bound in share)
+    tenths = constant(tuple(share), number.dtype, device)[:, None]
+    static = 2 + len(crowd) + (10 * matched >= tenths * number).sum(0)
     static = torch.where(_is_beside(sweeps, moves), 3 + len(crowd) + len(share), static)
 
     y, x = sweeps.grid.centre(pixels.row_col)

@@ -108,17 +108,19 @@ def motion_by_pixel(
     slope = torch.zeros_like(rigid.flow)
     if sweeps.batch.ground is not None:
         slope = sweeps.batch.ground.slopes(rigid.centre, window)
-    flow = torch.cat((rigid.flow, (slope * rigid.flow).sum(1, keepdim=True)), 1)
+    z = (slope * rigid.flow).sum(1, keepdim=True)
+    rows = torch.cat((rigid.flow, z, rigid.rotation[:, None], rigid.centre, slope), 1)
+    flow, rotation, centre, slope = lookup(rows, of_pixel).split((3, 1, 2, 2), 1)
     return RotatingMotion(
         cluster_of_cell=torch.arange(sweeps.num_pixels + 1, device=window.device),
         cell_of_point=_pixel_of_result(sweeps, lookup(is_moving, of_pixel), lookup(is_moving & ~is_weak, of_pixel)),
-        flow=F.pad(flow, (0, 0, 0, 1)).index_select(0, of_pixel),
-        cluster_id=F.pad(ids, (0, 1), value=-1).index_select(0, of_pixel),
+        flow=flow,
+        cluster_id=lookup(ids, of_pixel, -1),
         score=lookup(score, of_pixel),
         confidence=confidence,
-        rotation=lookup(rigid.rotation, of_pixel),
-        centre=lookup(rigid.centre, of_pixel),
-        slope=lookup(slope, of_pixel),
+        rotation=rotation[:, 0],
+        centre=centre,
+        slope=slope,
     )
 
 
