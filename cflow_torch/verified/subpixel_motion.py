@@ -105,8 +105,8 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     weight, error = _meet(ahead, weights)
     unshifted = weight
     for _ in range(_NUM_STEPS):
-        total, *sums = scatter_count(of, num_objects, torch.cat((weight[None], weight * error)))
-        shift += (_STEP_LENGTH * torch.stack(sums) / total.clamp(min=1 / 256)).round_()  # no weight is smaller
+        sums = scatter_count(of, num_objects, torch.cat((weight[None], weight * error)))
+        shift += (_STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # no weight is smaller
         shift.clamp_(-_FARTHEST, _FARTHEST)
         weight, error = _meet(ahead - shift.index_select(1, of)[:, None], weights)
     gain = weight - unshifted
@@ -117,10 +117,9 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
 
 def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Weight of the nearest of 25 cubes, (K,) float64, and where it is, (2, K) float64, units; (2, 25, K) float64."""
-    x, y = ahead
-    slot = torch.arange(len(x), dtype=torch.float64, device=x.device)[:, None]
+    slot = constant(tuple(range(ahead.shape[1])), torch.float64, ahead.device)[:, None]
     # The square and the slot in one number: its least is found several times faster than by argmin.
-    key = (x * x).add_(y * y).mul_(32).add_(slot).amin(0).long()
+    key = torch.add(slot, ahead.square().sum(0), alpha=32).amin(0).long()
     weight = weights.index_select(0, (key >> 11).clamp_(max=2048))
     return weight, ahead.gather(1, (key & 31).expand(2, 1, -1))[:, 0]
 
