@@ -13,7 +13,7 @@ from cflow_torch.ops.segments import bounding_boxes, segment_amin
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
-from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, NUM_LAYERS, VoxelPairs, register
+from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, NUM_LAYERS, VoxelPairs
 from cflow_torch.verified.subpixel_motion import subpixel_motion
 from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 
@@ -59,7 +59,7 @@ def register_deskewed(
 
     Convention: times of 0 change nothing, to the last bit.
 
-    Cost: twice that of `register`, and a sort of the points.
+    Cost: that of two registrations, and a sort of the points.
     """
     pairs = VoxelPairs(points, sweeps, len(start))
     apparent = pairs.register(start)
@@ -69,7 +69,7 @@ def register_deskewed(
     divided = RigidMotion(apparent.flow / stretch, apparent.rotation, apparent.centre)
     is_pair = ~sweeps.has_history
     points = points.take(~is_pair.index_select(0, points.window))
-    again = register(*deskew(points, sweeps, divided), start / stretch)
+    again = VoxelPairs(*deskew(points, sweeps, divided), len(start)).register(start / stretch)
     is_again = torch.bincount(points.object_id, minlength=len(start)) > 0
     deskewed = RigidMotion(
         torch.where(is_again[:, None], again.flow, divided.flow),

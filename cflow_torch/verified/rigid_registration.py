@@ -28,28 +28,15 @@ _FAR = 3.0  # squared distance of a pair, in standard deviations of both surface
 _MOST_TIME = 2.5  # sweep intervals: t, t-1 and their jitter; older sweeps pull where the rotation is not constant
 _NUM_STEPS = 4
 _STEP_LENGTH = 1.4  # of that of Gauss and Newton: nearest partners change with each step, so theirs falls short
-# From the given flow in x and in y, metres per interval, and from no rotation, tangent of half the angle per interval.
-_LARGEST_CHANGE = (0.15, 0.15, 0.1)
-# Pairs of points without a surface that the given translation is worth, and, at a distance of 1 m, no rotation.
-_HELD, _HELD_ROTATION = 2.0, 5.0
+# From the given flow in x and in y, units per interval, and from no rotation, tangent of half the angle per interval.
+_LARGEST_CHANGE = (0.15 * UNITS, 0.15 * UNITS, 0.1)
 _WEIGHT, _ARM = 256, 16  # weights are whole 256ths, and arms whole 16 units: sums are exact in any order
+# What holds on to the given translation, worth two pairs of points without a surface, and to no rotation, worth five at
+# a distance of 1 m. The angle is twice its tangent, nearly.
+_HELD = (2.0 * _WEIGHT, 2.0 * _WEIGHT, 5.0 * _WEIGHT * (2 * UNITS) ** 2)
 # An object that covers a quarter of a turn of the sensor in an interval would be nearer than its own length. Times that
 # differ by more are those of a direction that is measured at the end of one sweep and at the start of the next.
 _LEAST_STRETCH = 0.75
-
-
-def register(points: ObjectPoints, sweeps: HeightSlicedSweeps, flow: Tensor) -> RigidMotion:
-    """Refine the motion of every object by the voxels that meet under it, and estimate its rotation.
-
-    Args:
-        points: of the objects that move, of all sweeps.
-        sweeps: finest images.
-        flow: (G, 2) float64, x and y, metres per sweep interval, to start from.
-
-    Returns:
-        The motion. An object without points at t keeps its flow.
-    """
-    return VoxelPairs(points, sweeps, len(flow)).register(flow)
 
 
 class VoxelPairs:
@@ -93,25 +80,23 @@ class VoxelPairs:
         self._own_spread = take_columns(self._spread, self._voxel) + noise.view(9, 1)
 
     def register(self, flow: Tensor) -> RigidMotion:
-        """Refine the motion of every object from (G, 2) float64, x and y, metres per sweep interval.
+        """Refine the motion of every object, and estimate its rotation.
 
         Every voxel of another sweep is paired with the nearest one of its object at t+1. Each step minimises the
         errors over translation and angle. Two more terms hold on to the given translation and to no rotation.
 
+        Args:
+            flow: (G, 2) float64, x and y, metres per sweep interval, to start from.
+
+        Returns:
+            The motion. An object without points at t keeps its flow.
+
         Cost: 27 lookups a step for each voxel and sweep.
         """
-        # The motion: x, y and the tangent of half the angle, (3, G). The angle is twice its tangent, nearly.
-        given = motion = F.pad(flow * UNITS, (0, 1)).t()
-        held_in_units = tuple(_WEIGHT * held for held in (_HELD, _HELD, 4 * _HELD_ROTATION * UNITS**2))
-        held = constant(held_in_units, torch.float64, flow.device)[:, None]
-        x, y, rotation = _LARGEST_CHANGE
-        largest = constant((x * UNITS, y * UNITS, rotation), torch.float64, flow.device)[:, None]
-        lower, upper, hold = (
-            given - largest,
-            given + largest,
-            held[:, None] * torch.eye(3, device=flow.device)[..., None],
-        )
-        hold = hold.expand(-1, -1, len(flow))
+        given = motion = F.pad(flow * UNITS, (0, 1)).t()  # x, y and the tangent of half the angle, (3, G)
+        held, largest = (constant(of, torch.float64, flow.device)[:, None] for of in (_HELD, _LARGEST_CHANGE))
+        lower, upper = given - largest, given + largest
+        hold = torch.diag(held[:, 0])[..., None].expand(-1, -1, len(flow))
         for _ in range(_NUM_STEPS):
             equations = torch.cat((hold, (held * (given - motion))[:, None]), 1)
             for some in self._chunks():
@@ -120,7 +105,7 @@ class VoxelPairs:
             change = (inverse * equations[:, 3]).sum(1) / scale
             motion = torch.clamp(torch.add(motion, change, alpha=_STEP_LENGTH), lower, upper)
         centre = torch.view_as_real(self._centre_of_object) / UNITS + self._corner
-        return RigidMotion((motion[:2] / UNITS).t().contiguous(), motion[2], centre)
+        return RigidMotion((motion[:2] / UNITS).t(), motion[2], centre)
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
         """Ratio of the time between two measurements of an object to the time between the sweeps.

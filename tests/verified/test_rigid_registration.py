@@ -11,11 +11,11 @@ from moving_scenes import Scene, moving_scene, one_object
 from oracle import registration as oracle
 
 from cflow_torch.verified.rigid_motion import RigidMotion
-from cflow_torch.verified.rigid_registration import register
+from cflow_torch.verified.rigid_registration import VoxelPairs
 
 
 def registered(scene: Scene) -> RigidMotion:
-    return register(scene.points(), scene.sweeps, scene.flow)
+    return VoxelPairs(scene.points(), scene.sweeps, len(scene.flow)).register(scene.flow)
 
 
 def assert_equals_oracle(scene: Scene) -> RigidMotion:
