@@ -1,9 +1,9 @@
 """The aperture problem: long thin things that seem to slide along themselves, and long vehicles that really do.
 
 Walls, hedges and guard rails are sampled by a sensor that moves, so their samples seem to move with it, along the line.
-If t+1 has most of the line where it was, or the older sweeps have most of it where it is, the line itself is static:
-one end of it may come into sight or leave it. A car seen from its side is a line as well, but its rear leaves the old
-position, and its front comes to a new one.
+The line is static if t+1 has most of it at the old position, or the older sweeps have most of it at the new one: one
+end may have come into sight or left it. A car that is seen from its side is a line as well, but its rear leaves the old
+position, and its front comes to a new one. A low line of 7 m and more is a guard rail: it is always static.
 
 What is longer than other objects moves only if both of its ends do, as those of a tram. The ends of a wall do not: one
 stays, or each goes where the view of it ends. The ends of a guard rail may keep pace with the ego vehicle, since its
@@ -32,8 +32,9 @@ _LEAST_TRAVEL = 1.2
 _ALIKE = 0.1
 # Metres: no road vehicle is longer. The ends of a longer noise barrier are where the view of it ends.
 _LONGEST = 60.0
-# Height slices in a pixel at t+1, on average: guard rails have one or, across a slice's border, two.
-_TALL = 2
+# Height slices in a pixel at t+1, on average: guard rails have one or, across a slice's border, two. No vehicle is as
+# low and, standard deviation along the line in metres, as long.
+_TALL, _RAIL = 2, 2.0
 
 
 def slides_along_itself(
@@ -49,12 +50,13 @@ def slides_along_itself(
         is_covered: (A,) bool, other sweeps have most of the component where it is, as `Wins` says.
 
     Returns:
-        (A, C) bool: the component is covered and a line at t+1, and the motion points along it and leads at least 1.2 m
-        over the window.
+        (A, C) bool: the component is a line at t+1 that is covered or a rail, and the motion points along it and leads
+        at least 1.2 m over the window.
 
     Convention:
         Moments are sums of integers, everything else elementwise float64 in the written order. Standard deviations are
-        those of the positions of the pixels, at most 0.3 m across and at least 1 m along. Zero motion never slides.
+        those of the positions of the pixels, at most 0.3 m across and at least 1 m along; of a rail at least 2 m. The
+        pixels of a rail have less than two slices on average. Zero motion never slides.
 
     Cost: some passes over the pixels.
     Source: the aperture problem; not in the paper.
@@ -62,7 +64,9 @@ def slides_along_itself(
     count, pixel_size = len(candidates), sweeps.grid.pixel_size
     newest = flat_nonzero(members.step == 0)
     component, row, col, window = gather(newest, component, members.row, members.col, members.window)
-    is_line, axis_y, axis_x = principal_axes(component, row, col, count, pixel_size)
+    is_line, variance, axis_y, axis_x = principal_axes(component, row, col, count, pixel_size)
+    num_slices = count_slices(members.slices.index_select(0, newest)) - _TALL
+    is_rail = (scatter_count(component, count, num_slices) < 0) & (variance >= (_RAIL / pixel_size) ** 2)
 
     # Its window, of each component; those without pixels at t+1 are no lines.
     window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, window)
@@ -71,14 +75,15 @@ def slides_along_itself(
     across = axis_y[:, None] * x - axis_x[:, None] * y
     square = y * y + x * x
     length = (axis_y * axis_y + axis_x * axis_x)[:, None]
-    slides = (is_line & is_covered)[:, None] & (across * across <= _ALONG * square * length)
+    slides = (is_line & (is_covered | is_rail))[:, None] & (across * across <= _ALONG * square * length)
     return slides & (square * (intervals * intervals) >= (_LEAST_TRAVEL / pixel_size) ** 2)
 
 
 def principal_axes(
     component: Tensor, row: Tensor, col: Tensor, num_components: int, pixel_size: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return whether each component is a line, (A,) bool, and y and x of its direction, (A,) float64, of any length.
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return whether each component is a line, (A,) bool; the variance along it, (A,) float64, square pixels; and y and
+    x of its direction, (A,) float64, of any length.
 
     Args:
         component, row, col: (Q,) int64, its pixels at t+1.
@@ -96,7 +101,7 @@ def principal_axes(
     small, large = mean - root, mean + root
     is_line = (small <= (_THIN / pixel_size) ** 2) & (large >= (_LONG / pixel_size) ** 2)
     is_wide = var_y < var_x
-    return is_line, torch.where(is_wide, cov, large - var_x), torch.where(is_wide, large - var_y, cov)
+    return is_line, large, torch.where(is_wide, cov, large - var_x), torch.where(is_wide, large - var_y, cov)
 
 
 def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -> Tensor:

@@ -74,7 +74,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     z = torch.where(gain > 0, gain.double() / matched.double().sqrt(), 0.0)
     newest = flat_nonzero(members.step == 0)
     component, row, col = gather(newest, which, members.row, members.col)
-    is_line, _, _ = principal_axes(component, row, col, objects.count, size)
+    is_line, *_ = principal_axes(component, row, col, objects.count, size)
     is_fast = rigid.flow.square().sum(1) >= (2 * _DISPLACEMENT) ** 2
     return MotionMargin(z, (z >= _Z) | ((gain > 0) | is_fast) & (surplus[:, 0] > in_place) & ~is_line)
 

@@ -14,12 +14,17 @@ COVERED = 65  # per cent
 
 
 def slides_along_itself(sweeps: SlicedSweeps, members: Sequence[Pixel], motion: Vector) -> bool:
-    """Whether a line that stays where it is explains a motion of a component: it is a line at t+1 and covered, and the
-    motion points along it (the sine of the angle is at most 0.2) and leads at least 1.2 m over the window."""
-    axis, speed = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.size), math.hypot(*motion)
+    """Whether a line that stays where it is explains a motion of a component: it is a line at t+1 that is covered, or
+    low and of a standard deviation of 2 m or more; and the motion points along it (the sine of the angle is at most
+    0.2) and leads at least 1.2 m over the window."""
+    newest = [(r, c) for m, r, c in members if m == 0]
+    axis, speed = principal_axis(newest, sweeps.size), math.hypot(*motion)
     if axis is None or speed * (max(sweeps.elapsed) - min(sweeps.elapsed)) < LEAST_TRAVEL / sweeps.size:
         return False
-    return abs(axis[0] * motion[1] - axis[1] * motion[0]) <= 0.2 * speed and is_covered(sweeps, members)
+    is_long = np.var(np.array(newest) @ axis) >= (2.0 / sweeps.size) ** 2
+    is_rail = is_long and sum(count(sweeps.at(0, *cell)) for cell in newest) < 2 * len(newest)
+    along = abs(axis[0] * motion[1] - axis[1] * motion[0]) <= 0.2 * speed
+    return along and (is_rail or is_covered(sweeps, members))
 
 
 def principal_axis(cells: Sequence[Cell], size: float) -> Vector | None:

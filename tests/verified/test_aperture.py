@@ -20,14 +20,14 @@ def rail(start: int, stop: int, row: int = 30) -> Pixels:
     return {(row, c) for c in range(start, stop)}
 
 
-def slides(component: dict[int, Pixels], motion, others=None) -> bool:
-    """Pixels of a component by sweep, t+1 and t; its motion from t to t+1; pixels that are not its own."""
+def slides(component: dict[int, Pixels], motion, others=None, slices: int = 1) -> bool:
+    """Pixels of a component by sweep, t+1 and t; its motion from t to t+1; pixels that are not its own; their slices."""
     image = np.zeros((1, 2, 61, 83), dtype=np.uint8)
     for drawn, value in ((others or {}, 1), (component, 2)):
         for m, pixels in drawn.items():
             for r, c in pixels:
                 image[0, m, r, c] = value
-    sweeps = from_images(np.minimum(image, 1), 0.1)
+    sweeps = from_images(np.minimum(image, 1) * slices, 0.1)
     own = torch.from_numpy(image.ravel())[sweeps.pixels.index] == 2
     members = sweeps.pixels.take(own.nonzero()[:, 0])
     given = sweeps, members, torch.zeros_like(members.row), torch.tensor([[motion]], dtype=torch.float64)
@@ -40,6 +40,12 @@ def test_a_rail_that_stays_slides_and_one_that_leaves_does_not():
     assert not slides({0: rail(30, 80), 1: rail(10, 60)}, (0, 20))
     assert not slides({0: rail(10, 60), 1: rail(10, 60)}, (0, 0))
     assert not slides({0: rail(10, 60), 1: rail(10, 60)}, (12, 0))
+
+
+def test_a_long_rail_slides_even_if_each_sweep_samples_other_pixels():
+    for end, slices, expected in ((82, 1, True), (82, 2, True), (82, 3, False), (60, 1, False)):
+        sampled = {m: {(30, c) for c in range(2 * m, end, 4)} for m in (0, 1)}
+        assert slides(sampled, (0, 14), slices=slices) == expected
 
 
 def test_a_rail_that_comes_into_sight_or_leaves_it_at_one_end_slides():
