@@ -21,7 +21,7 @@ def rail(start: int, stop: int, row: int = 30) -> Pixels:
 
 
 def slides(component: dict[int, Pixels], motion, others=None, slices: int = 1) -> bool:
-    """Pixels of a component by sweep, t+1 and t; its motion from t to t+1; pixels that are not its own; their slices."""
+    """Pixels of a component by sweep, t+1 and t; its motion from t to t+1; pixels of others; their slices."""
     image = np.zeros((1, 2, 61, 83), dtype=np.uint8)
     for drawn, value in ((others or {}, 1), (component, 2)):
         for m, pixels in drawn.items():
