@@ -18,5 +18,6 @@ def adjugate(matrix: Tensor) -> tuple[Tensor, Tensor]:
     Convention: whole numbers give whole numbers, exact below 2^53. Each result depends on its own matrix only.
     """
     # A row of the adjugate is the cross product of the two other rows.
-    rows = torch.linalg.cross(torch.roll(matrix, -1, 0), torch.roll(matrix, -2, 0), dim=1)
+    twice = torch.cat((matrix, matrix))
+    rows = torch.linalg.cross(twice[1:4], twice[2:5], dim=1)
     return rows, (matrix[0] * rows[0]).sum(0)

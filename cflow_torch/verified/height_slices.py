@@ -234,9 +234,9 @@ class HeightSlicedSweeps:
         Returns:
             (...) int64; that of the last entry of `image` for pixels outside.
         """
-        size = constant((self.grid.height, self.grid.width), torch.int64, at.device)
-        inside = (at >= 0) & (at < size.view(2, *(1,) * index.dim()))
-        return torch.where(inside[0] & inside[1], index, self.image.numel() - 1)
+        ends = constant(((0, 0), (self.grid.height - 1, self.grid.width - 1)), torch.int64, at.device)
+        is_outside = at.clamp(*ends.view(2, 2, *(1,) * index.dim())) != at
+        return index.masked_fill(is_outside[0] | is_outside[1], self.image.numel() - 1)
 
     def around(self, pixel: Tensor, reach: int) -> Tensor:
         """Return the occupied pixels around some pixels, in the same sweep.
@@ -304,10 +304,14 @@ def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:
     row, col = pixels.row + line[:, None], pixels.col + line[:, None]
     inside = (row.clamp(0, grid.height - 1) == row)[:, None] & (col.clamp(0, grid.width - 1) == col)
     around = pixels.index + torch.add(line, line[:, None], alpha=grid.width)[..., None]
-    # No two pixels have the same index in a round, but outside: there anything may be written.
-    rounds = torch.where(inside, around, outside).view(9, -1).unbind()
-    for index in rounds[:4] + rounds[5:]:  # without that of the pixels themselves
+    # Two entries of a round that have the same index write the same, but outside: there anything may be written.
+    upper, middle, lower = around.masked_fill_(~inside, outside).flatten(1)
+    left, _, right = middle.view(3, -1)
+    for index in (left, right):
         image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(above))
+    of_row = image.index_select(0, middle).bitwise_and_(OWN << NUM_SLICES)
+    for index in (upper, lower):
+        image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(of_row))
     image[outside] = 0
 
 
