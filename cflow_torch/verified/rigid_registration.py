@@ -59,8 +59,9 @@ class VoxelPairs:
         summed = F.pad(take_columns(voxels.position[:2], at_t), (0, 0, 0, 1), value=1.0)
         *sums, count = scatter_count(voxels.object_id.index_select(0, at_t), num_objects, summed)
         self._centre_of_object = torch.complex(*(torch.floor(total / count.clamp(min=1)) for total in sums))
-        self._object_of_voxel = F.pad(voxels.object_id, (0, 1), value=-1)
-        self._spread = F.pad(spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT).view(9, -1), (0, 1))
+        # Object, spread and position of each voxel; the last one, of no voxel, is far from all others.
+        spread = spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT).view(9, -1)
+        self._table = torch.cat((F.pad(torch.cat((voxels.object_id[None], spread)), (0, 1)), voxels.position))
         self._corner = constant(sweeps.grid.lower[:2], torch.float64, device)
 
         # The voxels that look for a partner.
@@ -77,7 +78,9 @@ class VoxelPairs:
         self._centre = self._centre_of_object.index_select(0, self._object)
         self._arm = torch.complex(x, y) - self._centre
         noise = (NOISE * UNITS) ** 2 * torch.eye(3, dtype=torch.float64, device=device)
-        self._own_spread = take_columns(self._spread, self._voxel) + noise.view(9, 1)
+        self._own_spread = spread.index_select(1, self._voxel) + noise.view(9, 1)
+        # Derivatives of x, y and z at t+1 by x and y per interval: k and 0.
+        self._by_flow = torch.eye(3, 2, dtype=torch.float64, device=device)[..., None] * self._k
 
     def register(self, flow: Tensor) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
@@ -147,13 +150,12 @@ class VoxelPairs:
             some: which voxels.
         """
         _, weight, error, arm = self._pairs(motion, some)
-        # Derivatives of the position at t+1 by x and y, k, and by the tangent: twice the arm, rotated by a right angle.
-        k = self._k[some]
-        lever = torch.view_as_real(arm * (1j / _ARM)).round().t() * (2 * _ARM * k)
-        columns = (weight[:, :2] * k, (weight[:, :2] * lever).sum(1, True), (weight * error).sum(1, True))
-        weighted = torch.cat(columns, 1)
-        terms = torch.cat((weighted * k, (weighted * lever[:, None]).sum(0, True)))
-        equations.view(12, -1).scatter_add_(1, self._object[some].expand(12, -1), terms.view(12, -1))
+        # The derivative by the tangent is twice the arm, rotated by a right angle.
+        lever = torch.view_as_real(arm * (1j / _ARM)).round().t() * (2 * _ARM * self._k[some])
+        columns = torch.cat((self._by_flow[..., some], F.pad(lever, (0, 0, 0, 1))[:, None], error[:, None]), 1)
+        weighted = (weight[:, :, None] * columns).sum(1)
+        terms = (columns[:2, :3, None] * weighted[:, None]).sum(0).view(12, -1)
+        equations.view(12, -1).scatter_add_(1, self._object[some].expand(12, -1), terms)
 
     def _pairs(self, motion: Tensor, some: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Pair some voxels with those of t+1 under a motion.
@@ -171,9 +173,9 @@ class VoxelPairs:
         at = torch.view_as_real(self._centre[some] + velocity * end + arm).round()
         target = torch.cat((at.t(), height[None]))
         other, square = voxels.nearest(self._sweep[some], self._layers[:, some], target)
-        is_pair = (square <= round((_FARTHEST * UNITS) ** 2)) & (self._object_of_voxel.index_select(0, other) == index)
-        error = take_columns(voxels.position, other) - target
-        spread = self._own_spread[:, some] + take_columns(self._spread, other)
+        of_other = take_columns(self._table, other)
+        is_pair = (square <= round((_FARTHEST * UNITS) ** 2)) & (of_other[0] == index)
+        error, spread = of_other[10:] - target, self._own_spread[:, some] + of_other[1:10]
         inverse, scale = adjugate(spread.view(3, 3, -1))
         square = ((inverse * error).sum(1) * error).sum(0)
         # (f / (f + d^2))^2 / s^2 of the squared distance d^2 = square / scale in standard deviations.
