@@ -13,28 +13,30 @@ def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: float)
     """Smallest value of each segment.
 
     Args:
-        values: (N,) numbers.
+        values: (..., N) numbers.
         index: (N,) int64, segment of each value, 0 ... num_segments - 1.
         num_segments: S.
         empty: result of a segment without values; must not be smaller than any value.
 
     Returns:
-        (S,), dtype of `values`.
+        (..., S), dtype of `values`.
     """
-    return values.new_full((num_segments,), empty).scatter_reduce_(0, index, values, "amin")
+    least = values.new_full((*values.shape[:-1], num_segments), empty)
+    return least.scatter_reduce_(-1, index.expand_as(values), values, "amin")
 
 
 def segment_minmax(values: Tensor, index: Tensor, num_segments: int) -> tuple[Tensor, Tensor]:
     """Smallest and largest value of each segment.
 
     Args:
-        values: (N,) int64, at most 2^61.
+        values: (..., N) int64, at most 2^61.
         index, num_segments: as for `segment_amin`.
 
     Returns:
-        first, last: (S,) int64; for a segment without values the last is far below the first.
+        first, last: (..., S) int64; for a segment without values the last is far below the first.
     """
-    last = values.new_full((num_segments,), -_FAR).scatter_reduce_(0, index, values, "amax")
+    last = values.new_full((*values.shape[:-1], num_segments), -_FAR)
+    last.scatter_reduce_(-1, index.expand_as(values), values, "amax")
     return segment_amin(values, index, num_segments, _FAR), last
 
 

@@ -143,9 +143,8 @@ class _NodeImages(NamedTuple):
             scale at which it is not, or the coarsest.
         """
         members, node, device = nodes.members, nodes.node, nodes.node.device
-        (top, bottom), (left, right) = (segment_minmax(at, node, nodes.count) for at in members.row_col)
         block = constant(tuple(blocks), torch.int64, device)
-        ends = torch.stack((top, left, bottom, right), 1)[:, None]
+        ends = torch.cat(segment_minmax(members.row_col, node, nodes.count)).t()[:, None]
         ends = torch.div(ends, block[:, None], rounding_mode="floor")  # (N, scales, 4)
         sizes = ends[:, :, 2:] - ends[:, :, :2] + 1
         num_small = (sizes.prod(2) <= _LARGEST_BOX).sum(1)  # they come first, as scales are coarse to fine

@@ -15,7 +15,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lazy_zeros, lookup, renumber, scatter_count
+from cflow_torch.ops.indices import (
+    flat_nonzero,
+    floor_divide,
+    gather,
+    lazy_zeros,
+    lookup,
+    renumber,
+    scatter_count,
+    take_columns,
+)
 from cflow_torch.ops.labeling import label_together, padded_size
 from cflow_torch.ops.segments import segment_amin, segment_minmax
 from cflow_torch.verified.aperture import both_ends_move
@@ -154,7 +163,7 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
     root = torch.cat((roots[-1], changed_root))
     # The first sum counts all pixels and, above 2^32, those at t+1; the second those that are missing, or may be.
     is_missing = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
-    codes = torch.stack((torch.where(pixels.step == 0, 1 + (1 << 32), 1), is_missing))
+    codes = torch.stack((((pixels.step == 0) << 32) + 1, is_missing))
     sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
     # What the components of a level hold adds up to what those of the coarser level hold.
     for level in range(len(roots) - 1, 0, -1):
@@ -222,13 +231,13 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
 
 def _length(sweeps: HeightSlicedSweeps, components: Components) -> Tensor:
     """(V,) float64, pixels: longer side of the box of each component at t+1."""
-    step, row, col = sweeps.pixels.step, sweeps.pixels.row, sweeps.pixels.col
+    step = sweeps.pixels.step
     newest = flat_nonzero(step == 0)
     changed = flat_nonzero(step.index_select(0, components.changed) == 0)
     root = torch.cat((components.roots[:, newest].flatten(), components.changed_root[changed]))
-    row, col = gather(torch.cat((newest.repeat(components.num_levels), components.changed[changed])), row, col)
-    (top, bottom), (left, right) = (segment_minmax(at, root, components.count) for at in (row, col))
-    return torch.maximum(bottom - top, right - left).add_(1).double()
+    pixel = torch.cat((newest.repeat(components.num_levels), components.changed[changed]))
+    first, last = segment_minmax(take_columns(sweeps.pixels.row_col, pixel), root, components.count)
+    return (last - first).amax(0).add_(1).double()
 
 
 def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_pixels: int) -> tuple[Objects, Tensor]:
@@ -258,8 +267,7 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
         value = (value - _PRICE).clamp_(min=0)
         children.index_add_(0, nodes.parent, value.masked_fill_(nodes.level != level, 0))
     own = torch.arange(count + 1, device=evidence.device)
-    winner = torch.where(F.pad(evidence, (0, 1)) > children, own, count)
-    winner[-1:] = count
+    winner = own.masked_fill(F.pad(evidence, (0, 1)) <= children, count)
     parent = F.pad(nodes.parent, (0, 1), value=count)
     for _ in range(num_levels - 1):  # coarse winners spread to what they hold, a level at a time
         winner = torch.minimum(winner, winner.index_select(0, parent))  # nodes are numbered coarse to fine

@@ -128,7 +128,7 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     moves = lookup(motion.any(1), objects.of_pixel)
     tenths = constant(tuple(share), number.dtype, device)[:, None]
     static = 2 + len(crowd) + (10 * matched >= tenths * number).sum(0)
-    static = torch.where(_is_beside(sweeps, moves), 3 + len(crowd) + len(share), static)
+    static.masked_fill_(_is_beside(sweeps, moves), 3 + len(crowd) + len(share))
 
     y, x = sweeps.grid.centre(pixels.row_col)
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2

@@ -115,15 +115,25 @@ class Wins(NamedTuple):
 
     Args:
         won, lost: (M, C) int64, slices.
-        in_place: (M,) int64, slices that other sweeps have where they are, whatever the motion.
-        is_covered: (M,) bool, all other sweeps have `_COVERED` per cent of its slices at t+1 in the 3 x 3 pixels
-            where they are, or t+1 has as many of its slices in the other sweeps.
+        of_static: (2, M, 2) int64, slices of other sweeps, then of t+1: first those in place in the sweep compared;
+            then all of them and, times 2^32, those that it has in the 3 x 3 pixels around.
     """
 
     won: Tensor
     lost: Tensor
-    in_place: Tensor
-    is_covered: Tensor
+    of_static: Tensor
+
+    @property
+    def in_place(self) -> Tensor:
+        """(M,) int64, slices that other sweeps have where they are, whatever the motion."""
+        return self.of_static[0].sum(1)
+
+    @property
+    def is_covered(self) -> Tensor:
+        """(M,) bool: all other sweeps have `_COVERED` per cent of the slices at t+1 in the 3 x 3 pixels where they are,
+        or t+1 has as many of the slices in the other sweeps."""
+        near, total = self.of_static[1] >> 32, self.of_static[1] & 0xFFFFFFFF
+        return ((total > 0) & (near * 100 >= total * _COVERED)).any(1)
 
 
 def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, candidates: Tensor) -> Wins:
@@ -160,14 +170,15 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     at = members.table[3:]
     ends = constant((sweeps.grid.height - 1, sweeps.grid.width - 1), torch.int64, device)[:, None]
     border = torch.minimum(*torch.minimum(at, ends - at))
-    # Slices that are lost and, times 2^32, won; slices in place; all slices and, times 2^32, those that stay within a
-    # pixel: of the sweeps before t+1, then of t+1.
+    table = torch.stack((component, first, move, border))
+    # Slices that are lost and, times 2^32, won.
     sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=device)
     of_static = torch.zeros((2, 2 * count), dtype=torch.int64, device=device)
     column = constant(tuple(range(num_candidates)), torch.int64, device)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
     for to, pixel in zip(*(of_all.split(size) for of_all in comparisons(members.step, num_steps))):
-        of, start, own, which, near_border = gather(pixel, component, first, members.slices, move, border)
+        of, start, which, near_border = take_columns(table, pixel)
+        own = members.slices.index_select(0, pixel)
         start.add_(to, alpha=area)
         which -= to
         seen = sweeps.image.index_select(0, start)
@@ -186,11 +197,8 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         given = own * moves.is_given.index_select(0, which)
         counts = count_slices(torch.stack((in_both, given | near << NUM_SLICES)))
         of_static.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(2, -1), counts)
-    in_place, both = of_static.view(2, count, 2)
-    near, total = both >> 32, both & 0xFFFFFFFF
-    is_covered = ((total > 0) & (near * 100 >= total * _COVERED)).any(1)
     sums = sums.view(count, num_candidates)
-    return Wins(sums >> 32, sums & 0xFFFFFFFF, in_place.sum(1), is_covered)
+    return Wins(sums >> 32, sums & 0xFFFFFFFF, of_static.view(2, count, 2))
 
 
 class Moves(NamedTuple):

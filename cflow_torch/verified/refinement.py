@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, gather, lazy_zeros, split_index
-from cflow_torch.ops.segments import bounding_boxes, segment_amin
+from cflow_torch.ops.indices import flat_nonzero, lazy_zeros, split_index, take_columns
+from cflow_torch.ops.segments import segment_amin, segment_minmax
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
@@ -33,11 +33,11 @@ def refine(
         The motion in metres; and the apparent motion, that of the images, which differs where points have times.
     """
     newest = flat_nonzero((sweeps.pixels.step == 0) & (objects.of_pixel < objects.count))
-    row, col, object_id = gather(newest, sweeps.pixels.row, sweeps.pixels.col, objects.of_pixel)
-    length = bounding_boxes(row, col, object_id, objects.count)[1].amax(1).double() * sweeps.grid.pixel_size
+    row_col = take_columns(sweeps.pixels.row_col, newest)
+    first, last = segment_minmax(row_col, objects.of_pixel.index_select(0, newest), objects.count)
+    length = (last - first + 1).amax(0).double() * sweeps.grid.pixel_size
     start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
-    moves = start.any(1)
-    points = points_of_objects(sweeps, objects, moves, LAYER_HEIGHT, NUM_LAYERS)
+    points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS)
     return register_deskewed(points, sweeps, start)
 
 
