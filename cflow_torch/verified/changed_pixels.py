@@ -60,10 +60,10 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     pixel, step = split_index(comparison, num_steps)
     sweep = pixels.window.index_select(0, pixel) * num_steps + step
     farther = RangeImages(sweeps).farther(sweep, _centre(sweeps, pixel, bit))
-    is_seen, none = farther >= 0, len(nothing)
+    is_occluded = (farther < 0) & (farther != -math.inf)
     is_missing, has_changed = (
-        F.pad(nothing, (0, 1)).index_fill_(0, torch.where(of, pixel, none), True)[:-1]
-        for of in (is_seen | farther.isinf(), is_seen)
+        F.pad(nothing, (0, 1)).index_fill_(0, pixel.masked_fill(of, len(nothing)), True)[:-1]
+        for of in (is_occluded, farther < 0)
     )
     return ChangedPixels(is_missing, has_changed)
 
@@ -121,8 +121,9 @@ class RangeImages:
 
     def _direction(self, sweep: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Bin of the range images, (K,) int64, and distance over ground, (K,) float32, metres."""
-        x, y, z = positions.sub(take_columns(self._origin, sweep)).float().unbind(0)
-        distance, sum_of_sides = torch.sqrt(x * x + y * y), x.abs().add_(y.abs()).clamp_(min=1e-3)
+        offset = positions.sub(take_columns(self._origin, sweep)).float()
+        x, y, z = offset
+        distance, sum_of_sides = offset[:2].square().sum(0).sqrt_(), offset[:2].abs().sum(0).clamp_(min=1e-3)
         around = y.div_(sum_of_sides)
         around = torch.where(x >= 0, around + 1, 3 - around).nan_to_num_(0.0)  # 0 ... 4
         azimuth = around.mul_(_AZIMUTHS / 4).long().clamp_(max=_AZIMUTHS - 1)

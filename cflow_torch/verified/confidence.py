@@ -71,7 +71,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     counts = torch.zeros(objects.count, 6, dtype=torch.int64, device=device).index_add_(0, object_of_group, counts)
     surplus, in_place = counts[:, :5], counts[:, 5]
     gain, matched = (surplus[:, 0] - surplus[:, 1:].amax(1)).clamp(min=0), surplus[:, 0] + in_place
-    z = torch.where(gain > 0, gain.double() / matched.double().sqrt(), 0.0)
+    z = gain / matched.clamp(min=1).double().sqrt()
     newest = flat_nonzero(members.step == 0)
     component, row, col = gather(newest, which, members.row, members.col)
     is_line, *_ = principal_axes(component, row, col, objects.count, size)

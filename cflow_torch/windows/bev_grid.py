@@ -91,8 +91,8 @@ class Grid:
         """
         size = constant((self.pixel_size,), positions.dtype, positions.device)
         # Inside the region nothing is below the lower end, so int() rounds down.
-        col = (positions[0] - self.lower[0]).div_(size).int()
-        row = (positions[1] - self.lower[1]).div_(size).int()
+        lower = constant(self.lower[:2], positions.dtype, positions.device)
+        col, row = (positions[:2] - lower[:, None]).div_(size).int()
         return col.add_(row, alpha=self.width)
 
     def pixel_of_image(

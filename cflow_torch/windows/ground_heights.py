@@ -106,20 +106,22 @@ class GroundHeights:
         is_used = is_known = count >= _FEWEST_POINTS
         design = constant(_AROUND, torch.float64, window.device)
         terms = torch.cat((design.t().expand(len(window), 3, -1), height[:, None]), 1)
-        is_flat, plane = torch.ones_like(window, dtype=torch.bool), design.new_empty((3, len(window)))
+        plane, fits = design.new_empty((3, len(window))), []
         for fit in range(_NUM_FITS):
             if fit > 0:
                 is_used = is_known & ((height - (plane[:, :, None] * design.t()[:, None]).sum(0)).abs() <= _FARTHEST)
             sums = ((terms * is_used[:, None]) @ design).permute(1, 2, 0)
-            n, force, (inverse, det) = sums[0, 0], sums[3], adjugate(sums[:3])
-            is_flat &= (n >= _FEWEST_BLOCKS) & (4 * det >= n**3)
-            plane = (inverse * force).sum(1) / det  # undefined where it is not flat
+            inverse, det = adjugate(sums[:3])
+            plane = (inverse * sums[3]).sum(1) / det  # undefined where it is not flat
+            fits.append((sums[0, 0], det))
+        n, det = (torch.stack(of_fits) for of_fits in zip(*fits))
+        is_flat = ((n >= _FEWEST_BLOCKS) & (4 * det >= n**3)).all(0)
         slope = plane[1:] / (1000 * _BLOCK)
         is_ground = is_flat & (slope.square().sum(0) <= _STEEPEST**2)
         return torch.where(is_ground, slope, 0.0).t().contiguous()
 
     def _block(self, positions: Tensor) -> Tensor:
         """(N,) int32 block of positions inside the region, where int() rounds down."""
-        row = (positions[1] - self._lower[1]).div_(_BLOCK).int()
-        col = (positions[0] - self._lower[0]).div_(_BLOCK).int()
+        lower = constant(self._lower[:2], positions.dtype, positions.device)
+        col, row = (positions[:2] - lower[:, None]).div_(_BLOCK).int()
         return col.add_(row, alpha=self._heights.shape[2])
