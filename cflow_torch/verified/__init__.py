@@ -1,1 +1,1 @@
-"""Ours, presets `default` and `offline`: motion candidates, verified; `method.py` is the page to read first."""
+"""Our method: presets `default` and `offline`. Begin with `method.py`."""

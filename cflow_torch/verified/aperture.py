@@ -1,14 +1,14 @@
-"""The aperture problem: long thin things that seem to slide along themselves, and long vehicles that really do.
+"""The aperture problem: static lines that seem to slide along themselves, and long vehicles that do.
 
-Walls, hedges and guard rails are sampled by a sensor that moves, so their samples seem to move with it, along the line.
-The line is static if t+1 has most of it at the old position, or the older sweeps have most of it at the new one: one
-end may have come into sight or left it. A car that is seen from its side is a line as well, but its rear leaves the old
-position, and its front comes to a new one. A low line of 7 m and more is a guard rail: it is always static.
+A moving sensor samples walls, hedges and guard rails at positions that move with it, so they seem to slide along
+themselves. We take such a line for static if t+1 has most of it at the old position, or if the older sweeps have most
+of it at the new one, because one end may enter or leave the view. The side of a car is a line as well, but its rear
+leaves the old position and its front reaches a new one. A low line of 7 m or more is a guard rail and always static.
 
-What is longer than other objects moves only if both of its ends do, as those of a tram. The ends of a wall do not: one
-stays, or each goes where the view of it ends. The ends of a guard rail may keep pace with the ego vehicle, since its
-few beams meet it at positions that are fixed in the vehicle's frame; but no vehicle is as low as a rail, nor as long as
-a noise barrier.
+A component longer than other objects moves only if both of its ends move, as those of a tram do. One end of a wall
+stays, or each end follows the border of what is visible. The ends of a guard rail or a noise barrier may keep pace with
+the ego vehicle, because the beams hit it at positions that are fixed in the frame of the vehicle. However, no vehicle
+is as low as a guard rail, or as long as a noise barrier.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, renumber, scatter_count
@@ -26,37 +25,37 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count
 _THIN, _LONG = 0.3, 1.0
 # Squared sine of the largest angle between a line and a motion along it.
 _ALONG = 0.04
-# Shorter displacements than this over the window, metres, tell nothing.
+# Metres; shorter displacements over the window are ignored.
 _LEAST_TRAVEL = 1.2
 # The displacements of two ends that move together differ by at most this share of their sum.
 _ALIKE = 0.1
-# Metres: no road vehicle is longer. The ends of a longer noise barrier are where the view of it ends.
+# Metres; no road vehicle is longer. The ends of a longer noise barrier are the borders of what is visible.
 _LONGEST = 60.0
-# Height slices in a pixel at t+1, on average: guard rails have one or, across a slice's border, two. No vehicle is as
-# low and, standard deviation along the line in metres, as long.
+# A guard rail has fewer height slices per pixel at t+1, on average, and a larger standard deviation along the line, in
+# metres. No vehicle is as low and as long. Where a rail crosses the border of a slice, its pixels have two slices.
 _TALL, _RAIL = 2, 2.0
 
 
 def slides_along_itself(
     sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, candidates: Tensor, is_covered: Tensor
 ) -> Tensor:
-    """Find the motions that a static line explains.
+    """Find the motions that a static line would seem to have.
 
     Args:
         sweeps: images of all windows.
         members: K pixels of components.
-        component: (K,) int64, of each of them.
+        component: (K,) int64, component of each pixel.
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
-        is_covered: (A,) bool, other sweeps have most of the component where it is, as `Wins` says.
+        is_covered: (A,) bool, other sweeps have most of the component in place, as defined in `Wins`.
 
     Returns:
-        (A, C) bool: the component is a line at t+1 that is covered or a rail, and the motion points along it and leads
+        (A, C) bool: the component is a line at t+1, it is covered or a rail, and the motion points along it and covers
         at least 1.2 m over the window.
 
     Convention:
-        Moments are sums of integers, everything else elementwise float64 in the written order. Standard deviations are
-        those of the positions of the pixels, at most 0.3 m across and at least 1 m along; of a rail at least 2 m. The
-        pixels of a rail have less than two slices on average. Zero motion never slides.
+        Moments are sums of integers; all else is elementwise float64 in the written order. The positions of the pixels
+        of a line have a standard deviation of at most 0.3 m across and at least 1 m along the line. A rail is a line
+        with at least 2 m along it and fewer than two slices per pixel on average. Zero motion never slides.
 
     Cost: some passes over the pixels.
     Source: the aperture problem; not in the paper.
@@ -68,7 +67,7 @@ def slides_along_itself(
     num_slices = count_slices(members.slices.index_select(0, newest)) - _TALL
     is_rail = (scatter_count(component, count, num_slices) < 0) & (variance >= (_RAIL / pixel_size) ** 2)
 
-    # Its window, of each component; those without pixels at t+1 are no lines.
+    # The window of each component; components without pixels at t+1 are not lines.
     window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, window)
     intervals = (sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)).index_select(0, window)[:, None]
     y, x = candidates.unbind(2)
@@ -82,20 +81,20 @@ def slides_along_itself(
 def principal_axes(
     component: Tensor, row: Tensor, col: Tensor, num_components: int, pixel_size: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return whether each component is a line, (A,) bool; the variance along it, (A,) float64, square pixels; and y and
-    x of its direction, (A,) float64, of any length.
+    """Return whether each component is a line, (A,) bool, the variance along it, (A,) float64, square pixels, and y and
+    x of a vector along it, (A,) float64, of any length.
 
     Args:
-        component, row, col: (Q,) int64, its pixels at t+1.
+        component, row, col: (Q,) int64, of each pixel at t+1.
         num_components: A.
         pixel_size: s, metres.
     """
-    one_y_x = F.pad(torch.stack((row, col)), (0, 0, 1, 0), value=1)
+    one_y_x = torch.stack((torch.ones_like(row), row, col))
     moments = scatter_count(component, num_components, (one_y_x[:, None] * one_y_x).view(9, -1)).view(3, 3, -1)
     n, sums = moments[0, 0], moments[0, 1:]
-    # Differences of large products, exact in whole numbers.
+    # Differences of large products are exact in integers.
     (var_y, cov), (_, var_x) = (n * moments[1:, 1:] - sums[:, None] * sums) / (n * n).clamp(min=1).double()
-    # Eigenvalues of the 2 x 2 matrix; of the two ways to write the eigenvector, the one that does not vanish.
+    # Eigenvalues of the 2 x 2 matrix. Of the two forms of the eigenvector, we take the one that does not vanish.
     mean, half = (var_y + var_x) / 2, (var_y - var_x) / 2
     root = torch.sqrt(half * half + cov * cov)
     small, large = mean - root, mean + root
@@ -110,17 +109,17 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     Args:
         sweeps: P occupied pixels.
         roots: (L, P) int64, component of each pixel at each level.
-        is_long: (V,) bool, those that are asked about; each has pixels at t+1.
+        is_long: (V,) bool, the components to test; each has pixels at t+1.
 
     Returns:
-        (V,) bool: from the sweep that is farthest in time to t+1 (or back), both ends have moved in one direction along
-        the component, at least 1.2 m, alike to a tenth of their sum; and its pixels at t+1 have two slices on average
-        and are at most 60 m long. False for all others.
+        (V,) bool. True if, between t+1 and the sweep farthest in time, both ends moved at least 1.2 m in one direction
+        along the component, their displacements differ by at most a tenth of their sum, its pixels at t+1 have at least
+        two slices on average, and it is at most 60 m long. False for components that are not tested.
 
     Convention:
-        A component lies along y, x or one of the diagonals: along the one in which its pixels at t+1 reach farthest.
-        Its ends are the first and the last pixel in this direction. Ties: the first direction; of sweeps equally far in
-        time the first. A component without pixels in that sweep does not move.
+        The direction of a component is y, x or one of the diagonals: the one in which its pixels at t+1 reach farthest.
+        Its ends are the first and the last pixel in this direction. Ties: the first direction, and the first of sweeps
+        equally far in time. A component without pixels in that sweep does not move.
 
     Cost: some passes over the pixels of long components.
     Source: not in the paper.
@@ -136,7 +135,7 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     num_slices = torch.where(is_new, count_slices(pixels.slices) - _TALL, 0)
     is_tall = scatter_count(component, count, num_slices) >= 0
 
-    # Ends in four directions, at t+1 and in the farthest sweep; pixels of other sweeps count for a component behind.
+    # Ends in four directions, at t+1 and in the farthest sweep. Pixels of other sweeps go to an extra component.
     is_farthest = pixels.step == sweeps.elapsed.abs().argmax(1).index_select(0, pixels.window)
     of_sweep = torch.where(is_new, component, torch.where(is_farthest, component + count, 2 * count))
     along = torch.stack((pixels.row, pixels.col, pixels.row + pixels.col, pixels.row - pixels.col)).double()
@@ -147,6 +146,6 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     unit = constant(metres, torch.float64, along.device)[:, None]
     length, direction = ((high[:, 0] - low[:, 0]) * unit).max(0)
     low, high = (((ends[:, 0] - ends[:, 1]) * unit).gather(0, direction[None])[0] for ends in (low, high))
-    both = (low + high).abs()  # infinite or NaN where the component is not seen
+    both = (low + high).abs()  # infinite or NaN if the component is not visible
     moves = is_tall & (length <= _LONGEST) & (both >= 2 * _LEAST_TRAVEL) & ((low - high).abs() <= _ALIKE * both)
     return torch.zeros_like(is_long).index_copy_(0, name, moves)

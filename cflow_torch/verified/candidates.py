@@ -1,4 +1,4 @@
-"""Motion candidates of nodes: peaks of the correlation with each sweep, their pool, the pools of the nodes around."""
+"""Motion candidates of nodes: correlation peaks with each sweep, their median, and the medians of surrounding nodes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cflow_torch.ops.segments import masked_median, segment_minmax
 from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, count_slices
 
-# A node whose box has more pixels is correlated at a coarser scale: its children are followed at the finer ones.
+# A node whose box has more pixels is correlated at a coarser scale. Its children are correlated at the finer scales.
 _LARGEST_BOX = 1 << 12
 
 
@@ -36,9 +36,8 @@ class Candidates(NamedTuple):
     """Motion candidates of N nodes.
 
     Args:
-        motion: (N, C, 2) float64, (y, x), finest pixels per sweep interval, in the order in which ties are decided; 0
-            stands for what is not known.
-        score: (N,) float32, NCC with the nearest sweep that has the node.
+        motion: (N, C, 2) float64, (y, x), finest pixels per sweep interval; 0 = unknown. Ties: the first candidate.
+        score: (N,) float32, NCC with the nearest sweep in which the node has pixels.
     """
 
     motion: Tensor
@@ -46,11 +45,11 @@ class Candidates(NamedTuple):
 
 
 def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig) -> Candidates:
-    """Candidates of all nodes, each correlated at its own pixel size.
+    """Return the candidates of all nodes, each correlated at its own pixel size.
 
     Args:
         nodes: N of them.
-        components: at which scales they are.
+        components: the scales of the nodes.
         sweeps: finest images.
         config: `max_speed`, `correlation`, `max_memory`.
     """
@@ -67,18 +66,19 @@ def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, co
 
 
 def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Tensor:
-    """(M, C, 2) float64, pixels per sweep interval: the median of the estimates in y and in x (where K > 1), then each
-    estimate divided by its interval.
+    """Return (M, C, 2) float64, pixels per sweep interval: the median of the estimates in y and in x (if K > 1), then
+    each estimate divided by its interval.
 
     Args:
         estimates: (M, K, 2) float64, (y, x) finest pixels m -> t+1, nearest sweep first.
-        available: (M, K) bool, False = it is unknown; its entry is ignored.
+        available: (M, K) bool, False = the estimate is unknown and its entry ignored.
         intervals: (M, K) float64, sweep intervals from m to t+1; not 0 where an estimate is available.
 
     Convention:
-        The median of one estimate is that estimate, so sweeps that a window lacks change no choice. No -0.0.
+        The median of one estimate is that estimate, so sweeps that a window lacks do not affect the choice. The result
+        has no -0.0.
 
-    Source: after Sec. leverage_past_pcs, which takes the median of magnitudes and that of orientations.
+    Source: adapted from Sec. leverage_past_pcs, which takes the median of magnitudes and that of orientations.
     """
     unknown = ~available
     per_interval = (estimates / intervals.masked_fill(unknown, 1.0)[:, :, None]).masked_fill_(unknown[:, :, None], 0.0)
@@ -90,7 +90,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
 def _find_peaks(
     nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Displacement m -> t+1 of nodes for every other sweep m, to fractions of a pixel.
+    """Return the sub-pixel displacement m -> t+1 of each node for every other sweep m.
 
     Args:
         nodes, components, sweeps, config: as for `propose`.
@@ -98,9 +98,9 @@ def _find_peaks(
     Returns:
         estimates: (N, S - 1, 2) float64, (y, x), finest pixels m -> t+1, nearest sweep first.
         scores: (N, S - 1) float32, NCC at the peak.
-        available: (N, S - 1) bool, False = no pixel in that sweep; both above are 0 then.
+        available: (N, S - 1) bool, False = the node has no pixel in that sweep; both above are 0 then.
 
-    Convention: a peak at no shift stays. The parabola counts slices of the node's own pixels.
+    Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
     """
     images = _NodeImages.of(nodes, components.blocks, sweeps.num_steps)
     clusters = Clusters(nodes.window, images.first, images.size, images.pixels)
@@ -120,12 +120,12 @@ class _NodeImages(NamedTuple):
     """A small image of each of N nodes for each of S sweeps, at the scale at which the node is correlated.
 
     Args:
-        block: (N,) int64, finest pixels a side of a pixel.
+        block: (N,) int64, side of a pixel in finest pixels.
         first: (N, 2) int64, top-left (row, col) of the box over all sweeps, in pixels of the scale.
         size: (N, 2) int64, its height and width.
-        start: (N,) int64, where the images of a node begin.
-        image: (I,) uint8, slices of the pixels of all images, one behind the other.
-        pixels: the pixels that are set.
+        start: (N,) int64, where the images of each node begin in `image`.
+        image: (I,) uint8, slices of the pixels of all images, one image after the other.
+        pixels: the occupied pixels.
     """
 
     block: Tensor
@@ -139,22 +139,22 @@ class _NodeImages(NamedTuple):
     def of(cls, nodes: Nodes, blocks: Sequence[int], num_steps: int) -> _NodeImages:
         """Draw the nodes.
 
-        Convention: the scale is that of the level; if the box is larger than `_LARGEST_BOX` pixels at it, the finest
-            scale at which it is not, or the coarsest.
+        Convention: a node has the scale of its level, unless its box has more than `_LARGEST_BOX` pixels there. Then it
+            has the finest scale at which the box fits, or the coarsest if it fits nowhere.
         """
         members, node, device = nodes.members, nodes.node, nodes.node.device
         block = constant(tuple(blocks), torch.int64, device)
         ends = torch.cat(segment_minmax(members.row_col, node, nodes.count)).t()[:, None]
         ends = torch.div(ends, block[:, None], rounding_mode="floor")  # (N, scales, 4)
         sizes = ends[:, :, 2:] - ends[:, :, :2] + 1
-        num_small = (sizes.prod(2) <= _LARGEST_BOX).sum(1)  # they come first, as scales are coarse to fine
+        num_small = (sizes.prod(2) <= _LARGEST_BOX).sum(1)  # these come first, because scales are coarse to fine
         scale = torch.minimum(nodes.level.clamp(max=len(blocks) - 1), (num_small - 1).clamp(min=0))
         at = (torch.arange(nodes.count, device=device), scale)
         block, first, size = block[scale], ends[at][:, :2], sizes[at]
         area = size.prod(1) * num_steps
         end = area.cumsum(0)
 
-        # Pixels that fall into one at their scale are found by drawing them. It remembers one of them, whichever.
+        # We draw the pixels to find those that coincide at their scale. Any one of those is kept.
         table = torch.stack((end - area, block, *size.unbind(1), *first.unbind(1)))
         of_member = take_columns(table, node)
         start, side, height, width = of_member[:4]
@@ -162,7 +162,7 @@ class _NodeImages(NamedTuple):
         row, col = pixel - of_member[4:]
         index = (members.step * height + row).mul_(width).add_(start).add_(col)
         total = int(end[-1]) if nodes.count else 0
-        # Where several of the finest pixels fall into one, all slices are set.
+        # At coarser scales, all slices of a pixel are set.
         slices = torch.where(side == 1, members.slices, OWN)
         image = lazy_zeros(total, torch.uint8, device).index_copy_(0, index, slices)
         member = torch.arange(len(node), dtype=torch.int32, device=device)
@@ -173,13 +173,13 @@ class _NodeImages(NamedTuple):
 
 
 def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tensor:
-    """(J, 2) float64, (y, x), pixels of each scale: tops of the parabolas through the pixels that templates share with
-    their targets at their peaks and beside them; 0 for pairs that do not move.
+    """Return the sub-pixel offset of each peak, (J, 2) float64, (y, x), pixels of its scale: vertices of the parabolas
+    through the counts of common slices at the peak and at its four neighbours; 0 for pairs whose peak is at shift 0.
 
     Args:
         images: of all nodes.
         pairs: J of them.
-        shift: (J, 2) int64, (dy, dx), of the peak.
+        shift: (J, 2) int64, (dy, dx), of each peak.
     """
     is_moved = shift.any(1)
     some = flat_nonzero(is_moved.index_select(0, pairs.template.image))
@@ -196,5 +196,5 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     target = images.image.index_select(0, index.view(-1)).view_as(index)
     meets = count_slices(own[:, None] & target) * inside
     sums = scatter_count(pair, len(shift), meets.t())
-    # Before and after the peak: above and below it, then left and right of it.
+    # Counts before and after the peak: above and below it, then left and right of it.
     return (parabola_vertex(sums[1::2], sums[:1], sums[2::2]) * is_moved).t()

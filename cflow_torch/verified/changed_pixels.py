@@ -1,7 +1,7 @@
-"""Changed pixels: what is not found in place in another sweep, although that sweep saw the position.
+"""Changed pixels: pixels with a slice that is missing in another sweep, although that sweep saw its position.
 
-Near objects cast shadows on the background, and when the sensor moves, the shadows move as well. So a slice
-that is missing counts only where the other sweep saw through: a return in the same direction is at least as far away.
+Near objects cast shadows on the background, and the shadows move with the sensor. So a missing slice counts only if the
+other sweep has a return in the same direction that is at least as far away.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, scatter_count, split_index, take_columns
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps
 
-# Range images: bins of about half a degree around, and of one degree up and down, half of them below level.
+# Range images: bins of about half a degree of azimuth and one degree of elevation; half of them are below level.
 _AZIMUTHS, _ELEVATIONS, _RISE = 720, 120, 1 / 57.3
-# Sweeps do not tell where the sensor is. We guess: over the origin of the ego frame, so high above the lowest points
-# within 12 m; one near point of fifty may lie lower.
+# Sweeps do not contain the sensor position. We assume that it is above the origin of the ego frame, at this height over
+# the lowest points within 12 m; one near point in fifty may be lower than those.
 _ABOVE_LOWEST, _NEAR, _OUTLIERS = 1.6, 12.0, 50
-_PER_METRE, _HIGHEST = 256, 8192  # steps of height, and the largest number of them, up and down
+_PER_METRE, _HIGHEST = 256, 8192  # steps of height per metre; their largest number, up and down
 
 
 class ChangedPixels(NamedTuple):
-    """What P pixels show of change; all False in windows without history, where one other sweep would decide.
+    """The change of P pixels; all False in windows without history, because a single other sweep would decide there.
 
     Args:
-        is_missing: (P,) bool, a slice is missing in another sweep, and not occluded there.
+        is_missing: (P,) bool, a slice is missing in another sweep and not occluded there.
         has_changed: (P,) bool, a slice is missing in another sweep that saw its position.
     """
 
@@ -41,9 +41,10 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     """Compare every pixel in place with every other sweep of its window.
 
     Convention:
-        A slice is missing if none of the 3 x 3 pixels around its position has it. Its height is that of its middle, the
-        first at or above the lowest point of its pixel. A sweep saw a position if a return in its direction is at least
-        as far away; it is occluded if all returns there are nearer. Without a return, neither is known.
+        A slice is missing if none of the 3 x 3 pixels around its position has it. Slices repeat, so we take the lowest
+        one that is not below the slice of the lowest point of its pixel, and the height of its middle. A sweep saw a
+        position if a return in its direction is at least as far away. The position is occluded if all returns in its
+        direction are nearer. Without a return, it is neither seen nor occluded.
 
     Cost: a lookup for each pixel and sweep, and a range image of every sweep.
     """
@@ -69,7 +70,7 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
 
 
 def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
-    """The set bits of (P, S) uint8 masks: flat index of the mask and number of the bit, (K,) int64 each."""
+    """Return the set bits of (P, S) uint8 masks: flat index of the mask and number of the bit, (K,) int64 each."""
     some = flat_nonzero(missing.bool())
     bits = missing.view(-1).index_select(0, some)[:, None] & constant((1, 2, 4, 8), torch.uint8, missing.device)
     entry, bit = split_index(flat_nonzero(bits.bool()), NUM_SLICES)
@@ -77,7 +78,7 @@ def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, bit: Tensor) -> Tensor:
-    """(3, K) float64, metres, of the middle of slices, by their pixels and bits, (K,) int64 each."""
+    """Return the centres of slices, (3, K) float64, metres, by their pixels and bits, (K,) int64 each."""
     first = torch.floor(sweeps.lowest.index_select(0, pixel) / SLICE_HEIGHT)
     height = first + torch.remainder(bit - first, NUM_SLICES) + 0.5
     y, x = sweeps.grid.centre(take_columns(sweeps.pixels.row_col, pixel))
@@ -85,14 +86,14 @@ def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, bit: Tensor) -> Tensor:
 
 
 class RangeImages:
-    """How far every sweep sees in each direction: the farthest return of each bin.
+    """Range images of all sweeps: the distance of the farthest return in each direction.
 
     Args:
         sweeps: points that are active, without ground.
 
-    Convention: angles are measured without trigonometry, so that every device finds the same bins. The azimuth is
-    measured by y / (|x| + |y|), in bins of .32 to .64 degrees; the elevation by height over distance. Distances are
-    float32.
+    Convention: bins are computed without trigonometry, so that they are the same on every device. The azimuth is
+    measured by y / (|x| + |y|), in bins of 0.32 to 0.64 degrees, and the elevation by height over distance. Distances
+    are float32.
     """
 
     def __init__(self, sweeps: HeightSlicedSweeps) -> None:
@@ -109,8 +110,8 @@ class RangeImages:
         self._farthest = farthest
 
     def farther(self, sweep: Tensor, positions: Tensor) -> Tensor:
-        """(K,) float32, metres: distance of the farthest return in the direction of each position, minus that of the
-        position; -infinity = no return.
+        """Return (K,) float32, metres: the distance of the farthest return in the direction of each position, minus
+        that of the position; -infinity = no return.
 
         Args:
             sweep: (K,) int64, window * S + step.
@@ -120,7 +121,7 @@ class RangeImages:
         return self._farthest.index_select(0, direction).sub_(distance)
 
     def _direction(self, sweep: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Bin of the range images, (K,) int64, and distance over ground, (K,) float32, metres."""
+        """Return the bin of the range images, (K,) int64, and the horizontal distance, (K,) float32, metres."""
         offset = positions.sub(take_columns(self._origin, sweep)).float()
         x, y, z = offset
         distance, sum_of_sides = offset[:2].square().sum(0).sqrt_(), offset[:2].abs().sum(0).clamp_(min=1e-3)
@@ -133,7 +134,7 @@ class RangeImages:
 
     @staticmethod
     def _sensor_height(sweeps: HeightSlicedSweeps) -> Tensor:
-        """(B,) float64, metres, above the origin of t+1."""
+        """Return the height of the sensor above the origin of t+1, (B,) float64, metres."""
         batch, (x, y, z) = sweeps.batch, sweeps.batch.positions.unbind(0)
         is_near = (x * x + y * y <= _NEAR**2) & batch.is_active
         height = (z * _PER_METRE).floor_().nan_to_num_(0.0).clamp_(-_HIGHEST, _HIGHEST - 1).long().add_(_HIGHEST)

@@ -1,8 +1,8 @@
-"""The component tree: components at several scales, those of them that may move, and the cut that selects objects.
+"""The component tree: components at several scales, the test whether they may move, and the selection of objects.
 
-A component at one scale holds children at the next finer one. It may be one object whose children are too small to be
-followed, or several objects that move apart. All components that may move are nodes of one list, whatever their scale,
-and every later step runs once, on that list.
+A component contains its children, the components at the next finer scale. It may be one object whose children are too
+small to be matched, or several objects with different motions. The components of all scales that may move are nodes of
+one list, and every later step runs once, on that list.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ from cflow_torch.verified.aperture import both_ends_move
 from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 
-# The static test: a component may move only if more than one of so many of its pixels is missing somewhere.
+# The static test: a component may move only if more than one in so many of its pixels is missing in another sweep.
 _MISSING = 20
-# Metres: changed pixels that reach farther at t+1 are not those of a person or of a cyclist.
+# Metres; longer components of changed pixels at t+1 are not persons or cyclists.
 _LOCAL = 3.0
-# What every object costs, sixteenths of a slice of evidence: children move on their own only if they explain more.
+# The price of an object, in sixteenths of a slice. Children move separately only if that gains more evidence.
 _PRICE = 16 * 4
 
 
 @dataclass(frozen=True)
 class Components:
-    """All components of all windows. They have V names, level by level; some names are free.
+    """All components of all windows. Each has a name, a number below V, level by level; some numbers are unused.
 
     Args:
         roots: (L, P) int64, component of each pixel at each level, coarse to fine; the last level is not dilated.
         changed: (Q,) int64, pixels that changed, positions in the list.
-        changed_root: (Q,) int64, component of each of them among the changed pixels only.
-        firsts: first name of each level; that of the components of changed pixels follows.
+        changed_root: (Q,) int64, component of each of them, labelled among the changed pixels alone.
+        firsts: first name of each level, then of the components of changed pixels.
         parent: (V + 1,) int64, component of the next coarser level; V = none.
-        size: (V,) int64, number of pixels; 0 = a free name.
+        size: (V,) int64, number of pixels; 0 = an unused name.
         is_linked: (V,) bool, it has pixels at t+1 and before.
-        may_move: (V,) bool, it is linked, and the static test does not rule a motion out.
-        blocks: of each scale the finest pixels a side of a pixel of its images.
+        may_move: (V,) bool, it is linked, and the static test does not exclude a motion.
+        blocks: side of a pixel at each scale, in finest pixels.
     """
 
     roots: Tensor
@@ -81,12 +81,12 @@ class Nodes:
     """N components that may move: coarse to fine, then those of changed pixels, then those under overhangs.
 
     Args:
-        component: (N,) int64, its name; those under overhangs are named from V on.
+        component: (N,) int64, its name; names of those under overhangs begin at V.
         level: (N,) int64, 0 ... L - 1; L = changed pixels, L + 1 = under an overhang.
         parent: (N,) int64, the next coarser node around it; N = none.
         window: (N,) int64.
         travels: (N,) bool, it is longer than other objects, and both of its ends move.
-        pixel: (A,) int64, pixels of all nodes, positions in the list; a pixel of several nodes is here several times.
+        pixel: (A,) int64, pixels of all nodes, positions in the list; a pixel of several nodes is repeated.
         node: (A,) int64, node of each of them.
         members: the same pixels.
     """
@@ -127,15 +127,16 @@ class Objects:
 
 
 def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: Sequence[int]) -> Components:
-    """Components of all scales by one union-find, and the static test.
+    """Label the components of all scales by one union-find, and apply the static test.
 
     Args:
         sweeps: P occupied pixels.
-        change: what they show.
-        blocks: finest pixels a side of a pixel, coarse to fine, the last one 1. Each scale is dilated as in
-            Alg. clustering, but nothing is eroded: so scales are nested. Plain components of the finest pixels follow.
+        change: change of the pixels.
+        blocks: side of a pixel at each scale in finest pixels, coarse to fine, the last one 1. Each scale is dilated as
+            in Alg. clustering, but not eroded, so the scales are nested. The last level is the plain components of the
+            finest pixels, without dilation.
 
-    Convention: the static test holds in windows with history only.
+    Convention: the static test excludes motions only in windows with history.
 
     Cost: one pass over the images of each scale, a few rounds of union-find, some passes over the pixels.
     """
@@ -161,11 +162,11 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
 
     firsts = tuple(blocks_of.first for blocks_of in found)
     root = torch.cat((roots[-1], changed_root))
-    # The first sum counts all pixels and, above 2^32, those at t+1; the second those that are missing, or may be.
+    # The first sum counts all pixels and, times 2^32, those at t+1; the second counts those that are missing or may be.
     is_missing = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
     codes = torch.stack((((pixels.step == 0) << 32) + 1, is_missing))
     sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
-    # What the components of a level hold adds up to what those of the coarser level hold.
+    # The sums of a component are those of its children added up.
     for level in range(len(roots) - 1, 0, -1):
         names = slice(firsts[level], (*firsts, count)[level + 1])
         sums += scatter_count(parent[names], count + 1, sums[:, names])
@@ -176,22 +177,22 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
 
 
 def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -> Tensor:
-    """(B, H', W') bool padded images, set at rows, counted through all of them, and columns (K,) int64."""
+    """Draw (B, H', W') bool padded images from columns and from rows of all images in a stack, (K,) int64 each."""
     shape = num_windows, padded_size(height), padded_size(width)
     image = lazy_zeros(math.prod(shape), torch.bool, row.device)
     return image.index_fill_(0, torch.add(col, row, alpha=shape[2]), True).view(shape)
 
 
 def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: float | None) -> Nodes:
-    """The components that may move, as a list.
+    """List the components that may move.
 
     Args:
         sweeps: P occupied pixels.
         components: V names.
-        longest: metres; what is longer at t+1 moves only if both of its ends do. None = anything may move.
+        longest: metres; components longer than this at t+1 may move only if both of their ends do. None = no such test.
 
-    Convention: a plain component that equals the dilated one around it is not in the list a second time. A length is
-        that of the longer side of the box of the pixels at t+1.
+    Convention: a plain component that equals its dilated parent is not listed twice. The length is the longer side of
+        the bounding box of the pixels at t+1.
 
     Cost: linear in the pixels of the nodes.
     """
@@ -202,7 +203,7 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
     may_move = may_move & (travels | ~is_long)
     if len(components.firsts) > components.num_levels:
         may_move[components.firsts[-1] :] &= length[components.firsts[-1] :] <= _LOCAL
-    # A plain component of as many pixels as its parent is the same component once more.
+    # A plain component with as many pixels as its parent is the same component.
     size, parent = F.pad(components.size, (0, 1)), components.parent
     is_node = F.pad(may_move, (0, 1))
     plain = slice(components.firsts[components.num_levels - 1], (*components.firsts, count)[components.num_levels])
@@ -230,7 +231,7 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
 
 
 def _length(sweeps: HeightSlicedSweeps, components: Components) -> Tensor:
-    """(V,) float64, pixels: longer side of the box of each component at t+1."""
+    """Return the longer side of the bounding box of each component at t+1, (V,) float64, pixels."""
     step = sweeps.pixels.step
     newest = flat_nonzero(step == 0)
     changed = flat_nonzero(step.index_select(0, components.changed) == 0)
@@ -241,38 +242,38 @@ def _length(sweeps: HeightSlicedSweeps, components: Components) -> Tensor:
 
 
 def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_pixels: int) -> tuple[Objects, Tensor]:
-    """Cut the tree from below: a component wins where its one motion has more evidence than its children together.
+    """Select objects from the leaves up: a component wins if its motion has more evidence than its children together.
 
     Args:
         nodes: N of them.
-        components: V names; those under overhangs follow.
-        evidence: (N,) int64, of the best motion of each, 0 = none is significant; sums must stay below 2^63.
-        num_pixels: P, those of the copies included.
+        components: V names; the names of components under overhangs follow.
+        evidence: (N,) int64, of the best motion of each node; 0 = none is significant. Sums must stay below 2^63.
+        num_pixels: P, including the pixels of copies.
 
     Returns:
         The objects, and the node of each, (G,) int64, N = none. A pixel belongs to the coarsest of its nodes that won.
-        If none did, it moves with the node of its changed pixels, if that moves. Otherwise it is static and belongs
-        to its finest component, or to none if that is not linked. Pixels of copies belong to a node that moves, or to
+        If none won, it belongs to its node of changed pixels, if that moves. Otherwise it is static and belongs to its
+        finest component, or to none if that is not linked. The pixel of a copy belongs to its node if that moves, or to
         none.
 
-    Convention: a child counts with its evidence less `_PRICE`, at least 0. The whole must have more; at a draw the
-        children keep their own motion.
+    Convention: a child counts with its evidence minus `_PRICE`, at least 0. A component wins if it has more evidence
+        than its children together. Ties: the children win.
 
     Cost: a few passes over the nodes for each level, and over the pixels.
     """
     count, num_levels = nodes.count, components.num_levels
     children = evidence.new_zeros(count + 1)
-    for level in range(num_levels - 1, 0, -1):  # finer levels first: what a node holds is complete before it counts
+    for level in range(num_levels - 1, 0, -1):  # finer levels first: the children of a node are complete
         value = torch.maximum(evidence, children[:-1])
         value = (value - _PRICE).clamp_(min=0)
         children.index_add_(0, nodes.parent, value.masked_fill_(nodes.level != level, 0))
     own = torch.arange(count + 1, device=evidence.device)
     winner = own.masked_fill(F.pad(evidence, (0, 1)) <= children, count)
     parent = F.pad(nodes.parent, (0, 1), value=count)
-    for _ in range(num_levels - 1):  # coarse winners spread to what they hold, a level at a time
+    for _ in range(num_levels - 1):  # winners spread to their descendants, a level at a time
         winner = torch.minimum(winner, winner.index_select(0, parent))  # nodes are numbered coarse to fine
 
-    # So the largest number is that of the finest node, or of the node of changed pixels or under an overhang.
+    # Of all nodes of a pixel, the largest number is that of one of changed pixels or under an overhang, or the finest.
     is_other = nodes.level >= num_levels
     last, finest = (
         torch.full((num_pixels,), -1, dtype=torch.int64, device=own.device)
@@ -292,7 +293,7 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
 
 
 def number_objects(name: Tensor, num_names: int) -> Objects:
-    """Objects by the name of the component that each pixel belongs to, (P,) int64; `num_names` = none."""
+    """Number the objects, by the name of the component that each pixel belongs to, (P,) int64; `num_names` = none."""
     is_used = torch.zeros(num_names + 1, dtype=torch.bool, device=name.device).index_fill_(0, name, True)
     component = flat_nonzero(is_used[:-1])
     position = torch.arange(len(name), device=name.device)

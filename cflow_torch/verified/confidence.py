@@ -1,11 +1,12 @@
 """The margin of motions, and the confidence of the flow of each point (docs/verified.md).
 
-The margin of a motion says how much worse it explains the sweeps when it is displaced. Along a wall that seems to slide
-nothing gets worse, and a trunk of few points fits many positions: what fits as well when displaced is static.
+The margin of a motion measures how much worse a displaced copy of it explains the sweeps. If a motion fits no better
+than a displaced copy, the object is static, such as a wall that seems to slide or a trunk of few points.
 
-Counts that need no truth give every point a probability, from a table. A moving object is trusted by its margin, a
-static one by the share of its neighbourhood that is matched, and less beside a moving object, which may be larger than
-it seems. What could not be linked to t+1 is trusted the less the more of it there is.
+A table gives each point a probability from counts that need no ground truth. For a moving object, the probability
+depends on its margin. For a static point, it depends on the share of its neighbourhood that is matched, and it is lower
+next to a moving object, which may be larger than it seems. The more slices are around a point without correspondence at
+t+1, the lower is its probability.
 """
 
 from __future__ import annotations
@@ -25,24 +26,25 @@ from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, P
 from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 
-# Bounds of the bins and the probabilities, written by scripts/ablation/calibrate_confidence.py. Bins, in order: left
-# out; unlinked, by `crowd`; static, by `share`; static beside a moving object; moving, by `margin`: pairs near, pairs
-# far, with history near and far.
+# Bounds of the bins and the probabilities, written by scripts/ablation/calibrate_confidence.py. The order of the bins:
+# left out; without correspondence at t+1, by `crowd`; static, by `share`; static next to a moving object; moving, by
+# `margin`, for near and far points of pairs, then for near and far points of windows with history.
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
-_BLOCK = 1.6  # metres, sides of a neighbourhood
+_BLOCK = 1.6  # metres, side of a neighbourhood
 _DISPLACEMENT = 0.4  # metres per interval, along x and along y
-_Z = 1.0  # standard deviations of noise by which a motion must be better than displaced
+_Z = 1.0  # standard deviations of noise by which a motion must exceed its displaced copies
 
 
 class MotionMargin(NamedTuple):
     """The margins of G objects.
 
     Args:
-        z: (G,) float64, slices matched by the motion less those matched by the best displaced one, in standard
-            deviations of noise; 0 = it is not better, or the object is static.
-        is_dynamic: (G,) bool, it moves: z is at least 1, or the object is not a line, more of it is matched by the
-            motion than where it is, and the motion is better than displaced ones or at least twice the displacement,
-            because then the displaced ones move as well. Lines need z: beams meet a rail at positions that move.
+        z: (G,) float64, slices matched by the motion minus those matched by its best displaced copy, in standard
+            deviations of noise; 0 = the motion is not better, or the object is static.
+        is_dynamic: (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line, the motion
+            matches more of it than zero motion does, and it is better than its displaced copies or at least twice as
+            long as the displacement. If it is so long, the displaced copies are motions as well. A line needs z,
+            because beams hit a rail at positions that move with the vehicle.
     """
 
     z: Tensor
@@ -50,7 +52,7 @@ class MotionMargin(NamedTuple):
 
 
 def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> MotionMargin:
-    """The margin of each object.
+    """Return the margin of each object.
 
     Args:
         sweeps: finest images.
@@ -82,13 +84,13 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 def _groups_of_one_motion(
     sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion
 ) -> tuple[Tensor, Tensor]:
-    """Groups of pixels that share a motion: the pixels of an object, but those that its rotation takes a pixel
-    farther are groups of their own.
+    """Group pixels that share a motion: the pixels of an object, except those that its rotation displaces by a
+    pixel or more. Each of these is a group of its own.
 
     Args:
         sweeps: finest images.
         pixels: K pixels of objects.
-        which: (K,) int64, object of each.
+        which: (K,) int64, object of each pixel.
         rigid: motion of the G objects.
 
     Returns:
@@ -99,7 +101,7 @@ def _groups_of_one_motion(
     elapsed = sweeps.elapsed.index_select(0, pixels.window)
     since_t = elapsed[:, 1] - elapsed.gather(1, pixels.step[:, None])[:, 0]
     (y, x), (flow_x, flow_y) = sweeps.grid.centre(pixels.row_col), rigid.flow.index_select(0, which).unbind(1)
-    flow_x, flow_y = rigid.flow_at(which, x - flow_x * since_t, y - flow_y * since_t)  # by where the pixel was at t
+    flow_x, flow_y = rigid.flow_at(which, x - flow_x * since_t, y - flow_y * since_t)  # the position is that at t
     flow = torch.stack((flow_y, flow_x), 1) / size
     rotates = flat_nonzero(((flow - motion.index_select(0, which)).abs() >= 1).any(1))
     group = which.index_copy(0, rotates, torch.arange(len(rotates), device=which.device) + len(motion))
@@ -107,16 +109,16 @@ def _groups_of_one_motion(
 
 
 def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor) -> Tensor:
-    """Probability that the motion of a pixel of t is right to 0.1 m per sweep interval.
+    """Return the probability that the motion of a pixel of t is right to 0.1 m per sweep interval.
 
     Args:
         sweeps: finest images, P occupied pixels.
         objects: G of them.
-        rigid: their motion. Rotations are ignored: an object counts as if it moved as its centre does.
+        rigid: their motion. Rotations are ignored: all pixels of an object move as its centre does.
         margin: (G,) float64, of each motion, `MotionMargin.z`.
 
     Returns:
-        (P + 1,) float32; entry P is for points whose pixel was left out. Undefined for pixels of other sweeps.
+        (P + 1,) float32; entry P is for points whose pixel was left out. Undefined for pixels of sweeps other than t.
 
     Cost: one lookup for each pixel of t, and nine for those that move.
     """
@@ -143,18 +145,18 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 
 
 def _is_beside(sweeps: HeightSlicedSweeps, moves: Tensor) -> Tensor:
-    """(P,) bool: whether one of the 3 x 3 pixels around each pixel moves in the same sweep. `moves` is (P,) bool."""
+    """Return whether one of the 3 x 3 pixels around each pixel moves in the same sweep, (P,) bool, as `moves` is."""
     around = sweeps.around(flat_nonzero(moves), 1).view(-1)
     return F.pad(torch.zeros_like(moves), (0, 1)).index_fill_(0, around, True)[:-1]
 
 
 def _bin(values: Tensor, bounds: list[float]) -> Tensor:
-    """(K,) int64, how many of the ascending bounds each value reaches."""
+    """Return how many of the ascending bounds each value reaches, (K,) int64."""
     return torch.bucketize(values, constant(tuple(bounds), values.dtype, values.device), right=True)
 
 
 def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Slices of t in the block around each pixel, and how many of them t+1 has where they move to.
+    """Count the slices of t in the block around each pixel, and those of them that t+1 has at their target.
 
     Args:
         sweeps: P pixels.

@@ -1,7 +1,7 @@
 """Height-sliced occupancy: images of all sweeps at the finest pixels, with four height slices a pixel.
 
-A slice is half a metre of height, and slices repeat every two metres, so that a wheel cannot match a roof. One byte of
-an image holds the slices of its pixel, and those of the 3 x 3 pixels around it.
+A slice is half a metre high, and slices repeat every two metres, so that a wheel cannot match a roof. One byte of an
+image holds the slices of its pixel and those of the 3 x 3 pixels around it.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ NUM_SLICES = 4
 SLICE_HEIGHT = 0.5  # metres
 OWN = (1 << NUM_SLICES) - 1  # bits of the slices of the pixel itself
 _COUNTS = tuple(bin(byte & OWN).count("1") + (bin(byte >> NUM_SLICES).count("1") << 32) for byte in range(256))
-# Beyond this float64 only holds multiples of 16, so cutting heights off here changes no slice.
+# Beyond this, float64 has only multiples of 16, so clamping heights here changes no slice.
 _HIGHEST_SLICE = 2.0**56
-# A low pixel belongs to the object of a tall one that is at most so many rows and columns away.
+# A low pixel belongs to the object of a tall one at most so many rows and columns away.
 _RESIDUE_REACH = 2
 _BESIDE = (-1, 0, 1)  # rows or columns
 
@@ -45,9 +45,9 @@ class Pixels:
     """Occupied pixels of sweeps.
 
     Args:
-        table: (5, K) int64: flat index into the images, window, step, row and column of each. Step 0 is sweep t+1, 1 is
-            t, 2 is t-1, ...
-        slices: (K,) uint8, its height slices, a bit each.
+        table: (5, K) int64: flat index into the images, window, step, row and column of each pixel. Step 0 is sweep
+            t+1, 1 is t, 2 is t-1, ...
+        slices: (K,) uint8, height slices of each pixel, a bit each.
     """
 
     table: Tensor
@@ -84,28 +84,28 @@ class Pixels:
         return self.table[4]
 
     def take(self, index: Tensor) -> Pixels:
-        """Some of them, (L,) int64 positions in the list."""
+        """Select pixels by (L,) int64 positions in the list."""
         return Pixels(take_columns(self.table, index), self.slices.index_select(0, index))
 
     def followed_by(self, others: Pixels) -> Pixels:
-        """These pixels, then the others."""
+        """Append other pixels."""
         return Pixels(torch.cat((self.table, others.table), 1), torch.cat((self.slices, others.slices)))
 
 
 @dataclass(frozen=True)
 class HeightSlicedSweeps:
-    """All sweeps of all windows, as the verified method sees them.
+    """All sweeps of all windows, as height-sliced images.
 
     Args:
         batch: the points.
         grid: the finest BEV.
-        image: (I,) uint8 with I - 1 = 2 B S H W. Bits 0 ... 3: a point of this height slice lies here; bits 4 ... 7:
-            one lies in the 3 x 3 pixels around. The second half is empty until `with_copies` draws there. The last
-            entry, always 0, is for whatever lies outside.
+        image: (I,) uint8 with I - 1 = 2 B S H W. Bits 0 ... 3: a point of this height slice is in the pixel; bits 4 ...
+            7: one is in the 3 x 3 pixels around. The second half is empty until `with_copies` draws there. The last
+            entry, always 0, is for positions outside the images.
         rank: (I,) int32, 1 + position of each occupied pixel in the list; 0 for empty pixels.
         pixels: the P occupied pixels, ascending.
         pixel_of_point: (N + K,) int64, position in the list of the pixel of each point, then of each copy; P for points
-            that are inactive or lie on a pixel that was left out.
+            that are inactive or in a pixel that was left out.
         copied: (K,) int64, the points that have copies; empty before `with_copies`.
     """
 
@@ -124,8 +124,8 @@ class HeightSlicedSweeps:
         Args:
             batch: positions with three axes.
             grid: the finest BEV.
-            min_height: metres; pixels that rise less than this above the ground of the batch are left out, unless they
-                are next to one that does. None = all are drawn.
+            min_height: metres; pixels lower than this above the ground of the batch are left out, unless they are next
+                to a higher one. None = all are drawn.
 
         Convention:
             The slice of a height z is floor(z / 0.5 m) mod 4 in float64. A height is compared with the ground in
@@ -149,7 +149,7 @@ class HeightSlicedSweeps:
                 window = floor_divide(batch.image[points].long(), batch.num_steps)
                 height = batch.ground.at(positions, window, ground)
                 is_tall[points] = positions[2] * 100 >= height + round(100 * min_height)
-        if ground is not None:  # after all points are drawn: a tall one makes its pixel tall whatever else lies there
+        if ground is not None:  # after all points are drawn, because one tall point makes its pixel tall
             image.index_fill_(0, torch.where(is_tall, index, num_indices), 2)
         image[num_indices] = 0  # that of points that are inactive
         pixel = occupied(image[:num_indices])
@@ -165,14 +165,14 @@ class HeightSlicedSweeps:
         return cls(batch, grid, image, rank, pixels, pixel_of_point, pixel[:0])
 
     def with_copies(self, rows: Tensor) -> HeightSlicedSweeps:
-        """The sweeps, and once more some of their points: in further windows B ... 2 B - 1, drawn by themselves.
+        """Return the sweeps with copies of some points, drawn by themselves in further windows B ... 2 B - 1.
 
         Args:
             rows: (K,) int64, points of the batch.
 
         Returns:
-            Sweeps that have the copies behind their points, whose pixels follow the others, and the same images: these
-            sweeps must not be asked for copies a second time.
+            Sweeps with the copies after their points, and the pixels of the copies after the others. They share the
+            images, which hold one set of copies, so call this method only once.
 
         Cost: that of the copies.
         """
@@ -188,7 +188,7 @@ class HeightSlicedSweeps:
         _draw_neighbourhoods(self.image, pixels, self.grid)
         rank = torch.arange(count + 1, count + 1 + len(pixel), dtype=torch.int32, device=rows.device)
         none = self.pixel_of_point == count
-        of_point = self.pixel_of_point.masked_fill(none, count + len(pixel))  # "none" is a larger number now
+        of_point = self.pixel_of_point.masked_fill(none, count + len(pixel))  # "none" is now a larger number
         return HeightSlicedSweeps(
             self.batch.with_empty_windows(),
             self.grid,
@@ -225,14 +225,14 @@ class HeightSlicedSweeps:
         return self.num_more > 0
 
     def or_outside(self, index: Tensor, at: Tensor) -> Tensor:
-        """Flat index into `image` of pixels that may lie outside it.
+        """Return the flat index into `image` of pixels that may lie outside it.
 
         Args:
-            index: (...) int64, that of pixels inside.
+            index: (...) int64, flat index, right for pixels inside.
             at: (2, ...) int64, rows and columns, any value.
 
         Returns:
-            (...) int64; that of the last entry of `image` for pixels outside.
+            (...) int64; for pixels outside, the index of the last entry of `image`.
         """
         ends = constant(((0, 0), (self.grid.height - 1, self.grid.width - 1)), torch.int64, at.device)
         is_outside = at.clamp(*ends.view(2, 2, *(1,) * index.dim())) != at
@@ -256,55 +256,55 @@ class HeightSlicedSweeps:
         return (rank - 1).remainder_(self.num_pixels + 1)
 
     def point(self, index: Tensor) -> Tensor:
-        """(L,) int64, rows of the batch of some points or copies, (L,) int64 below N + K."""
+        """Return the rows in the batch of some points or copies, (L,) int64, by their numbers below N + K."""
         num_points = self.batch.image.numel()
         return torch.where(index < num_points, index, lookup(self.copied, (index - num_points).clamp_(min=0)))
 
     @cached_property
     def lowest(self) -> Tensor:
-        """(P,) float64, metres: height of the lowest point of each occupied pixel."""
+        """Height of the lowest point of each occupied pixel, (P,) float64, metres."""
         return segment_amin(self.batch.positions[2], self.pixel_of_point, self.num_pixels + 1, math.inf)[:-1]
 
 
 def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Tensor:
-    """(N,) uint8: slice of heights (N,) float64, metres, floor(z / slice_height) mod n; 0 for NaN. n: a power of 2, at
-    most 16."""
+    """Return the slices of heights, (N,) float64, metres: floor(z / slice_height) mod n, (N,) uint8; 0 for NaN. n is a
+    power of 2, at most 16."""
     layer = (z / constant((slice_height,), z.dtype, z.device)).floor_()  # see `Grid.pixel`
     layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
     return (layer.long() & (num_slices - 1)).to(torch.uint8)
 
 
 def count_slices(slices: Tensor) -> Tensor:
-    """Set bits of uint8 values: of the lower four and, times 2^32, of the upper four; int64 of the same shape. Two
-    counts are one number because sums cost more than lookups."""
+    """Count the set bits of uint8 values: of the lower four and, times 2^32, of the upper four; int64, same shape. Two
+    counts share one number because sums cost more than lookups."""
     return constant(_COUNTS, torch.int64, slices.device).index_select(0, slices.reshape(-1).int()).view(slices.shape)
 
 
 def _slices(of_point: Tensor, height_slice: Tensor, num_pixels: int) -> Tensor:
-    """(P,) uint8 masks of the slices, (N,) uint8, of the points of each pixel; a point of pixel P counts nowhere."""
+    """Return masks, (P,) uint8, of the slices, (N,) uint8, of the points of each pixel. Pixel P is ignored."""
     lanes = torch.zeros((num_pixels + 1) * NUM_SLICES, dtype=torch.bool, device=height_slice.device)
     lanes.index_fill_(0, torch.add(height_slice, of_point, alpha=NUM_SLICES), True)
-    # A pixel is four bytes that hold 0 or 1; read as one number, its bits are 0, 8, 16 and 24.
+    # A pixel is four bytes that are 0 or 1. Read as one number, these are its bits 0, 8, 16 and 24.
     word = lanes.view(torch.int32)[:num_pixels]
     word = word | (word >> 7)
     return (word | (word >> 14)).bitwise_and_(OWN).to(torch.uint8)
 
 
 def _pixels(pixel: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels:
-    """Pixels by their flat indices."""
+    """Make pixels from their flat indices."""
     of_image, within = split_index(pixel, grid.height * grid.width)
     columns = (pixel, *split_index(of_image, num_steps), *split_index(within, grid.width))
     return Pixels(torch.stack(columns), slices)
 
 
 def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:
-    """Write the slices of pixels, and into the upper bits of the 3 x 3 pixels around each what lies there."""
+    """Write the slices of each pixel into its own entry, and into the upper bits of the 3 x 3 entries around it."""
     above, outside, line = pixels.slices << NUM_SLICES, image.numel() - 1, constant(_BESIDE, torch.int64, image.device)
     image.index_copy_(0, pixels.index, pixels.slices | above)
     row, col = pixels.row + line[:, None], pixels.col + line[:, None]
     inside = (row.clamp(0, grid.height - 1) == row)[:, None] & (col.clamp(0, grid.width - 1) == col)
     around = pixels.index + torch.add(line, line[:, None], alpha=grid.width)[..., None]
-    # Two entries of a round that have the same index write the same, but outside: there anything may be written.
+    # Within a round, all indices differ, except those outside, where the value does not matter.
     upper, middle, lower = around.masked_fill_(~inside, outside).flatten(1)
     left, _, right = middle.view(3, -1)
     for index in (left, right):
@@ -316,14 +316,14 @@ def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:
 
 
 def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
-    """(P,) bool: is a pixel of value 2 at most `_RESIDUE_REACH` rows and columns away from each of these flat indices?
-    Ground residue, which a ground mask left over, seems to move, because it differs in every sweep."""
+    """Return whether a pixel of value 2 is at most `_RESIDUE_REACH` rows and columns away from each pixel, (P,) bool.
+    Ground residue, the ground points that a ground mask misses, seems to move, because it differs in every sweep."""
     answer = image.index_select(0, pixel) == 2
     low = flat_nonzero(~answer)
     line, col = split_index(pixel.index_select(0, low), grid.width)
     number, row = split_index(line, grid.height)
     reach = constant(tuple(range(-_RESIDUE_REACH, _RESIDUE_REACH + 1)), torch.int64, pixel.device)
-    # Beyond the border the border's pixel is looked up, which is as near.
+    # Beyond the border, we look up the pixel at the border, which is within reach as well.
     rows = (row[:, None] + reach).clamp_(0, grid.height - 1).add_(number[:, None], alpha=grid.height)
     cols = (col[:, None] + reach).clamp_(0, grid.width - 1)
     index = torch.add(cols[:, None], rows[:, :, None], alpha=grid.width)

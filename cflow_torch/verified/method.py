@@ -1,9 +1,9 @@
-"""VerifiedFlow: draw, find changed pixels, grow a tree, propose, verify, select, refine (docs/verified.md).
+"""VerifiedFlow: draw, find changed pixels, build a tree, propose, verify, select, refine (docs/verified.md).
 
-Connected components at several pixel sizes are hypotheses for rigid objects. Each receives motion candidates:
-correlation peaks with every sweep, their median, the medians of the components around it. A paired test against
-"static" at the finest pixels, over all sweeps and in both time directions, picks the best one. In the tree of
-components, one wins if it explains more than its parts together. Winning motions are refined to centimetres.
+Connected components at several pixel sizes are hypotheses for rigid objects. Each receives motion candidates: the
+correlation peaks with every sweep, their median, and the medians of the components around it. A paired test against
+"static" at the finest pixels, over all sweeps and in both time directions, selects the best candidate. In the tree of
+components, a component wins if it explains more than its children together. Winning motions are refined to centimetres.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from cflow_torch.verified.rigid_motion import RotatingMotion, motion_by_pixel
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
-# Metres around the region that are processed as well, so that objects that cross its border are complete: at least the
-# distance of 40 m/s in a sweep.
+# We process so many metres around the region as well, so that objects that cross its border are complete. An object of
+# 40 m/s covers 4 m in a sweep.
 _AROUND = 4.0
 
 
@@ -56,24 +56,24 @@ class VerifiedFlow(SceneFlowModel):
 
     @property
     def bytes_per_point(self) -> int:  # type: ignore[override]
-        """Working memory, if every point has a pixel of its own; its largest part is that of sub-pixel motion."""
+        """Working memory if every point has its own pixel. Sub-pixel motion needs most of it."""
         return int(super().bytes_per_point) + 170 + subpixel_motion.BYTES_PER_POINT
 
     def grid(self, pixel_size: float) -> Grid:
-        """The BEV at a pixel size, metres: the region and whole pixels of the coarsest size around it."""
+        """Return the BEV at a pixel size in metres: the region and a margin of whole pixels of the coarsest size."""
         x0, y0, z0, x1, y1, z1 = self.config.point_cloud_range
         wide = math.ceil(_AROUND / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
         return Grid(pixel_size, (x0 - wide, y0 - wide, z0), (x1 + wide, y1 + wide, z1))
 
     def motion(self, batch: Batch) -> RotatingMotion:
-        """Motion of everything in a batch, by occupied pixel; ids number what is static or moves together."""
+        """Return the motion of all points of a batch, one per occupied pixel. Ids number the objects."""
         if self.config.num_future == 0:
             return self.estimate(batch)
         sides, copied = batch.split_past_and_future()
         return choose_side(sides, copied, self.estimate(sides))
 
     def estimate(self, batch: Batch) -> RotatingMotion:
-        """The motion by all sweeps of each window, in seven steps."""
+        """Estimate the motion from all sweeps of each window, in seven steps."""
         config = self.config
         blocks = [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes]
         with stage("draw"):

@@ -1,8 +1,8 @@
-"""Sweeps after t+1, for recordings: they show objects that have just appeared, or that begin with the log.
+"""Sweeps after t+1, for recordings: they show objects that have just appeared, and all objects at the start of a log.
 
-Past and future are two windows of one batch. A point of t takes the motion that the future gives it only if the future
-shows its object more than twice as often as the past does: a past of one sweep is hardly better than none, and with a
-full one the future was not better in our tests.
+Past and future are two windows of one batch. A point of t takes its motion from the future only if the future shows its
+object in more than twice as many sweeps as the past. A past of one sweep hardly helps; with all past sweeps, the future
+was not better in our tests.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from cflow_torch.verified.paired_test import best_candidate, count_wins, evidenc
 from cflow_torch.verified.rigid_motion import RotatingMotion
 from cflow_torch.windows.collation import Batch
 
-# How often the future must show an object for each time that the past does. At 1, façades that a moving ego vehicle
-# uncovers get more false motion (simulated drives).
+# The future must show an object in more than so many sweeps for each sweep of the past. At 1, façades that are
+# uncovered as the ego vehicle moves get more false motion (simulated drives).
 _TIMES = 2
-# Pixels each way from the motion found.
+# Pixels each way from the given motion.
 _REACH = 2
 
 
 def choose_side(sides: Batch, copied: Tensor, motion: RotatingMotion) -> RotatingMotion:
-    """The motion of each point by the past or by the future.
+    """Choose the motion from the past or from the future for each point.
 
     Args:
-        sides: the result of `Batch.split_past_and_future`: points, then copies of those of t+1 and t in windows of the
-            future.
+        sides: the result of `Batch.split_past_and_future`: the points, then copies of the points of t+1 and t in
+            windows of the future.
         copied: (K,) int64, the points that have copies.
-        motion: of all of them.
+        motion: motion of all points and copies.
 
     Returns:
-        The same motion, in which points go by the pixels that decide.
+        The motion, in which each point has the pixel of the chosen side.
     """
     num_points = sides.image.numel() - len(copied)
     shown = _num_shown(sides, motion)
@@ -48,10 +48,10 @@ def choose_side(sides: Batch, copied: Tensor, motion: RotatingMotion) -> Rotatin
 
 
 def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, significance: float) -> Tensor:
-    """The motion of most evidence among those within two pixels of the motion of each object.
+    """Return the motion with the most evidence among those within two pixels of the motion of each object.
 
-    The part of an object that is visible at t lies anywhere on what later sweeps show of it, so peaks of the
-    correlation are off by a pixel or two. The paired test over all sweeps finds the right one, once it is asked.
+    The side of an object that is visible at t may match any side that later sweeps show, so correlation peaks are off
+    by a pixel or two. The paired test over all sweeps chooses among the neighbours of the peak.
 
     Args:
         sweeps: finest images; objects of windows without sweeps after t+1 keep their motion.
@@ -62,7 +62,7 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
     Returns:
         (G, 2) float64.
 
-    Convention: whole pixels in y and in x. Ties: the nearest, of those the first in raster order.
+    Convention: whole pixels in y and in x. Ties: the nearest motion, then the first in raster order.
 
     Cost: 25 lookups for each pixel and sweep of the moving objects.
     """
@@ -78,7 +78,7 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
 
 
 def _num_shown(batch: Batch, motion: RotatingMotion) -> Tensor:
-    """(N,) int64: how many sweeps other than t and t+1 show the object of each of the N points; 0 for no object."""
+    """Count the sweeps besides t and t+1 that show the object of each of the N points, (N,) int64; 0 = no object."""
     window, step = split_index(batch.image.long(), batch.num_steps)
     number = 1 + motion.cluster_id.index_select(0, motion.cluster(slice(None)))
     most = int(number.amax()) + 1 if number.numel() else 1

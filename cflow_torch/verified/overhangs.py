@@ -1,8 +1,7 @@
 """Objects under overhangs: a car under the crown of a tree shares its bird's-eye component with the crown.
 
-In space the two are apart. We join the cells of components that may move in three dimensions. A component that lies
-under another one and above none is drawn once more, by itself, as an image of the same batch. It is a node like any
-other.
+The two are separate in space. We label the points of components that may move in three dimensions. A component under
+another one and above none is drawn again, by itself, in a further window of the same batch, and becomes a node.
 """
 
 from __future__ import annotations
@@ -32,28 +31,29 @@ from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, Pixels
 
 _CELL = 0.4  # metres, side of a cell; it is as high as a slice
-_NUM_SLICES = 32  # from the lowest cell of a window on; what lies higher counts as the highest one
-_GROUND = 4.0  # metres: the lowest cell of the nine squares of this side around stands on the ground
-_GAP = 3  # slices, at least, from a cell to the next one above it: less lies between the body of a car and its roof
-# A vehicle or a person, in slices: begins at most this far above the ground, and is neither flat nor taller than a bus.
+_NUM_SLICES = 32  # from the lowest cell of a window on; higher points are in the highest slice
+_GROUND = 4.0  # metres, side of a square; the lowest cell of the nine squares around a cell is on the ground
+_GAP = 3  # slices from a cell to the next one above it, at least; the body and the roof of a car are closer
+# A vehicle or a person, in slices: it begins at most this far above the ground, and it is neither flat nor taller than
+# a bus.
 _HIGHEST_FOOT, _SMALLEST, _LARGEST = 2, 1, 10
 
 
 def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> tuple[HeightSlicedSweeps, Nodes]:
-    """Nodes for what lies under something else.
+    """Add nodes for components under other components.
 
     Args:
         sweeps: images, and the points.
-        components: we search the points of those that may move, dilated at the finest pixels.
-        nodes: those of all levels.
+        components: we search those that may move, dilated at the finest pixels.
+        nodes: nodes of all levels.
 
     Returns:
-        The sweeps with copies of the points that lie under something, and the nodes with theirs behind them.
+        The sweeps with copies of the points under other components, and the nodes followed by the added ones.
 
     Convention:
-        Cells of 0.4 m x 0.4 m x 0.5 m join with their 26 neighbours. A component lies under another one where that has
-        the next occupied cell above it in any column, with two empty ones at least between. Of two components in one
-        pixel of a sweep the one whose first cell is the first has it.
+        Cells of 0.4 m x 0.4 m x 0.5 m are connected to their 26 neighbours. A component is under another one if, in any
+        column, the next occupied cell above one of its cells belongs to the other one, with at least two empty cells
+        between. If two components share a pixel of a sweep, it belongs to the one with the first cell.
 
     Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
     """
@@ -95,10 +95,10 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
 
 
 def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor, int]:
-    """Component in space of some points, (K,) int64: its first cell, V for what does not lie on the ground under
-    something else; and V."""
+    """Return the 3-D component of some points, (K,) int64, named by its first cell, and V. Points that are not in an
+    object on the ground under another component have V."""
     batch, grid = sweeps.batch, sweeps.grid
-    # A free margin all around: neighbours need no bounds check.
+    # With an empty margin all around, neighbours need no bounds check.
     num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 3 for axis in (1, 0))
     index = torch.empty_like(rows)
     lowest = torch.full((batch.num_windows,), 1 << 41, device=rows.device)
@@ -132,7 +132,7 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     pair = flat_nonzero(is_above)
     is_under = torch.zeros(count, dtype=torch.bool, device=rows.device)
     is_under.index_fill_(0, component.index_select(0, pair), True)
-    is_under.index_fill_(0, component[1:].index_select(0, pair), False)  # that is above one
+    is_under.index_fill_(0, component[1:].index_select(0, pair), False)  # it is above another one
     foot, top = segment_minmax(height, component, count)
     rise = segment_amin(
         height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, _NUM_SLICES
@@ -145,8 +145,8 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
 
 @lru_cache(maxsize=64)
 def _half_neighbours(num_cols: int, device: torch.device) -> Tensor:
-    """(13,) int64, offsets of half of the 26 neighbours of a cell; the other half are the same links from their other
-    ends."""
+    """Return the offsets of half of the 26 neighbours of a cell, (13,) int64. The other half are the same links, seen
+    from their other ends."""
     steps = itertools.product((0, 1), (-1, 0, 1), (-1, 0, 1))
     offsets = [
         (down * num_cols + right) * _NUM_SLICES + up for down, right, up in steps if (down, right, up) > (0, 0, 0)
@@ -155,7 +155,7 @@ def _half_neighbours(num_cols: int, device: torch.device) -> Tensor:
 
 
 def _ground(column: Tensor, height: Tensor, num_windows: int, num_rows: int, num_cols: int) -> Tensor:
-    """(V,) int64, slice of the ground around each cell: the lowest cell of the nine squares around."""
+    """Return the slice of the ground at each cell, (V,) int64: the lowest cell of the nine squares around."""
     side = round(_GROUND / _CELL)
     line, col = split_index(column, num_cols)
     window, row = split_index(line, num_rows)

@@ -21,30 +21,30 @@ from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Nodes
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, Pixels, count_slices
 
-# Comparisons (pixel x sweep x candidate) done at once: their temporaries take about 64 bytes each.
+# Comparisons (pixel x sweep x candidate) at once; each needs about 64 bytes of temporaries.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
 _FAR = 2  # pixels, in y or in x
 _COVERED = 65  # per cent
 _CHANGED_Z = 4.0
 _REACH = 2  # pixels around an object
-# A motion must gain so many slices for each sweep besides t and t+1, or one for so many pixels, whichever is less.
+# A motion must gain so many slices per sweep besides t and t+1, or one for every so many pixels, whichever is less.
 _LEAST_GAIN, _LEAST_SHARE = 2, 12
 
 
 def verify(
     sweeps: HeightSlicedSweeps, nodes: Nodes, candidates: Tensor, num_levels: int, significance: float
 ) -> tuple[Tensor, Tensor]:
-    """The candidate of each node that explains the sweeps best, if it does so significantly.
+    """Return the candidate of each node that explains the sweeps best, if it is significant.
 
     Args:
         sweeps: images.
         nodes: N of them.
         candidates: (N, C, 2) float64, (y, x), finest pixels per sweep interval.
-        num_levels: L; nodes of changed pixels, level L, need `_CHANGED_Z` standard deviations.
-        significance: z of all other nodes.
+        num_levels: L; for nodes of changed pixels, which have level L, z is `_CHANGED_Z`.
+        significance: z of the paired test for all other nodes.
 
     Returns:
-        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant and gains enough.
+        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant with enough gain.
         evidence: (N,) int64, of that motion, sixteenths of a slice.
     """
     tested = flat_nonzero((candidates != 0).any(2).any(1))  # other nodes are static and cost nothing
@@ -67,10 +67,10 @@ def verify(
 
 
 def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_levels: int) -> Nodes:
-    """Complete nodes of changed pixels: add the pixels of the same object that did not change.
+    """Complete moving nodes of changed pixels: add the pixels of the same object that did not change.
 
-    The middle of a pedestrian is occupied in the sweeps before and after as well, so only the outline has changed. If
-    the pedestrian touches a wall, the middle belongs to the component of the wall.
+    The middle of a pedestrian is occupied in the other sweeps as well, so only the outline has changed. If the
+    pedestrian touches a wall, the middle belongs to the component of the wall.
 
     Args:
         sweeps: images, P pixels.
@@ -81,9 +81,9 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
     Returns:
         The nodes with more pixels.
 
-    Convention: a pixel at most two rows and columns away from a moving node of changed pixels joins it, if the motion
-        wins more slices than it loses in the 3 x 3 pixels there, without those of such nodes. Ties: the first node; the
-        pixel does not join.
+    Convention: a pixel at most two rows and columns away from a moving node of changed pixels joins it if the motion
+        wins more slices than it loses in the 3 x 3 pixels around, without the pixels of such nodes. Ties: the first of
+        several nodes; with as many slices won as lost, the pixel does not join.
 
     Cost: 25 lookups for each pixel of these nodes, and the paired test of the pixels around them.
     """
@@ -139,25 +139,26 @@ class Wins(NamedTuple):
 def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, candidates: Tensor) -> Wins:
     """Paired counts of candidate motions against "static".
 
-    For each slice of a pixel we check another sweep at two positions: where the motion would take the pixel, and where
-    it is. The motion wins the slice if it is found only at the first, and loses it if only at the second; slices found
-    at both or at neither are ignored. For motions of two pixels or more, "not found" means absent from the 3 x 3 pixels
-    as well: beams sample a surface differently in each sweep, and a static side must not seem to have left.
+    For each slice of a pixel, we check two positions in another sweep: the target of the motion, and the position of
+    the pixel itself. The motion wins the slice if it is found only at the target, and loses it if it is found only in
+    place; slices found at both or at neither are ignored. For motions of two pixels or more, "not found" means absent
+    from the 3 x 3 pixels around as well. Beams sample a surface differently in each sweep, so a static surface would
+    otherwise seem to leave its position.
 
     Args:
         sweeps: images.
         members: K pixels of components.
-        component: (K,) int64, of each of them.
+        component: (K,) int64, component of each pixel.
         candidates: (M, C, 2) float64, (y, x) finest pixels per sweep interval, axes of ego1; C at least 1.
 
     Returns:
-        The counts, summed over all sweeps m other than t+1: m compared with t+1, and t+1 with m.
+        The counts, summed over all sweeps m other than t+1: of m compared with t+1, and of t+1 compared with m.
 
     Convention:
-        A pixel is taken by floor(k f + 0.5) pixels, elementwise float64; k = elapsed intervals, negative from t+1 into
-        the past. What it meets counts whatever component it is of. A position outside the image has nothing, nor has
-        any of the pixels around it. Sweeps that a window lacks are empty: no counts.
-        Fewer than 2^31 slices of a component may be compared.
+        The target is floor(k f + 0.5) pixels away, elementwise float64; k = elapsed intervals, negative from t+1 into
+        the past. The slice found may belong to any component. Positions outside the image are empty, and so are the
+        pixels around them. Sweeps that a window lacks are not counted. At most 2^31 - 1 slices of a component may be
+        compared.
 
     Cost: K (S - 1) C lookups at most.
     """
@@ -190,7 +191,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         shift += take_columns(at, pixel.index_select(0, leaves))[..., None]
         index.index_copy_(0, leaves, sweeps.or_outside(index.index_select(0, leaves), shift))
         seen, far = sweeps.image.index_select(0, index.view(-1)).view_as(index), moves.is_far.index_select(0, which)
-        won = seen & torch.where(far, left_far, left)  # no slice of the neighbourhood is left
+        won = seen & torch.where(far, left_far, left)  # if far, absent from the neighbourhood
         lost = in_both[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
         counts = count_slices(lost | won << NUM_SLICES)
         sums.index_add_(0, torch.add(column, of[:, None], alpha=num_candidates).view(-1), counts.view(-1))
@@ -202,14 +203,14 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
 
 
 class Moves(NamedTuple):
-    """Where C motions of T components lead, from each of S sweeps to each other one by the difference of their steps,
-    from 1 - S to S - 1: R = (2 S - 1) T of them. One of the two sweeps is t+1.
+    """Displacements by C motions of T components between t+1 and each of S sweeps, in both directions. Each has a row
+    for every difference of steps from 1 - S to S - 1, so there are R = (2 S - 1) T rows.
 
     Args:
         shift: (2, R, C) int64, whole pixels down and to the right.
-        offset: (R, C) int64, the same as an offset of flat indices.
-        longest: (R,) float64, longest side of any of the C motions, pixels.
-        is_far: (R, C) bool, a side is at least two pixels long.
+        offset: (R, C) int64, the shift as an offset of flat indices.
+        longest: (R,) float64, largest shift in y or x by any of the C motions, pixels.
+        is_far: (R, C) bool, the shift in y or in x is at least two pixels.
         is_given: (R,) bool, the window has both sweeps.
     """
 
@@ -221,7 +222,7 @@ class Moves(NamedTuple):
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> Moves:
-        """Moves of components: their window, (T,) int64, and motion, (T, C, 2) float64 per sweep interval."""
+        """Compute them from the window, (T,) int64, and the motions, (T, C, 2) float64 per sweep interval."""
         elapsed = sweeps.elapsed.index_select(0, window)
         k = torch.cat((-elapsed.flip(1), elapsed[:, 1:]), 1)[..., None]
         shift = (motion.permute(2, 0, 1)[:, :, None] * k + 0.5).floor_().flatten(1, 2)
@@ -236,14 +237,14 @@ class Moves(NamedTuple):
 
 
 def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
-    """All comparisons of pixels with other sweeps: those of every other sweep with t+1, those of t+1 with every other.
+    """List the comparisons of pixels with other sweeps: of every other sweep with t+1, and of t+1 with every other.
 
     Args:
         step: (K,) int64, sweep of each pixel; 0 = t+1.
         num_steps: S.
 
     Returns:
-        Step of the sweep that a pixel is compared with, and position of the pixel, (L,) int64 each.
+        The step of the sweep that a pixel is compared with, and the position of the pixel, (L,) int64 each.
     """
     is_newest = constant(tuple(to == 0 for to in range(num_steps)), torch.bool, step.device)
     return split_index(flat_nonzero((step == 0) != is_newest[:, None]), len(step))
@@ -254,7 +255,7 @@ def evidence_of(won: Tensor, lost: Tensor, z: float | Tensor) -> Tensor:
 
     Args:
         won, lost: int64 of one shape, below 2^31.
-        z: standard deviations that noise is granted, of all or one each; 0 = every surplus counts.
+        z: required standard deviations of noise, one for all or one each; 0 = every surplus counts.
 
     Returns:
         int64, same shape, rounded down; 0 = not significant.
@@ -264,21 +265,21 @@ def evidence_of(won: Tensor, lost: Tensor, z: float | Tensor) -> Tensor:
 
 
 def best_candidate(evidence: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
-    """The motion of each component that has most evidence.
+    """Return the motion with the most evidence for each component.
 
     Args:
         evidence: (M, C) int64, below 2^36 (C below 2^20), as `evidence_of` gives it.
         candidates: (M, C, 2) float64.
 
     Returns:
-        motion: (M, 2) float64; 0 where no candidate has any.
+        motion: (M, 2) float64; 0 where no candidate has evidence.
         evidence: (M,) int64, of that motion.
 
     Convention: ties go to the first candidate.
     """
     num_candidates = evidence.shape[1]
     reverse = torch.arange(num_candidates - 1, -1, -1, device=evidence.device)
-    key = (evidence * num_candidates + reverse).amax(1)  # no two candidates have the same
+    key = (evidence * num_candidates + reverse).amax(1)  # keys of two candidates always differ
     most = torch.div(key, num_candidates, rounding_mode="floor")
     best = num_candidates - 1 - (key - most * num_candidates)
     motion = candidates.gather(1, best[:, None, None].expand(-1, 1, 2))[:, 0]

@@ -1,4 +1,4 @@
-"""Refinement: the motion of objects from whole pixels to centimetres, with rotation, and in time."""
+"""Refinement: from motions in pixels to rigid motions in centimetres, with rotation and times of points."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 def refine(
     sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, longest: float | None
 ) -> tuple[RigidMotion, RigidMotion]:
-    """The final motion of objects.
+    """Return the final motion of objects.
 
     Args:
         sweeps: finest images.
         objects: G of them.
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
-        longest: metres; what is longer at t+1 and static stays static. None = no bound.
+        longest: metres; static objects longer than this at t+1 stay static. None = no bound.
 
     Returns:
-        The motion in metres; and the apparent motion, that of the images, which differs where points have times.
+        The motion in metres, and the apparent motion between the images, which differs if points have times.
     """
     newest = flat_nonzero((sweeps.pixels.step == 0) & (objects.of_pixel < objects.count))
     row_col = take_columns(sweeps.pixels.row_col, newest)
@@ -44,7 +44,7 @@ def refine(
 def register_deskewed(
     points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor
 ) -> tuple[RigidMotion, RigidMotion]:
-    """The motion of objects per sweep interval, by registration and the times of points.
+    """Return the motion of objects per sweep interval, by registration and the times of points.
 
     Args:
         points: of the objects that move, of all sweeps.
@@ -52,12 +52,12 @@ def register_deskewed(
         start: (G, 2) float64, x and y, metres per sweep interval, to start from.
 
     Returns:
-        The motion, and the apparent motion, which registration finds. Without times they are the same. With more than
-        two sweeps, the points are de-skewed and registered again, from the start divided by the same factor. For pairs
-        the motion is only divided: de-skewed smooth sides would slide along the pattern of the beams, and there is no
-        third sweep to prevent it.
+        The motion, and the apparent motion, which registration finds. Without times, both are equal. With times, the
+        apparent motion is divided by `VoxelPairs.stretch`. In windows with history, the points are then de-skewed and
+        registered again, from the start divided by the same factor. In pairs they are not, because de-skewed smooth
+        surfaces would slide along the pattern of the beams, and only a third sweep can prevent that.
 
-    Convention: times of 0 change nothing, to the last bit.
+    Convention: times of 0 give the result without times to the bit.
 
     Cost: that of two registrations, and a sort of the points.
     """
@@ -82,18 +82,18 @@ def register_deskewed(
 def deskew(
     points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion
 ) -> tuple[ObjectPoints, HeightSlicedSweeps]:
-    """Points of objects where they were at the instant of their sweep.
+    """Move the points of objects to their positions at the instant of their sweep.
 
     Args:
         points: of G objects, with times.
         sweeps: finest images.
-        rigid: motion of the objects, which pass and turn in proportion to time.
+        rigid: motion of the objects, whose translation and rotation are proportional to time.
 
     Returns:
-        The points, and sweeps whose occupied pixels are those where the points lie now; their images stay as they were.
+        The points, and sweeps whose occupied pixels are those of the moved points; the images are unchanged.
 
-    Convention: points that leave the region are left out. Where objects meet in a pixel, the points of the first of
-    them stay. Points whose time is 0 stay exactly where they are.
+    Convention: points that leave the region are dropped. If several objects share a pixel, only the points of the first
+    one are kept. Points whose time is 0 do not move.
 
     Cost: a sort of the points.
     """
@@ -101,7 +101,7 @@ def deskew(
     grid, num_steps, object_id = sweeps.grid, sweeps.num_steps, points.object_id
     time, image = points.time.double(), points.window * num_steps + points.step
     flow, centre = (torch.view_as_complex(values.index_select(0, object_id)) for values in (rigid.flow, rigid.centre))
-    # The centre is that of t; at the instant of another sweep it has moved on.
+    # The centre is that at t; at the instant of another sweep, it has moved.
     since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
     at_instant = torch.complex(*points.position[:2]) - flow * time
     arm = at_instant - centre - flow * since_t

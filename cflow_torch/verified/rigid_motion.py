@@ -1,4 +1,4 @@
-"""Rigid motion in the plane: a translation and a rotation about a centre; the flow of the points of objects."""
+"""Rigid motion in the plane, a translation and a rotation about a centre, and the flow of points by it."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ class RigidMotion:
     centre: Tensor
 
     def pixels_per_interval(self, pixel_size: float) -> Tensor:
-        """(G, 2) float64, (y, x): the flow at the centre, in pixels of a size in metres."""
+        """Return the flow at the centre, (G, 2) float64, (y, x), in pixels of a size in metres."""
         return self.flow.flip(1) / torch.full_like(self.flow, pixel_size)
 
     def only(self, is_moving: Tensor) -> RigidMotion:
-        """The motion of some objects, (G,) bool; the others are static."""
+        """Keep the motion of some objects, (G,) bool, and make the others static."""
         flow, rotation = self.flow.masked_fill(~is_moving[:, None], 0.0), self.rotation.masked_fill(~is_moving, 0.0)
         return RigidMotion(flow, rotation, self.centre)
 
     def flow_at(self, index: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """x and y of the flow, metres per interval, of points of t, by their object and position in metres, (K,)."""
+        """Return x and y of the flow of points of t, metres per interval, by their object and position, (K,) each."""
         (c_x, c_y), (v_x, v_y) = (values.index_select(0, index).unbind(1) for values in (self.centre, self.flow))
         arm = torch.complex(x - c_x, y - c_y)
         shift = rotate(self.rotation.index_select(0, index), arm) - arm
@@ -46,7 +46,7 @@ class RigidMotion:
 
 
 def rotate(rotation: Tensor, arm: Tensor) -> Tensor:
-    """(K,) complex128: x + iy, rotated about the origin by the angle whose half has the tangent `rotation`, (K,)."""
+    """Rotate x + iy, (K,) complex128, about the origin by the angle whose half has the tangent `rotation`, (K,)."""
     half = torch.complex(constant((1.0,), rotation.dtype, rotation.device), rotation)
     return half / half.conj() * arm
 
@@ -66,7 +66,7 @@ class RotatingMotion(Motion):
     slope: Tensor = torch.empty(0)
 
     def residual_flow(self, points: slice, positions: Tensor) -> Tensor:
-        """(K, 3) float32 flow of some points, each at its position in a motion that rotates."""
+        """Return the flow of some points, (K, 3) float32, which depends on their positions if their object rotates."""
         cluster = self.cluster(points)
         flow = self.flow.index_select(0, cluster)
         rotating = flat_nonzero((self.rotation != 0).index_select(0, cluster))
@@ -88,7 +88,7 @@ def motion_by_pixel(
     confidence: Tensor,
     is_weak: Tensor,
 ) -> RotatingMotion:
-    """The motion of G objects, by pixel: clusters are the P pixels.
+    """Return the motion of G objects by pixel; the clusters of the result are the P pixels.
 
     Args:
         sweeps: finest images.
@@ -96,9 +96,9 @@ def motion_by_pixel(
         rigid: their motion in the plane. The slope of the ground around their centre gives the z of the flow.
         score: (G,) float32.
         confidence: (P + 1,) float32.
-        is_weak: (G,) bool, objects that give way to moving objects under an overhang.
+        is_weak: (G,) bool, objects whose points take the motion of their copies under an overhang, if those move.
 
-    Convention: in a window the ids of objects of its copies go on after those of the window itself.
+    Convention: within a window, the ids of objects of copies follow those of the other objects.
     """
     window = sweeps.pixels.window.index_select(0, objects.first)
     ordered, order = (window % len(sweeps.batch.rows)).sort(stable=True)
@@ -125,8 +125,8 @@ def motion_by_pixel(
 
 
 def _pixel_of_result(sweeps: HeightSlicedSweeps, is_moving: Tensor, is_sure: Tensor) -> Tensor:
-    """(N,) int64, the pixel whose motion each point has, P = none: that of its copy, if that moves and its own is not
-    sure to move; (P + 1,) bool each."""
+    """Return the pixel whose motion each point takes, (N,) int64, P = none. It is the pixel of its copy if that moves
+    and the motion of its own pixel is not sure; (P + 1,) bool each."""
     num_points = sweeps.batch.image.numel()
     pixel, copy = sweeps.pixel_of_point[:num_points], sweeps.pixel_of_point[num_points:]
     own = pixel.index_select(0, sweeps.copied)

@@ -1,8 +1,8 @@
 """Rigid registration: a few Gauss-Newton steps on the voxels of objects, surface to surface, all objects at once.
 
-Beams hit a surface at positions that are fixed in the frame of the vehicle. So the nearest points of two sweeps pull a
-moving surface along itself. Therefore a pair counts only across the surface: it weighs the less in a direction, the
-farther the voxels around extend in it (generalised ICP).
+Beams hit a surface at positions that are fixed in the frame of the vehicle, so pairs of nearest points shift a moving
+surface along itself. Therefore a pair counts only across the surface. The farther the voxels around it extend in a
+direction, the lower is its weight in that direction (generalised ICP).
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from cflow_torch.verified.rigid_motion import RigidMotion, rotate
 from cflow_torch.verified.surface_spread import NOISE, spread_of
 from cflow_torch.verified.voxel_centroids import UNITS, ObjectPoints, Voxels
 
-# We chose these on real pairs and windows with history (docs/benchmarks.md).
+# We chose these values on real pairs and windows with history (docs/benchmarks.md).
 LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels, metres
 _FARTHEST = 0.2  # metres, between the voxels of a pair
-_FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces, at which its weight is a quarter
-_MOST_TIME = 2.5  # sweep intervals: t, t-1 and their jitter; older sweeps pull where the rotation is not constant
+_FAR = 3.0  # squared distance of a pair, in variances of both surfaces, at which its weight is a quarter
+_MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _NUM_STEPS = 4
-_STEP_LENGTH = 1.4  # of that of Gauss and Newton: nearest partners change with each step, so theirs falls short
-# From the given flow in x and in y, units per interval, and from no rotation, tangent of half the angle per interval.
+_STEP_LENGTH = 1.4  # in Gauss-Newton steps; above 1, because nearest partners change with each step
+# Largest change of the flow in x and y, units per interval, and largest rotation, tangent of half the angle.
 _LARGEST_CHANGE = (0.15 * UNITS, 0.15 * UNITS, 0.1)
-_WEIGHT, _ARM = 256, 16  # weights are whole 256ths, and arms whole 16 units: sums are exact in any order
-# What holds on to the given translation, worth two pairs of points without a surface, and to no rotation, worth five at
-# a distance of 1 m. The angle is twice its tangent, nearly.
+_WEIGHT, _ARM = 256, 16  # weights are multiples of 1/256, arms of 16 units, so sums are exact in any order
+# Weights that keep the motion near the given translation, as two pairs of points without a surface would, and near zero
+# rotation, as five pairs at a distance of 1 m would. The angle is nearly twice the tangent of its half.
 _HELD = (2.0 * _WEIGHT, 2.0 * _WEIGHT, 5.0 * _WEIGHT * (2 * UNITS) ** 2)
-# An object that covers a quarter of a turn of the sensor in an interval would be nearer than its own length. Times that
-# differ by more are those of a direction that is measured at the end of one sweep and at the start of the next.
+# An object that passes a quarter of the rotation of the sensor in an interval would be nearer than its own length. If
+# times differ by more, the direction was measured at the end of one sweep and at the start of the next.
 _LEAST_STRETCH = 0.75
 
 
 class VoxelPairs:
-    """Voxels of G objects in the sweeps that are paired with t+1. Lengths are in units, in the plane complex numbers.
+    """Voxels of G objects, in the sweeps that are paired with t+1. Lengths are in units, vectors in the plane complex.
 
     Args:
         points: of the objects that move, of all sweeps.
@@ -56,7 +56,8 @@ class VoxelPairs:
         self._voxels = voxels = Voxels(points.take(of_point.abs() <= _MOST_TIME), sweeps, NUM_LAYERS)
         device = of_point.device
         at_t = flat_nonzero(voxels.step == 1)
-        summed = F.pad(take_columns(voxels.position[:2], at_t), (0, 0, 0, 1), value=1.0)
+        x, y = take_columns(voxels.position[:2], at_t)
+        summed = torch.stack((x, y, torch.ones_like(x)))
         *sums, count = scatter_count(voxels.object_id.index_select(0, at_t), num_objects, summed)
         self._centre_of_object = torch.complex(*(torch.floor(total / count.clamp(min=1)) for total in sums))
         # Object, spread and position of each voxel; the last one, of no voxel, is far from all others.
@@ -64,7 +65,7 @@ class VoxelPairs:
         self._table = torch.cat((F.pad(torch.cat((voxels.object_id[None], spread)), (0, 1)), voxels.position))
         self._corner = constant(sweeps.grid.lower[:2], torch.float64, device)
 
-        # The voxels that look for a partner.
+        # The voxels that we pair with those of t+1.
         self._voxel = flat_nonzero((voxels.step != 0) & (count > 0).index_select(0, voxels.object_id))
         of_voxel = (voxels.window, voxels.step, voxels.layer, voxels.object_id)
         window, step, layer, self._object = gather(self._voxel, *of_voxel)
@@ -85,14 +86,15 @@ class VoxelPairs:
     def register(self, flow: Tensor) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
 
-        Every voxel of another sweep is paired with the nearest one of its object at t+1. Each step minimises the
-        errors over translation and angle. Two more terms hold on to the given translation and to no rotation.
+        We pair every voxel of another sweep with the nearest one of its object at t+1. Each step minimises the errors
+        of the pairs over translation and angle. Two more terms keep the motion near the given translation and near zero
+        rotation.
 
         Args:
             flow: (G, 2) float64, x and y, metres per sweep interval, to start from.
 
         Returns:
-            The motion. An object without points at t keeps its flow.
+            The motion. An object without points at t keeps the given flow.
 
         Cost: 27 lookups a step for each voxel and sweep.
         """
@@ -111,16 +113,16 @@ class VoxelPairs:
         return RigidMotion((motion[:2] / UNITS).t(), motion[2], centre)
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
-        """Ratio of the time between two measurements of an object to the time between the sweeps.
+        """Return the ratio of the time between two measurements of an object to the time between their sweeps.
 
         Args:
             rigid: apparent motion of the objects, whose points have times: the result of `register`.
 
         Returns:
-            (G,) float64: sum of w k (k + b - a) over the sum of w k^2, over all pairs of voxels; w is the weight of a
-            pair in x plus that in y, k the intervals between its sweeps, a and b the mean times of its voxels in
-            intervals. The motion divided by this ratio explains the pairs best. 1 for objects without pairs, and where
-            it is below 0.75.
+            (G,) float64: the sum of w k (k + b - a) divided by the sum of w k^2, over all pairs of voxels. Here w is
+            the weight of a pair in x plus that in y, k the intervals between its sweeps, and a and b are the mean times
+            of its voxels in intervals. The motion divided by this ratio explains the pairs best. The ratio is 1 for
+            objects without pairs, and if it would be below 0.75.
 
         Convention: k is rounded to a 16th and b - a to a 1024th.
         """
@@ -138,21 +140,22 @@ class VoxelPairs:
         return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
 
     def _chunks(self) -> Iterator[slice]:
-        """Voxels that are paired at once."""
+        """Split the voxels into slices that are paired at once."""
         return chunks(0, len(self._voxel), self._voxel.device, 27)
 
     def _add_equations(self, equations: Tensor, motion: Tensor, some: slice) -> None:
-        """Add the pairs of some voxels under a motion to the equations of their objects.
+        """Pair some voxels under a motion, and add the pairs to the equations of their objects.
 
         Args:
-            equations: (3, 4, G) float64, normal matrices and, in column 3, the force, in whole 256ths.
+            equations: (3, 4, G) float64, normal matrices and, in column 3, right-hand sides, times 256.
             motion: (3, G) float64, x and y per interval, and the tangent of half the angle.
             some: which voxels.
         """
         _, weight, error, arm = self._pairs(motion, some)
         # The derivative by the tangent is twice the arm, rotated by a right angle.
         lever = torch.view_as_real(arm * (1j / _ARM)).round().t() * (2 * _ARM * self._k[some])
-        columns = torch.cat((self._by_flow[..., some], F.pad(lever, (0, 0, 0, 1))[:, None], error[:, None]), 1)
+        lever = torch.cat((lever, torch.zeros_like(lever[:1])))
+        columns = torch.cat((self._by_flow[..., some], lever[:, None], error[:, None]), 1)
         weighted = (weight[:, :, None] * columns).sum(1)
         terms = (columns[:2, :3, None] * weighted[:, None]).sum(0).view(12, -1)
         equations.view(12, -1).scatter_add_(1, self._object[some].expand(12, -1), terms)
@@ -162,8 +165,8 @@ class VoxelPairs:
 
         Returns:
             other: (K,) int64, the voxel of t+1.
-            weight: (2, 3, K) float64, of the errors in x and y, whole 256ths; 0 = there is no pair.
-            error: (3, K) float64.
+            weight: (2, 3, K) float64, of the errors in x and y, times 256, rounded; 0 = not paired.
+            error: (3, K) float64, units, from the moved voxel to the other one.
             arm: (K,) complex128, from the centre at t+1 to the moved voxel.
         """
         voxels, index, end, height = self._voxels, self._object[some], self._end[some], self._height[some]

@@ -1,8 +1,8 @@
-"""Sub-pixel motion of pairs: slow objects, found by how well the centroids of small cubes meet.
+"""Sub-pixel motion of pairs: find slow objects by matching the centroids of small cubes.
 
-Between two sweeps, the pixels of a slow object stay where they are, but the points within them shift. So the points are
-put into cubes as high as a pixel is wide, and a few steps find the shift under which they meet best. A static object
-must gain significantly by its shift to become a moving one. Registration finds its motion to centimetres.
+Between two sweeps, the pixels of a slow object hardly change, but the points within them shift. We put the points into
+cubes as high as a pixel is wide, and a few steps find the shift under which their centroids match best. A static object
+becomes a moving one if its match improves significantly. Registration then refines its motion to centimetres.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_objects
 
-# Rows and columns, a pixel ahead in four directions, then a pixel behind.
+# Rows and columns of a pixel ahead in four directions, then of a pixel behind.
 _SIDES = ((0, 1, 1, 1, 0, -1, -1, -1), (1, -1, 0, 1, -1, 1, 0, -1))
-_BIAS_Z, _LEAST_BIAS = 3, 0.1  # a directional bias, standard deviations of noise, and as a share of the object's slices
-_NUM_LAYERS = 16  # layers of cubes are told apart by this many numbers, then they repeat
-# Steps to the best shift, and their length: cubes on the sides of an object hold it back.
+_BIAS_Z, _LEAST_BIAS = 3, 0.1  # least difference, in standard deviations of noise and as a share of the slices
+_NUM_LAYERS = 16  # numbers of the layers of cubes repeat after so many
+# Steps to the best shift, and their length; above 1, because cubes on the sides of an object shorten them.
 _NUM_STEPS, _STEP_LENGTH = 4, 2.0
 _FARTHEST = 154  # units (1/1024 m) of a shift in x and in y
-_Z, _LEAST_GAIN, _LEAST_CUBES = 4.0, 0.05, 6  # significance; gain per cube, as a share of a perfect meeting; cubes
-_SIGMA = 0.07  # metres, of the weight of two centroids
-_AROUND = 2  # pixels in which a cube meets others
-_BEYOND = 2.0**12  # units: no cube meets another one so far away
+_Z, _LEAST_GAIN, _LEAST_CUBES = 4.0, 0.05, 6  # significance; gain per cube, as a share of a perfect match; cubes
+_SIGMA = 0.07  # metres, of the weight of two centroids by their distance
+_AROUND = 2  # pixels each way in which a cube may match
+_BEYOND = 2.0**12  # units; cubes so far apart never match
 BYTES_PER_POINT = 560  # cubes and the 25 around each
 
 
 def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, may_be_slow: Tensor) -> Tensor:
-    """The motion of all objects, with that of slow objects of pairs.
+    """Return the motion of all objects, including slow objects of pairs.
 
     Args:
         sweeps: finest images; windows with history keep their motion.
         objects: G of them.
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval; 0 = static.
-        may_be_slow: (G,) bool, static objects that are tested; the other static ones stay static.
+        may_be_slow: (G,) bool, static objects to test; the other static ones stay static.
 
     Returns:
         (G, 2) float64, x and y, metres per sweep interval.
@@ -57,22 +57,22 @@ def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor
 
 
 def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> Tensor:
-    """Find objects that match the other sweep better one pixel ahead than one pixel behind, or one pixel behind.
+    """Find objects that match the other sweep better one pixel to one side than one pixel to the opposite side.
 
     Args:
-        sweeps: of pairs; other steps are ignored.
+        sweeps: pairs; steps other than t and t+1 are ignored.
         objects: G of them.
-        wanted: (G,) bool; of the others the answer is False.
+        wanted: (G,) bool, the objects to test.
 
     Returns:
-        (G,) bool: in one of four directions ahead and behind differ by (a - b)^2 >= z^2 (a + b) and by a 10th of the
-        slices that the object has, where a slices are matched ahead only and b behind only, both sweeps together: for
-        t+1 ahead is the opposite side.
+        (G,) bool. Of the slices of both sweeps, a are matched only ahead and b only behind. True if, in one of four
+        directions, (a - b)^2 >= z^2 (a + b), and |a - b| is at least a tenth of the slices of the object. For t+1,
+        "ahead" is the opposite side. False for objects that are not tested.
     """
     pixels = sweeps.pixels
     some = flat_nonzero(lookup(wanted, objects.of_pixel) & (pixels.step < 2))
     of, asked = objects.of_pixel.index_select(0, some), pixels.take(some)
-    grid, from_t = sweeps.grid, 2 * asked.step - 1  # the opposite from t+1
+    grid, from_t = sweeps.grid, 2 * asked.step - 1  # opposite for t+1
     offsets = tuple(dy * grid.width + dx - grid.height * grid.width for dy, dx in zip(*_SIDES))
     offset, at = (constant(values, torch.int64, of.device)[..., None] * from_t for values in (offsets, _SIDES))
     index = sweeps.or_outside(asked.index + offset, asked.table[3:, None] + at)
@@ -86,20 +86,20 @@ def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> 
 
 
 def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
-    """(G, 2) float64, x and y, whole units: the shift from t to t+1 under which the cubes of an object meet best; 0 =
-    it is not significant.
+    """Return the shift from t to t+1 under which the cubes of each object match best, (G, 2) float64, x and y, whole
+    units; 0 = the shift is not significant.
 
-    Convention: a cube of t that is moved by the shift meets the nearest one of t+1, one of t+1 that is moved back the
-        nearest of t, among those in the 5 x 5 pixels around it. Ties: the first in raster order. Each step moves the
-        shift by twice the weighted mean of what cubes miss, and it stays within `_FARTHEST`. The gain is the weight of
-        all meetings less that without a shift; it must exceed `_Z` standard deviations of noise.
+    Convention: a cube of t, moved by the shift, matches the nearest cube of t+1 among those in the 5 x 5 pixels around
+        it. A cube of t+1, moved back, likewise matches one of t. Ties: the first in raster order. Each step changes the
+        shift by twice the weighted mean of the errors, within `_FARTHEST`. The gain is the weight of all matches minus
+        their weight without a shift. It must exceed `_Z` standard deviations of noise.
     """
     some = flat_nonzero(voxels.step < 2)
     window, step, layer, of = gather(some, voxels.window, voxels.step, voxels.layer, voxels.object_id)
     position = take_columns(voxels.position[:2], some)
     near = voxels.around(window * voxels.num_steps + 1 - step, layer[None], position, _AROUND)
     ahead = take_columns(voxels.position[:2], near.view(-1)).view(2, *near.shape) - position[:, None]
-    ahead = ahead.clamp_(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # from t+1 all signs change
+    ahead = ahead.clamp_(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # for t+1, all signs change
 
     weights, shift = _meeting_weights(_SIGMA, step.device), position.new_zeros((2, num_objects))
     weight, error = _meet(ahead, weights)
@@ -116,22 +116,22 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
 
 
 def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Weight of the nearest of 25 cubes, (K,) float64, and where it is, (2, K) float64, units; (2, 25, K) float64."""
+    """Return the weight of the nearest of 25 cubes, (K,) float64, and its position, (2, K); `ahead` is (2, 25, K)."""
     slot = constant(tuple(range(ahead.shape[1])), torch.float64, ahead.device)[:, None]
-    # The square and the slot in one number: its least is found several times faster than by argmin.
+    # Square and slot share one number, because taking the minimum is several times faster than argmin.
     key = torch.add(slot, ahead.square().sum(0), alpha=32).amin(0).long()
     weight = weights.index_select(0, (key >> 11).clamp_(max=2048))
     return weight, ahead.gather(1, (key & 31).expand(2, 1, -1))[:, 0]
 
 
 def _meeting_weights(sigma: float, device: torch.device) -> Tensor:
-    """(2049,) float64: weights exp(-d^2 / 2 sigma^2) of centroids that miss each other by d, whole 256ths.
+    """Return the weights exp(-d^2 / 2 sigma^2) of centroids at distance d, (2049,) float64, multiples of 1/256.
 
     Args:
         sigma: metres.
-        device: where it is to lie.
+        device: device of the result.
 
-    Convention: entry i stands for d^2 from 64 i to 64 (i + 1) square units; the last one, 0, for all that is farther.
+    Convention: entry i is for d^2 from 64 i to 64 (i + 1) square units; the last entry, 0, is for larger distances.
     """
     square = 64 * torch.arange(2048, dtype=torch.float64) + 32
     return F.pad((256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))).round_() / 256, (0, 1)).to(device)

@@ -1,4 +1,4 @@
-"""The spread of a surface: covariance of the voxels of an object around each of its voxels."""
+"""The spread of a surface: the covariance of the voxels of an object around each of its voxels."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from torch import Tensor
 from cflow_torch.ops.indices import constant, scatter_count
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels
 
-NOISE = 0.05  # metres, standard deviation of a centroid that is not that of its surface
-# Sides of the blocks, voxels; those around are counted as well: 0.6 m and 1.2 m. One ring of beams on a surface looks
-# like a line. So where the voxels of the smaller blocks lie on a line, we take the larger blocks.
+NOISE = 0.05  # metres, standard deviation of a centroid, besides the spread of its surface
+# Sides of the blocks in voxels. With the blocks around, they cover 0.6 m and 1.2 m. A ring of beams on a surface forms
+# a line, so if the voxels of the smaller blocks form a line, we take the larger blocks.
 _SIDES = (2, 4)
-_FEWEST = 3  # voxels; a lonely voxel may belong to a surface of any direction
+_FEWEST = 3  # voxels; an isolated voxel may belong to a surface of any direction
 _UNKNOWN = 0.2  # metres, standard deviation of such a surface
-_LINE = 5 / 3  # squared trace of a covariance over the sum of its squared entries, at least: not on a line
-_STEP = 4  # units: coordinates are whole 256ths of a metre, so that sums are exact
-_ROW, _LAYER = 1 << 15, 1 << 12  # more than blocks in a row or column; more than blocks above each other
+_LINE = 5 / 3  # squared trace of a covariance over the sum of its squared entries; below this, voxels form a line
+_STEP = 4  # units; coordinates are multiples of 1/256 m, so that sums are exact
+_ROW, _LAYER = 1 << 15, 1 << 12  # more than the blocks in a row or column; more than the blocks in a stack
 
 
 def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
-    """Covariance of the centroids around each voxel, of its object and sweep.
+    """Return the covariance of the centroids around each voxel, of its object and sweep.
 
     Args:
         voxels: V of them.
@@ -49,25 +49,25 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
 
 
 def _scatter(sums: Tensor) -> tuple[Tensor, Tensor]:
-    """Number of voxels, (V,), and n^2 times their covariance, (3, 3, V), of sums of moments, (10, V)."""
+    """Return the number n of voxels, (V,), and n^2 times their covariance, (3, 3, V), from sums of moments, (10, V)."""
     n, total = sums[0], sums[1:4]
     squares = sums.index_select(0, constant((4, 5, 6, 5, 7, 8, 6, 8, 9), torch.int64, sums.device)).view(3, 3, -1)
     return n, n * squares - total[:, None] * total
 
 
 def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
-    """(R, V) float64: sums of values, (R, V), over the 27 blocks around the block of each voxel.
+    """Return the sums of values, (R, V) float64, over the 27 blocks around the block of each voxel.
 
     Args:
-        block: (3, V) int64, column, row and layer; layers beyond +-2046 are one.
-        image: (V,) int64, only voxels of one image are added.
-        values: whole numbers.
+        block: (3, V) int64, column, row and layer; layers beyond +-2046 are merged.
+        image: (V,) int64; only voxels of the same image are added.
+        values: (R, V) float64, whole numbers.
     """
     column = torch.add(block[0], torch.add(block[1], image, alpha=_ROW), alpha=_ROW)
     layer = block[2].clamp(2 - _LAYER // 2, _LAYER // 2 - 2)
     key, of_voxel = torch.unique(torch.add(layer, column, alpha=_LAYER), return_inverse=True)
-    rows = F.pad(scatter_count(of_voxel, len(key), values).t(), (0, 0, 0, 1))  # the last one is for no block
-    # The layers of a column follow each other: we search for the lowest of three and read on.
+    rows = F.pad(scatter_count(of_voxel, len(key), values).t(), (0, 0, 0, 1))  # the last row is for missing blocks
+    # The layers of a column are adjacent, so we search for the lowest of three and read on.
     lowest = tuple((down * _ROW + right) * _LAYER - 1 for down in (-1, 0, 1) for right in (-1, 0, 1))
     lowest = (key + constant(lowest, torch.int64, key.device)[:, None]).view(-1)
     at = torch.searchsorted(key, lowest) + constant((0, 1, 2), torch.int64, key.device)[:, None]

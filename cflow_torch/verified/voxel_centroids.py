@@ -1,4 +1,4 @@
-"""Voxels (pixels by height slices of every sweep), the centroids of their points, and the nearest one to a position."""
+"""Voxels (a pixel and a height slice of a sweep), the centroids of their points, and the search for the nearest one."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scat
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 
-# Centroids are whole numbers of 1 / UNITS metre: their sums are exact, in any order of the points and on any device.
+# Centroids are multiples of 1 / UNITS metre, so their sums are exact, in any order of the points and on any device.
 UNITS = 1024
-_HIGHEST = 2.0**24  # units: coordinates are clamped to this, which is far beyond a region, so that no square overflows
-_BEYOND = 2.0**28  # units: a position far beyond every other
-_FARTHEST = 2.0**46  # square units: no square between voxels of a region is as large
+_HIGHEST = 2.0**24  # units; coordinates are clamped to this, far beyond a region, so that no square overflows
+_BEYOND = 2.0**28  # units; a position far beyond all others
+_FARTHEST = 2.0**46  # square units; all squares between voxels of a region are smaller
 
 
 @dataclass(frozen=True)
 class ObjectPoints:
-    """N points of G objects, of all sweeps; the points of a pixel have one object.
+    """N points of G objects, of all sweeps; all points of a pixel belong to one object.
 
     Args:
-        object_id: (N,) int64, object of each.
-        window, step: (N,) int64, which sweep: step 0 = t+1, 1 = t, ...
+        object_id: (N,) int64, object of each point.
+        window, step: (N,) int64, its sweep; step 0 = t+1, 1 = t, ...
         pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
         layer: (N,) int64, height slice, from 0 on.
         position: (3, N) float64, metres, frame of t+1; inside the region.
-        time: (N,) float32, sweep intervals, `Batch.point_times`; None = there are none.
+        time: (N,) float32, sweep intervals, `Batch.point_times`; None = no times are given.
     """
 
     object_id: Tensor
@@ -41,11 +41,11 @@ class ObjectPoints:
     time: Tensor | None = None
 
     def take(self, wanted: Tensor) -> ObjectPoints:
-        """Some of them, (N,) bool."""
+        """Select points by a mask, (N,) bool."""
         return self.at(flat_nonzero(wanted))
 
     def at(self, index: Tensor) -> ObjectPoints:
-        """Some of them, (K,) int64."""
+        """Select points by their positions in the list, (K,) int64."""
         object_id, window, step, pixel, layer = (
             values.index_select(0, index) for values in (self.object_id, self.window, self.step, self.pixel, self.layer)
         )
@@ -60,7 +60,7 @@ def points_of_objects(
     slice_height: float,
     num_slices: int,
 ) -> ObjectPoints:
-    """The points of some objects in all sweeps, in the order of the batch.
+    """Return the points of some objects in all sweeps, in the order of the batch.
 
     Args:
         sweeps: finest images.
@@ -69,7 +69,7 @@ def points_of_objects(
         slice_height: metres.
         num_slices: a power of 2.
 
-    Cost: two lookups a point, the rest for those that are kept.
+    Cost: two lookups for each point, and more for each that is kept.
     """
     points = flat_nonzero(lookup(lookup(wanted, objects.of_pixel), sweeps.pixel_of_point))
     pixel, rows = sweeps.pixel_of_point.index_select(0, points), sweeps.point(points)
@@ -82,20 +82,20 @@ def points_of_objects(
 
 
 class Voxels:
-    """V voxels that hold points of objects, by pixel, then by slice.
+    """V voxels that contain points of objects, sorted by pixel, then by slice.
 
     Args:
-        points: of all sweeps.
+        points: points of all sweeps.
         sweeps: finest images.
-        num_slices: of the points.
+        num_slices: number of slices of the points.
 
     Attributes:
         object_id, window, step, layer: (V,) int64, as for `ObjectPoints`.
         position: (3, V + 1) float64, x and y of the centroid from the lower corner of the region and z from 0, whole
-            units of 1/1024 m; the last entry, of no voxel, is far away.
-        time: (V,) float64, mean of `ObjectPoints.time`; None = there are none.
+            units of 1/1024 m; the last entry, for "no voxel", is far away.
+        time: (V,) float64, mean of `ObjectPoints.time`; None = no times are given.
 
-    Convention: a coordinate is rounded to the nearest unit, their mean down to a whole one.
+    Convention: coordinates are rounded to the nearest unit, and their mean is rounded down.
 
     Cost: a sort of the points.
     """
@@ -113,7 +113,7 @@ class Voxels:
         # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), len(key), device=key.device)
         self._of_key.scatter_(0, key + num_slices, number)
-        # Of all points of a voxel these are the same, so it does not matter which of them is written last.
+        # All points of a voxel have the same values here, so it does not matter which one is written last.
         of_point = (points.object_id, points.window, points.step)
         self.object_id, self.window, self.step = (torch.empty_like(key).scatter_(0, voxel, of) for of in of_point)
         self.layer = key & (num_slices - 1)
@@ -122,7 +122,7 @@ class Voxels:
             self.time = scatter_count(voxel, len(key), points.time.double()) / count
 
     def nearest(self, sweep: Tensor, layers: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Nearest voxel of a sweep in the 3 x 3 pixels around a position.
+        """Find the nearest voxel of a sweep in the 3 x 3 pixels around a position.
 
         Args:
             sweep: (K,) int64, window * S + step.
@@ -130,29 +130,29 @@ class Voxels:
             position: (3, K) float64, units, anywhere.
 
         Returns:
-            voxel: (K,) int64, V = there is none. Ties: the first slice of the first pixel in raster order.
+            voxel: (K,) int64, V = not found. Ties: the first slice of the first pixel in raster order.
             square: (K,) int64, its squared distance, square units, at most 2^46.
 
-        Cost: 9 L lookups each.
+        Cost: 9 L lookups for each position.
         """
         voxel = self.around(sweep, layers, position, 1)
         apart = take_columns(self.position, voxel.view(-1)).view(3, *voxel.shape).sub_(position[:, None])
-        # The square and the slot in one number: its least is found several times faster than by argmin. In float64,
-        # which holds these numbers exactly, many times faster than in int64.
+        # Square and slot share one number, because taking the minimum is several times faster than argmin. It is many
+        # times faster in float64, which holds these numbers exactly, than in int64.
         slot = constant(tuple(range(len(voxel))), torch.float64, position.device)[:, None]
         key = torch.add(slot, apart.square_().sum(0).clamp_(max=_FARTHEST), alpha=32).amin(0).long()
         return voxel.gather(0, (key & 31)[None])[0], key >> 5
 
     def around(self, sweep: Tensor, layers: Tensor, position: Tensor, reach: int) -> Tensor:
-        """Voxels of a sweep in the pixels around a position, `reach` pixels each way.
+        """Return the voxels of a sweep in the pixels around a position, `reach` pixels each way.
 
         Args:
             sweep, layers, position: as for `nearest`; z is ignored.
             reach: r, pixels.
 
         Returns:
-            ((2 r + 1)^2 L, K) int64, pixel by pixel in raster order, V = there is none. Near the border and beyond it,
-            the pixels are the outermost ones.
+            ((2 r + 1)^2 L, K) int64, pixel by pixel in raster order, V = no voxel. Near the border and beyond it, the
+            outermost pixels are taken.
         """
         grid, device, line = self._sweeps.grid, layers.device, range(-reach, reach + 1)
         ends = ((reach, reach), (grid.width - 1 - reach, grid.height - 1 - reach))
@@ -162,7 +162,7 @@ class Voxels:
         pixel = torch.add(col, row, alpha=grid.width).add_(sweep, alpha=grid.height * grid.width)
         offsets = constant(tuple(dy * grid.width + dx for dy in line for dx in line), torch.int64, device)
         pixel = pixel + offsets[:, None]
-        pixel.clamp_(0, self._sweeps.rank.numel() - 1)  # a tiny image has fewer rows or columns than are asked for
+        pixel.clamp_(0, self._sweeps.rank.numel() - 1)  # an image may have fewer rows or columns than this
         rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view(len(pixel), 1, -1)
         key = torch.add(layers, rank, alpha=self.num_slices).view(-1)
         return self._of_key.index_select(0, key).view(len(pixel) * len(layers), -1)

@@ -34,7 +34,7 @@ def slides(component: dict[int, Pixels], motion, others=None, slices: int = 1) -
     return bool(slides_along_itself(*given, count_wins(*given).is_covered))
 
 
-def test_a_rail_that_stays_slides_and_one_that_leaves_does_not():
+def test_a_rail_covered_in_place_slides_and_one_that_leaves_does_not():
     assert slides({0: rail(10, 60), 1: rail(10, 60)}, (0, 12))
     assert slides({0: rail(10, 60), 1: rail(10, 60)}, (0, -12))
     assert not slides({0: rail(30, 80), 1: rail(10, 60)}, (0, 20))
@@ -48,13 +48,13 @@ def test_a_long_rail_slides_even_if_each_sweep_samples_other_pixels():
         assert slides(sampled, (0, 14), slices=slices) == expected
 
 
-def test_a_rail_that_comes_into_sight_or_leaves_it_at_one_end_slides():
+def test_a_rail_slides_if_one_end_enters_or_leaves_the_view():
     assert slides({0: rail(10, 80), 1: rail(10, 60)}, (0, 12))
     assert slides({0: rail(10, 60), 1: rail(10, 80)}, (0, 12))
     assert not slides({0: rail(10, 60)}, (0, 12))
 
 
-def test_what_stands_there_need_not_belong_to_the_component():
+def test_pixels_of_other_components_cover_a_line_as_well():
     assert slides({0: rail(30, 80), 1: rail(10, 60)}, (0, 20), others={0: rail(2, 30), 1: rail(60, 82)})
 
 
@@ -66,7 +66,7 @@ def test_a_diagonal_slides_along_itself_and_a_square_does_not_slide():
     assert not any(slides({0: square, 1: square}, motion) for motion in ((0, 12), (12, 0), (9, 9)))
 
 
-def test_the_share_that_must_be_covered():
+def test_a_line_slides_only_if_65_per_cent_are_covered():
     # 41 of 60 pixels are in both sweeps, then 32.
     assert slides({0: rail(0, 60), 1: rail(19, 79)}, (0, 13))
     assert not slides({0: rail(0, 60), 1: rail(28, 83)}, (0, 13))
@@ -145,15 +145,15 @@ def test_a_tram_moves():
     assert abs(mean_flow(-SPEED, -SPEED) + SPEED) < 0.05
 
 
-def test_a_wall_whose_ends_do_not_go_together_is_static():
+def test_a_wall_whose_ends_move_differently_is_static():
     for low, high in ((0.0, 0.0), (SPEED, 0.0), (0.0, SPEED), (SPEED, -SPEED), (SPEED, 0.5 * SPEED)):
         assert mean_flow(low, high) == 0.0
 
 
-def test_a_noise_barrier_that_seems_to_keep_pace_is_static():
+def test_a_noise_barrier_whose_visible_ends_move_is_static():
     assert mean_flow(SPEED, SPEED, length=65.0) == 0.0
     assert mean_flow(SPEED, SPEED, length=55.0) > 0.5 * SPEED
 
 
-def test_a_rail_that_seems_to_keep_pace_is_static():
+def test_a_rail_whose_visible_ends_move_is_static():
     assert mean_flow(SPEED, SPEED, LOW) == 0.0

@@ -29,7 +29,7 @@ def crossing(x: float, speed: float, num_history: int) -> Window:
 
 @pytest.mark.parametrize("where", [6.4, 7.6, 9.0])
 @pytest.mark.parametrize("speed", [1.4, -1.2])
-def test_what_crosses_the_border_has_its_motion_and_not_another(where, speed):
+def test_an_object_that_crosses_the_border_has_its_true_motion(where, speed):
     settings = make_config("default", point_cloud_range=REGION)
     window = crossing(where, speed, settings.num_history)
     result = flow_as_oracle(window, settings)
@@ -40,7 +40,7 @@ def test_what_crosses_the_border_has_its_motion_and_not_another(where, speed):
     assert not result.residual_flow[240:].any()
 
 
-def test_what_lies_in_the_margin_has_no_result():
+def test_points_in_the_margin_have_no_result():
     settings = make_config("default", point_cloud_range=REGION)
     result = VerifiedFlow(settings)([crossing(10.2, 1.4, settings.num_history)])[0]
     for values, none in ((result.is_valid, 0), (result.residual_flow, 0), (result.score, 0), (result.confidence, 0)):
@@ -48,7 +48,7 @@ def test_what_lies_in_the_margin_has_no_result():
     assert (result.cluster_id[:240] == -1).all() and result.is_valid[240:].all()
 
 
-def test_pixels_of_the_region_are_where_they_would_be_without_a_margin():
+def test_the_margin_does_not_shift_the_pixels_of_the_region():
     for sizes in ((0.4, 0.2, 0.1), (0.25,), (3.0,)):
         settings = make_config("default", pixel_sizes=sizes, point_cloud_range=REGION)
         for size in sizes:

@@ -35,7 +35,7 @@ def nothing(sweeps) -> ChangedPixels:
     return ChangedPixels(every, ~every)
 
 
-def test_a_walker_beside_a_wall_moves_and_the_wall_is_static(monkeypatch):
+def test_a_pedestrian_next_to_a_wall_moves_and_the_wall_is_static(monkeypatch):
     window, is_walker = beside_a_wall(0.13, 20.0)
     flow = VerifiedFlow(MODEL)([window])[0].residual_flow.numpy()
     moves = flow.any(1)

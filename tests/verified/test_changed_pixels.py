@@ -37,7 +37,7 @@ def farther(clouds: Sequence[np.ndarray], places: Sequence[Sequence[float]], way
     return [images.farther(torch.full((len(places),), step), positions).tolist() for step in (0, 1)]
 
 
-def test_places_before_a_screen_are_seen_and_those_behind_are_hidden():
+def test_positions_before_a_screen_are_seen_and_those_behind_are_occluded():
     seen, hidden, unknown = [(4, 0, -1), (4.9, 1, -1)], [(10, 0, -1), (10, 3.5, -1), (10, 0, 0.3)], [(10, 4.5, -1)]
     unknown += [(10, 0, 1.0), (0, 9, 0)]  # beside the screen, over its top, which rises from the sensor, to the left
     for values in farther([screen(5.0)] * 2, [*seen, *hidden, *unknown], 0.0):
@@ -45,7 +45,7 @@ def test_places_before_a_screen_are_seen_and_those_behind_are_hidden():
         assert values[5:] == [-np.inf] * 3
 
 
-def test_shadows_are_cast_from_where_the_sensor_was():
+def test_occlusion_depends_on_the_sensor_position_of_each_sweep():
     # From 3 m further left the screen hides what is further right.
     left, right = (10.0, 3.5, -1.0), (10.0, -6.0, -1.0)
     newest, older = farther([screen(5.0)] * 2, [left, right], 3.0)
@@ -68,13 +68,13 @@ def shares(sweeps: Sequence[np.ndarray], rows: tuple[float, float]) -> tuple[flo
     return tuple(float(values[mine].double().mean()) for values in found)  # type: ignore[return-value]
 
 
-def test_a_walker_before_a_wall_has_changed_and_the_wall_has_not():
+def test_a_pedestrian_before_a_wall_has_changed_and_the_wall_has_not():
     walk = [np.concatenate((block(6.0, y), screen(8.0, 6.0, 0.5))) for y in (1.0, 0.0, -1.0)]
     assert shares(walk, (5.9, 6.6)) == (1.0, 1.0)
     assert shares(walk, (7.9, 8.3)) == (0.0, 0.0)
 
 
-def test_what_a_car_hides_has_not_changed_but_what_is_seen_through_it_has():
+def test_a_pedestrian_behind_a_car_has_changed_only_if_seen_through_its_windows():
     # The walker is gone at t+1: behind the car nobody can tell; through its windows the wall shows.
     wall, car = screen(8.0, 6.0, 0.5), screen(3.0, 2.0, -0.1)
     hidden = [np.concatenate((car, wall)), np.concatenate((block(6.0, 0.0), wall)), np.concatenate((car, wall))]
@@ -85,7 +85,7 @@ def test_what_a_car_hides_has_not_changed_but_what_is_seen_through_it_has():
     assert min(shares(through, (5.9, 6.6))) > 0.5
 
 
-def test_where_nothing_returns_pixels_are_missing_but_have_not_changed():
+def test_without_returns_pixels_are_missing_but_have_not_changed():
     alone = [screen(5.0, 0.5), np.concatenate((block(6.0, 4.0), screen(5.0, 0.5))), screen(5.0, 0.5)]
     assert shares(alone, (5.9, 6.6)) == (1.0, 0.0)
 

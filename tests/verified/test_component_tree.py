@@ -135,7 +135,7 @@ def test_the_cut_equals_the_oracle(seed, of_evidence):
 
 
 @pytest.mark.parametrize("whole, wins", [(0, False), (71, False), (72, False), (73, True)])
-def test_a_whole_must_explain_more_than_its_parts_less_their_price(whole, wins):
+def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_price(whole, wins):
     # Two columns 0.75 m apart are one component at 0.5 m and two at 0.25 m: each is worth 100 - 64 = 36.
     images = np.zeros((1, 2, 9, 12), dtype=np.uint8)
     images[0, :, 2:6, 2], images[0, :, 2:6, 6] = 1, 1
@@ -149,7 +149,7 @@ def test_a_whole_must_explain_more_than_its_parts_less_their_price(whole, wins):
 
 
 @pytest.mark.parametrize("num_missing, may_move", [(0, False), (1, False), (2, True)])
-def test_what_is_hardly_missing_anywhere_may_not_move(num_missing, may_move):
+def test_a_component_may_move_only_if_more_than_5_per_cent_are_missing(num_missing, may_move):
     images = np.zeros((1, 3, 9, 12), dtype=np.uint8)
     images[0, :2, 2:4, 1:6] = 1  # 20 pixels: one of them is 5 per cent
     sweeps = from_images(images, SIZE)

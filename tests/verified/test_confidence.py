@@ -49,7 +49,7 @@ def test_every_bin_equals_the_oracle(numbered):
     assert min(kinds) >= 2, (kinds, seen)  # unlinked, static, moving in pairs, moving with history
 
 
-def test_the_wall_beside_a_walker_is_trusted_less(numbered):
+def test_a_wall_next_to_a_pedestrian_has_less_confidence(numbered):
     window, is_walker = beside_a_wall(0.13, 20.0)
     settings = MODEL.replace(point_cloud_range=(-10.0, -10.0, -3.0, 10.0, 10.0, 8.0), num_history=4)
     bins = (64 * flow_as_oracle(window, settings).confidence).round()
@@ -70,7 +70,7 @@ def test_far_begins_where_the_table_says(numbered, monkeypatch):
     assert (moves & (distance > 3.1)).any() and (moves & (distance < 2.9)).any()
 
 
-def test_zero_for_what_took_no_part_and_none_of_the_other_methods():
+def test_invalid_points_have_confidence_0_and_other_methods_none():
     window = turning_car(0)
     for method in ("dense", "keypoints"):
         (result,) = make_model(make_config(method=method), "cpu")([window])
@@ -80,8 +80,8 @@ def test_zero_for_what_took_no_part_and_none_of_the_other_methods():
     assert not result.confidence[~result.is_valid].any() and (result.confidence[result.is_valid] > 0).all()
 
 
-def test_a_wall_is_trusted_less_than_a_car(monkeypatch):
-    # Nothing but its ends tells how far a wall slid along itself; the car has two sides.
+def test_a_wall_has_less_confidence_than_a_car(monkeypatch):
+    # Only the ends of a wall show how far it slid along itself, but the car has two sides.
     rng = np.random.default_rng(0)
     wall = np.stack((rng.uniform(-3, 3, 600), np.full(600, 4.05), rng.uniform(-1, 1, 600)), 1)
     long_side = np.stack((rng.uniform(-2, 2, 300), np.full(300, -3.05), rng.uniform(-1, 1, 300)), 1)
@@ -94,8 +94,8 @@ def test_a_wall_is_trusted_less_than_a_car(monkeypatch):
 
 
 @pytest.mark.parametrize("width", [1.0, 0.0])
-def test_what_could_nearly_as_well_be_displaced_moves_if_it_left_its_place_and_is_no_line(width):
-    # 8 m long, it moves by 5 m; 0.4 m more or less is hardly worse for it.
+def test_with_a_small_margin_an_object_that_left_its_position_moves_unless_it_is_a_line(width):
+    # An object of 8 m moves by 5 m, so motions of 0.4 m more or less fit nearly as well.
     x, y = np.meshgrid(np.arange(-7.95, 0.0, 0.1), (3.05, 3.05 + width))
     points = np.stack((x.ravel(), y.ravel(), np.full(x.size, 0.1)), 1)
     result = flow_as_oracle(Window(Sweep(points), Sweep(points + (5.0, 0.0, 0.0))), MODEL.replace(max_speed=60.0))
@@ -103,8 +103,8 @@ def test_what_could_nearly_as_well_be_displaced_moves_if_it_left_its_place_and_i
 
 
 @pytest.mark.parametrize(("speed", "moves"), [(6.0, True), (0.7, False)])
-def test_what_could_as_well_be_displaced_moves_only_if_it_is_fast(speed, moves):
-    # Its front and its rear come into sight: t+1 has 1 m more of it on both sides, so all displacements fit as well.
+def test_without_a_margin_only_fast_objects_move(speed, moves):
+    # At t+1, the object is 1 m longer at the front and at the rear, so all displacements fit equally well.
     x, y = np.meshgrid(np.arange(-7.95, 0.0, 0.1), (3.05, 3.55, 4.05))
     longer, more = np.meshgrid(np.arange(-8.95, 1.0, 0.1), (3.05, 3.55, 4.05))
     points = np.stack((x.ravel(), y.ravel(), np.full(x.size, 0.1)), 1)
@@ -113,7 +113,7 @@ def test_what_could_as_well_be_displaced_moves_only_if_it_is_fast(speed, moves):
     assert bool(result.residual_flow.any()) == moves
 
 
-def test_the_margin_of_a_bus_that_turns_follows_its_rotation():
+def test_the_margin_follows_the_rotation_of_a_bus():
     # 5 m from the centre, 5 degrees are 0.44 m: more than a pixel, and than the displacement of the margin.
     x = np.arange(-5.5, 5.5, 0.1)
     sides = np.concatenate([np.stack((x, np.full_like(x, y)), 1) for y in (-1.25, 1.25)])
@@ -129,7 +129,7 @@ def test_the_margin_of_a_bus_that_turns_follows_its_rotation():
 
 
 @pytest.mark.slow
-def test_dropping_what_is_least_trusted_lowers_the_error():
+def test_dropping_points_of_low_confidence_lowers_the_error():
     drive = make_drive(seed=11, num_sweeps=8)
     window = window_of(drive, 6, 4)
     (result,) = VerifiedFlow.from_preset()([window])

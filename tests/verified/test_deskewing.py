@@ -88,7 +88,7 @@ def test_a_known_motion_under_known_times_is_found(elapsed):
         assert (first - second).abs().max() < 2e-3
 
 
-def test_times_that_differ_by_a_turn_of_the_sensor_are_not_believed():
+def test_times_that_differ_by_a_rotation_of_the_sensor_are_ignored():
     """What is met at the end of one sweep and at the start of the next would be faster by far than it seems."""
     clouds, of_points = seen_box((0.3, 0.0), [(0.0,), (0.0,)])
     of_points[len(clouds[0]) :] = 0.9
@@ -138,14 +138,14 @@ def test_times_may_be_arrays_or_tensors_of_any_width():
         (lambda times: np.ma.masked_array(times), "masked"),
     ],
 )
-def test_times_that_are_none_are_refused(change, message):
+def test_invalid_times_are_refused(change, message):
     times = late(turning_car(4), 1).pc0.point_times
     with pytest.raises(CFlowError, match=message) as caught:
         flow_with(change(times))
     assert re.match(r"Sweep\.point_times|point times of pc0", str(caught.value))
 
 
-def test_time_stamps_say_how_long_an_interval_is():
+def test_time_stamps_give_the_length_of_an_interval():
     """Two tenths of a second between the sweeps: the same times are half as many intervals."""
     window = late(turning_car(4), 1)
     pc0, pc1 = (replace(s, timestamp_ns=stamp) for s, stamp in ((window.pc0, 0), (window.pc1, 200_000_000)))

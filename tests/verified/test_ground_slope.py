@@ -41,7 +41,7 @@ def test_slopes_equal_the_oracle_in_any_order():
     assert 20 < known < 130
 
 
-def test_what_fits_no_plane_has_no_slope_whatever_is_left_of_it():
+def test_rough_ground_equals_the_oracle():
     # Of rough ground, few blocks are near a plane: too few of them, or on a line.
     for seed in range(100):
         rng = np.random.default_rng(seed)

@@ -74,7 +74,7 @@ def test_equals_the_oracle_on_random_scenes(seed):
 # ------------------------------------------------------------------------------------------------ what it is for
 
 
-def test_a_car_that_comes_out_from_behind_something_has_its_motion():
+def test_a_car_that_has_just_appeared_has_its_motion():
     sweeps, model = drive(is_hidden=True), VerifiedFlow(OFFLINE)
     for num_history in (4, 0):  # behind something; in the first window of a log
         online, offline = (window_at_t(sweeps, num_history, num_future) for num_future in (0, 4))
@@ -96,7 +96,7 @@ def test_the_future_decides_where_it_shows_an_object_more_than_twice_as_often(nu
     assert_same_bits(without, VerifiedFlow(OFFLINE.replace(num_future=0))([replace(window, pcf=())])[0])
 
 
-def test_what_vanishes_goes_by_the_past():
+def test_objects_that_vanish_take_the_motion_from_the_past():
     sweeps = drive(is_hidden=False, seen=range(6))  # until t+1
     window = window_at_t(sweeps, 4, 4)
     (result,) = VerifiedFlow(OFFLINE)([window])
@@ -144,7 +144,7 @@ def untimed(window: Window) -> Window:
 
 
 @pytest.mark.parametrize("num_history", [0, 1])
-def test_a_mover_that_comes_out_and_is_stretched_has_its_motion(num_history):
+def test_times_correct_the_motion_of_an_object_that_has_just_appeared(num_history):
     window, model = rolling_drive(num_history), VerifiedFlow(SMALL)
     windows = window, untimed(window), replace(window, pcf=())
     error, without_times, without_future = (error_of_car(w, model([w])[0], ROLLING) for w in windows)

@@ -110,7 +110,7 @@ def filled(box: Box, seed: int) -> np.ndarray:
         (((-2.0, -0.9, 0.0), (2.0, 0.9, 1.0)), [CROWN, ((-2.0, -0.9, -1.9), (2.0, 0.9, -1.5))], False),  # between two
     ],
 )
-def test_what_lies_under_an_overhang(thing, others, is_under):
+def test_which_shapes_are_objects_under_an_overhang(thing, others, is_under):
     pc1, pc0 = (Sweep(np.concatenate([filled(box, seed) for box in (thing, POST, *others)])) for seed in (0, 1))
     (found,) = overhung([Window(pc0, pc1)])
     assert len(found) == is_under
@@ -156,7 +156,7 @@ def test_a_car_under_a_crown_has_its_motion_which_is_the_oracles(num_history, st
     assert error_under_crown(window, flow_as_oracle(window, AVENUE)) < 0.1
 
 
-def test_without_overhangs_the_crown_holds_the_car(monkeypatch):
+def test_without_overhangs_a_car_under_a_crown_has_a_wrong_motion(monkeypatch):
     window, model = avenue(3), VerifiedFlow(AVENUE)
     (whole,) = model([window])
     crown = torch.from_numpy(window.pc0.points[:, 2] > 2.0)

@@ -83,7 +83,7 @@ def test_choice_equals_the_oracle(evidence):
     assert [(tuple(f), e) for f, e in zip(motion.tolist(), most.tolist())] == expected
 
 
-def test_much_evidence_is_told_apart():
+def test_large_evidence_is_compared_exactly():
     evidence = torch.tensor([[2**36 - 2, 2**36 - 1, 2**36 - 1], [1, 0, 2**36 - 1]])
     motion, most = fast.best_candidate(evidence, torch.arange(12, dtype=torch.float64).view(2, 3, 2))
     assert motion.tolist() == [[2.0, 3.0], [10.0, 11.0]] and most.tolist() == [2**36 - 1] * 2

@@ -70,13 +70,13 @@ def test_the_motion_of_a_fast_object_is_found_between_the_pixels():
         assert (found.flow[0] - torch.tensor(truth)).abs().max() < 0.02
 
 
-def test_what_meets_nothing_keeps_its_motion():
+def test_an_object_without_pairs_keeps_its_motion():
     cloud = np.array([[0.05, 0.05, 0.2], [0.15, 0.05, 0.2]])
     found = assert_equals_oracle(one_object([cloud + (2.0, 0.0, 0.0), cloud], (0.5, 0.0)))
     assert found.flow.tolist() == [[0.5, 0.0]] and found.rotation.tolist() == [0.0]
 
 
-def test_an_object_turns_about_its_centre_which_moves_with_it():
+def test_an_object_rotates_about_its_moving_centre():
     """Of sweeps t+1, t and t-1 at a constant turn and speed: all pairs agree."""
     angle, shift = 0.04, (0.4, -0.2)
     clouds = [sides(k * angle, k * shift[0], k * shift[1]) for k in (1, 0, -1)]

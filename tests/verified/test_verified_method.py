@@ -70,7 +70,7 @@ def test_more_of_real_drives_equals_the_oracle(av2_folder, data_root):
 # ---------------------------------------------------------------------------------------------- what parts are for
 
 
-def test_a_turning_car_moves_and_the_rest_stands_still():
+def test_a_turning_car_moves_and_all_else_is_static():
     window, (start, velocity, turn) = turning_car(7, 2), car_of(7)
     (result,) = VerifiedFlow(MODEL.replace(num_history=2))([window])
     points = window.pc0.points[:, :2].astype(np.float64)
@@ -96,7 +96,7 @@ def test_a_wall_that_seems_to_slide_is_static(monkeypatch):
     assert (VerifiedFlow(MODEL)([window])[0].residual_flow[:, 0] > 1.0).any()
 
 
-def test_what_is_longer_than_the_limit_does_not_move():
+def test_objects_longer_than_the_limit_are_static():
     # An L of 6 m x 5 m that moves by (0.5, 0.25) m; exactly 6 m is not longer.
     rng = np.random.default_rng(2)
     long_side = np.stack((np.full(900, 0.05), rng.uniform(0.0, 5.999, 900), rng.uniform(-1, 1, 900)), 1)
@@ -139,6 +139,6 @@ def mean_error(window: Window, first: int) -> float:
 
 
 @pytest.mark.parametrize("times", [(100, 300, 400), (50, 150, 250, 350), (120, 200, 310, 395, 510)])
-def test_time_stamps_are_heeded(times):
+def test_time_stamps_give_the_times_of_sweeps(times):
     assert mean_error(uneven_drive(times), times[0]) < 0.03
     assert mean_error(uneven_drive(times, stamped=False), times[0]) > 0.06  # places say t-1, t-2, ...
