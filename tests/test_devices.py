@@ -18,11 +18,11 @@ pytestmark = pytest.mark.skipif(not pretend_device.IS_THERE, reason="torch befor
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 # Launches and waits of one window, and launches of sixteen windows: the counted numbers plus 15 %.
 BOUNDS: dict[str, tuple[Config, int, int, int]] = {
-    "paper": (small("paper", num_history=0), 639, 31, 729),
-    "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3711, 137, 3939),
-    "keypoints": (small("keypoints"), 922, 34, 1013),
-    "default": (small("default"), 4027, 105, 4208),
-    "offline": (small("offline"), 4324, 122, 4643),
+    "paper": (small("paper", num_history=0), 608, 32, 637),
+    "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3510, 129, 3539),
+    "keypoints": (small("keypoints"), 868, 35, 898),
+    "default": (small("default"), 2694, 85, 2725),
+    "offline": (small("offline"), 3077, 96, 3108),
 }
 
 
