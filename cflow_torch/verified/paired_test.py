@@ -125,7 +125,7 @@ class Wins(NamedTuple):
 
     @property
     def in_place(self) -> Tensor:
-        """(M,) int64, slices that other sweeps have where they are, whatever the motion."""
+        """(M,) int64, slices that other sweeps have at the same position, for any motion."""
         return self.of_static[0].sum(1)
 
     @property
