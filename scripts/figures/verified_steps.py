@@ -22,7 +22,7 @@ from cflow_torch.verified.changed_pixels import find_changed
 from cflow_torch.verified.component_tree import find_components, movable_nodes, select_objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
 from cflow_torch.verified.overhangs import add_overhung
-from cflow_torch.verified.paired_test import verify
+from cflow_torch.verified.paired_test import add_unchanged, verify
 from cflow_torch.viz import save_picture, style
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, MOVING, group_medians
@@ -60,6 +60,7 @@ def take_steps(drive: Any) -> tuple[Any, ...]:
     sweeps, nodes = add_overhung(sweeps, components, movable_nodes(sweeps, components, config.max_object_length))
     candidates = propose(nodes, components, sweeps, config)
     motion, evidence = verify(sweeps, nodes, candidates.motion, components.num_levels, config.significance)
+    nodes = add_unchanged(sweeps, nodes, motion, components.num_levels)
     objects, node = select_objects(nodes, components, evidence, sweeps.num_pixels)
     return sweeps, change, components, nodes, objects, lookup(motion, node).any(1), model(given)[0]
 
