@@ -48,7 +48,7 @@ def test_an_appearing_car_is_wrong_at_first(failures: Any) -> None:
 def test_later_sweeps_fix_an_appearing_car(failures: Any) -> None:
     for seed in range(3):  # with the second seed, the car is part of the coarse component of a parked van
         online, offline = failures.make_case("appearing", seed).errors()
-        assert online > 0.5 and offline < 0.09 and offline < online / 6
+        assert online > 0.4 and offline < 0.09 and offline < online / 6
 
 
 def test_a_wrong_frame_is_found_by_the_static_check(failures: Any) -> None:
