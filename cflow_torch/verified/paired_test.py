@@ -26,7 +26,7 @@ _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
 _FAR = 2  # pixels, in y or in x
 _COVERED = 65  # per cent
 _CHANGED_Z = 4.0
-_REACH = 2  # pixels around an object
+_REACH = 2  # pixels from a changed pixel to an unchanged one of the same object
 # A motion must gain so many slices per sweep besides t and t+1, or one for every so many pixels, whichever is less.
 _LEAST_GAIN, _LEAST_SHARE = 2, 12
 
@@ -130,8 +130,8 @@ class Wins(NamedTuple):
 
     @property
     def is_covered(self) -> Tensor:
-        """(M,) bool: all other sweeps have `_COVERED` per cent of the slices at t+1 in the 3 x 3 pixels where they are,
-        or t+1 has as many of the slices in the other sweeps."""
+        """(M,) bool: the other sweeps have `_COVERED` per cent of the slices at t+1 in the 3 x 3 pixels around the same
+        position, or t+1 has as many of those in the other sweeps. The other sweeps are counted together."""
         near, total = self.of_static[1] >> 32, self.of_static[1] & 0xFFFFFFFF
         return ((total > 0) & (near * 100 >= total * _COVERED)).any(1)
 

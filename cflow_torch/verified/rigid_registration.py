@@ -60,7 +60,7 @@ class VoxelPairs:
         summed = torch.stack((x, y, torch.ones_like(x)))
         *sums, count = scatter_count(voxels.object_id.index_select(0, at_t), num_objects, summed)
         self._centre_of_object = torch.complex(*(torch.floor(total / count.clamp(min=1)) for total in sums))
-        # Object, spread and position of each voxel; the last one, of no voxel, is far from all others.
+        # Object, spread and position of each voxel; the last entry, for "no voxel", is far from all others.
         spread = spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT).view(9, -1)
         self._table = torch.cat((F.pad(torch.cat((voxels.object_id[None], spread)), (0, 1)), voxels.position))
         self._corner = constant(sweeps.grid.lower[:2], torch.float64, device)
