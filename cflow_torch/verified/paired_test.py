@@ -24,11 +24,12 @@ from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, P
 # Comparisons (pixel x sweep x candidate) at once; each needs about 64 bytes of temporaries.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
 _FAR = 2  # pixels, in y or in x
+_NEAR_Z = 2.0  # for near counts, z is so many times larger: one slice matches several neighbours, so counts correlate
 _COVERED = 65  # per cent
 _CHANGED_Z = 4.0
 _REACH = 2  # pixels from a changed pixel to an unchanged one of the same object
 # A motion must gain so many slices per sweep besides t and t+1, or one for every so many pixels, whichever is less.
-_LEAST_GAIN, _LEAST_SHARE = 2, 12
+_LEAST_GAIN, _LEAST_SHARE = 3, 8
 
 
 def verify(
@@ -54,7 +55,8 @@ def verify(
     level, travels, window, candidates_of = gather(tested, nodes.level, nodes.travels, nodes.window, candidates)
     wins = count_wins(sweeps, members, node, candidates_of)
     z = constant((_CHANGED_Z, significance), torch.float64, level.device)
-    evidence = evidence_of(wins.won, wins.lost, torch.where(level == num_levels, z[0], z[1])[:, None])
+    z = torch.where(level == num_levels, z[0], z[1])[:, None]
+    evidence = evidence_of(wins.won, wins.lost, z) + evidence_of(*wins.near, _NEAR_Z * z)
     slides = slides_along_itself(sweeps, members, node, candidates_of, wins.is_covered & ~travels)
     num_more = sweeps.num_more.index_select(0, window)
     least = torch.minimum(16 * _LEAST_GAIN * num_more, 16 * scatter_count(node, len(tested)) // _LEAST_SHARE)
@@ -115,12 +117,15 @@ class Wins(NamedTuple):
 
     Args:
         won, lost: (M, C) int64, slices.
+        near: (2, M, C) int64, won and lost if a slice also counts as found in the 3 x 3 pixels around a position. They
+            equal the counts above for motions below two pixels.
         of_static: (2, M, 2) int64, slices of other sweeps, then of t+1: first those in place in the sweep compared;
             then all of them and, times 2^32, those that it has in the 3 x 3 pixels around.
     """
 
     won: Tensor
     lost: Tensor
+    near: Tensor
     of_static: Tensor
 
     @property
@@ -143,7 +148,8 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     the pixel itself. The motion wins the slice if it is found only at the target, and loses it if it is found only in
     place; slices found at both or at neither are ignored. For motions of two pixels or more, "not found" means absent
     from the 3 x 3 pixels around as well. Beams sample a surface differently in each sweep, so a static surface would
-    otherwise seem to leave its position.
+    otherwise seem to leave its position. For the near counts, "found" means found in the 3 x 3 pixels as well. Points
+    of far objects are sparse and rarely fall into the same pixels again.
 
     Args:
         sweeps: images.
@@ -172,8 +178,8 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     ends = constant((sweeps.grid.height - 1, sweeps.grid.width - 1), torch.int64, device)[:, None]
     border = torch.minimum(*torch.minimum(at, ends - at))
     table = torch.stack((component, first, move, border))
-    # Slices that are lost and, times 2^32, won.
-    sums = torch.zeros(count * num_candidates, dtype=torch.int64, device=device)
+    # Slices that are lost and, times 2^32, won; then the near counts.
+    sums = torch.zeros((2, count * num_candidates), dtype=torch.int64, device=device)
     of_static = torch.zeros((2, 2 * count), dtype=torch.int64, device=device)
     column = constant(tuple(range(num_candidates)), torch.int64, device)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
@@ -184,22 +190,24 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         which -= to
         seen = sweeps.image.index_select(0, start)
         in_both, near = own & seen, own & (seen >> NUM_SLICES)
-        left, left_far = (own ^ in_both)[:, None], (own ^ near)[:, None]
         index = moves.offset.index_select(0, which).add_(start[:, None])
         leaves = flat_nonzero(near_border < moves.longest.index_select(0, which))
         shift = moves.shift.index_select(1, which.index_select(0, leaves))
         shift += take_columns(at, pixel.index_select(0, leaves))[..., None]
         index.index_copy_(0, leaves, sweeps.or_outside(index.index_select(0, leaves), shift))
         seen, far = sweeps.image.index_select(0, index.view(-1)).view_as(index), moves.is_far.index_select(0, which)
-        won = seen & torch.where(far, left_far, left)  # if far, absent from the neighbourhood
-        lost = in_both[:, None] & ~torch.where(far, seen >> NUM_SLICES, seen)
-        counts = count_slices(lost | won << NUM_SLICES)
-        sums.index_add_(0, torch.add(column, of[:, None], alpha=num_candidates).view(-1), counts.view(-1))
+        # Slices in place and at the target; if the motion is far, also those around the position and the target.
+        stays = torch.where(far, near[:, None], in_both[:, None])
+        moved = own[:, None] & torch.where(far, seen >> NUM_SLICES, seen)
+        won, lost = own[:, None] & seen & ~stays, in_both[:, None] & ~moved
+        near_won, near_lost = moved & ~stays, stays & ~moved
+        counts = count_slices(torch.stack((lost | won << NUM_SLICES, near_lost | near_won << NUM_SLICES)))
+        sums.index_add_(1, torch.add(column, of[:, None], alpha=num_candidates).view(-1), counts.view(2, -1))
         given = own * moves.is_given.index_select(0, which)
         counts = count_slices(torch.stack((in_both, given | near << NUM_SLICES)))
         of_static.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(2, -1), counts)
-    sums = sums.view(count, num_candidates)
-    return Wins(sums >> 32, sums & 0xFFFFFFFF, of_static.view(2, count, 2))
+    won, lost = (of_all.view(2, count, num_candidates) for of_all in (sums >> 32, sums & 0xFFFFFFFF))
+    return Wins(won[0], lost[0], torch.stack((won[1], lost[1])), of_static.view(2, count, 2))
 
 
 class Moves(NamedTuple):

@@ -8,7 +8,9 @@ from typing import Iterable, Sequence
 from oracle.height_slices import Pixel, SlicedSweeps, Vector, count, shift
 
 
-def count_wins(sweeps: SlicedSweeps, members: Iterable[Pixel], motion: Vector) -> tuple[int, int]:
+def count_wins(
+    sweeps: SlicedSweeps, members: Iterable[Pixel], motion: Vector, is_near: bool = False
+) -> tuple[int, int]:
     """Paired counts of a component's motion against "static", over all sweeps and in both directions.
 
     Returns:
@@ -17,7 +19,8 @@ def count_wins(sweeps: SlicedSweeps, members: Iterable[Pixel], motion: Vector) -
 
     Convention: every sweep is compared with t+1, and t+1 with every other sweep, all of whose pixels count, not the
         component's alone. Of a motion that takes a pixel two pixels or more, in rows or in columns, "not" means that
-        none of the 3 x 3 pixels there has the slice. A pixel outside the image has nothing around it either.
+        none of the 3 x 3 pixels there has the slice. A pixel outside the image has nothing around it either. With
+        `is_near`, "where" means any of the 3 x 3 pixels as well.
     """
     won = lost = 0
     for m, r, c in members:
@@ -27,7 +30,9 @@ def count_wins(sweeps: SlicedSweeps, members: Iterable[Pixel], motion: Vector) -
             here, there = own & sweeps.at(other, r, c), own & sweeps.at(other, r + dy, c + dx)
             near_here, near_there = here, there
             if max(abs(dy), abs(dx)) >= 2:
-                near_here, near_there = sweeps.around(other, r, c), sweeps.around(other, r + dy, c + dx)
+                near_here, near_there = own & sweeps.around(other, r, c), own & sweeps.around(other, r + dy, c + dx)
+            if is_near:
+                here, there = near_here, near_there
             won += count(there & ~near_here)
             lost += count(here & ~near_there)
     return won, lost

@@ -159,15 +159,17 @@ def estimate(every: Sequence[Cloud], ground: np.ndarray, config: VerifiedConfig)
 
 
 def verify(node: Node, candidates: Sequence[Vector], num_levels: int, config: VerifiedConfig) -> tuple[Vector, int]:
-    """The candidate of most evidence, and its evidence. What moves by its changed pixels alone needs more standard
-    deviations. All must gain two slices for each sweep besides t and t+1, or one for twelve pixels."""
+    """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations,
+    that of the near counts. What moves by its changed pixels alone needs more standard deviations. All must gain three
+    slices for each sweep besides t and t+1, or one for eight pixels."""
     z = CHANGED_Z if node.level == num_levels else config.significance
-    least = min(16 * 2 * (len(node.sweeps.images) - 2), 16 * len(node.members) // 12)
+    least = min(16 * 3 * (len(node.sweeps.images) - 2), 16 * len(node.members) // 8)
     evidence = []
     for motion in candidates:
         slides = not node.travels and slides_along_itself(node.sweeps, node.members, motion)
-        own = 0 if slides else evidence_of(*count_wins(node.sweeps, node.members, motion), z)
-        evidence.append(own if own > least else 0)
+        own = evidence_of(*count_wins(node.sweeps, node.members, motion), z)
+        own += evidence_of(*count_wins(node.sweeps, node.members, motion, is_near=True), 2 * z)
+        evidence.append(own if own > least and not slides else 0)
     return best_candidate(evidence, candidates)
 
 

@@ -39,8 +39,11 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
             window = for_oracle(sweeps, number // 3)
             components = component[sweeps.pixels.window == number // 3].tolist()
             members = [pixel for pixel, own in zip(window.pixels(), components) if own == number]
-            expected = [oracle.count_wins(window, members, (y, x)) for y, x in candidates[number].tolist()]
-            assert list(zip(wins.won[number].tolist(), wins.lost[number].tolist())) == expected
+            for counts, is_near in (((wins.won, wins.lost), False), (wins.near, True)):
+                won, lost = (of_all[number].tolist() for of_all in counts)
+                motions = candidates[number].tolist()
+                expected = [oracle.count_wins(window, members, (y, x), is_near) for y, x in motions]
+                assert list(zip(won, lost)) == expected
             assert wins.in_place[number] == oracle.count_in_place(window, members)
             assert wins.is_covered[number] == is_covered(window, members)
             num_covered += int(wins.is_covered[number])
