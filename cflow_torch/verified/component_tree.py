@@ -50,6 +50,7 @@ class Components:
         firsts: first name of each level, then of the components of changed pixels.
         parent: (V + 1,) int64, component of the next coarser level; V = none.
         size: (V,) int64, number of pixels; 0 = an unused name.
+        length: (V,) float64, metres, longer side of the bounding box of its pixels at t+1.
         is_linked: (V,) bool, it has pixels at t+1 and before.
         may_move: (V,) bool, it is linked, and the static test does not exclude a motion.
         blocks: side of a pixel at each scale, in finest pixels.
@@ -61,6 +62,7 @@ class Components:
     firsts: tuple[int, ...]
     parent: Tensor
     size: Tensor
+    length: Tensor
     is_linked: Tensor
     may_move: Tensor
     blocks: tuple[int, ...]
@@ -173,7 +175,13 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
     (size, num_missing), num_newest = sums[:, :-1] & 0xFFFFFFFF, sums[0, :-1] >> 32
     is_linked = (num_newest > 0) & (num_newest < size)
     may_move = is_linked & (num_missing * _MISSING > size)
-    return Components(roots, changed, changed_root, firsts, parent, size, is_linked, may_move, tuple(blocks))
+    newest = flat_nonzero(pixels.step == 0)
+    is_older = pixels.step.index_select(0, changed) > 0
+    root = torch.cat((roots.index_select(1, newest).flatten(), changed_root.masked_fill(is_older, count)))
+    pixel = torch.cat((newest.repeat(len(roots)), changed))
+    first, last = segment_minmax(take_columns(pixels.row_col, pixel), root, count + 1)
+    length = (last - first)[:, :-1].amax(0).add_(1).double() * grid.pixel_size
+    return Components(roots, changed, changed_root, firsts, parent, size, length, is_linked, may_move, tuple(blocks))
 
 
 def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -> Tensor:
@@ -191,13 +199,11 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
         components: V names.
         longest: metres; components longer than this at t+1 may move only if both of their ends do. None = no such test.
 
-    Convention: a plain component that equals its dilated parent is not listed twice. The length is the longer side of
-        the bounding box of the pixels at t+1.
+    Convention: a plain component that equals its dilated parent is not listed twice.
 
     Cost: linear in the pixels of the nodes.
     """
-    roots, count, may_move = components.roots, components.count, components.may_move
-    length = _length(sweeps, components) * sweeps.grid.pixel_size
+    roots, count, may_move, length = components.roots, components.count, components.may_move, components.length
     is_long = may_move & (length > (math.inf if longest is None else longest))
     travels = both_ends_move(sweeps, roots, is_long)
     may_move = may_move & (travels | ~is_long)
@@ -228,17 +234,6 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
         node=node,
         members=members,
     )
-
-
-def _length(sweeps: HeightSlicedSweeps, components: Components) -> Tensor:
-    """Return the longer side of the bounding box of each component at t+1, (V,) float64, pixels."""
-    step = sweeps.pixels.step
-    newest = flat_nonzero(step == 0)
-    changed = flat_nonzero(step.index_select(0, components.changed) == 0)
-    root = torch.cat((components.roots[:, newest].flatten(), components.changed_root[changed]))
-    pixel = torch.cat((newest.repeat(components.num_levels), components.changed[changed]))
-    first, last = segment_minmax(take_columns(sweeps.pixels.row_col, pixel), root, components.count)
-    return (last - first).amax(0).add_(1).double()
 
 
 def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_pixels: int) -> tuple[Objects, Tensor]:

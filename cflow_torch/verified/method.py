@@ -95,7 +95,7 @@ class VerifiedFlow(SceneFlowModel):
             if config.num_future > 0:
                 motion = best_nearby(sweeps, objects, motion, config.significance)
         with stage("refine"):
-            rigid, apparent = refine(sweeps, objects, motion, config.max_object_length)
+            rigid, apparent = refine(sweeps, components, objects, motion, config.max_object_length)
             margin = motion_margin(sweeps, objects, apparent)
         with stage("confidence"):
             confidence = confidence_of(sweeps, objects, apparent, margin.z)

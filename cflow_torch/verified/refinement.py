@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, lazy_zeros, split_index, take_columns
-from cflow_torch.ops.segments import segment_amin, segment_minmax
-from cflow_torch.verified.component_tree import Objects
+from cflow_torch.ops.indices import flat_nonzero, lazy_zeros, lookup, split_index
+from cflow_torch.ops.segments import segment_amin
+from cflow_torch.verified.component_tree import Components, Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
 from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, NUM_LAYERS, VoxelPairs
@@ -19,12 +19,13 @@ from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 
 
 def refine(
-    sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, longest: float | None
+    sweeps: HeightSlicedSweeps, components: Components, objects: Objects, motion: Tensor, longest: float | None
 ) -> tuple[RigidMotion, RigidMotion]:
     """Return the final motion of objects.
 
     Args:
         sweeps: finest images.
+        components: among them those of the objects.
         objects: G of them.
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
         longest: metres; static objects longer than this at t+1 stay static. None = no bound.
@@ -32,10 +33,8 @@ def refine(
     Returns:
         The motion in metres, and the apparent motion between the images, which differs if points have times.
     """
-    newest = flat_nonzero((sweeps.pixels.step == 0) & (objects.of_pixel < objects.count))
-    row_col = take_columns(sweeps.pixels.row_col, newest)
-    first, last = segment_minmax(row_col, objects.of_pixel.index_select(0, newest), objects.count)
-    length = (last - first + 1).amax(0).double() * sweeps.grid.pixel_size
+    # A static object of a pair is a whole component; copies of points are objects only if they move.
+    length = lookup(components.length, objects.component.clamp(max=components.count))
     start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
     points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS)
     return register_deskewed(points, sweeps, start)
