@@ -102,7 +102,7 @@ def _find_peaks(
 
     Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
     """
-    images = _NodeImages.of(nodes, components.blocks, sweeps.num_steps)
+    images = _NodeImages.of(nodes, components.blocks, sweeps)
     clusters = Clusters(nodes.window, images.first, images.size, images.pixels)
     pairs = make_pairs(clusters, sweeps.batch, images.block.double() * sweeps.grid.pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
@@ -136,13 +136,13 @@ class _NodeImages(NamedTuple):
     pixels: ClusterPixels
 
     @classmethod
-    def of(cls, nodes: Nodes, blocks: Sequence[int], num_steps: int) -> _NodeImages:
+    def of(cls, nodes: Nodes, blocks: Sequence[int], sweeps: HeightSlicedSweeps) -> _NodeImages:
         """Draw the nodes.
 
         Convention: a node has the scale of its level, unless its box has more than `_LARGEST_BOX` pixels there. Then it
             has the finest scale at which the box fits, or the coarsest if it fits nowhere.
         """
-        members, node, device = nodes.members, nodes.node, nodes.node.device
+        members, node, device = sweeps.pixels.take(nodes.pixel), nodes.node, nodes.node.device
         block = constant(tuple(blocks), torch.int64, device)
         ends = torch.cat(segment_minmax(members.row_col, node, nodes.count)).t()[:, None]
         ends = torch.div(ends, block[:, None], rounding_mode="floor")  # (N, scales, 4)
@@ -151,7 +151,7 @@ class _NodeImages(NamedTuple):
         scale = torch.minimum(nodes.level.clamp(max=len(blocks) - 1), (num_small - 1).clamp(min=0))
         at = (torch.arange(nodes.count, device=device), scale)
         block, first, size = block[scale], ends[at][:, :2], sizes[at]
-        area = size.prod(1) * num_steps
+        area = size.prod(1) * sweeps.num_steps
         end = area.cumsum(0)
 
         # We draw the pixels to find those that coincide at their scale. Any one of those is kept.

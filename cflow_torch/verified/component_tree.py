@@ -29,7 +29,7 @@ from cflow_torch.ops.labeling import label_together, padded_size
 from cflow_torch.ops.segments import segment_amin, segment_minmax
 from cflow_torch.verified.aperture import both_ends_move
 from cflow_torch.verified.changed_pixels import ChangedPixels
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 # The static test: a component may move only if more than one in so many of its pixels is missing in another sweep.
 _MISSING = 20
@@ -90,7 +90,6 @@ class Nodes:
         travels: (N,) bool, it is longer than other objects, and both of its ends move.
         pixel: (A,) int64, pixels of all nodes, positions in the list; a pixel of several nodes is repeated.
         node: (A,) int64, node of each of them.
-        members: the same pixels.
     """
 
     component: Tensor
@@ -100,7 +99,6 @@ class Nodes:
     travels: Tensor
     pixel: Tensor
     node: Tensor
-    members: Pixels
 
     @property
     def count(self) -> int:
@@ -223,16 +221,14 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
     node = number.index_select(0, torch.cat((roots.flatten(), components.changed_root)))
     kept = flat_nonzero(node < len(name))
     node, pixel = gather(kept, node, torch.cat((pixel, components.changed)))
-    members = sweeps.pixels.take(pixel)
     return Nodes(
         component=name,
         level=torch.bucketize(name, torch.tensor(components.firsts[1:], device=name.device), right=True),
         parent=number.index_select(0, around),
-        window=torch.zeros_like(name).scatter_(0, node, members.window),
+        window=torch.zeros_like(name).scatter_(0, node, sweeps.pixels.window.index_select(0, pixel)),
         travels=travels.index_select(0, name),
         pixel=pixel,
         node=node,
-        members=members,
     )
 
 

@@ -87,10 +87,6 @@ class Pixels:
         """Select pixels by (L,) int64 positions in the list."""
         return Pixels(take_columns(self.table, index), self.slices.index_select(0, index))
 
-    def followed_by(self, others: Pixels) -> Pixels:
-        """Append other pixels."""
-        return Pixels(torch.cat((self.table, others.table), 1), torch.cat((self.slices, others.slices)))
-
 
 @dataclass(frozen=True)
 class HeightSlicedSweeps:
@@ -194,7 +190,7 @@ class HeightSlicedSweeps:
             self.grid,
             self.image,
             self.rank.scatter_(0, pixels.index, rank),
-            self.pixels.followed_by(pixels),
+            Pixels(torch.cat((self.pixels.table, table), 1), torch.cat((self.pixels.slices, pixels.slices))),
             torch.cat((of_point, of_copy + count)),
             rows,
         )

@@ -28,7 +28,7 @@ from cflow_torch.ops.indices import (
 from cflow_torch.ops.labeling import union_find
 from cflow_torch.ops.segments import segment_amin, segment_minmax
 from cflow_torch.verified.component_tree import Components, Nodes
-from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, Pixels
+from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps
 
 _CELL = 0.4  # metres, side of a cell; it is as high as a slice
 _NUM_SLICES = 32  # from the lowest cell of a window on; higher points are in the highest slice
@@ -68,13 +68,13 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     sweeps = sweeps.with_copies(rows)
     num_copies = sweeps.num_pixels - num_own
     component = segment_amin(component, sweeps.pixel_of_point[num_points:] - num_own, num_copies, num_names)
-    copies = Pixels(sweeps.pixels.table[:, num_own:], sweeps.pixels.slices[num_own:])
     seen = torch.zeros(2 * num_names, dtype=torch.bool, device=rows.device)
-    seen.index_fill_(0, component + num_names * (copies.step > 0), True)
+    seen.index_fill_(0, component + num_names * (sweeps.pixels.step[num_own:] > 0), True)
     name = flat_nonzero(seen[:num_names] & seen[num_names:])  # at t+1 and before
     node = renumber(name, num_names).index_select(0, component)
     kept = flat_nonzero(node < len(name))
-    node, members = node.index_select(0, kept), copies.take(kept)
+    node, pixel = node.index_select(0, kept), kept + num_own
+    window = torch.zeros_like(name).scatter_(0, node, sweeps.pixels.window.index_select(0, pixel))
     count = nodes.count + len(name)
     none = torch.full_like(name, count)
     return (
@@ -85,11 +85,10 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
             ),
             level=torch.cat((nodes.level, torch.full_like(name, components.num_levels + 1))),
             parent=torch.cat((nodes.parent.masked_fill(nodes.parent == nodes.count, count), none)),
-            window=torch.cat((nodes.window, torch.zeros_like(name).scatter_(0, node, members.window))),
+            window=torch.cat((nodes.window, window)),
             travels=F.pad(nodes.travels, (0, len(name))),
-            pixel=torch.cat((nodes.pixel, kept + num_own)),
+            pixel=torch.cat((nodes.pixel, pixel)),
             node=torch.cat((nodes.node, node + nodes.count)),
-            members=nodes.members.followed_by(members),
         ),
     )
 

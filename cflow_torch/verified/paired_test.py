@@ -51,7 +51,7 @@ def verify(
     tested = flat_nonzero((candidates != 0).any(2).any(1))  # other nodes are static and cost nothing
     node = renumber(tested, nodes.count).index_select(0, nodes.node)
     some = flat_nonzero(node < len(tested))
-    members, node = nodes.members.take(some), node.index_select(0, some)
+    members, node = sweeps.pixels.take(nodes.pixel.index_select(0, some)), node.index_select(0, some)
     level, travels, window, candidates_of = gather(tested, nodes.level, nodes.travels, nodes.window, candidates)
     wins = count_wins(sweeps, members, node, candidates_of)
     z = constant((_CHANGED_Z, significance), torch.float64, level.device)
@@ -104,12 +104,7 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
     surplus = torch.zeros_like(nearest).index_copy_(0, pixel, (wins.won - wins.lost)[:, 0])
     joins = flat_nonzero(surplus[sweeps.around(pixel, 1)].sum(1) > 0)
     pixel, node = gather(joins, pixel, node)
-    return replace(
-        nodes,
-        pixel=torch.cat((nodes.pixel, pixel)),
-        node=torch.cat((nodes.node, node)),
-        members=nodes.members.followed_by(sweeps.pixels.take(pixel)),
-    )
+    return replace(nodes, pixel=torch.cat((nodes.pixel, pixel)), node=torch.cat((nodes.node, node)))
 
 
 class Wins(NamedTuple):

@@ -40,7 +40,7 @@ class Grown(NamedTuple):
     def fast_names(self) -> list[Name]:
         """Of all nodes of all windows."""
         pixels: list[list[Pixel]] = [[] for _ in range(self.nodes.count)]
-        members = self.nodes.members
+        members = self.sweeps.pixels.take(self.nodes.pixel)
         for node, *place in zip(*(v.tolist() for v in (self.nodes.node, members.step, members.row, members.col))):
             pixels[node].append(tuple(place))
         return [(frozenset(own), level) for own, level in zip(pixels, self.nodes.level.tolist())]

@@ -65,7 +65,7 @@ def overhung(windows: Sequence[Window]) -> list[Found]:
         for node in range(tree_nodes.count, nodes.count):
             assert nodes.level[node] == len(tree.levels) + 1 and nodes.parent[node] == nodes.count
             if nodes.window[node] == window + len(windows):
-                members = nodes.members.take((nodes.node == node).nonzero()[:, 0])
+                members = drawn.pixels.take(nodes.pixel[nodes.node == node])
                 found.add(tuple(zip(members.step.tolist(), members.row.tolist(), members.col.tolist())))
         assert found == {node.members for node in expected}
         mine = (drawn.pixels.window == window + len(windows)).nonzero()[:, 0]
