@@ -56,7 +56,7 @@ def verify(
     wins = count_wins(sweeps, members, node, candidates_of)
     z = constant((_CHANGED_Z, significance), torch.float64, level.device)
     z = torch.where(level == num_levels, z[0], z[1])[:, None]
-    evidence = evidence_of(wins.won, wins.lost, z) + evidence_of(*wins.near, _NEAR_Z * z)
+    evidence = evidence_of(wins.won, wins.lost, z) + evidence_of(wins.near_won, wins.near_lost, _NEAR_Z * z)
     slides = slides_along_itself(sweeps, members, node, candidates_of, wins.is_covered & ~travels)
     num_more = sweeps.num_more.index_select(0, window)
     least = torch.minimum(16 * _LEAST_GAIN * num_more, 16 * scatter_count(node, len(tested)) // _LEAST_SHARE)
@@ -112,15 +112,16 @@ class Wins(NamedTuple):
 
     Args:
         won, lost: (M, C) int64, slices.
-        near: (2, M, C) int64, won and lost if a slice also counts as found in the 3 x 3 pixels around a position. They
-            equal the counts above for motions below two pixels.
+        near_won, near_lost: (M, C) int64, near counts: a slice also counts as found in the 3 x 3 pixels around a
+            position, if the motion is at least two pixels.
         of_static: (2, M, 2) int64, slices of other sweeps, then of t+1: first those in place in the sweep compared;
             then all of them and, times 2^32, those that it has in the 3 x 3 pixels around.
     """
 
     won: Tensor
     lost: Tensor
-    near: Tensor
+    near_won: Tensor
+    near_lost: Tensor
     of_static: Tensor
 
     @property
@@ -165,7 +166,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     """
     count, num_candidates, num_steps = len(candidates), candidates.shape[1], sweeps.num_steps
     area, device = sweeps.grid.height * sweeps.grid.width, component.device
-    window = torch.zeros((count,), dtype=torch.int64, device=device).scatter_(0, component, members.window)
+    window = torch.zeros(count, dtype=torch.int64, device=device).scatter_(0, component, members.window)
     moves = Moves.of(sweeps, window, candidates)
     first = torch.sub(members.index, members.step, alpha=area)
     move = torch.add(members.step + (num_steps - 1), component, alpha=2 * num_steps - 1)
@@ -173,36 +174,33 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     ends = constant((sweeps.grid.height - 1, sweeps.grid.width - 1), torch.int64, device)[:, None]
     border = torch.minimum(*torch.minimum(at, ends - at))
     table = torch.stack((component, first, move, border))
-    # Slices that are lost and, times 2^32, won; then the near counts.
-    sums = torch.zeros((2, count * num_candidates), dtype=torch.int64, device=device)
-    of_static = torch.zeros((2, 2 * count), dtype=torch.int64, device=device)
-    column = constant(tuple(range(num_candidates)), torch.int64, device)
+    # For each candidate, slices that are lost and, times 2^32, won; then near counts; then the rows of `Wins.of_static`.
+    sums = torch.zeros((2 * num_candidates + 2, 2 * count), dtype=torch.int64, device=device)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
     for to, pixel in zip(*(of_all.split(size) for of_all in comparisons(members.step, num_steps))):
         of, start, which, near_border = take_columns(table, pixel)
         own = members.slices.index_select(0, pixel)
         start.add_(to, alpha=area)
         which -= to
-        seen = sweeps.image.index_select(0, start)
-        in_both, near = own & seen, own & (seen >> NUM_SLICES)
-        index = moves.offset.index_select(0, which).add_(start[:, None])
+        in_place = sweeps.image.index_select(0, start)
+        in_both, near = own & in_place, own & (in_place >> NUM_SLICES)
+        index = take_columns(moves.offset, which).add_(start)
         leaves = flat_nonzero(near_border < moves.longest.index_select(0, which))
-        shift = moves.shift.index_select(1, which.index_select(0, leaves))
-        shift += take_columns(at, pixel.index_select(0, leaves))[..., None]
-        index.index_copy_(0, leaves, sweeps.or_outside(index.index_select(0, leaves), shift))
-        seen, far = sweeps.image.index_select(0, index.view(-1)).view_as(index), moves.is_far.index_select(0, which)
-        # Slices in place and at the target; if the motion is far, also those around the position and the target.
-        stays = torch.where(far, near[:, None], in_both[:, None])
-        moved = own[:, None] & torch.where(far, seen >> NUM_SLICES, seen)
-        won, lost = own[:, None] & seen & ~stays, in_both[:, None] & ~moved
-        near_won, near_lost = moved & ~stays, stays & ~moved
-        counts = count_slices(torch.stack((lost | won << NUM_SLICES, near_lost | near_won << NUM_SLICES)))
-        sums.index_add_(1, torch.add(column, of[:, None], alpha=num_candidates).view(-1), counts.view(2, -1))
+        shift = moves.shift.index_select(2, which.index_select(0, leaves))
+        shift += take_columns(at, pixel.index_select(0, leaves))[:, None]
+        index.index_copy_(1, leaves, sweeps.or_outside(take_columns(index, leaves), shift))
+        at_target = sweeps.image.index_select(0, index.view(-1)).view_as(index)
+        bits = take_columns(moves.bits, which)
+        near_static, near_target = own & (in_place >> bits), own & (at_target >> bits)
+        won, lost = own & at_target & ~near_static, in_both & ~near_target
+        near_won, near_lost = near_target & ~near_static, near_static & ~near_target
         given = own * moves.is_given.index_select(0, which)
-        counts = count_slices(torch.stack((in_both, given | near << NUM_SLICES)))
-        of_static.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(2, -1), counts)
-    won, lost = (of_all.view(2, count, num_candidates) for of_all in (sums >> 32, sums & 0xFFFFFFFF))
-    return Wins(won[0], lost[0], torch.stack((won[1], lost[1])), of_static.view(2, count, 2))
+        of_static = torch.stack((in_both, given | near << NUM_SLICES))
+        found = torch.cat((lost | won << NUM_SLICES, near_lost | near_won << NUM_SLICES, of_static))
+        sums.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(len(sums), -1), count_slices(found))
+    sums = sums.view(len(sums), count, 2)
+    exact, near = sums[:-2].sum(2).view(2, num_candidates, count).transpose(1, 2)
+    return Wins(exact >> 32, exact & 0xFFFFFFFF, near >> 32, near & 0xFFFFFFFF, sums[-2:])
 
 
 class Moves(NamedTuple):
@@ -210,31 +208,32 @@ class Moves(NamedTuple):
     for every difference of steps from 1 - S to S - 1, so there are R = (2 S - 1) T rows.
 
     Args:
-        shift: (2, R, C) int64, whole pixels down and to the right.
-        offset: (R, C) int64, the shift as an offset of flat indices.
+        shift: (2, C, R) int64, whole pixels down and to the right.
+        offset: (C, R) int64, the shift as an offset of flat indices.
         longest: (R,) float64, largest shift in y or x by any of the C motions, pixels.
-        is_far: (R, C) bool, the shift in y or in x is at least two pixels.
+        bits: (C, R) uint8, the first bit of an image that tells whether a slice is absent: if the shift in y or in x is
+            at least two pixels, that of the 3 x 3 pixels around, otherwise that of the pixel.
         is_given: (R,) bool, the window has both sweeps.
     """
 
     shift: Tensor
     offset: Tensor
     longest: Tensor
-    is_far: Tensor
+    bits: Tensor
     is_given: Tensor
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> Moves:
         """Compute them from the window, (T,) int64, and the motions, (T, C, 2) float64 per sweep interval."""
         elapsed = sweeps.elapsed.index_select(0, window)
-        k = torch.cat((-elapsed.flip(1), elapsed[:, 1:]), 1)[..., None]
-        shift = (motion.permute(2, 0, 1)[:, :, None] * k + 0.5).floor_().flatten(1, 2)
+        k = torch.cat((-elapsed.flip(1), elapsed[:, 1:]), 1)
+        shift = (motion.permute(2, 1, 0)[..., None] * k + 0.5).floor_().flatten(2)
         side, shift = torch.maximum(*shift.abs()), shift.long()
         return cls(
             shift,
             torch.add(shift[1], shift[0], alpha=sweeps.grid.width),
-            side.amax(1),
-            side >= _FAR,
+            side.amax(0),
+            (side >= _FAR).view(torch.uint8) * NUM_SLICES,
             (k != 0).flatten(),
         )
 

@@ -39,7 +39,7 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
             window = for_oracle(sweeps, number // 3)
             components = component[sweeps.pixels.window == number // 3].tolist()
             members = [pixel for pixel, own in zip(window.pixels(), components) if own == number]
-            for counts, is_near in (((wins.won, wins.lost), False), (wins.near, True)):
+            for counts, is_near in (((wins.won, wins.lost), False), ((wins.near_won, wins.near_lost), True)):
                 won, lost = (of_all[number].tolist() for of_all in counts)
                 motions = candidates[number].tolist()
                 expected = [oracle.count_wins(window, members, (y, x), is_near) for y, x in motions]
