@@ -174,7 +174,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     ends = constant((sweeps.grid.height - 1, sweeps.grid.width - 1), torch.int64, device)[:, None]
     border = torch.minimum(*torch.minimum(at, ends - at))
     table = torch.stack((component, first, move, border))
-    # For each candidate, slices that are lost and, times 2^32, won; then near counts; then the rows of `Wins.of_static`.
+    # For each candidate, slices lost and, times 2^32, won; then the near counts; then the rows of `Wins.of_static`.
     sums = torch.zeros((2 * num_candidates + 2, 2 * count), dtype=torch.int64, device=device)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
     for to, pixel in zip(*(of_all.split(size) for of_all in comparisons(members.step, num_steps))):
