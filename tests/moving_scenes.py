@@ -12,6 +12,7 @@ from oracle.registration import LAYER_HEIGHT, NUM_LAYERS
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.rigid_registration import MOST_TIME
 from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
@@ -35,7 +36,7 @@ class Scene(NamedTuple):
     def points(self) -> ObjectPoints:
         """Of all objects."""
         every = torch.ones(len(self.flow), dtype=torch.bool)
-        return points_of_objects(self.sweeps, self.objects, every, LAYER_HEIGHT, NUM_LAYERS)
+        return points_of_objects(self.sweeps, self.objects, every, LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
 
     def windows(self) -> list[tuple[SlicedSweeps, dict[Pixel, int], list[Vector]]]:
         """Sweeps, object of each pixel and flow of each object for the oracle, window by window; objects from 0."""

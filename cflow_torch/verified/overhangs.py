@@ -24,6 +24,7 @@ from cflow_torch.ops.indices import (
     lookup,
     renumber,
     split_index,
+    take_columns,
 )
 from cflow_torch.ops.labeling import union_find
 from cflow_torch.ops.segments import segment_amin, segment_minmax
@@ -105,7 +106,7 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     side = constant((_CELL,), torch.float64, rows.device)  # see `Grid.pixel`
     corner = constant(grid.lower[:2], torch.float64, rows.device)
     for some in chunks(0, len(rows), rows.device):
-        position = batch.positions.index_select(1, rows[some])
+        position = take_columns(batch.positions, rows[some])
         window = floor_divide(batch.image.index_select(0, rows[some]).long(), batch.num_steps)
         col, row = (position[:2] - corner[:, None]).div_(side).long().add_(1)
         index[some] = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)

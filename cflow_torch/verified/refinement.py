@@ -8,12 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, lazy_zeros, lookup, split_index
+from cflow_torch.ops.indices import flat_nonzero, lazy_zeros, lookup, split_index, take_columns
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.component_tree import Components, Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
-from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, NUM_LAYERS, VoxelPairs
+from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, MOST_TIME, NUM_LAYERS, VoxelPairs
 from cflow_torch.verified.subpixel_motion import subpixel_motion
 from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 
@@ -36,7 +36,7 @@ def refine(
     # A static object of a pair is a whole component; copies of points are objects only if they move.
     length = lookup(components.length, objects.component.clamp(max=components.count))
     start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
-    points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS)
+    points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
     return register_deskewed(points, sweeps, start)
 
 
@@ -46,7 +46,7 @@ def register_deskewed(
     """Return the motion of objects per sweep interval, by registration and the times of points.
 
     Args:
-        points: of the objects that move, of all sweeps.
+        points: of the objects that move, as `VoxelPairs` takes them.
         sweeps: finest images.
         start: (G, 2) float64, x and y, metres per sweep interval, to start from.
 
@@ -67,7 +67,7 @@ def register_deskewed(
     stretch = pairs.stretch(apparent)[:, None]
     divided = RigidMotion(apparent.flow / stretch, apparent.rotation, apparent.centre)
     is_pair = ~sweeps.has_history
-    points = points.take(~is_pair.index_select(0, points.window))
+    points = points.take(~is_pair.index_select(0, sweeps.pixels.window.index_select(0, points.pixel)))
     again = VoxelPairs(*deskew(points, sweeps, divided), len(start)).register(start / stretch)
     is_again = torch.bincount(points.object_id, minlength=len(start)) > 0
     deskewed = RigidMotion(
@@ -98,9 +98,10 @@ def deskew(
     """
     assert points.time is not None
     grid, num_steps, object_id = sweeps.grid, sweeps.num_steps, points.object_id
-    time, image = points.time.double(), points.window * num_steps + points.step
+    time, (window, step) = points.time.double(), take_columns(sweeps.pixels.table[1:3], points.pixel)
     flow, centre = (torch.view_as_complex(values.index_select(0, object_id)) for values in (rigid.flow, rigid.centre))
     # The centre is that at t; at the instant of another sweep, it has moved.
+    image = torch.add(step, window, alpha=num_steps)
     since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
     at_instant = torch.complex(*points.position[:2]) - flow * time
     arm = at_instant - centre - flow * since_t
@@ -108,7 +109,7 @@ def deskew(
     position = torch.cat((torch.view_as_real(at_instant).t(), points.position[2:]))
 
     inside = flat_nonzero(grid.contains(position[:2]))
-    position, image = position.index_select(1, inside), image.index_select(0, inside)
+    position, image = take_columns(position, inside), image.index_select(0, inside)
     index = grid.pixel_of_image(position, image, sweeps.batch.num_windows * num_steps).long()
     pixel, number = torch.unique(index, return_inverse=True)
     moved = replace(points.at(inside), position=position, pixel=number)
@@ -118,6 +119,6 @@ def deskew(
     table = torch.stack((pixel, window, step, *split_index(within, grid.width)))
     pixels = Pixels(table, torch.zeros_like(pixel, dtype=torch.uint8))  # slices are unused downstream
     rank = lazy_zeros(len(sweeps.rank), torch.int32, pixel.device)
-    rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=pixel.device))
+    rank.scatter_(0, pixel, torch.arange(len(pixel), 0, -1, dtype=torch.int32, device=pixel.device))
     drawn = replace(sweeps, pixels=pixels, rank=rank)
     return moved.take(moved.object_id == first), drawn

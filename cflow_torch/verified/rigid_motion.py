@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion
-from cflow_torch.ops.indices import constant, flat_nonzero, index_in_group, lookup
+from cflow_torch.ops.indices import constant, flat_nonzero, index_in_group, lookup, take_columns
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
@@ -74,7 +74,7 @@ class RotatingMotion(Motion):
             RigidMotion(self.flow[:, :2], self.rotation, self.centre),
             cluster.index_select(0, rotating),
         )
-        x, y = rigid.flow_at(of_rotating, *positions[:2].index_select(1, rotating).unbind(0))
+        x, y = rigid.flow_at(of_rotating, *take_columns(positions[:2], rotating))
         slope_x, slope_y = self.slope.index_select(0, of_rotating).unbind(1)
         flow.index_copy_(0, rotating, torch.stack((x, y, slope_x * x + slope_y * y), 1))
         return flow.float()

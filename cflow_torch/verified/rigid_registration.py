@@ -25,7 +25,7 @@ from cflow_torch.verified.voxel_centroids import UNITS, ObjectPoints, Voxels
 LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels, metres
 _FARTHEST = 0.2  # metres, between the voxels of a pair
 _FAR = 3.0  # squared distance of a pair, in variances of both surfaces, at which its weight is a quarter
-_MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
+MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _NUM_STEPS = 4
 _STEP_LENGTH = 1.4  # in Gauss-Newton steps; above 1, because nearest partners change with each step
 # Largest change of the flow in x and y, units per interval, and largest rotation, tangent of half the angle.
@@ -43,18 +43,16 @@ class VoxelPairs:
     """Voxels of G objects, in the sweeps that are paired with t+1. Lengths are in units, vectors in the plane complex.
 
     Args:
-        points: of the objects that move, of all sweeps.
+        points: of the objects that move, of sweeps at most `MOST_TIME` from t+1.
         sweeps: finest images.
         num_objects: G.
 
-    Cost: twice 27 searches for each block of voxels.
+    Cost: twice 18 searches for each block of voxels.
     """
 
     def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> None:
-        elapsed = sweeps.elapsed.flatten()
-        of_point = elapsed.index_select(0, points.window * sweeps.num_steps + points.step)
-        self._voxels = voxels = Voxels(points.take(of_point.abs() <= _MOST_TIME), sweeps, NUM_LAYERS)
-        device = of_point.device
+        self._voxels = voxels = Voxels(points, sweeps, NUM_LAYERS)
+        device = points.position.device
         at_t = flat_nonzero(voxels.step == 1)
         x, y = take_columns(voxels.position[:2], at_t)
         summed = torch.stack((x, y, torch.ones_like(x)))
@@ -67,11 +65,11 @@ class VoxelPairs:
 
         # The voxels that we pair with those of t+1.
         self._voxel = flat_nonzero((voxels.step != 0) & (count > 0).index_select(0, voxels.object_id))
-        of_voxel = (voxels.window, voxels.step, voxels.layer, voxels.object_id)
-        window, step, layer, self._object = gather(self._voxel, *of_voxel)
+        of_voxel = (voxels.window, voxels.pixel, voxels.layer, voxels.object_id)
+        window, pixel, layer, self._object = gather(self._voxel, *of_voxel)
         self._sweep = window * sweeps.num_steps  # t+1
         self._layers = (layer + constant(((-1,), (0,), (1,)), torch.int64, device)) & (NUM_LAYERS - 1)
-        self._elapsed = elapsed.index_select(0, self._sweep + step)
+        self._elapsed = sweeps.elapsed_of_pixel.index_select(0, pixel)
         self._k = (self._elapsed * 16).round_() / 16
         self._end = sweeps.elapsed[:, 1].index_select(0, window)
         self._since_t = self._end - self._elapsed

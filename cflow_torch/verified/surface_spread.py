@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, scatter_count
+from cflow_torch.ops.indices import constant, scatter_count, take_columns
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels
 
 NOISE = 0.05  # metres, standard deviation of a centroid, besides the spread of its surface
@@ -30,10 +30,10 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
     Returns:
         (3, 3, V) float64, square units.
 
-    Cost: twice 27 searches for each block.
+    Cost: twice 18 searches for each block.
     """
     position, device = voxels.position[:, :-1], voxels.position.device
-    xyz = torch.floor(position / _STEP)
+    xyz = torch.floor(position / _STEP).long()
     first, second = (constant(axes, torch.int64, device) for axes in ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)))
     moments = torch.cat((torch.ones_like(xyz[:1]), xyz, xyz.index_select(0, first) * xyz.index_select(0, second)))
     size = constant((pixel_size, pixel_size, layer_height), torch.float64, device)[:, None] * UNITS
@@ -50,27 +50,28 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
 
 def _scatter(sums: Tensor) -> tuple[Tensor, Tensor]:
     """Return the number n of voxels, (V,), and n^2 times their covariance, (3, 3, V), from sums of moments, (10, V)."""
+    sums = sums.double()
     n, total = sums[0], sums[1:4]
     squares = sums.index_select(0, constant((4, 5, 6, 5, 7, 8, 6, 8, 9), torch.int64, sums.device)).view(3, 3, -1)
     return n, n * squares - total[:, None] * total
 
 
 def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
-    """Return the sums of values, (R, V) float64, over the 27 blocks around the block of each voxel.
+    """Return the sums of values, (R, V) int64, over the 27 blocks around the block of each voxel.
 
     Args:
         block: (3, V) int64, column, row and layer; layers beyond +-2046 are merged.
         image: (V,) int64; only voxels of the same image are added.
-        values: (R, V) float64, whole numbers.
+        values: (R, V) int64.
     """
     column = torch.add(block[0], torch.add(block[1], image, alpha=_ROW), alpha=_ROW)
     layer = block[2].clamp(2 - _LAYER // 2, _LAYER // 2 - 2)
     key, of_voxel = torch.unique(torch.add(layer, column, alpha=_LAYER), return_inverse=True)
-    rows = F.pad(scatter_count(of_voxel, len(key), values).t(), (0, 0, 0, 1))  # the last row is for missing blocks
-    # The layers of a column are adjacent, so we search for the lowest of three and read on.
-    lowest = tuple((down * _ROW + right) * _LAYER - 1 for down in (-1, 0, 1) for right in (-1, 0, 1))
-    lowest = (key + constant(lowest, torch.int64, key.device)[:, None]).view(-1)
-    at = torch.searchsorted(key, lowest) + constant((0, 1, 2), torch.int64, key.device)[:, None]
-    found = F.pad(key, (0, 3), value=1 << 62).index_select(0, at.view(-1)).view_as(at)
-    at = torch.where(found <= lowest + 2, at, len(key)).view(-1)
-    return rows.index_select(0, at).view(27, -1).sum(0).view(-1, len(values)).t().index_select(1, of_voxel)
+    # The layers of a column are adjacent, so we subtract the sum of all blocks below three layers from the sum of all
+    # blocks up to them. Running sums may overflow, but their differences are right.
+    below = F.pad(scatter_count(of_voxel, len(key), values).cumsum(1), (1, 0)).t().contiguous()
+    columns = [(down * _ROW + right) * _LAYER for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    ends = constant(tuple(column + end for end in (-1, 2) for column in columns), torch.int64, key.device)
+    at = torch.searchsorted(key, key + ends[:, None])
+    first, last = below.index_select(0, at.view(-1)).view(2, 9, len(key), len(values))
+    return take_columns((last - first).sum(0).t(), of_voxel)

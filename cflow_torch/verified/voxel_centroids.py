@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count, take_columns
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count, split_index, take_columns
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 
 # Centroids are multiples of 1 / UNITS metre, so their sums are exact, in any order of the points and on any device.
 UNITS = 1024
 _HIGHEST = 2.0**24  # units; coordinates are clamped to this, far beyond a region, so that no square overflows
-_BEYOND = 2.0**28  # units; a position far beyond all others
-_FARTHEST = 2.0**46  # square units; all squares between voxels of a region are smaller
+_BEYOND = 2.0**27  # units; a position far beyond all others
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,6 @@ class ObjectPoints:
 
     Args:
         object_id: (N,) int64, object of each point.
-        window, step: (N,) int64, its sweep; step 0 = t+1, 1 = t, ...
         pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
         layer: (N,) int64, height slice, from 0 on.
         position: (3, N) float64, metres, frame of t+1; inside the region.
@@ -33,8 +32,6 @@ class ObjectPoints:
     """
 
     object_id: Tensor
-    window: Tensor
-    step: Tensor
     pixel: Tensor
     layer: Tensor
     position: Tensor
@@ -46,11 +43,9 @@ class ObjectPoints:
 
     def at(self, index: Tensor) -> ObjectPoints:
         """Select points by their positions in the list, (K,) int64."""
-        object_id, window, step, pixel, layer = (
-            values.index_select(0, index) for values in (self.object_id, self.window, self.step, self.pixel, self.layer)
-        )
+        object_id, pixel, layer = gather(index, self.object_id, self.pixel, self.layer)
         time = None if self.time is None else self.time.index_select(0, index)
-        return ObjectPoints(object_id, window, step, pixel, layer, self.position.index_select(1, index), time)
+        return ObjectPoints(object_id, pixel, layer, take_columns(self.position, index), time)
 
 
 def points_of_objects(
@@ -59,8 +54,9 @@ def points_of_objects(
     wanted: Tensor,
     slice_height: float,
     num_slices: int,
+    most_time: float = math.inf,
 ) -> ObjectPoints:
-    """Return the points of some objects in all sweeps, in the order of the batch.
+    """Return the points of some objects, in the order of the batch.
 
     Args:
         sweeps: finest images.
@@ -68,17 +64,18 @@ def points_of_objects(
         wanted: (G,) bool.
         slice_height: metres.
         num_slices: a power of 2.
+        most_time: sweep intervals; sweeps farther in time from t+1 are left out.
 
-    Cost: two lookups for each point, and more for each that is kept.
+    Cost: a lookup for each point, and more for each that is kept.
     """
-    points = flat_nonzero(lookup(lookup(wanted, objects.of_pixel), sweeps.pixel_of_point))
+    is_kept = lookup(wanted, objects.of_pixel) & (sweeps.elapsed_of_pixel.abs() <= most_time)
+    points = flat_nonzero(lookup(is_kept, sweeps.pixel_of_point))
     pixel, rows = sweeps.pixel_of_point.index_select(0, points), sweeps.point(points)
-    position = sweeps.batch.positions.index_select(1, rows)
-    window, step, object_id = gather(pixel, sweeps.pixels.window, sweeps.pixels.step, objects.of_pixel)
+    position = take_columns(sweeps.batch.positions, rows)
     layer = slice_of(position[2], slice_height, num_slices).long()
     times = sweeps.batch.point_times
     time = None if times is None else times.index_select(0, rows)
-    return ObjectPoints(object_id, window, step, pixel, layer, position, time)
+    return ObjectPoints(objects.of_pixel.index_select(0, pixel), pixel, layer, position, time)
 
 
 class Voxels:
@@ -90,7 +87,8 @@ class Voxels:
         num_slices: number of slices of the points.
 
     Attributes:
-        object_id, window, step, layer: (V,) int64, as for `ObjectPoints`.
+        object_id, pixel, layer: (V,) int64, as for `ObjectPoints`.
+        window, step: (V,) int64, of the pixel.
         position: (3, V + 1) float64, x and y of the centroid from the lower corner of the region and z from 0, whole
             units of 1/1024 m; the last entry, for "no voxel", is far away.
         time: (V,) float64, mean of `ObjectPoints.time`; None = no times are given.
@@ -105,18 +103,18 @@ class Voxels:
         key, voxel, count = torch.unique(
             points.pixel * num_slices + points.layer, return_inverse=True, return_counts=True
         )
-        number = torch.arange(len(key), device=key.device)
+        self.pixel, self.layer = split_index(key, num_slices)
+        self.window, self.step = take_columns(sweeps.pixels.table[1:3], self.pixel)
+        # All points of a voxel belong to one object, so it does not matter which of them is written last.
+        self.object_id = torch.empty_like(key).scatter_(0, voxel, points.object_id)
         corner = constant((*sweeps.grid.lower[:2], 0.0), torch.float64, key.device)[:, None]
         position = ((points.position - corner) * UNITS).round_().clamp_(-_HIGHEST, _HIGHEST)
         centroid = torch.floor(scatter_count(voxel, len(key), position) / count)
         self.position = F.pad(centroid, (0, 1), value=_BEYOND)
-        # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
+        # By the rank of a pixel, as in `HeightSlicedSweeps.rank`, and by the layer.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), len(key), device=key.device)
-        self._of_key.scatter_(0, key + num_slices, number)
-        # All points of a voxel have the same values here, so it does not matter which one is written last.
-        of_point = (points.object_id, points.window, points.step)
-        self.object_id, self.window, self.step = (torch.empty_like(key).scatter_(0, voxel, of) for of in of_point)
-        self.layer = key & (num_slices - 1)
+        key = torch.add(self.layer, sweeps.num_pixels - self.pixel, alpha=num_slices)
+        self._of_key.scatter_(0, key, torch.arange(len(key), device=key.device))
         self.time: Tensor | None = None
         if points.time is not None:
             self.time = scatter_count(voxel, len(key), points.time.double()) / count
@@ -131,7 +129,7 @@ class Voxels:
 
         Returns:
             voxel: (K,) int64, V = not found. Ties: the first slice of the first pixel in raster order.
-            square: (K,) int64, its squared distance, square units, at most 2^46.
+            square: (K,) int64, its squared distance, square units.
 
         Cost: 9 L lookups for each position.
         """
@@ -140,7 +138,7 @@ class Voxels:
         # Square and slot share one number, because taking the minimum is several times faster than argmin. It is many
         # times faster in float64, which holds these numbers exactly, than in int64.
         slot = constant(tuple(range(len(voxel))), torch.float64, position.device)[:, None]
-        key = torch.add(slot, apart.square_().sum(0).clamp_(max=_FARTHEST), alpha=32).amin(0).long()
+        key = torch.add(slot, apart.square_().sum(0), alpha=32).amin(0).long()
         return voxel.gather(0, (key & 31)[None])[0], key >> 5
 
     def around(self, sweep: Tensor, layers: Tensor, position: Tensor, reach: int) -> Tensor:

@@ -88,7 +88,7 @@ class PieceReader:
             if ground is not None:
                 if self.ground is not None and step == 1:
                     found = flat_nonzero(is_active & ground[rows])
-                    self.ground.add(_select(window, found), moved.index_select(1, found))
+                    self.ground.add(_select(window, found), take_columns(moved, found))
                 is_active &= ~ground[rows]
             if self.config.ego_box is not None:
                 x0, y0, x1, y1 = self.config.ego_box

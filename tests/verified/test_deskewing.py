@@ -82,9 +82,9 @@ def test_a_known_motion_under_known_times_is_found(elapsed):
     np.testing.assert_allclose(found.flow[0], velocity, atol=1e-3)
     assert abs(float(found.rotation)) < 1e-3
 
-    sharp, _ = deskew(points, scene.sweeps, found)
+    sharp, drawn = deskew(points, scene.sweeps, found)
     for step in range(len(elapsed)):  # the images of both units become one
-        first, second = sharp.position[:2, sharp.step == step].chunk(2, 1)
+        first, second = sharp.position[:2, drawn.pixels.step[sharp.pixel] == step].chunk(2, 1)
         assert (first - second).abs().max() < 2e-3
 
 
