@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, renumber, scatter_count
+from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
 # A line: largest standard deviation across and smallest along, metres.
@@ -63,7 +64,10 @@ def slides_along_itself(
     count, pixel_size = len(candidates), sweeps.grid.pixel_size
     newest = flat_nonzero(members.step == 0)
     component, row, col, window = gather(newest, component, members.row, members.col, members.window)
-    is_line, variance, axis_y, axis_x = principal_axes(component, row, col, count, pixel_size)
+    is_line, variance, (var_y, cov, var_x) = principal_axes(component, row, col, count, pixel_size)
+    # Of the two forms of the eigenvector, we take the one that does not vanish.
+    is_wide = var_y < var_x
+    axis_y, axis_x = torch.where(is_wide, cov, variance - var_x), torch.where(is_wide, variance - var_y, cov)
     num_slices = count_slices(members.slices.index_select(0, newest)) - _TALL
     is_rail = (scatter_count(component, count, num_slices) < 0) & (variance >= (_RAIL / pixel_size) ** 2)
 
@@ -80,9 +84,9 @@ def slides_along_itself(
 
 def principal_axes(
     component: Tensor, row: Tensor, col: Tensor, num_components: int, pixel_size: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return whether each component is a line, (A,) bool, the variance along it, (A,) float64, square pixels, and y and
-    x of a vector along it, (A,) float64, of any length.
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
+    """Return whether each component is a line, (A,) bool, the largest variance in any direction, (A,) float64, square
+    pixels, and the variance in y, the covariance and the variance in x, likewise.
 
     Args:
         component, row, col: (Q,) int64, of each pixel at t+1.
@@ -94,13 +98,12 @@ def principal_axes(
     n, sums = moments[0, 0], moments[0, 1:]
     # Differences of large products are exact in integers.
     (var_y, cov), (_, var_x) = (n * moments[1:, 1:] - sums[:, None] * sums) / (n * n).clamp(min=1).double()
-    # Eigenvalues of the 2 x 2 matrix. Of the two forms of the eigenvector, we take the one that does not vanish.
+    # Eigenvalues of the 2 x 2 matrix.
     mean, half = (var_y + var_x) / 2, (var_y - var_x) / 2
     root = torch.sqrt(half * half + cov * cov)
     small, large = mean - root, mean + root
     is_line = (small <= (_THIN / pixel_size) ** 2) & (large >= (_LONG / pixel_size) ** 2)
-    is_wide = var_y < var_x
-    return is_line, large, torch.where(is_wide, cov, large - var_x), torch.where(is_wide, large - var_y, cov)
+    return is_line, large, (var_y, cov, var_x)
 
 
 def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -> Tensor:
@@ -139,13 +142,12 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     is_farthest = pixels.step == sweeps.elapsed.abs().argmax(1).index_select(0, pixels.window)
     of_sweep = torch.where(is_new, component, torch.where(is_farthest, component + count, 2 * count))
     along = torch.stack((pixels.row, pixels.col, pixels.row + pixels.col, pixels.row - pixels.col)).double()
-    infinite = along.new_full((4, 2 * count + 1), math.inf)
-    low = infinite.scatter_reduce(1, of_sweep.expand(4, -1), along, "amin")[:, :-1].view(4, 2, count)
-    high = (-infinite).scatter_reduce(1, of_sweep.expand(4, -1), along, "amax")[:, :-1].view(4, 2, count)
+    ends = segment_amin(torch.cat((along, -along)), of_sweep, 2 * count + 1, math.inf)[:, :-1]
+    low, high = ends.view(2, 4, 2, count)  # the high ends are negative
     metres = tuple(scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))
     unit = constant(metres, torch.float64, along.device)[:, None]
-    length, direction = ((high[:, 0] - low[:, 0]) * unit).max(0)
+    length, direction = (-(high[:, 0] + low[:, 0]) * unit).max(0)
     low, high = (((ends[:, 0] - ends[:, 1]) * unit).gather(0, direction[None])[0] for ends in (low, high))
-    both = (low + high).abs()  # infinite or NaN if the component is not visible
-    moves = is_tall & (length <= _LONGEST) & (both >= 2 * _LEAST_TRAVEL) & ((low - high).abs() <= _ALIKE * both)
+    both = (low - high).abs()  # infinite or NaN if the component is not visible
+    moves = is_tall & (length <= _LONGEST) & (both >= 2 * _LEAST_TRAVEL) & ((low + high).abs() <= _ALIKE * both)
     return torch.zeros_like(is_long).index_copy_(0, name, moves)

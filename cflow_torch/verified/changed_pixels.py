@@ -10,7 +10,6 @@ import math
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
@@ -61,12 +60,11 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     pixel, step = split_index(comparison, num_steps)
     sweep = pixels.window.index_select(0, pixel) * num_steps + step
     farther = RangeImages(sweeps).farther(sweep, _centre(sweeps, pixel, bit))
-    is_occluded = (farther < 0) & (farther != -math.inf)
-    is_missing, has_changed = (
-        F.pad(nothing, (0, 1)).index_fill_(0, pixel.masked_fill(of, len(nothing)), True)[:-1]
-        for of in (is_occluded, farther < 0)
-    )
-    return ChangedPixels(is_missing, has_changed)
+    is_seen = farther >= 0
+    of_missing = torch.stack((is_seen | (farther == -math.inf), is_seen)).view(torch.uint8)
+    change = of_missing.new_zeros((2, len(nothing)))
+    change.scatter_reduce_(1, pixel.expand(2, -1), of_missing, "amax")
+    return ChangedPixels(*change.view(torch.bool))
 
 
 def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:

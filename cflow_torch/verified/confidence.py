@@ -123,11 +123,11 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     Cost: one lookup for each pixel of t, and nine for those that move.
     """
     pixels, size, device = sweeps.pixels, sweeps.grid.pixel_size, margin.device
-    motion = rigid.pixels_per_interval(size)
-    number, matched = _neighbourhood(sweeps, lookup(motion, objects.of_pixel))
+    motion_of_pixel = lookup(rigid.pixels_per_interval(size), objects.of_pixel)
+    number, matched = _neighbourhood(sweeps, motion_of_pixel)
     crowd, share, bounds = (TABLE[name] for name in ("crowd", "share", "margin"))
     unlinked = 1 + _bin(number, crowd)
-    moves = lookup(motion.any(1), objects.of_pixel)
+    moves = motion_of_pixel.any(1)
     tenths = constant(tuple(share), number.dtype, device)[:, None]
     static = 2 + len(crowd) + (10 * matched >= tenths * number).sum(0)
     static.masked_fill_(_is_beside(sweeps, moves), 3 + len(crowd) + len(share))
@@ -167,7 +167,8 @@ def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, 
     """
     pixels, side = sweeps.pixels, max(1, round(_BLOCK / sweeps.grid.pixel_size))
     height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
-    block = (pixels.window * height + floor_divide(pixels.row, side)) * width + floor_divide(pixels.col, side)
+    row, col = floor_divide(pixels.row_col, side)
+    block = (pixels.window * height + row) * width + col
     source = flat_nonzero(pixels.step == 1)
     of_t, block_of_t = pixels.take(source), block.index_select(0, source)
     elapsed = sweeps.elapsed[:, 1].index_select(0, of_t.window)

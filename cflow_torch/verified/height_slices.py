@@ -21,7 +21,6 @@ from cflow_torch.ops.indices import (
     lazy_zeros,
     lookup,
     occupied,
-    renumber,
     split_index,
     take_columns,
 )
@@ -172,11 +171,9 @@ class HeightSlicedSweeps:
 
         Cost: that of the copies.
         """
-        count, of_row = self.num_pixels, self.pixel_of_point.index_select(0, rows)
+        count = self.num_pixels
         height_slice = slice_of(self.batch.positions[2].index_select(0, rows), SLICE_HEIGHT)
-        is_copied = torch.zeros(count, dtype=torch.bool, device=rows.device).index_fill_(0, of_row, True)
-        pixel = flat_nonzero(is_copied)
-        of_copy = renumber(pixel, count).index_select(0, of_row)
+        pixel, of_copy = torch.unique(self.pixel_of_point.index_select(0, rows), return_inverse=True)
         # The same pixels, in the second half of the images and of the windows.
         behind = constant((self.image.numel() // 2, self.batch.num_windows, 0, 0, 0), torch.int64, rows.device)
         table = take_columns(self.pixels.table, pixel).add_(behind[:, None])

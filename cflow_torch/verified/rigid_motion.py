@@ -30,7 +30,7 @@ class RigidMotion:
 
     def pixels_per_interval(self, pixel_size: float) -> Tensor:
         """Return the flow at the centre, (G, 2) float64, (y, x), in pixels of a size in metres."""
-        return self.flow.flip(1) / torch.full_like(self.flow, pixel_size)
+        return self.flow.flip(1) / constant((pixel_size,), self.flow.dtype, self.flow.device)  # see `Grid.pixel`
 
     def only(self, is_moving: Tensor) -> RigidMotion:
         """Keep the motion of some objects, (G,) bool, and make the others static."""

@@ -56,15 +56,15 @@ class VoxelPairs:
         at_t = flat_nonzero(voxels.step == 1)
         x, y = take_columns(voxels.position[:2], at_t)
         summed = torch.stack((x, y, torch.ones_like(x)))
-        *sums, count = scatter_count(voxels.object_id.index_select(0, at_t), num_objects, summed)
-        self._centre_of_object = torch.complex(*(torch.floor(total / count.clamp(min=1)) for total in sums))
+        sums = scatter_count(voxels.object_id.index_select(0, at_t), num_objects, summed)
+        self._centre_of_object = torch.complex(*torch.floor(sums[:2] / sums[2].clamp(min=1)))
         # Object, spread and position of each voxel; the last entry, for "no voxel", is far from all others.
         spread = spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT).view(9, -1)
         self._table = torch.cat((F.pad(torch.cat((voxels.object_id[None], spread)), (0, 1)), voxels.position))
         self._corner = constant(sweeps.grid.lower[:2], torch.float64, device)
 
         # The voxels that we pair with those of t+1.
-        self._voxel = flat_nonzero((voxels.step != 0) & (count > 0).index_select(0, voxels.object_id))
+        self._voxel = flat_nonzero((voxels.step != 0) & (sums[2] > 0).index_select(0, voxels.object_id))
         of_voxel = (voxels.window, voxels.pixel, voxels.layer, voxels.object_id)
         window, pixel, layer, self._object = gather(self._voxel, *of_voxel)
         self._sweep = window * sweeps.num_steps  # t+1
@@ -76,10 +76,13 @@ class VoxelPairs:
         x, y, self._height = take_columns(voxels.position, self._voxel)
         self._centre = self._centre_of_object.index_select(0, self._object)
         self._arm = torch.complex(x, y) - self._centre
-        noise = (NOISE * UNITS) ** 2 * torch.eye(3, dtype=torch.float64, device=device)
-        self._own_spread = spread.index_select(1, self._voxel) + noise.view(9, 1)
-        # Derivatives of x, y and z at t+1 by x and y per interval: k and 0.
-        self._by_flow = torch.eye(3, 2, dtype=torch.float64, device=device)[..., None] * self._k
+        variance = (NOISE * UNITS) ** 2
+        noise = constant(tuple(variance if i % 4 == 0 else 0.0 for i in range(9)), torch.float64, device)
+        self._own_spread = take_columns(spread, self._voxel) + noise[:, None]
+        # Derivatives of x, y and z at t+1 by x and y per interval: k and 0. That by the tangent is twice the arm times
+        # k, rotated by a right angle.
+        axes = constant(((1.0, 0.0), (0.0, 1.0), (0.0, 0.0)), torch.float64, device)
+        self._by_flow, self._by_tangent = axes[..., None] * self._k, self._k * (2 * _ARM)
 
     def register(self, flow: Tensor) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
@@ -150,10 +153,8 @@ class VoxelPairs:
             some: which voxels.
         """
         _, weight, error, arm = self._pairs(motion, some)
-        # The derivative by the tangent is twice the arm, rotated by a right angle.
-        lever = torch.view_as_real(arm * (1j / _ARM)).round().t() * (2 * _ARM * self._k[some])
-        lever = torch.cat((lever, torch.zeros_like(lever[:1])))
-        columns = torch.cat((self._by_flow[..., some], lever[:, None], error[:, None]), 1)
+        lever = torch.view_as_real(arm * (1j / _ARM)).round().t() * self._by_tangent[some]
+        columns = torch.cat((self._by_flow[..., some], F.pad(lever, (0, 0, 0, 1))[:, None], error[:, None]), 1)
         weighted = (weight[:, :, None] * columns).sum(1)
         terms = (columns[:2, :3, None] * weighted[:, None]).sum(0).view(12, -1)
         equations.view(12, -1).scatter_add_(1, self._object[some].expand(12, -1), terms)

@@ -36,7 +36,7 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
     xyz = torch.floor(position / _STEP).long()
     first, second = (constant(axes, torch.int64, device) for axes in ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)))
     moments = torch.cat((torch.ones_like(xyz[:1]), xyz, xyz.index_select(0, first) * xyz.index_select(0, second)))
-    size = constant((pixel_size, pixel_size, layer_height), torch.float64, device)[:, None] * UNITS
+    size = constant((pixel_size * UNITS, pixel_size * UNITS, layer_height * UNITS), torch.float64, device)[:, None]
     image = voxels.object_id * voxels.num_steps + voxels.step
     (n, spread), (n_of_large, spread_of_large) = (
         _scatter(_sums_around(torch.floor(position / (side * size)).long(), image, moments)) for side in _SIDES

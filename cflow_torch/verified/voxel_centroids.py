@@ -160,7 +160,8 @@ class Voxels:
         pixel = torch.add(col, row, alpha=grid.width).add_(sweep, alpha=grid.height * grid.width)
         offsets = constant(tuple(dy * grid.width + dx for dy in line for dx in line), torch.int64, device)
         pixel = pixel + offsets[:, None]
-        pixel.clamp_(0, self._sweeps.rank.numel() - 1)  # an image may have fewer rows or columns than this
+        if min(grid.height, grid.width) <= 2 * reach:
+            pixel.clamp_(0, self._sweeps.rank.numel() - 1)
         rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view(len(pixel), 1, -1)
         key = torch.add(layers, rank, alpha=self.num_slices).view(-1)
         return self._of_key.index_select(0, key).view(len(pixel) * len(layers), -1)
