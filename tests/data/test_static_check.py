@@ -76,6 +76,8 @@ def test_mistakes_are_recognised(drive):
     for change in (without_rotation, lambda pose: millimetres @ pose @ np.linalg.inv(millimetres)):
         assert verdict(Changed(drive, change))
     assert "common frame" in verdict(Changed(drive, points=points))
+    slow = Changed(drive, lambda pose: np.block([[np.eye(3), 0.15 * pose[:3, 3:]], [pose[3:]]]), points=points)
+    assert "common frame" in static_world_residual(slow, 2).verdict, "both fit, but no motion fits far better"
     assert "no poses" in verdict(Changed(drive, pose=None))
     assert verdict(Changed(drive, pose=None, points=points)) == "", "a static sensor needs no poses"
 
