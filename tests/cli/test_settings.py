@@ -163,14 +163,3 @@ def test_the_harness_models_are_those_in_the_package(tmp_path: Path, cflow: Cflo
     assert cflow("settings", "--opensceneflow", tmp_path / "model") == 0
     committed = {file.name: file.read_text() for file in (CONFIGS / "opensceneflow" / "model").glob("*.yaml")}
     assert committed == {file.name: file.read_text() for file in (tmp_path / "model").iterdir()}
-    for preset in set(PRESETS) - {"offline"}:  # the harness gives no sweeps after t+1
-        config = make_config(preset)
-        name = "cflow" if preset == "default" else f"cflow_{preset}"
-        target: Any = OmegaConf.to_container(OmegaConf.create(committed[f"{name}.yaml"]).target, resolve=False)
-        region = target["point_cloud_range"]
-        assert region[:2] + region[3:5] == [*config.point_cloud_range[:2], *config.point_cloud_range[3:5]]
-        assert region[2::3] == [-1000.0, 1000.0], "finite: the harness computes with it"
-        settings = {**config.as_dict(), "point_cloud_range": region}
-        assert target["num_frames"] == settings.pop("num_history", 0) + 2
-        assert settings.pop("num_future", 0) == 0
-        assert settings.items() <= target.items()
