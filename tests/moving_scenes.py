@@ -6,11 +6,12 @@ from typing import NamedTuple, Sequence
 
 import numpy as np
 import torch
-from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, Pixel, SlicedSweeps, SweepPoint, Vector
+from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, SlicedSweeps, Vector
 from oracle.registration import LAYER_HEIGHT, NUM_LAYERS
+from scenes import pose
 
 from cflow_torch.config import VerifiedConfig
-from cflow_torch.verified.component_tree import Objects
+from cflow_torch.verified.component_tree import Objects, number_objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_registration import MOST_TIME
 from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
@@ -38,14 +39,14 @@ class Scene(NamedTuple):
         every = torch.ones(len(self.flow), dtype=torch.bool)
         return points_of_objects(self.sweeps, self.objects, every, LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
 
-    def windows(self) -> list[tuple[SlicedSweeps, dict[Pixel, int], list[Vector]]]:
+    def windows(self) -> list[tuple[SlicedSweeps, np.ndarray, list[Vector]]]:
         """Sweeps, object of each pixel and flow of each object for the oracle, window by window; objects from 0."""
         result, pixels = [], self.sweeps.pixels
         for window in range(self.sweeps.batch.num_windows):
             sweeps = for_oracle(self.sweeps, window)
             numbers = (pixels.window[self.objects.first] == window).nonzero()[:, 0].tolist()
-            of_pixel = zip(sweeps.pixels(), self.objects.of_pixel[pixels.window == window].tolist())
-            object_of = {pixel: numbers.index(own) for pixel, own in of_pixel if own in numbers}
+            of_pixel = self.objects.of_pixel[pixels.window == window].tolist()
+            object_of = np.array([numbers.index(own) if own in numbers else -1 for own in of_pixel], dtype=int)
             result.append((sweeps, object_of, [(x, y) for x, y in self.flow[numbers].tolist()]))
         return result
 
@@ -55,11 +56,9 @@ def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:
     batch, grid = sweeps.batch, sweeps.grid
     elapsed, seconds = sweeps.elapsed[window].tolist(), batch.seconds[window].tolist()
     steps = [step for step, k in enumerate(elapsed) if step == 0 or k != 0]
-    times = torch.zeros(batch.image.numel()) if batch.point_times is None else batch.point_times
-    table = torch.cat((batch.positions, times.double()[None])).T
     is_drawn = sweeps.pixel_of_point[: batch.image.numel()] < sweeps.num_pixels
     rows = [is_drawn & (batch.image == window * sweeps.num_steps + step) for step in steps]
-    clouds = [[SweepPoint(*point) for point in table[mine].tolist()] for mine in rows]
+    clouds = [batch.positions.T[mine].numpy() for mine in rows]
     config = VerifiedConfig(pixel_sizes=(grid.pixel_size,), point_cloud_range=(*grid.lower, *grid.upper))
     return SlicedSweeps(clouds, [elapsed[step] for step in steps], [seconds[step] for step in steps], config)
 
@@ -92,7 +91,7 @@ def moving_scene(seeds: Sequence[int], num_steps: int = 2, pixel_size: float = 0
         snap: metres, places are rounded to multiples of it: equal distances and shared voxels; 0 = they are not.
     """
     clouds: list[list[np.ndarray]] = []
-    owners: list[list[np.ndarray]] = []
+    numbers: list[list[np.ndarray]] = []
     flows: list[np.ndarray] = []
     elapsed = []
     for seed in seeds:
@@ -107,37 +106,36 @@ def moving_scene(seeds: Sequence[int], num_steps: int = 2, pixel_size: float = 0
             shape = rng.uniform(-0.5, 0.5, (40, 2)) * sides
             gone = rng.random(num_steps) < 0.15
             for step in range(num_steps):
-                turn, way = -angle * times[step], centre - velocity * times[step]
-                rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+                rotation = pose(0.0, 0.0, -angle * times[step])[:2, :2]
                 kept = shape[rng.random(40) < (0.0 if gone[step] else 0.8)]
-                xy = kept @ rotation.T + way + rng.normal(0, 0.01, kept.shape)
+                xy = kept @ rotation.T + (centre - velocity * times[step]) + rng.normal(0, 0.01, kept.shape)
                 xy = np.round(xy / snap) * snap if snap else xy
                 parts[step].append(np.concatenate([xy, rng.uniform(-1.5, 2.0, (len(xy), 1))], 1))
                 of_parts[step].append(np.full(len(xy), len(flows) if rng.random() < 0.95 else -1))
             flows.append(velocity + rng.normal(0, 0.04, 2))
         clouds.append([np.concatenate(of_step) for of_step in parts])
-        owners.append([np.concatenate(of_step) for of_step in of_parts])
-    return _draw(clouds, owners, flows, elapsed, pixel_size)
+        numbers.append([np.concatenate(of_step) for of_step in of_parts])
+    return _draw(clouds, numbers, flows, elapsed, pixel_size)
 
 
 def one_object(clouds: Sequence[np.ndarray], flow: Sequence[float], elapsed: Sequence[float] | None = None) -> Scene:
     """One object, (N, 3) points in every sweep, t+1 first, and the motion to start from; sweeps `elapsed` before t+1,
     None = 0, 1, 2, ... intervals."""
     times = np.arange(len(clouds)) if elapsed is None else np.array(elapsed)
-    owners = [np.zeros(len(cloud), dtype=np.int64) for cloud in clouds]
-    return _draw([list(clouds)], [owners], [np.array(flow)], [times.astype(np.float64)], 0.1)
+    numbers = [np.zeros(len(cloud), dtype=np.int64) for cloud in clouds]
+    return _draw([list(clouds)], [numbers], [np.array(flow)], [times.astype(np.float64)], 0.1)
 
 
 def _draw(
     clouds: list[list[np.ndarray]],
-    owners: list[list[np.ndarray]],
+    numbers: list[list[np.ndarray]],
     flows: list[np.ndarray],
     elapsed: list[np.ndarray],
     pixel_size: float,
 ) -> Scene:
     grid, num_steps = Grid(pixel_size, LOWER, UPPER), len(elapsed[0])
     positions = torch.from_numpy(np.concatenate([cloud for window in clouds for cloud in window]).T.copy())
-    owner = np.concatenate([of_sweep for window in owners for of_sweep in window])
+    number_of_point = np.concatenate([of_sweep for window in numbers for of_sweep in window])
     sizes = [len(cloud) for window in clouds for cloud in window]
     image = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
     inside = grid.contains(positions)
@@ -146,16 +144,9 @@ def _draw(
     sweeps = HeightSlicedSweeps.of(batch, grid)
     # The first point of a pixel says whose it is. Objects are numbered by their first pixel, so by window.
     _, first_point = np.unique(sweeps.pixel_of_point.numpy(), return_index=True)
-    of_pixel = owner[inside.numpy()][first_point]
-    present, first = np.unique(of_pixel[of_pixel >= 0], return_index=True)
-    first = np.flatnonzero(of_pixel >= 0)[first]
-    order = first.argsort()
-    number = np.full(len(flows) + 1, len(present))
-    number[present[order]] = np.arange(len(present))
-    objects = Objects(
-        torch.from_numpy(number[of_pixel]), torch.arange(len(present)), torch.from_numpy(first[order].astype(np.int64))
-    )
-    flow = np.array(flows, dtype=np.float64).reshape(-1, 2)[present[order]]
+    of_pixel = number_of_point[inside.numpy()][first_point]
+    objects = number_objects(torch.from_numpy(np.where(of_pixel < 0, len(flows), of_pixel)), len(flows))
+    flow = np.array(flows, dtype=np.float64).reshape(-1, 2)[objects.component.numpy()]
     return Scene(sweeps, objects, torch.from_numpy(flow))
 
 

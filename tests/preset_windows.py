@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Callable
 
 from scenes import RANGE, scene
@@ -38,6 +39,11 @@ def windows_for(config: Config, number: int = 1) -> list[Window]:
 def changed(window: Window, change: Callable[[Sweep], Sweep]) -> Window:
     """Change every sweep of a window."""
     return Window(*map(change, (window.pc0, window.pc1)), *(tuple(map(change, s)) for s in (window.pch, window.pcf)))
+
+
+def untimed(window: Window) -> Window:
+    """Drop the times of points."""
+    return changed(window, lambda sweep: replace(sweep, point_times=None))
 
 
 def num_moving(result: FlowResult) -> int:

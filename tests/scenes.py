@@ -14,6 +14,7 @@ from oracle import reference_flow
 from cflow_torch.config import CONFIGS, Config, VerifiedConfig
 from cflow_torch.estimate import make_model
 from cflow_torch.types import FlowResult, Sweep, Window
+from cflow_torch.verified import method, refinement
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import make_batch
@@ -59,7 +60,7 @@ def scene(
     stamps: bool = False,
     num_objects: int = 9,
     num_points: int = 70,
-    turn: float | None = None,
+    rotation: float | None = None,
 ) -> Window:
     """Boxes, L-shapes and a wall, moving at constant velocity, seen by a sensor that drives and turns (rad per sweep).
 
@@ -73,7 +74,7 @@ def scene(
         velocity = np.array([*rng.normal(0, 0.35, 2), rng.normal(0, 0.1)]) * (rng.random() < 0.7)
         objects.append(("box" if i % 2 else "ell", size, rng.uniform(-3, 3), rng.uniform((-7, -6), (7, 6)), velocity))
     drawn, speed = rng.normal(0, 0.02), rng.normal(0.5, 0.2)
-    turn = drawn if turn is None else turn
+    rotation = drawn if rotation is None else rotation
     sweeps = []
     for k in [*range(num_history + 2), *range(-1, -1 - num_future, -1)]:  # sweeps t+1, t, t-1, ..., then t+2, t+3, ...
         clouds = []
@@ -89,7 +90,7 @@ def scene(
         ground = np.stack([rng.uniform(-9, 9, 60), rng.uniform(-8, 8, 60), rng.normal(-0.1, 0.02, 60)], 1)
         far = rng.uniform((9, 8, 0), (20, 20, 5), (8, 3))
         is_ground = np.repeat([False, True, False], [len(world), len(ground), len(far)])
-        T_world_ego = pose(-k * speed, 0.02 * k, -k * turn) if poses else np.eye(4)
+        T_world_ego = pose(-k * speed, 0.02 * k, -k * rotation) if poses else np.eye(4)
         points = np.concatenate([world, ground, far]) - T_world_ego[:3, 3]
         points = (points @ T_world_ego[:3, :3]).astype(np.float32)
         points[5, 0], points[11, 2], points[17, 1] = np.nan, np.inf, -np.inf
@@ -140,8 +141,13 @@ def assert_same(a: FlowResult, b: FlowResult, atol: float = 1e-6) -> None:
 
 
 def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
-    """The result of the method of the settings, which is the oracle's."""
-    (result,) = make_model(settings)([window])
+    """The result of the method of the settings, which is the oracle's, without the steps that the oracle lacks."""
+    with pytest.MonkeyPatch.context() as without:
+        without.setattr(method, "add_overhung", lambda sweeps, components, nodes: (sweeps, nodes))
+        without.setattr(
+            refinement, "subpixel_motion", lambda sweeps, _, motion, __: motion.flip(1) * sweeps.grid.pixel_size
+        )
+        (result,) = make_model(settings)([window])
     assert_same(result, reference_flow(window, settings))
     return result
 

@@ -59,8 +59,8 @@ def test_labels_between_samples_are_near_the_truth(drive, tmp_path):
 
 def tracks_of(*boxes: Any) -> Tracks:
     """Boxes (sample, track, x, yaw, length) at samples 0, 1, 2, 3 of 0.5 s."""
-    turn = [[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)] for _, _, _, yaw, _ in boxes]
-    pose = poses_from_quaternions([[x, 0, 0] for _, _, x, _, _ in boxes], turn, str)
+    rotation = [[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)] for _, _, _, yaw, _ in boxes]
+    pose = poses_from_quaternions([[x, 0, 0] for _, _, x, _, _ in boxes], rotation, str)
     size = np.array([[length, 2.0, 1.0] for *_, length in boxes]).reshape(-1, 3)
     times = np.array([box[0] * 500_000 for box in boxes], np.int64)
     names = [box[1] for box in boxes]

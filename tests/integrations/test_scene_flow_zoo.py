@@ -98,7 +98,7 @@ def test_causal_gives_one_flow_in_the_axes_of_t_with_nan_in_padding_rows() -> No
 
 def test_sequences_of_a_batch_may_differ_in_length_and_kind() -> None:
     sweeps = drive(4)
-    others = make_sequence(drive(3, seed=3), LoaderType.NON_CAUSAL), make_sequence(drive(2, turn=-0.05))
+    others = make_sequence(drive(3, seed=3), LoaderType.NON_CAUSAL), make_sequence(drive(2, rotation=-0.05))
     batch = [make_sequence(sweeps), *others]
     outputs = run(batch, num_history=1)
     assert [len(output.ego_flows) for output in outputs] == [1, 2, 1] and run([]) == []

@@ -14,9 +14,9 @@ from cflow_torch import CorrelationFlow, Sweep, Window, make_config
 SETTINGS: dict[str, Any] = {"preset": "paper", "pixel_sizes": (0.25,), "point_cloud_range": RANGE, "max_extent": 5.0}
 
 
-def drive(num_sweeps: int, seed: int = 7, turn: float = 0.2) -> list[Sweep]:
+def drive(num_sweeps: int, seed: int = 7, rotation: float = 0.2) -> list[Sweep]:
     """Sweeps of a vehicle that turns (rad per sweep), oldest first."""
-    made = scene(seed, num_history=num_sweeps - 2, num_objects=6, turn=turn)
+    made = scene(seed, num_history=num_sweeps - 2, num_objects=6, rotation=rotation)
     sweeps = [*made.pch[::-1], made.pc0, made.pc1]
     return [replace(sweep, timestamp_ns=10**8 * k) for k, sweep in enumerate(sweeps)]
 

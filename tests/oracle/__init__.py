@@ -1,4 +1,4 @@
-"""The three methods in plain NumPy loops: the oracle of the tests and the comparator of the benchmark.
+"""The three methods in plain NumPy, one window at a time: the oracle of the tests.
 
 What the paper describes carries the label of its equation, algorithm or section. Nothing here is fast, batched or
 shared with the fast path; where the paper leaves something open (ties, borders, medians of an even number), the
@@ -8,8 +8,8 @@ Order of reading: reference_flow, here -> `dense` (Alg. general_correlation_flow
 CorrelationFlow-Keypoints) or `verified` (ours). What they use: `sweeps` (ego motion), `pixels` (Eq. 3d_to_bev),
 `clustering` (Alg. clustering), `history` (Sec. leverage_past_pcs), `matching` (key points).
 
-Parts of the verified method, in its order: `height_slices`, `changed_pixels`, `component_tree`, `overhangs`,
-`candidates`, `paired_test`, `aperture`, `subpixel_motion`, `registration` (with `voxels`), `confidence`.
+Parts of the verified method, in its order: `height_slices`, `changed_pixels`, `component_tree`, `candidates`,
+`paired_test`, `aperture`, `registration`, `confidence`.
 """
 
 from __future__ import annotations

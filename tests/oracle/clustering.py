@@ -1,65 +1,16 @@
-"""Oracle of Sec. clustering: morphology, labelling, Alg. clustering, and HDBSCAN in its place."""
+"""Oracle of Sec. clustering: Alg. clustering by SciPy's morphology and labelling, and HDBSCAN in its place."""
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Sequence
 
 import numpy as np
+from scipy import ndimage
 
 from cflow_torch.config import DenseConfig
 from oracle.pixels import bounding_box
 
-
-def dilate(image: np.ndarray) -> np.ndarray:
-    """Dilate with a 3 x 3 square of ones, clipped at the border: every foreground pixel paints its square."""
-    result = np.zeros_like(image)
-    for r, c in np.argwhere(image).tolist():
-        result[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2] = True
-    return result
-
-
-def erode(image: np.ndarray) -> np.ndarray:
-    """Erode with a 3 x 3 square of ones: a pixel stays if its whole square is foreground.
-
-    Convention: pixels outside the image are ignored; the border itself does not erode.
-    """
-    result = np.zeros_like(image)
-    for r, c in np.argwhere(image).tolist():
-        result[r, c] = image[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2].all()
-    return result
-
-
-def connected_components(image: np.ndarray, connectivity: int) -> tuple[np.ndarray, int]:
-    """Label a binary image, breadth first.
-
-    Args:
-        image: (H, W) bool.
-        connectivity: 4 (orthogonal neighbours) or 8 (diagonal ones too).
-
-    Returns:
-        (H, W) int64 labels, 0 = background, 1 ... n in raster order of each component's first pixel; and n.
-    """
-    steps = [(-1, 0), (0, -1), (0, 1), (1, 0)]
-    if connectivity == 8:
-        steps += [(-1, -1), (-1, 1), (1, -1), (1, 1)]
-    height, width = image.shape
-    labels = np.zeros(image.shape, dtype=np.int64)
-    count = 0
-    for seed in np.argwhere(image).tolist():
-        if labels[seed[0], seed[1]]:
-            continue
-        count += 1
-        labels[seed[0], seed[1]] = count
-        queue = deque([seed])
-        while queue:
-            r, c = queue.popleft()
-            for dr, dc in steps:
-                i, j = r + dr, c + dc
-                if 0 <= i < height and 0 <= j < width and image[i, j] and not labels[i, j]:
-                    labels[i, j] = count
-                    queue.append([i, j])
-    return labels, count
+SQUARE = np.ones((3, 3), dtype=bool)
 
 
 def cluster(images: Sequence[np.ndarray], pixel_size: float, max_extent: float, connectivity: int) -> np.ndarray:
@@ -79,16 +30,16 @@ def cluster(images: Sequence[np.ndarray], pixel_size: float, max_extent: float, 
         not too large. An oversized component is eroded and labelled again once, whatever size results.
     """
     aggregated = np.logical_or.reduce(images)
-    labels, count = connected_components(dilate(aggregated), connectivity)
+    neighbours = ndimage.generate_binary_structure(2, connectivity // 4)
+    labels, total = ndimage.label(ndimage.binary_dilation(aggregated, SQUARE), neighbours)
 
-    # Validation of the connected components.
-    total = count
+    # Validation of the connected components. Pixels outside the image are ignored: its border does not erode.
     for component in range(1, 1 + total):
         _, _, height, width = bounding_box([np.argwhere(labels == component)])
         if max(height, width) * pixel_size > max_extent:
-            eroded = erode(labels == component)
+            eroded = ndimage.binary_erosion(labels == component, SQUARE, border_value=1)
             labels[labels == component] = 0
-            parts, count = connected_components(eroded, connectivity)
+            parts, count = ndimage.label(eroded, neighbours)
             labels[eroded] = parts[eroded] + total
             total += count
 

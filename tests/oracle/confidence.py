@@ -7,10 +7,12 @@ import math
 from pathlib import Path
 from typing import Any, Sequence
 
+import numpy as np
+
 import cflow_torch
 from oracle.aperture import principal_axis
-from oracle.height_slices import NEAR, Cell, Pixel, SlicedSweeps, Vector, count, shift
-from oracle.paired_test import count_in_place, count_wins
+from oracle.height_slices import COUNT, SlicedSweeps, over_squares, value_at
+from oracle.paired_test import count_wins, found_in_place
 from oracle.registration import RigidMotion
 
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
@@ -18,98 +20,65 @@ TABLE: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
 DISPLACEMENT, BLOCK = 0.4, 1.6  # metres per interval; metres
 
 
-def margin(sweeps: SlicedSweeps, members: Sequence[Pixel], rigid: RigidMotion) -> tuple[float, bool]:
+def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tuple[float, bool]:
     """What an object's motion loses by being displaced by 0.4 m per interval, the best of four displacements, in
     standard deviations of what it finds; and whether it is dynamic. 0 for a static object.
 
     An object that loses at least one standard deviation is dynamic. So is one that is not a line and is found less in
     place than where it moves to, if it loses something or moves at least twice as far as it is displaced.
     """
-    off = DISPLACEMENT / sweeps.size
-    surpluses = [0] * 5
-    for pixel in members:
-        y, x = motion_of_pixel(sweeps, pixel, rigid)
-        for i, (dy, dx) in enumerate([(0.0, 0.0), (off, 0.0), (-off, 0.0), (0.0, off), (0.0, -off)]):
-            won, lost = count_wins(sweeps, [pixel], (y + dy, x + dx))
-            surpluses[i] += won - lost
-    surplus, *displaced = surpluses
-    gain, stays = surplus - max(displaced), count_in_place(sweeps, members)
     if not any(rigid.flow):
         return 0.0, False
+    off, motion = DISPLACEMENT / sweeps.size, motion_of_pixels(sweeps, members, rigid)
+    displaced = [motion + shift for shift in ((0, 0), (off, 0), (-off, 0), (0, off), (0, -off))]
+    surplus, *others = (int(np.subtract(*count_wins(sweeps, members, each)).sum()) for each in displaced)
+    gain, stays = surplus - max(others), found_in_place(sweeps, members, sweeps.image)[:, 0].sum()
     z = gain / math.sqrt(surplus + stays) if gain > 0 else 0.0
-    is_line = principal_axis([(r, c) for m, r, c in members if m == 0], sweeps.size) is not None
+    is_line = principal_axis(sweeps, members[sweeps.pixels[members, 0] == 0]) is not None
     is_fast = rigid.flow[0] * rigid.flow[0] + rigid.flow[1] * rigid.flow[1] >= (2 * DISPLACEMENT) ** 2
-    return z, z >= 1 or ((gain > 0 or is_fast) and surplus > stays and not is_line)
+    return z, bool(z >= 1 or ((gain > 0 or is_fast) and surplus > stays and not is_line))
 
 
-def motion_of_pixel(sweeps: SlicedSweeps, pixel: Pixel, rigid: RigidMotion) -> Vector:
-    """(y, x) pixels per interval, of one pixel of an object: that of the centre, if the rotation adds less than a
-    pixel in y and in x."""
-    size, since_t = sweeps.size, sweeps.elapsed[1] - sweeps.elapsed[pixel[0]]
-    y, x = rigid.flow[1] / size, rigid.flow[0] / size
-    at_x, at_y = middle_of(sweeps, pixel)
-    own = rigid.flow_at(at_x - rigid.flow[0] * since_t, at_y - rigid.flow[1] * since_t)
-    own_x, own_y = (value / size for value in own)
-    return (own_y, own_x) if max(abs(own_y - y), abs(own_x - x)) >= 1 else (y, x)
-
-
-def middle_of(sweeps: SlicedSweeps, pixel: Pixel) -> Vector:
-    """(x, y), metres."""
-    _, r, c = pixel
-    return (c + 0.5) * sweeps.size + sweeps.lower[0], (r + 0.5) * sweeps.size + sweeps.lower[1]
+def motion_of_pixels(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> np.ndarray:
+    """(K, 2): (y, x) pixels per interval, of the pixels of an object: that of the centre, if the rotation adds less
+    than a pixel in y and in x."""
+    pixels, flow = sweeps.pixels[members], np.array(rigid.flow)
+    since_t = (sweeps.elapsed[1] - sweeps.elapsed[pixels[:, 0]])[:, None]
+    own = rigid.flow_at(sweeps.middle(pixels) - flow * since_t) / sweeps.size
+    rotates = (np.abs(own - flow / sweeps.size) >= 1).any(1, keepdims=True)
+    return np.where(rotates, own, flow / sweeps.size)[:, ::-1]
 
 
 def confidences(
-    sweeps: SlicedSweeps, object_of: dict[Pixel, int], motions: Sequence[Vector], margins: Sequence[float]
-) -> dict[Pixel, float]:
-    """Probability of every pixel of t.
-
-    Args:
-        sweeps: the window.
-        object_of: object of each pixel that belongs to one.
-        motions: (y, x) of each object at its centre, pixels per interval.
-        margins: of each object.
+    sweeps: SlicedSweeps, object_of: np.ndarray, rigid: Sequence[RigidMotion], margins: Sequence[float]
+) -> np.ndarray:
+    """(P,): probability of every pixel; undefined for those of sweeps other than t. Given are the object of each pixel,
+    and the motion of each object and its margin.
 
     The bins of the table: left out; unlinked, by how many slices lie in the block around; static, by the share of them
     that is found; static beside something that moves; moving, by the margin, for pairs near and far, then with history.
+    A block is 1.6 m wide, and its slices are found if t+1 has them where they move to.
     """
-    at_t = [pixel for pixel in sweeps.pixels() if pixel[0] == 1]
-    motion_of = {pixel: motions[object_of[pixel]] if pixel in object_of else (0.0, 0.0) for pixel in at_t}
-    blocks = neighbourhoods(sweeps, motion_of)
-    crowd, share, bounds = TABLE["crowd"], TABLE["share"], TABLE["margin"]
-    static = 1 + len(crowd) + 1
+    motion = np.array([*(each.flow[::-1] for each in rigid), (0.0, 0.0)])[object_of] / sweeps.size
+    step, row, col = sweeps.pixels.T
+    moves = (object_of >= 0) & motion.any(1)
+    dy, dx = np.floor(motion.T * sweeps.elapsed[1] + 0.5).astype(int)
+    found = COUNT[sweeps.slices & value_at(sweeps.image[0], row + dy, col + dx)]
+    side, counts = max(1, round(BLOCK / sweeps.size)), np.zeros((2, *sweeps.around.shape[1:]), dtype=int)
+    for of_block, of_pixel in zip(counts, (COUNT[sweeps.slices], found)):
+        np.add.at(of_block, (row // side, col // side), np.where(step == 1, of_pixel, 0))
+    total, found = counts[:, row // side, col // side]
+    crowd, share, bounds = (np.array(TABLE[name]) for name in ("crowd", "share", "margin"))
+    static = 2 + len(crowd)
     beside = static + len(share) + 1
-    result = {}
-    for pixel in at_t:
-        _, r, c = pixel
-        total, found = blocks[block_of(sweeps, r, c)]
-        if pixel not in object_of:
-            index = 1 + sum(total >= bound for bound in crowd)
-        elif any(motion_of[pixel]):
-            x, y = middle_of(sweeps, pixel)
-            is_far = x * x + y * y >= TABLE["far"] ** 2
-            kind = 2 * (len(sweeps.images) > 2) + is_far
-            margin_bin = sum(margins[object_of[pixel]] >= bound for bound in bounds)
-            index = beside + 1 + kind * (1 + len(bounds)) + margin_bin
-        elif any(any(motion_of.get((1, r + dy, c + dx), ())) for dy, dx in NEAR):
-            index = beside
-        else:
-            index = static + sum(10 * found >= bound * total for bound in share)
-        result[pixel] = TABLE["probabilities"][index]
-    return result
 
-
-def neighbourhoods(sweeps: SlicedSweeps, motion: dict[Pixel, Vector]) -> dict[Cell, tuple[int, int]]:
-    """Of each block of 1.6 m with pixels of t: slices, and how many of them t+1 has where they move to."""
-    sums: dict[Cell, tuple[int, int]] = {}
-    for (m, r, c), of_pixel in motion.items():
-        dy, dx = shift(of_pixel, sweeps.elapsed[1])
-        total, found = sums.get(block_of(sweeps, r, c), (0, 0))
-        own = sweeps.at(m, r, c)
-        sums[block_of(sweeps, r, c)] = total + count(own), found + count(own & sweeps.at(0, r + dy, c + dx))
-    return sums
-
-
-def block_of(sweeps: SlicedSweeps, row: int, col: int) -> Cell:
-    side = max(1, round(BLOCK / sweeps.size))
-    return row // side, col // side
+    is_moving = np.zeros(sweeps.image.shape, dtype=bool)
+    is_moving[tuple(sweeps.pixels.T)] = moves
+    is_beside = over_squares(is_moving, 1, np.logical_or)[tuple(sweeps.pixels.T)]
+    is_far = (sweeps.middle(sweeps.pixels) ** 2).sum(1) >= TABLE["far"] ** 2
+    reached = (np.array([*margins, 0.0])[object_of, None] >= bounds).sum(1)
+    bins = static + (10 * found[:, None] >= share * total[:, None]).sum(1)
+    bins[is_beside] = beside
+    bins[object_of < 0] = (1 + (total[:, None] >= crowd).sum(1))[object_of < 0]
+    moving = beside + 1 + (2 * sweeps.has_history + is_far) * (1 + len(bounds)) + reached
+    return np.array(TABLE["probabilities"])[np.where(moves, moving, bins)]

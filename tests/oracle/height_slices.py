@@ -2,128 +2,98 @@
 
 from __future__ import annotations
 
-import math
-from itertools import product
-from typing import Iterable, NamedTuple, Sequence, Tuple
+from typing import Sequence, Tuple
 
 import numpy as np
 
 from cflow_torch.config import VerifiedConfig
-from oracle.pixels import bev_dims, in_range
+from oracle.pixels import bev_dims, in_range, project_bev
 
 NUM_SLICES, SLICE_HEIGHT = 4, 0.5  # metres
 GROUND_BLOCK = 2.0  # metres
+COUNT = np.array([bin(slices).count("1") for slices in range(1 << NUM_SLICES)])
 
-Cell = Tuple[int, int]  # row, column
-Pixel = Tuple[int, int, int]  # sweep (0 = t+1, 1 = t, ...), row, column
 Vector = Tuple[float, float]
-
-
-class SweepPoint(NamedTuple):
-    """A point: metres in the frame of t+1, and sweep intervals from the instant of its sweep."""
-
-    x: float
-    y: float
-    z: float
-    time: float = 0.0
 
 
 class SlicedSweeps:
     """One window as the verified method sees it, sweep by sweep: t+1, t, t-1, ..., then t+2, ...
 
     Args:
-        clouds: the points that are drawn.
+        clouds: (N, 3) of each sweep, the points that are drawn.
         elapsed, seconds: from each sweep to t+1, in sweep intervals and in seconds.
         config: `pixel_sizes`, `point_cloud_range`.
 
     Attributes:
-        images: slices of the occupied pixels, bit c = a point of slice c lies there.
-        size: s, metres.
-        lower: (x, y), metres, corner of the region.
-        shape: rows and columns.
+        image, around: (S, H, W), bit c = a point of slice c lies in the pixel, or in the 3 x 3 pixels around it.
+        both: (S, H, W), `image`, and `around` in the next four bits.
+        pixels: (P, 3), sweep, row and column of the occupied pixels, in this order.
+        slices: (P,), of these pixels.
+        number: (S, H, W), position of each pixel in this list, -1 = none.
+        pixel_of_point: (N,), of the points of all clouds.
     """
 
     def __init__(
         self,
-        clouds: Sequence[Sequence[SweepPoint]],
+        clouds: Sequence[np.ndarray],
         elapsed: Sequence[float],
         seconds: Sequence[float],
         config: VerifiedConfig,
     ) -> None:
-        self.clouds, self.elapsed, self.seconds, self.config = clouds, elapsed, seconds, config
-        self.size, self.lower = config.pixel_sizes[-1], config.point_cloud_range[:2]
-        self.shape = bev_dims(config, self.size)
-        self.images: list[dict[Cell, int]] = [{} for _ in clouds]
-        for image, cloud in zip(self.images, clouds):
-            for x, y, z, _ in cloud:
-                cell = self.cell(x, y)
-                image[cell] = image.get(cell, 0) | 1 << slice_of(z)
+        self.elapsed, self.seconds, self.config = np.array(elapsed), seconds, config
+        self.has_history = len(elapsed) > 2
+        self.size, self.lower = config.pixel_sizes[-1], np.array(config.point_cloud_range[:2])
+        self.points = np.concatenate(clouds)
+        index = (
+            np.repeat(range(len(clouds)), [len(cloud) for cloud in clouds]),
+            *project_bev(self.points, config, self.size).T,
+        )
+        self.image = np.zeros((len(clouds), *bev_dims(config, self.size)), dtype=int)
+        np.bitwise_or.at(self.image, index, 1 << slice_of(self.points[:, 2]))
+        self.around = over_squares(self.image, 1, np.bitwise_or)
+        self.both = self.image | self.around << NUM_SLICES
+        self.pixels, self.slices = np.argwhere(self.image), self.image[self.image > 0]
+        self.number = np.where(self.image > 0, np.cumsum(self.image > 0).reshape(self.image.shape) - 1, -1)
+        self.pixel_of_point = self.number[index]
 
-    def with_points(self, clouds: Sequence[Sequence[SweepPoint]]) -> SlicedSweeps:
-        """The same window with other points."""
-        return SlicedSweeps(clouds, self.elapsed, self.seconds, self.config)
-
-    def cell(self, x: float, y: float) -> Cell:
-        """Eq. 3d_to_bev."""
-        return math.floor((y - self.lower[1]) / self.size), math.floor((x - self.lower[0]) / self.size)
-
-    def pixels(self) -> list[Pixel]:
-        """The occupied pixels, sweep by sweep, in raster order."""
-        return [(m, *cell) for m, image in enumerate(self.images) for cell in sorted(image)]
-
-    def points(self) -> list[tuple[Pixel, SweepPoint]]:
-        """All points, and their pixels."""
-        return [((m, *self.cell(p.x, p.y)), p) for m, cloud in enumerate(self.clouds) for p in cloud]
-
-    def others(self, m: int) -> Iterable[int]:
-        """The sweeps that a sweep is compared with: t+1 with all others, the others with t+1."""
-        return [0] if m > 0 else range(1, len(self.images))
-
-    def at(self, m: int, row: int, col: int) -> int:
-        """The slices of a pixel; none outside the image."""
-        return self.images[m].get((row, col), 0)
-
-    def around(self, m: int, row: int, col: int) -> int:
-        """The slices that any of the 3 x 3 pixels around a pixel has; none if the pixel lies outside the image."""
-        slices = 0
-        if 0 <= row < self.shape[0] and 0 <= col < self.shape[1]:
-            for dy, dx in NEAR:
-                slices |= self.at(m, row + dy, col + dx)
-        return slices
+    def middle(self, pixels: np.ndarray) -> np.ndarray:
+        """(K, 2): x and y of the middles of pixels (K, 3), metres."""
+        return (pixels[:, :0:-1] + 0.5) * self.size + self.lower
 
 
-NEAR = tuple(product((-1, 0, 1), repeat=2))  # a pixel and the eight around it
+def value_at(image: np.ndarray, *index: np.ndarray) -> np.ndarray:
+    """Values of an image at indices along each of its axes; 0 outside."""
+    inside = np.logical_and.reduce([(axis >= 0) & (axis < size) for axis, size in zip(index, image.shape)])
+    return np.where(inside, image[tuple(np.where(inside, axis, 0) for axis in index)], 0)
 
 
-def slice_of(z: float, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES) -> int:
+def over_squares(image: np.ndarray, reach: int, combine: np.ufunc) -> np.ndarray:
+    """Combine, for each pixel of (..., H, W), those at most `reach` rows and columns away."""
+    padded = np.pad(image, [(0, 0)] * (image.ndim - 2) + [(reach, reach)] * 2)
+    squares = np.lib.stride_tricks.sliding_window_view(padded, (2 * reach + 1,) * 2, (-2, -1))
+    return combine.reduce(squares, axis=(-2, -1))
+
+
+def slice_of(z: np.ndarray, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES) -> np.ndarray:
     """Slice of a height, metres: they repeat, as the ground has no fixed height in the frame of the vehicle."""
-    return math.floor(z / height) % num_slices
-
-
-def count(slices: int) -> int:
-    """How many slices are set."""
-    return bin(slices).count("1")
-
-
-def shift(motion: Vector, intervals: float) -> Cell:
-    """Whole pixels that a motion leads in some intervals, halves up."""
-    return math.floor(motion[0] * intervals + 0.5), math.floor(motion[1] * intervals + 0.5)
+    return (np.floor(z / height) % num_slices).astype(int)
 
 
 # ------------------------------------------------------------------------------------------------ ground
 
 
-def block_heights(ground: np.ndarray, config: VerifiedConfig) -> dict[Cell, list[int]]:
-    """Heights, centimetres, rounded down, of the ground points (N, 3) of each block of 2 m x 2 m."""
-    heights: dict[Cell, list[int]] = {}
-    for x, y, z in ground[in_range(ground, config)].tolist():
-        heights.setdefault(block_of(x, y, config), []).append(math.floor(z * 100))
-    return heights
+def blocks_of(points: np.ndarray, config: VerifiedConfig) -> tuple[np.ndarray, ...]:
+    """Row and column of the block of 2 m x 2 m of each point."""
+    return tuple(project_bev(points, config, GROUND_BLOCK).T)
 
 
-def block_of(x: float, y: float, config: VerifiedConfig) -> Cell:
-    x0, y0 = config.point_cloud_range[:2]
-    return math.floor((y - y0) / GROUND_BLOCK), math.floor((x - x0) / GROUND_BLOCK)
+def block_heights(ground: np.ndarray, config: VerifiedConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Sum of the heights, centimetres, each rounded down, of the ground points (N, 3) of each block; their number."""
+    total, number = np.zeros((2, *bev_dims(config, GROUND_BLOCK)))
+    ground = ground[in_range(ground, config)]
+    np.add.at(total, blocks_of(ground, config), np.floor(ground[:, 2] * 100))
+    np.add.at(number, blocks_of(ground, config), 1)
+    return total, number
 
 
 def is_residue(points: np.ndarray, ground: np.ndarray, config: VerifiedConfig) -> np.ndarray:
@@ -134,15 +104,14 @@ def is_residue(points: np.ndarray, ground: np.ndarray, config: VerifiedConfig) -
         block and of the eight around it, rounded down, if these have five ground points.
     """
     assert config.min_height is not None
-    pixel_of, heights = SlicedSweeps([], [], [], config).cell, block_heights(ground, config)
-    tall = set()
-    for x, y, z in points.tolist():
-        row, col = block_of(x, y, config)
-        near = [height for dr, dc in NEAR for height in heights.get((row + dr, col + dc), [])]
-        if len(near) < 5 or math.floor(z * 100) - sum(near) // len(near) >= round(100 * config.min_height):
-            tall.add(pixel_of(x, y))
-    kept = {(r + dr, c + dc) for r, c in tall for dr, dc in product(range(-2, 3), repeat=2)}
-    return np.array([pixel_of(x, y) not in kept for x, y, _ in points.tolist()], dtype=bool)
+    block = blocks_of(points, config)
+    total, number = (over_squares(values, 1, np.add)[block] for values in block_heights(ground, config))
+    height = np.floor(points[:, 2] * 100) - total // np.maximum(number, 1)
+    is_tall = (number < 5) | (height >= round(100 * config.min_height))
+    pixel = tuple(project_bev(points, config, config.pixel_sizes[-1]).T)
+    image = np.zeros(bev_dims(config, config.pixel_sizes[-1]), dtype=bool)
+    image[tuple(axis[is_tall] for axis in pixel)] = True
+    return ~over_squares(image, 2, np.logical_or)[pixel]
 
 
 def ground_slope(ground: np.ndarray, centre: Vector, config: VerifiedConfig) -> Vector:
@@ -153,19 +122,17 @@ def ground_slope(ground: np.ndarray, centre: Vector, config: VerifiedConfig) -> 
         variances in x and y must not be small: a determinant of a quarter. A slope of more than 0.3 is not ground.
     """
     x0, y0, _, x1, y1, _ = config.point_cloud_range
-    row, col = block_of(min(max(centre[0], x0), x1), min(max(centre[1], y0), y1), config)
-    known = np.array(
-        [
-            (c - col, r - row, 1, 10 * sum(heights) // len(heights))
-            for (r, c), heights in block_heights(ground, config).items()
-            if abs(r - row) <= 2 and abs(c - col) <= 2 and len(heights) >= 5
-        ]
-    ).reshape(-1, 4)
-    used = known
+    middle = np.array(blocks_of(np.clip(np.array([centre]), (x0, y0), (x1, y1)), config))
+    total, number = block_heights(ground, config)
+    at = np.argwhere(number >= 5)
+    at = at[(np.abs(at - middle.T) <= 2).all(1)]
+    heights = 10 * total[tuple(at.T)] // number[tuple(at.T)]
+    places = np.column_stack((at[:, ::-1] - middle[::-1, 0], np.ones(len(at))))
+    used = np.ones(len(at), dtype=bool)
     for _ in range(3):
-        if len(used) < 5 or np.linalg.det(np.cov(used.T[:2], bias=True)) < 0.25 - 1e-9:
+        if used.sum() < 5 or np.linalg.det(np.cov(places[used, :2].T, bias=True)) < 0.25 - 1e-9:
             return 0.0, 0.0
-        plane = np.linalg.lstsq(used[:, :3], used[:, 3], rcond=None)[0]
-        used = known[np.abs(known[:, 3] - known[:, :3] @ plane) <= 100 + 1e-6]
-    x, y = (plane[:2] / 1000 / GROUND_BLOCK).tolist()
-    return (x, y) if math.hypot(x, y) <= 0.3 else (0.0, 0.0)
+        plane = np.linalg.lstsq(places[used], heights[used], rcond=None)[0]
+        used = np.abs(heights - places @ plane) <= 100 + 1e-6
+    x, y = plane[:2] / 1000 / GROUND_BLOCK
+    return (float(x), float(y)) if np.hypot(x, y) <= 0.3 else (0.0, 0.0)

@@ -11,9 +11,10 @@ from statistics import median
 from typing import NamedTuple, Sequence
 
 import numpy as np
+from scipy import ndimage
 
 from cflow_torch.config import KeypointsConfig
-from oracle.clustering import cluster, connected_components
+from oracle.clustering import cluster
 from oracle.matching import Match, match_keypoints
 from oracle.pixels import bev_dims, in_range, occupancy, project_bev, search_radius
 from oracle.sweeps import Cloud, PointMotion
@@ -56,17 +57,15 @@ def correlation_flow_keypoints(
             # Alg. clustering keeps components that are there before and at t+1; with I_t for both it keeps all.
             ids = cluster([image, image], pixel_size, config.max_extent, config.connectivity)
         else:
-            ids = connected_components(image, config.connectivity)[0] - 1
+            ids = ndimage.label(image, ndimage.generate_binary_structure(2, config.connectivity // 4))[0] - 1
         shifts = median_of_components(ids, matches)
 
     flow, score = np.zeros(cloud.points.shape), np.zeros(len(cloud.points))
     cluster_id = np.full(len(cloud.points), -1, dtype=np.int64)
-    for i, (r, c) in zip(np.flatnonzero(inside).tolist(), pixels.tolist()):
-        cluster_id[i] = ids[r, c]
-        if ids[r, c] >= 0:
-            shift = shifts[ids[r, c]]
-            flow[i] = shift.dx * pixel_size, shift.dy * pixel_size, 0.0
-            score[i] = shift.score
+    cluster_id[inside] = ids[tuple(pixels.T)]
+    for number, shift in enumerate(shifts):
+        flow[cluster_id == number] = shift.dx * pixel_size, shift.dy * pixel_size, 0.0
+        score[cluster_id == number] = shift.score
     return PointMotion([flow], cluster_id, score)
 
 

@@ -42,14 +42,8 @@ def detect_keypoints(image: np.ndarray) -> np.ndarray:
         background, as in the zero padding of the descriptors.
     """
     padded = np.pad(image, 1)
-    keypoints = []
-    for r, c in np.argwhere(image).tolist():
-        # (r, c) of the image is (r + 1, c + 1) of the padded one.
-        above, below = padded[r, c + 1], padded[r + 2, c + 1]
-        left, right = padded[r + 1, c], padded[r + 1, c + 2]
-        if not (above and below and left and right):
-            keypoints.append((r, c))
-    return np.array(keypoints, dtype=np.int64).reshape(-1, 2)
+    is_inside = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    return np.argwhere(image & ~is_inside)
 
 
 def describe(image: np.ndarray, keypoints: np.ndarray, patch_size: int) -> np.ndarray:
@@ -63,11 +57,8 @@ def describe(image: np.ndarray, keypoints: np.ndarray, patch_size: int) -> np.nd
     Returns:
         (K, L * L) bool.
     """
-    padded = np.pad(image, patch_size // 2)
-    descriptors = np.zeros((len(keypoints), patch_size * patch_size), dtype=bool)
-    for k, (r, c) in enumerate(keypoints.tolist()):
-        descriptors[k] = padded[r : r + patch_size, c : c + patch_size].ravel()
-    return descriptors
+    patches = np.lib.stride_tricks.sliding_window_view(np.pad(image, patch_size // 2), (patch_size, patch_size))
+    return patches[tuple(keypoints.T)].reshape(len(keypoints), patch_size**2)
 
 
 # A key point of t+1 as a match of one of t; the smaller tuple is the better match: -c^2 / E of its descriptor, squared

@@ -3,44 +3,55 @@
 from __future__ import annotations
 
 import math
-from typing import Iterable, Sequence
 
-from oracle.height_slices import Pixel, SlicedSweeps, Vector, count, shift
+import numpy as np
+
+from oracle.height_slices import COUNT, NUM_SLICES, SlicedSweeps, Vector, value_at
 
 
 def count_wins(
-    sweeps: SlicedSweeps, members: Iterable[Pixel], motion: Vector, is_near: bool = False
-) -> tuple[int, int]:
+    sweeps: SlicedSweeps, members: np.ndarray, motion: Vector | np.ndarray, is_near: bool = False
+) -> np.ndarray:
     """Paired counts of a component's motion against "static", over all sweeps and in both directions.
 
+    Args:
+        members: (K,) pixels of the component.
+        motion: (y, x) pixels per interval, of all or (K, 2) of each.
+
     Returns:
-        won: slices of the component that another sweep has where the motion takes them, and not where they are.
-        lost: slices that it has where they are, and not where the motion takes them.
+        (2, K) of each pixel. Won: slices that another sweep has where the motion takes them, and not where they are.
+        Lost: slices that it has where they are, and not where the motion takes them.
 
     Convention: every sweep is compared with t+1, and t+1 with every other sweep, all of whose pixels count, not the
         component's alone. Of a motion that takes a pixel two pixels or more, in rows or in columns, "not" means that
         none of the 3 x 3 pixels there has the slice. A pixel outside the image has nothing around it either. With
         `is_near`, "where" means any of the 3 x 3 pixels as well.
     """
-    won = lost = 0
-    for m, r, c in members:
-        for other in sweeps.others(m):
-            dy, dx = shift(motion, sweeps.elapsed[m] - sweeps.elapsed[other])
-            own = sweeps.at(m, r, c)
-            here, there = own & sweeps.at(other, r, c), own & sweeps.at(other, r + dy, c + dx)
-            near_here, near_there = here, there
-            if max(abs(dy), abs(dx)) >= 2:
-                near_here, near_there = own & sweeps.around(other, r, c), own & sweeps.around(other, r + dy, c + dx)
-            if is_near:
-                here, there = near_here, near_there
-            won += count(there & ~near_here)
-            lost += count(here & ~near_there)
-    return won, lost
+    won, lost = np.zeros((2, len(members)), dtype=int)
+    step, row, col = sweeps.pixels[members].T
+    for other, elapsed in enumerate(sweeps.elapsed):
+        own = np.where((step == 0) != (other == 0), sweeps.slices[members], 0)
+        intervals = (sweeps.elapsed[step] - elapsed)[:, None]
+        dy, dx = np.floor(np.array(motion) * intervals + 0.5).astype(int).T
+        here, there = sweeps.both[other, row, col], value_at(sweeps.both[other], row + dy, col + dx)
+        is_far = np.maximum(np.abs(dy), np.abs(dx)) >= 2
+        near_here, near_there = (np.where(is_far, slices >> NUM_SLICES, slices) for slices in (here, there))
+        if is_near:
+            here, there = near_here, near_there
+        won += COUNT[own & there & ~near_here]
+        lost += COUNT[own & here & ~near_there]
+    return np.stack((won, lost))
 
 
-def count_in_place(sweeps: SlicedSweeps, members: Iterable[Pixel]) -> int:
-    """Slices of a component that another sweep has where they are, whatever the motion."""
-    return sum(count(sweeps.at(m, r, c) & sweeps.at(o, r, c)) for m, r, c in members for o in sweeps.others(m))
+def found_in_place(sweeps: SlicedSweeps, members: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """Slices of the pixels of a component that another sweep has in place, whatever the motion: of those of other
+    sweeps in t+1, and of those of t+1 in all other sweeps; and how many are compared, (2, 2)."""
+    result = np.zeros((2, 2), dtype=int)
+    step, row, col = sweeps.pixels[members].T
+    for other, image in enumerate(images):
+        own = np.where((step == 0) != (other == 0), sweeps.slices[members], 0)
+        result[int(other > 0)] += COUNT[own & image[row, col]].sum(), COUNT[own].sum()
+    return result
 
 
 def evidence_of(won: int, lost: int, z: float) -> int:
@@ -49,9 +60,3 @@ def evidence_of(won: int, lost: int, z: float) -> int:
     The difference of two counts of independent events has the variance won + lost if both are equally likely.
     """
     return max(math.floor(16 * ((won - lost) - z * math.sqrt(won + lost))), 0)
-
-
-def best_candidate(evidence: Sequence[int], candidates: Sequence[Vector]) -> tuple[Vector, int]:
-    """The candidate with most evidence, and how much; no motion if none has any. Ties: the first."""
-    best = evidence.index(max(evidence))
-    return (candidates[best], evidence[best]) if evidence[best] > 0 else ((0.0, 0.0), 0)

@@ -16,10 +16,8 @@ class Cloud(NamedTuple):
     Attributes:
         points: (N, 3) float64, metres, frame of t+1; NaN for a point that was not finite.
         is_active: (N,) bool, finite, neither ground nor of the vehicle itself.
-        intervals: k, sweep intervals to t+1: 1 for t, 2 for t-1, -1 for t+2 ..., or by time stamps; 0 for t+1 itself.
+        intervals: k, sweep intervals to t+1: 1 for t, 2 for t-1, ..., or by time stamps; 0 for t+1 itself.
         seconds: `intervals` in seconds.
-        times: (N,) float64, sweep intervals from the instant of the sweep to each point, multiples of 2^-20; None = a
-            sweep of the window has none.
         origin: (x, y, z), metres, frame of t+1: origin of the ego frame of the sweep.
     """
 
@@ -27,7 +25,6 @@ class Cloud(NamedTuple):
     is_active: np.ndarray
     intervals: float
     seconds: float
-    times: np.ndarray | None = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
@@ -51,42 +48,26 @@ def compensate(window: Window, config: Config) -> tuple[list[Cloud], Cloud]:
     """Eq. def_scene_flow: every sweep in the frame of t+1, by inv(pose1) @ pose.
 
     Returns:
-        Sweeps m = t, t-1, ..., nearest first, at most `config.num_history` before t, then t+2, t+3, ..., at most
-        `config.num_future`; and sweep t+1.
+        Sweeps m = t, t-1, ..., nearest first, at most `config.num_history` before t; and sweep t+1.
 
     Convention:
-        A sweep that repeats an earlier one of this list is dropped, and so is a sweep after t+1 that repeats t+1 (same
-        points, same pose). The others keep their times. Without poses the points are already in the frame of t+1.
-        Times are from the time stamps if all sweeps have one, else from the positions in the window.
+        A sweep that repeats an earlier one of this list is dropped (same points, same pose). The others keep their
+        times. Without poses the points are already in the frame of t+1. Times are from the time stamps if all sweeps
+        have one, else from the positions in the window.
     """
-    past = [window.pc0, *window.pch[: config.num_history]]
-    sweeps = [*past, *window.pcf[: config.num_future]]
+    sweeps = [window.pc0, *window.pch[: config.num_history]]
     stamps = [sweep.timestamp_ns for sweep in (window.pc1, *sweeps)]
     clouds: list[Cloud] = []
-    is_repeat = [
-        any(_is_repeat(sweep, other) for other in [*sweeps[:m], *[window.pc1] * (m >= len(past))])
-        for m, sweep in enumerate(sweeps)
-    ]
-    interval = config.sweep_interval if None in stamps else (stamps[0] - stamps[1]) / 1e9  # type: ignore[operator]
-    kept = [sweep for sweep, repeats in zip(sweeps, is_repeat) if not repeats]
-    has_times = all(sweep.point_times is not None for sweep in (window.pc1, *kept))
     for m, sweep in enumerate(sweeps):
-        if is_repeat[m]:
+        if any(_is_repeat(sweep, other) for other in sweeps[:m]):
             continue
-        position = len(past) - 1 - m if m >= len(past) else m + 1
-        intervals, seconds = float(position), position * config.sweep_interval
+        intervals, seconds = m + 1.0, (m + 1) * config.sweep_interval
         if None not in stamps:
             gap, first_gap = stamps[0] - stamps[m + 1], stamps[0] - stamps[1]  # type: ignore[operator]
             intervals, seconds = gap / first_gap, gap / 1e9
-        times = _point_times(sweep, interval) if has_times else None
         moved, is_active = _in_frame_of(window.pc1, sweep), _is_active(sweep, config)
-        clouds.append(Cloud(moved, is_active, intervals, seconds, times, _origin(window.pc1, sweep)))
-    times = _point_times(window.pc1, interval) if has_times else None
-    return clouds, Cloud(xyz(window.pc1), _is_active(window.pc1, config), 0.0, 0.0, times)
-
-
-def _point_times(sweep: Sweep, interval: float) -> np.ndarray:
-    return np.floor(as_numpy(sweep.point_times, np.float64) / interval * 2**20 + 0.5) / 2**20
+        clouds.append(Cloud(moved, is_active, intervals, seconds, _origin(window.pc1, sweep)))
+    return clouds, Cloud(xyz(window.pc1), _is_active(window.pc1, config), 0.0, 0.0)
 
 
 def xyz(sweep: Sweep) -> np.ndarray:

@@ -112,8 +112,9 @@ def test_ends_equal_the_oracle():
         assert not found[9]
         for number, answer in enumerate(found[:9].tolist()):
             window = int(sweeps.pixels.window[roots == number][0])
-            members = [tuple(at) for at in np.argwhere((number_of[window] == number) & (image[window] > 0)).tolist()]
-            assert answer == (bool(is_long[number]) and oracle.both_ends_move(for_oracle(sweeps, window), members))
+            alone = for_oracle(sweeps, window)
+            members = np.flatnonzero(number_of[window][tuple(alone.pixels.T)] == number)
+            assert answer == (bool(is_long[number]) and oracle.both_ends_move(alone, members))
             moved, stayed = moved + answer, stayed + (not answer)
     assert moved > 10 and stayed > 10
 

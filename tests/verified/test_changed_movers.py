@@ -1,4 +1,4 @@
-"""What moves by its changed pixels: a walker beside a wall moves; the wall, and shadows on it, do not."""
+"""Motion by changed pixels: a walker beside a wall moves; the wall, and shadows on it, do not."""
 
 from __future__ import annotations
 

@@ -27,9 +27,9 @@ def floor() -> np.ndarray:
     return np.stack((np.linspace(-10, -5, 500), np.zeros(500), np.full(500, -2.0)), 1)
 
 
-def farther(clouds: Sequence[np.ndarray], places: Sequence[Sequence[float]], way: float) -> list[list[float]]:
-    """Of t+1 and of t, when the sensor was `way` metres further left: by how much farther each sees than a place."""
-    T_world_ego = pose(0.0, way, 0.0)
+def farther(clouds: Sequence[np.ndarray], places: Sequence[Sequence[float]], shift: float) -> list[list[float]]:
+    """Of t+1 and of t, when the sensor was `shift` metres further left: by how much farther each sees than a place."""
+    T_world_ego = pose(0.0, shift, 0.0)
     pc1, pc0 = (np.concatenate((cloud, floor())) for cloud in clouds)
     window = Window(Sweep(pc0 - T_world_ego[:3, 3], pose=T_world_ego), Sweep(pc1, pose=np.eye(4)))
     images = RangeImages(sweeps_of([window], SETTINGS))

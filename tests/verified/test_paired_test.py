@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from moving_scenes import for_oracle, from_images
 from oracle import paired_test as oracle
 from oracle.aperture import is_covered
 
 from cflow_torch.verified import paired_test as fast
+from cflow_torch.verified.component_tree import Nodes
 
 
 def random_images(rng: np.random.Generator, shape: tuple) -> np.ndarray:
@@ -37,14 +36,12 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
         component[::7] = 6
         for number in range(6):
             window = for_oracle(sweeps, number // 3)
-            components = component[sweeps.pixels.window == number // 3].tolist()
-            members = [pixel for pixel, own in zip(window.pixels(), components) if own == number]
-            for counts, is_near in (((wins.won, wins.lost), False), ((wins.near_won, wins.near_lost), True)):
-                won, lost = (of_all[number].tolist() for of_all in counts)
-                motions = candidates[number].tolist()
-                expected = [oracle.count_wins(window, members, (y, x), is_near) for y, x in motions]
-                assert list(zip(won, lost)) == expected
-            assert wins.in_place[number] == oracle.count_in_place(window, members)
+            members = np.flatnonzero(component[sweeps.pixels.window == number // 3] == number)
+            motions = candidates[number].numpy()
+            for is_near, counts in enumerate(((wins.won, wins.lost), (wins.near_won, wins.near_lost))):
+                expected = [oracle.count_wins(window, members, each, bool(is_near)).sum(1) for each in motions]
+                assert np.array_equal(np.stack([of_all[number] for of_all in counts], 1), expected)
+            assert wins.in_place[number] == oracle.found_in_place(window, members, window.image)[:, 0].sum()
             assert wins.is_covered[number] == is_covered(window, members)
             num_covered += int(wins.is_covered[number])
             far += int((candidates[number].abs().amax(1) > 1.5).sum())
@@ -77,16 +74,19 @@ def test_evidence_equals_the_oracle(z):
     assert found.tolist() == [oracle.evidence_of(won, lost, z) for won, lost in counts.T.tolist()]
 
 
-@settings(deadline=None, max_examples=40, derandomize=True)
-@given(st.integers(1, 6).flatmap(lambda c: st.lists(st.lists(st.integers(0, 3), min_size=c, max_size=c), min_size=1)))
-def test_choice_equals_the_oracle(evidence):
-    candidates = np.random.default_rng(1).normal(size=(len(evidence), len(evidence[0]), 2))
-    motion, most = fast.best_candidate(torch.tensor(evidence), torch.from_numpy(candidates))
-    expected = [oracle.best_candidate(row, [tuple(f) for f in fs]) for row, fs in zip(evidence, candidates.tolist())]
-    assert [(tuple(f), e) for f, e in zip(motion.tolist(), most.tolist())] == expected
+def test_the_first_candidate_with_most_evidence_is_chosen():
+    evidence = torch.tensor([[2**36 - 2, 2**36 - 1, 2**36 - 1], [1, 0, 2**36 - 1], [0, 0, 0]])
+    motion, most = fast.best_candidate(evidence, torch.arange(18, dtype=torch.float64).view(3, 3, 2))
+    assert motion.tolist() == [[2.0, 3.0], [10.0, 11.0], [0.0, 0.0]] and most.tolist() == [2**36 - 1] * 2 + [0]
 
 
-def test_large_evidence_is_compared_exactly():
-    evidence = torch.tensor([[2**36 - 2, 2**36 - 1, 2**36 - 1], [1, 0, 2**36 - 1]])
-    motion, most = fast.best_candidate(evidence, torch.arange(12, dtype=torch.float64).view(2, 3, 2))
-    assert motion.tolist() == [[2.0, 3.0], [10.0, 11.0]] and most.tolist() == [2**36 - 1] * 2
+@pytest.mark.parametrize("level, num_pixels, moves", [(0, 1, False), (0, 2, True), (2, 8, False), (2, 9, True)])
+def test_nodes_of_changed_pixels_need_4_standard_deviations(level, num_pixels, moves):
+    """Lone pixels that move win two slices each: 4 > 1.5 * 2 and 18 > 4 * 4.2, but 16 = 4 * 4."""
+    images = np.zeros((1, 2, 40, 12), dtype=np.uint8)
+    images[0, 1, 2 : 4 * num_pixels : 4, 2] = images[0, 0, 2 : 4 * num_pixels : 4, 7] = 1
+    sweeps, zero = from_images(images), torch.zeros(1, dtype=torch.int64)
+    every = torch.arange(sweeps.num_pixels)
+    nodes = Nodes(zero, zero + level, zero + 1, zero, zero > 0, every, torch.zeros_like(every))
+    motion, _ = fast.verify(sweeps, nodes, torch.tensor([[[0.0, 5.0]]], dtype=torch.float64), 2, 1.5)
+    assert motion.tolist() == [[0.0, 5.0 * moves]]

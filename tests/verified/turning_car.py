@@ -26,11 +26,11 @@ def car_of(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
 
 def turning_car(seed: int, num_history: int = 0, share: float = 1.0) -> Window:
     """Every sweep sampled anew, with that share of the points; the sensor stands still."""
-    rng, (start, velocity, turn) = np.random.default_rng((seed, 1)), car_of(seed)
+    rng, (start, velocity, rotation) = np.random.default_rng((seed, 1)), car_of(seed)
     sweeps = []
     for k in range(1, -num_history - 1, -1):  # t+1 first
         parts = [
-            upright_box(start + k * velocity, (4.0, 1.8), 0.3 + k * turn, rng),
+            upright_box(start + k * velocity, (4.0, 1.8), 0.3 + k * rotation, rng),
             upright_box((-5.0 + 0.12 * k, -5.4), (0.4, 0.5), 0.0, rng, 60),
             upright_box((-4.0, -6.2), (6.0, 0.3), 0.0, rng),
             upright_box((5.5, 5.5), (0.3, 0.3), 0.0, rng, 40),
