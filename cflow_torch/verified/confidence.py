@@ -68,7 +68,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     members, which = sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel)
     group, motion = _groups_of_one_motion(sweeps, members, which, rigid)
     wins = count_wins(sweeps, members, group, motion[:, None] + displaced)
-    counts = torch.cat((wins.won - wins.lost, wins.in_place[:, None]), 1)
+    counts = torch.cat((wins.won[0] - wins.lost[0], wins.in_place[:, None]), 1)
     object_of_group = torch.zeros_like(wins.in_place).scatter_(0, group, which)
     counts = torch.zeros(objects.count, 6, dtype=torch.int64, device=device).index_add_(0, object_of_group, counts)
     surplus, in_place = counts[:, :5], counts[:, 5]

@@ -209,6 +209,11 @@ class HeightSlicedSweeps:
         return self.batch.elapsed
 
     @cached_property
+    def intervals(self) -> Tensor:
+        """(B, 2 S - 1) float64, sweep intervals from t+1 back to the sweeps S - 1 ... 1, 0, then from 1 ... S - 1."""
+        return torch.cat((-self.elapsed.flip(1), self.elapsed[:, 1:]), 1)
+
+    @cached_property
     def elapsed_of_pixel(self) -> Tensor:
         """(P,) float64, sweep intervals from the sweep of each occupied pixel to t+1."""
         sweep = torch.add(self.pixels.step, self.pixels.window, alpha=self.num_steps)

@@ -73,7 +73,7 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
     asked, candidates = motion.any(1) & has_after, motion[:, None] + offsets
     pixel = flat_nonzero(lookup(asked, objects.of_pixel))
     wins = count_wins(sweeps, sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel), candidates)
-    best, evidence = best_candidate(evidence_of(wins.won, wins.lost, significance), candidates)
+    best, evidence = best_candidate(evidence_of(wins.won[0], wins.lost[0], significance), candidates)
     return torch.where((evidence > 0)[:, None], best, motion)
 
 

@@ -56,7 +56,8 @@ def verify(
     wins = count_wins(sweeps, members, node, candidates_of)
     z = constant((_CHANGED_Z, significance), torch.float64, level.device)
     z = torch.where(level == num_levels, z[0], z[1])[:, None]
-    evidence = evidence_of(wins.won, wins.lost, z) + evidence_of(wins.near_won, wins.near_lost, _NEAR_Z * z)
+    factor = constant((1.0, _NEAR_Z), torch.float64, level.device)[:, None, None]
+    evidence = evidence_of(wins.won, wins.lost, factor * z).sum(0)
     slides = slides_along_itself(sweeps, members, node, candidates_of, wins.is_covered & ~travels)
     num_more = sweeps.num_more.index_select(0, window)
     least = torch.minimum(16 * _LEAST_GAIN * num_more, 16 * scatter_count(node, len(tested)) // _LEAST_SHARE)
@@ -101,7 +102,7 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
     pixel = flat_nonzero(nearest[:-1] < nodes.count)
     node, each = nearest.index_select(0, pixel), torch.arange(len(pixel), device=near.device)
     wins = count_wins(sweeps, sweeps.pixels.take(pixel), each, motion.index_select(0, node)[:, None])
-    surplus = torch.zeros_like(nearest).index_copy_(0, pixel, (wins.won - wins.lost)[:, 0])
+    surplus = torch.zeros_like(nearest).index_copy_(0, pixel, (wins.won - wins.lost)[0, :, 0])
     joins = flat_nonzero(surplus[sweeps.around(pixel, 1)].sum(1) > 0)
     pixel, node = gather(joins, pixel, node)
     return replace(nodes, pixel=torch.cat((nodes.pixel, pixel)), node=torch.cat((nodes.node, node)))
@@ -111,29 +112,26 @@ class Wins(NamedTuple):
     """Paired counts of M components with C candidate motions each.
 
     Args:
-        won, lost: (M, C) int64, slices.
-        near_won, near_lost: (M, C) int64, near counts: a slice also counts as found in the 3 x 3 pixels around a
-            position, if the motion is at least two pixels.
-        of_static: (2, M, 2) int64, slices of other sweeps, then of t+1: first those in place in the sweep compared;
-            then all of them and, times 2^32, those that it has in the 3 x 3 pixels around.
+        won, lost: (2, M, C) int64, slices; then the near counts: a slice also counts as found in the 3 x 3 pixels
+            around a position, if the motion is at least two pixels.
+        of_static: (2, M, 2) int64, slices of other sweeps, then of t+1: first all of them, then those in place in the
+            sweep compared and, times 2^32, those that it has in the 3 x 3 pixels around.
     """
 
     won: Tensor
     lost: Tensor
-    near_won: Tensor
-    near_lost: Tensor
     of_static: Tensor
 
     @property
     def in_place(self) -> Tensor:
         """(M,) int64, slices that other sweeps have at the same position, for any motion."""
-        return self.of_static[0].sum(1)
+        return (self.of_static[1] & 0xFFFFFFFF).sum(1)
 
     @property
     def is_covered(self) -> Tensor:
         """(M,) bool: the other sweeps have `_COVERED` per cent of the slices at t+1 in the 3 x 3 pixels around the same
         position, or t+1 has as many of those in the other sweeps. The other sweeps are counted together."""
-        near, total = self.of_static[1] >> 32, self.of_static[1] & 0xFFFFFFFF
+        total, near = self.of_static[0], self.of_static[1] >> 32
         return ((total > 0) & (near * 100 >= total * _COVERED)).any(1)
 
 
@@ -174,7 +172,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     ends = constant((sweeps.grid.height - 1, sweeps.grid.width - 1), torch.int64, device)[:, None]
     border = torch.minimum(*torch.minimum(at, ends - at))
     table = torch.stack((component, first, move, border))
-    # For each candidate, slices lost and, times 2^32, won; then the near counts; then the rows of `Wins.of_static`.
+    # For each candidate, slices lost and, times 2^32, won; then the near counts; then `Wins.of_static`.
     sums = torch.zeros((2 * num_candidates + 2, 2 * count), dtype=torch.int64, device=device)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
     for to, pixel in zip(*(of_all.split(size) for of_all in comparisons(members.step, num_steps))):
@@ -192,15 +190,16 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         at_target = sweeps.image.index_select(0, index.view(-1)).view_as(index)
         bits = take_columns(moves.bits, which)
         near_static, near_target = own & (in_place >> bits), own & (at_target >> bits)
-        won, lost = own & at_target & ~near_static, in_both & ~near_target
-        near_won, near_lost = near_target & ~near_static, near_static & ~near_target
+        not_static, not_target = ~near_static, ~near_target
         given = own * moves.is_given.index_select(0, which)
-        of_static = torch.stack((in_both, given | near << NUM_SLICES))
-        found = torch.cat((lost | won << NUM_SLICES, near_lost | near_won << NUM_SLICES, of_static))
+        found = torch.cat((in_both & not_target, near_static & not_target, given[None], in_both[None]))
+        won = torch.cat((own & at_target & not_static, near_target & not_static))
+        found[: len(won)] |= won << NUM_SLICES
+        found[-1] |= near << NUM_SLICES
         sums.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(len(sums), -1), count_slices(found))
     sums = sums.view(len(sums), count, 2)
-    exact, near = sums[:-2].sum(2).view(2, num_candidates, count).transpose(1, 2)
-    return Wins(exact >> 32, exact & 0xFFFFFFFF, near >> 32, near & 0xFFFFFFFF, sums[-2:])
+    of_motion = sums[:-2].sum(2).view(2, num_candidates, count).transpose(1, 2)
+    return Wins(of_motion >> 32, of_motion & 0xFFFFFFFF, sums[-2:])
 
 
 class Moves(NamedTuple):
@@ -225,8 +224,7 @@ class Moves(NamedTuple):
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> Moves:
         """Compute them from the window, (T,) int64, and the motions, (T, C, 2) float64 per sweep interval."""
-        elapsed = sweeps.elapsed.index_select(0, window)
-        k = torch.cat((-elapsed.flip(1), elapsed[:, 1:]), 1)
+        k = sweeps.intervals.index_select(0, window)
         shift = (motion.permute(2, 1, 0)[..., None] * k + 0.5).floor_().flatten(2)
         side, shift = torch.maximum(*shift.abs()), shift.long()
         return cls(

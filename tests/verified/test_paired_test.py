@@ -38,9 +38,9 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
             window = for_oracle(sweeps, number // 3)
             members = np.flatnonzero(component[sweeps.pixels.window == number // 3] == number)
             motions = candidates[number].numpy()
-            for is_near, counts in enumerate(((wins.won, wins.lost), (wins.near_won, wins.near_lost))):
-                expected = [oracle.count_wins(window, members, each, bool(is_near)).sum(1) for each in motions]
-                assert np.array_equal(np.stack([of_all[number] for of_all in counts], 1), expected)
+            for is_near, won, lost in zip((False, True), wins.won[:, number], wins.lost[:, number]):
+                expected = [oracle.count_wins(window, members, each, is_near).sum(1) for each in motions]
+                assert np.array_equal(torch.stack((won, lost), 1), expected)
             assert wins.in_place[number] == oracle.found_in_place(window, members, window.image)[:, 0].sum()
             assert wins.is_covered[number] == is_covered(window, members)
             num_covered += int(wins.is_covered[number])
@@ -51,7 +51,7 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
 def won_by_older(sweeps, motion: torch.Tensor) -> list[list[int]]:
     """Slices of the older sweep that a motion wins."""
     older = sweeps.pixels.take((sweeps.pixels.step == 1).nonzero()[:, 0])
-    return fast.count_wins(sweeps, older, torch.zeros_like(older.step), motion).won.tolist()
+    return fast.count_wins(sweeps, older, torch.zeros_like(older.step), motion).won[0].tolist()
 
 
 def test_a_far_motion_must_leave_the_neighbourhood_as_well():
