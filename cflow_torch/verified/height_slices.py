@@ -97,7 +97,7 @@ class HeightSlicedSweeps:
         image: (I,) uint8 with I - 1 = 2 B S H W. Bits 0 ... 3: a point of this height slice is in the pixel; bits 4 ...
             7: one is in the 3 x 3 pixels around. The second half is empty until `with_copies` draws there. The last
             entry, always 0, is for positions outside the images.
-        rank: (I,) int32, P minus the position in the list of each occupied pixel; 0 for empty pixels.
+        rank: (I,) int32, 1 + position of each occupied pixel in the list; 0 for empty pixels.
         pixels: the P occupied pixels, ascending.
         pixel_of_point: (N + K,) int64, position in the list of the pixel of each point, then of each copy; P for points
             that are inactive or in a pixel that was left out.
@@ -153,8 +153,8 @@ class HeightSlicedSweeps:
             is_kept = _is_near_tall(image, pixel, grid)
             image.index_copy_(0, pixel, is_kept.byte())
             pixel = pixel.index_select(0, flat_nonzero(is_kept))
-        rank.scatter_(0, pixel, torch.arange(len(pixel), 0, -1, dtype=torch.int32, device=device))
-        pixel_of_point = len(pixel) - rank.index_select(0, index).long()
+        rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=device))
+        pixel_of_point = (rank.index_select(0, index).long() - 1).remainder_(len(pixel) + 1)
         pixels = _pixels(pixel, _slices(pixel_of_point, height_slice, len(pixel)), grid, batch.num_steps)
         _draw_neighbourhoods(image, pixels, grid)
         return cls(batch, grid, image, rank, pixels, pixel_of_point, pixel[:0])
@@ -179,8 +179,7 @@ class HeightSlicedSweeps:
         table = take_columns(self.pixels.table, pixel).add_(behind[:, None])
         pixels = Pixels(table, _slices(of_copy, height_slice, len(pixel)))
         _draw_neighbourhoods(self.image, pixels, self.grid)
-        pixels = Pixels(torch.cat((self.pixels.table, table), 1), torch.cat((self.pixels.slices, pixels.slices)))
-        rank = torch.arange(count + len(pixel), 0, -1, dtype=torch.int32, device=rows.device)
+        rank = torch.arange(count + 1, count + 1 + len(pixel), dtype=torch.int32, device=rows.device)
         none = self.pixel_of_point == count
         of_point = self.pixel_of_point.masked_fill(none, count + len(pixel))  # "none" is now a larger number
         return HeightSlicedSweeps(
@@ -188,7 +187,7 @@ class HeightSlicedSweeps:
             self.grid,
             self.image,
             self.rank.scatter_(0, pixels.index, rank),
-            pixels,
+            Pixels(torch.cat((self.pixels.table, table), 1), torch.cat((self.pixels.slices, pixels.slices))),
             torch.cat((of_point, of_copy + count)),
             rows,
         )
@@ -258,7 +257,8 @@ class HeightSlicedSweeps:
         shift = constant(shifts, torch.int64, pixel.device)
         index = table[0] + torch.add(shift[1], shift[0], alpha=self.grid.width)
         index = self.or_outside(index, table[3:] + shift[:, None])
-        return self.num_pixels - self.rank.index_select(0, index.view(-1)).view_as(index).long()
+        rank = self.rank.index_select(0, index.view(-1)).view_as(index).long()
+        return (rank - 1).remainder_(self.num_pixels + 1)
 
     def point(self, index: Tensor) -> Tensor:
         """Return the rows in the batch of some points or copies, (L,) int64, by their numbers below N + K."""

@@ -119,6 +119,6 @@ def deskew(
     table = torch.stack((pixel, window, step, *split_index(within, grid.width)))
     pixels = Pixels(table, torch.zeros_like(pixel, dtype=torch.uint8))  # slices are unused downstream
     rank = lazy_zeros(len(sweeps.rank), torch.int32, pixel.device)
-    rank.scatter_(0, pixel, torch.arange(len(pixel), 0, -1, dtype=torch.int32, device=pixel.device))
+    rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=pixel.device))
     drawn = replace(sweeps, pixels=pixels, rank=rank)
     return moved.take(moved.object_id == first), drawn

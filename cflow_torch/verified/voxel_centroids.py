@@ -111,10 +111,9 @@ class Voxels:
         position = ((points.position - corner) * UNITS).round_().clamp_(-_HIGHEST, _HIGHEST)
         centroid = torch.floor(scatter_count(voxel, len(key), position) / count)
         self.position = F.pad(centroid, (0, 1), value=_BEYOND)
-        # By the rank of a pixel, as in `HeightSlicedSweeps.rank`, and by the layer.
+        # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), len(key), device=key.device)
-        key = torch.add(self.layer, sweeps.num_pixels - self.pixel, alpha=num_slices)
-        self._of_key.scatter_(0, key, torch.arange(len(key), device=key.device))
+        self._of_key.scatter_(0, key + num_slices, torch.arange(len(key), device=key.device))
         self.time: Tensor | None = None
         if points.time is not None:
             self.time = scatter_count(voxel, len(key), points.time.double()) / count
