@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.dense.clustering import Clusters
-from cflow_torch.ops.indices import flat_nonzero, gather, renumber
+from cflow_torch.ops.indices import flat_nonzero, gather, renumber, split_index
 from cflow_torch.windows.collation import Batch
 
 
@@ -37,6 +37,7 @@ class TemplatePairs:
         source: (J,) int64, sweep of the template: 0 = t, 1 = t-1, ...
         size: (M, 2) int64, height and width of each cluster's box, and so of its images.
         radius: (J,) float64, pixels, longest shift that is searched; None = half the box.
+        pixel: (P,) int64, position of each pixel of the templates in the list of those of the clusters; None = unknown.
     """
 
     template: Images
@@ -45,6 +46,7 @@ class TemplatePairs:
     source: Tensor
     size: Tensor
     radius: Tensor | None = None
+    pixel: Tensor | None = None
 
 
 def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max_speed: float | None) -> TemplatePairs:
@@ -63,7 +65,7 @@ def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max
     older, newest = flat_nonzero(pixels.step > 0), flat_nonzero(pixels.step == 0)
     slot = (pixels.cluster * num_sources + pixels.step - 1).index_select(0, older)
     pairs = flat_nonzero(torch.zeros(num_slots, dtype=torch.bool, device=row.device).index_fill_(0, slot, True))
-    cluster, source = pairs // num_sources, pairs % num_sources
+    cluster, source = split_index(pairs, num_sources)
     radius = None
     if max_speed is not None:
         seconds = batch.seconds[clusters.window[cluster], source + 1]
@@ -76,4 +78,5 @@ def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max
         source,
         clusters.size,
         radius,
+        older,
     )

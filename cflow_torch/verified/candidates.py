@@ -126,6 +126,7 @@ class _NodeImages(NamedTuple):
         start: (N,) int64, where the images of each node begin in `image`.
         image: (I,) uint8, slices of the pixels of all images, one image after the other.
         pixels: the occupied pixels.
+        occupied: (Q,) int64, index of each of them into `image`.
     """
 
     block: Tensor
@@ -134,6 +135,7 @@ class _NodeImages(NamedTuple):
     start: Tensor
     image: Tensor
     pixels: ClusterPixels
+    occupied: Tensor
 
     @classmethod
     def of(cls, nodes: Nodes, blocks: Sequence[int], sweeps: HeightSlicedSweeps) -> _NodeImages:
@@ -155,7 +157,8 @@ class _NodeImages(NamedTuple):
         end = area.cumsum(0)
 
         # We draw the pixels to find those that coincide at their scale. Any one of those is kept.
-        table = torch.stack((end - area, block, *size.unbind(1), *first.unbind(1)))
+        begin = end - area
+        table = torch.stack((begin, block, *size.unbind(1), *first.unbind(1)))
         of_member = take_columns(table, node)
         start, side, height, width = of_member[:4]
         pixel = torch.div(members.row_col, side, rounding_mode="floor")
@@ -167,9 +170,10 @@ class _NodeImages(NamedTuple):
         image = lazy_zeros(total, torch.uint8, device).index_copy_(0, index, slices)
         member = torch.arange(len(node), dtype=torch.int32, device=device)
         member = lazy_empty(total, torch.int32, device).scatter_(0, index, member)
-        member = member.index_select(0, flat_nonzero(image)).long()
+        drawn = flat_nonzero(image)
+        member = member.index_select(0, drawn).long()
         pixels = ClusterPixels(*gather(member, node, members.step, *pixel))
-        return cls(block, first, size, end - area, image, pixels)
+        return cls(block, first, size, begin, image, pixels, drawn)
 
 
 def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tensor:
@@ -182,19 +186,19 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
         shift: (J, 2) int64, (dy, dx), of each peak.
     """
     is_moved = shift.any(1)
-    some = flat_nonzero(is_moved.index_select(0, pairs.template.image))
-    pair, row, col = gather(some, pairs.template.image, pairs.template.row, pairs.template.col)
+    template = pairs.template
+    assert pairs.pixel is not None
+    some = flat_nonzero(is_moved.index_select(0, template.image))
+    pair, row, col, pixel = gather(some, template.image, template.row, template.col, pairs.pixel)
     node = pairs.cluster.index_select(0, pair)
-    size, start = images.size.index_select(0, node).t(), images.start.index_select(0, node)
+    start, (height, width) = images.start.index_select(0, node), images.size.index_select(0, node).t()
     beside = constant(((0, -1, 1, 0, 0), (0, 0, 0, -1, 1)), torch.int64, shift.device)
     peak = torch.stack((row, col)) + shift.index_select(0, pair).t()
-    at = peak[:, :, None] + beside[:, None]  # (2, pixels, 5)
-    inside = torch.logical_and(*((at >= 0) & (at < size[:, :, None])))
-    height, width = size
-    index = (start[:, None] + at[0] * width[:, None] + at[1]).mul_(inside)
-    own = images.image.index_select(0, start + ((pairs.source.index_select(0, pair) + 1) * height + row) * width + col)
+    y, x = peak[:, None] + beside[..., None]  # (5, pixels)
+    inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+    index = (y * width).add_(x).add_(start).mul_(inside)
+    own = images.image.index_select(0, images.occupied.index_select(0, pixel))
     target = images.image.index_select(0, index.view(-1)).view_as(index)
-    meets = count_slices(own[:, None] & target) * inside
-    sums = scatter_count(pair, len(shift), meets.t())
+    sums = scatter_count(pair, len(shift), count_slices(own & target) * inside)
     # Counts before and after the peak: above and below it, then left and right of it.
     return (parabola_vertex(sums[1::2], sums[:1], sums[2::2]) * is_moved).t()
