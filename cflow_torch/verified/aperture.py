@@ -18,7 +18,7 @@ import math
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, gather, renumber, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, renumber, scatter_count, take_columns
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
@@ -131,18 +131,20 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     if name.numel() == 0:
         return torch.zeros_like(is_long)
     count = name.numel()
-    number = renumber(name, is_long.numel()).index_select(0, roots.flatten())
+    step, farthest = sweeps.pixels.step, sweeps.elapsed.abs().argmax(1)
+    is_compared = (step == 0) | (step == farthest.index_select(0, sweeps.pixels.window))
+    compared = flat_nonzero(is_compared)
+    number = renumber(name, is_long.numel()).index_select(0, take_columns(roots, compared).flatten())
     some = flat_nonzero(number < count)
-    pixels, component = sweeps.pixels.take(some % roots.shape[1]), number.index_select(0, some)
-    is_new = pixels.step == 0
+    pixels = sweeps.pixels.take(compared.index_select(0, some % len(compared)))
+    is_new, component = pixels.step == 0, number.index_select(0, some)
     num_slices = torch.where(is_new, count_slices(pixels.slices) - _TALL, 0)
     is_tall = scatter_count(component, count, num_slices) >= 0
 
-    # Ends in four directions, at t+1 and in the farthest sweep. Pixels of other sweeps go to an extra component.
-    is_farthest = pixels.step == sweeps.elapsed.abs().argmax(1).index_select(0, pixels.window)
-    of_sweep = torch.where(is_new, component, torch.where(is_farthest, component + count, 2 * count))
+    # Ends in four directions, at t+1 and in the farthest sweep.
+    of_sweep = torch.where(is_new, component, component + count)
     along = torch.stack((pixels.row, pixels.col, pixels.row + pixels.col, pixels.row - pixels.col)).double()
-    ends = segment_amin(torch.cat((along, -along)), of_sweep, 2 * count + 1, math.inf)[:, :-1]
+    ends = segment_amin(torch.cat((along, -along)), of_sweep, 2 * count, math.inf)
     low, high = ends.view(2, 4, 2, count)  # the high ends are negative
     metres = tuple(scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))
     unit = constant(metres, torch.float64, along.device)[:, None]

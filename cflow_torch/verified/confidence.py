@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lookup, scatter_count
@@ -122,32 +121,30 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 
     Cost: one lookup for each pixel of t, and nine for those that move.
     """
-    pixels, size, device = sweeps.pixels, sweeps.grid.pixel_size, margin.device
-    motion_of_pixel = lookup(rigid.pixels_per_interval(size), objects.of_pixel)
-    number, matched = _neighbourhood(sweeps, motion_of_pixel)
+    device, of_t = margin.device, flat_nonzero(sweeps.pixels.step == 1)
+    pixels, of_pixel = sweeps.pixels.take(of_t), objects.of_pixel.index_select(0, of_t)
+    motion = lookup(rigid.pixels_per_interval(sweeps.grid.pixel_size), of_pixel)
+    number, matched = _neighbourhood(sweeps, pixels, motion)
     crowd, share, bounds = (TABLE[name] for name in ("crowd", "share", "margin"))
     unlinked = 1 + _bin(number, crowd)
-    moves = motion_of_pixel.any(1)
+    moves = motion.any(1)
     tenths = constant(tuple(share), number.dtype, device)[:, None]
     static = 2 + len(crowd) + (10 * matched >= tenths * number).sum(0)
-    static.masked_fill_(_is_beside(sweeps, moves), 3 + len(crowd) + len(share))
+    around = sweeps.around(of_t.index_select(0, flat_nonzero(moves)), 1).view(-1)
+    is_beside = torch.zeros(sweeps.num_pixels + 1, dtype=torch.bool, device=device).index_fill_(0, around, True)
+    static.masked_fill_(is_beside.index_select(0, of_t), 3 + len(crowd) + len(share))
 
     y, x = sweeps.grid.centre(pixels.row_col)
     is_far = x * x + y * y >= float(TABLE["far"]) ** 2
     kind = 2 * sweeps.has_history.index_select(0, pixels.window) + is_far.long()
     first = 4 + len(crowd) + len(share)
-    moving = first + kind * (1 + len(bounds)) + lookup(_bin(margin, bounds), objects.of_pixel)
+    moving = first + kind * (1 + len(bounds)) + lookup(_bin(margin, bounds), of_pixel)
 
-    static = torch.where(objects.of_pixel == objects.count, unlinked, static)
+    static = torch.where(of_pixel == objects.count, unlinked, static)
     index = torch.where(moves, moving, static)
     probabilities = constant(tuple(TABLE["probabilities"]), torch.float32, device)
-    return torch.cat((probabilities.index_select(0, index), probabilities[:1]))
-
-
-def _is_beside(sweeps: HeightSlicedSweeps, moves: Tensor) -> Tensor:
-    """Return whether one of the 3 x 3 pixels around each pixel moves in the same sweep, (P,) bool, as `moves` is."""
-    around = sweeps.around(flat_nonzero(moves), 1).view(-1)
-    return F.pad(torch.zeros_like(moves), (0, 1)).index_fill_(0, around, True)[:-1]
+    left_out = probabilities[:1].repeat(sweeps.num_pixels + 1)
+    return left_out.index_copy_(0, of_t, probabilities.index_select(0, index))
 
 
 def _bin(values: Tensor, bounds: list[float]) -> Tensor:
@@ -155,27 +152,26 @@ def _bin(values: Tensor, bounds: list[float]) -> Tensor:
     return torch.bucketize(values, constant(tuple(bounds), values.dtype, values.device), right=True)
 
 
-def _neighbourhood(sweeps: HeightSlicedSweeps, motion: Tensor) -> tuple[Tensor, Tensor]:
+def _neighbourhood(sweeps: HeightSlicedSweeps, pixels: Pixels, motion: Tensor) -> tuple[Tensor, Tensor]:
     """Count the slices of t in the block around each pixel, and those of them that t+1 has at their target.
 
     Args:
-        sweeps: P pixels.
-        motion: (P, 2) float64, (y, x) finest pixels per interval.
+        sweeps: finest images.
+        pixels: all K pixels of t.
+        motion: (K, 2) float64, (y, x) finest pixels per interval.
 
     Returns:
-        (P,) int64 each.
+        (K,) int64 each.
     """
-    pixels, side = sweeps.pixels, max(1, round(_BLOCK / sweeps.grid.pixel_size))
+    side = max(1, round(_BLOCK / sweeps.grid.pixel_size))
     height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
     row, col = floor_divide(pixels.row_col, side)
     block = (pixels.window * height + row) * width + col
-    source = flat_nonzero(pixels.step == 1)
-    of_t, block_of_t = pixels.take(source), block.index_select(0, source)
-    elapsed = sweeps.elapsed[:, 1].index_select(0, of_t.window)
-    shift = (motion.index_select(0, source).t() * elapsed + 0.5).floor_().long()
+    elapsed = sweeps.elapsed[:, 1].index_select(0, pixels.window)
+    shift = (motion.t() * elapsed + 0.5).floor_().long()
     offset = torch.add(shift[1], shift[0], alpha=sweeps.grid.width) - sweeps.grid.height * sweeps.grid.width  # t+1
-    index = sweeps.or_outside(of_t.index + offset, of_t.table[3:] + shift)
-    matched = of_t.slices & sweeps.image.index_select(0, index)
-    both = count_slices(of_t.slices | matched << NUM_SLICES)
-    sums = scatter_count(block_of_t, sweeps.batch.num_windows * height * width, both).index_select(0, block)
+    index = sweeps.or_outside(pixels.index + offset, pixels.row_col + shift)
+    matched = pixels.slices & sweeps.image.index_select(0, index)
+    both = count_slices(pixels.slices | matched << NUM_SLICES)
+    sums = scatter_count(block, sweeps.batch.num_windows * height * width, both).index_select(0, block)
     return sums & 0xFFFFFFFF, sums >> 32
