@@ -19,7 +19,6 @@ from cflow_torch.ops.indices import (
     flat_nonzero,
     floor_divide,
     lazy_zeros,
-    lookup,
     occupied,
     split_index,
     take_columns,
@@ -260,10 +259,10 @@ class HeightSlicedSweeps:
         rank = self.rank.index_select(0, index.view(-1)).view_as(index).long()
         return (rank - 1).remainder_(self.num_pixels + 1)
 
-    def point(self, index: Tensor) -> Tensor:
-        """Return the rows in the batch of some points or copies, (L,) int64, by their numbers below N + K."""
-        num_points = self.batch.image.numel()
-        return torch.where(index < num_points, index, lookup(self.copied, (index - num_points).clamp_(min=0)))
+    @cached_property
+    def row_of_point(self) -> Tensor:
+        """(N + K,) int64, row in the batch of each point, then of each copy."""
+        return torch.cat((torch.arange(self.batch.image.numel(), device=self.copied.device), self.copied))
 
     @cached_property
     def lowest(self) -> Tensor:
@@ -290,9 +289,9 @@ def _slices(of_point: Tensor, height_slice: Tensor, num_pixels: int) -> Tensor:
     lanes = torch.zeros((num_pixels + 1) * NUM_SLICES, dtype=torch.bool, device=height_slice.device)
     lanes.index_fill_(0, torch.add(height_slice, of_point, alpha=NUM_SLICES), True)
     # A pixel is four bytes that are 0 or 1. Read as one number, these are its bits 0, 8, 16 and 24.
-    word = lanes.view(torch.int32)[:num_pixels]
-    word = word | (word >> 7)
-    return (word | (word >> 14)).bitwise_and_(OWN).to(torch.uint8)
+    # The product moves them to bits 24 ... 27; other terms are below or overflow, and no two of them meet.
+    word = lanes.view(torch.int32)[:num_pixels] * 0x01020408
+    return (word >> 24).bitwise_and_(OWN).to(torch.uint8)
 
 
 def _pixels(pixel: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels:

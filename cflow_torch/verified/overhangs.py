@@ -18,7 +18,6 @@ from cflow_torch.ops.indices import (
     constant,
     flat_nonzero,
     floor_divide,
-    gather,
     lazy_empty,
     lazy_zeros,
     lookup,
@@ -61,9 +60,7 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     level, num_own, num_points = components.num_levels - 2, sweeps.num_pixels, sweeps.batch.image.numel()
     may_move = components.may_move.index_select(0, components.roots[level])
     rows = flat_nonzero(lookup(may_move, sweeps.pixel_of_point))
-    component, num_names = _components_under(sweeps, rows)
-    under = flat_nonzero(component < num_names)
-    rows, component = gather(under, rows, component)
+    rows, component, num_names = _components_under(sweeps, rows)
     if len(rows) == 0:
         return sweeps, nodes
     sweeps = sweeps.with_copies(rows)
@@ -94,9 +91,9 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     )
 
 
-def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor, int]:
-    """Return the 3-D component of some points, (K,) int64, named by its first cell, and V. Points that are not in an
-    object on the ground under another component have V."""
+def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor, Tensor, int]:
+    """Select the points, (K,) int64, that are in an object on the ground under another component. Return them, the 3-D
+    component of each, named by its first cell, and the number of names."""
     batch, grid = sweeps.batch, sweeps.grid
     # With an empty margin all around, neighbours need no bounds check.
     num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 3 for axis in (1, 0))
@@ -129,18 +126,19 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
 
     column, height = split_index(cells, _NUM_SLICES)
     is_above = (height[1:] - height[:-1] >= _GAP) & (component[1:] != component[:-1]) & (column[1:] == column[:-1])
-    pair = flat_nonzero(is_above)
-    is_under = torch.zeros(count, dtype=torch.bool, device=rows.device)
-    is_under.index_fill_(0, component.index_select(0, pair), True)
-    is_under.index_fill_(0, component[1:].index_select(0, pair), False)  # it is above another one
+    is_under = torch.zeros(count + 1, dtype=torch.bool, device=rows.device)
+    is_under.index_fill_(0, torch.where(is_above, component[:-1], count), True)
+    is_under.index_fill_(0, torch.where(is_above, component[1:], count), False)  # it is above another one
     foot, top = segment_minmax(height, component, count)
     rise = segment_amin(
         height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, _NUM_SLICES
     )
     size = top - foot
     is_object = (rise <= _HIGHEST_FOOT) & (size >= _SMALLEST) & (size <= _LARGEST)
-    wanted = (is_under & is_object).index_select(0, component)
-    return torch.where(wanted, component, count).index_select(0, number.index_select(0, index).long()), count
+    is_wanted = is_occupied.index_copy_(0, cells, (is_under[:-1] & is_object).index_select(0, component))
+    under = flat_nonzero(is_wanted.index_select(0, index))
+    cell = number.index_select(0, index.index_select(0, under)).long()
+    return rows.index_select(0, under), component.index_select(0, cell), count
 
 
 @lru_cache(maxsize=64)

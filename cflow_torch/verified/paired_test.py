@@ -48,7 +48,7 @@ def verify(
         motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant with enough gain.
         evidence: (N,) int64, of that motion, sixteenths of a slice.
     """
-    tested = flat_nonzero((candidates != 0).any(2).any(1))  # other nodes are static and cost nothing
+    tested = flat_nonzero(candidates.flatten(1).any(1))  # other nodes are static and cost nothing
     node = renumber(tested, nodes.count).index_select(0, nodes.node)
     some = flat_nonzero(node < len(tested))
     members, node = sweeps.pixels.take(nodes.pixel.index_select(0, some)), node.index_select(0, some)

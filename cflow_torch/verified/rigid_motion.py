@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.model import Motion
-from cflow_torch.ops.indices import constant, flat_nonzero, index_in_group, lookup, take_columns
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, index_in_group, lookup, take_columns
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
@@ -105,9 +105,9 @@ def motion_by_pixel(
     ids = torch.empty_like(window).index_copy_(0, order, index_in_group(ordered))
     of_pixel = F.pad(objects.of_pixel, (0, 1), value=objects.count)
     is_moving = rigid.flow.any(1) | (rigid.rotation != 0)
-    slope = torch.zeros_like(rigid.flow)
+    slope, moving = torch.zeros_like(rigid.flow), flat_nonzero(is_moving)
     if sweeps.batch.ground is not None:
-        slope = sweeps.batch.ground.slopes(rigid.centre, window)
+        slope.index_copy_(0, moving, sweeps.batch.ground.slopes(*gather(moving, rigid.centre, window)))
     z = (slope * rigid.flow).sum(1, keepdim=True)
     rows = torch.cat((rigid.flow, z, rigid.rotation[:, None], rigid.centre, slope), 1)
     flow, rotation, centre, slope = lookup(rows, of_pixel).split((3, 1, 2, 2), 1)

@@ -81,8 +81,9 @@ def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> 
     counts = count_slices(torch.cat((ahead & ~behind, behind & ~ahead, own[None])))
     sums = scatter_count(of, objects.count, counts)
     a, b = sums[:-1].view(2, 4, -1)
-    far = (a - b) * (a - b) >= _BIAS_Z**2 * (a + b)
-    return (far & ((a - b).abs() >= _LEAST_BIAS * sums[-1])).any(0) & (sums[-1] > 0)
+    bias = (a - b).abs()
+    is_significant = bias * bias >= _BIAS_Z**2 * (a + b)
+    return (is_significant & (bias >= _LEAST_BIAS * sums[-1])).any(0) & (sums[-1] > 0)
 
 
 def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
@@ -108,7 +109,7 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
         sums = scatter_count(of, num_objects, torch.cat((weight[None], weight * error)))
         shift += (_STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # no weight is smaller
         shift.clamp_(-_FARTHEST, _FARTHEST)
-        weight, error = _meet(ahead - shift.index_select(1, of)[:, None], weights)
+        weight, error = _meet(ahead - take_columns(shift, of)[:, None], weights)
     gain = weight - unshifted
     gain, square, count = scatter_count(of, num_objects, torch.stack((gain, gain * gain, torch.ones_like(gain))))
     moves = (gain > _Z * square.sqrt()) & (gain >= _LEAST_GAIN * count) & (count >= _LEAST_CUBES)

@@ -70,7 +70,7 @@ def points_of_objects(
     """
     is_kept = lookup(wanted, objects.of_pixel) & (sweeps.elapsed_of_pixel.abs() <= most_time)
     points = flat_nonzero(lookup(is_kept, sweeps.pixel_of_point))
-    pixel, rows = sweeps.pixel_of_point.index_select(0, points), sweeps.point(points)
+    pixel, rows = gather(points, sweeps.pixel_of_point, sweeps.row_of_point)
     position = take_columns(sweeps.batch.positions, rows)
     layer = slice_of(position[2], slice_height, num_slices).long()
     times = sweeps.batch.point_times
