@@ -21,24 +21,15 @@ from cflow_torch.windows.validation import check_windows, choose_device
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of M clusters of points. Entry M means "no cluster": motion 0, id -1, score 0.
+    """Motion of M clusters of points. Entry M means "no cluster": motion 0, id -1, score 0."""
 
-    Args:
-        cluster_of_cell: (Q,) int32 or int64, cluster of each cell (a pixel of a sweep, or a point), M = none.
-        cell_of_point: (P,) int64, cell of each point; ignored points have a cell without a cluster.
-        flow: (M + 1, 3) float64, metres per sweep interval, axes of ego1.
-        cluster_id: (M + 1,) int64, counted from 0 in each window.
-        score: (M + 1,) float32.
-        confidence: (M + 1,) float32, see `FlowResult`; None = the method does not estimate it.
-        before: (A, P) float64, metres per sweep interval, flow of each point from coarser scales; None = no such scale.
-    """
-
-    cluster_of_cell: Tensor
-    cell_of_point: Tensor
-    flow: Tensor
-    cluster_id: Tensor
-    score: Tensor
-    confidence: Tensor | None = None
+    cluster_of_cell: Tensor  # (Q,) int32 or int64, cluster of each cell (a pixel of a sweep, or a point), M = none
+    cell_of_point: Tensor  # (P,) int64, cell of each point; ignored points have a cell without a cluster
+    flow: Tensor  # (M + 1, 3) float64, metres per sweep interval, axes of ego1
+    cluster_id: Tensor  # (M + 1,) int64, counted from 0 in each window
+    score: Tensor  # (M + 1,) float32
+    confidence: Tensor | None = None  # (M + 1,) float32, see `FlowResult`; None = the method does not estimate it
+    # (A, P) float64, metres per sweep interval, flow of each point from coarser scales; None = no such scale.
     before: Tensor | None = None
 
     def cluster(self, points: slice) -> Tensor:

@@ -30,23 +30,14 @@ _NND = (0.14, 4.4)  # metres from a point to the nearest of the next sweep: fast
 
 
 class DynamicPoints(NamedTuple):
-    """The M points of a sweep that move by its own flow.
+    """The M points of a sweep that move by its own flow."""
 
-    Args:
-        rows: (M,) int64.
-        positions: (M, 3) float64, metres, world.
-        velocity: (M, 3) float64, m/s, world.
-        group: (M,) int64 cluster_id.
-        confidence: (M,) float64.
-        seconds: time of the sweep.
-    """
-
-    rows: np.ndarray
-    positions: np.ndarray
-    velocity: np.ndarray
-    group: np.ndarray
-    confidence: np.ndarray
-    seconds: float
+    rows: np.ndarray  # (M,) int64
+    positions: np.ndarray  # (M, 3) float64, metres, world
+    velocity: np.ndarray  # (M, 3) float64, m/s, world
+    group: np.ndarray  # (M,) int64 cluster_id
+    confidence: np.ndarray  # (M,) float64
+    seconds: float  # time of the sweep
 
 
 def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", overwrite: bool = False) -> int:

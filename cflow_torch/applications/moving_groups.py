@@ -17,23 +17,15 @@ MIN_POINTS = 5  # of a group
 
 @dataclass(frozen=True)
 class MovingGroups:
-    """The M active points of a sweep, in the world, and its G moving groups.
+    """The M active points of a sweep, in the world, and its G moving groups."""
 
-    Args:
-        row: (M,) int64 rows of the sweep.
-        point, step: (M, 3) float64, position and residual flow, metres.
-        group: (M,) int64, -1 = static.
-        cluster, count: (G,) int64 cluster_id and number of points of each group.
-        confidence: (G,) float64 mean over its points, NaN where the method has none.
-    """
-
-    row: Tensor
-    point: Tensor
-    step: Tensor
-    group: Tensor
-    cluster: Tensor
-    count: Tensor
-    confidence: Tensor
+    row: Tensor  # (M,) int64 rows of the sweep
+    point: Tensor  # (M, 3) float64 position, metres
+    step: Tensor  # (M, 3) float64 residual flow, metres
+    group: Tensor  # (M,) int64, -1 = static
+    cluster: Tensor  # (G,) int64 cluster_id of each group
+    count: Tensor  # (G,) int64 number of points of each group
+    confidence: Tensor  # (G,) float64 mean over its points, NaN where the method has none
 
     @classmethod
     def of(cls, sweeps: Window, result: FlowResult) -> MovingGroups:

@@ -24,15 +24,11 @@ class States:
     """States of K objects in a constant-velocity Kalman filter.
 
     The noise is equal along all axes, so one 2x2 covariance of (position, velocity) serves all three.
-
-    Args:
-        position, velocity: (K, 3) float64, metres and m/s in the world.
-        covariance: (K, 2, 2) float64 of (position, velocity), for each axis.
     """
 
-    position: Tensor
-    velocity: Tensor
-    covariance: Tensor
+    position: Tensor  # (K, 3) float64, metres in the world
+    velocity: Tensor  # (K, 3) float64, m/s in the world
+    covariance: Tensor  # (K, 2, 2) float64 of (position, velocity), for each axis
 
     def predict(self, seconds: float, acceleration: float) -> States:
         """States after `seconds`, in which each object has a constant random acceleration of the given standard

@@ -21,18 +21,12 @@ _MARGIN = (0.2, 0.2, 0.0)
 
 @dataclass(frozen=True)
 class Boxes:
-    """The K oriented boxes of one sweep.
+    """The K oriented boxes of one sweep."""
 
-    Args:
-        track_id: K names; an object keeps its name over time, and no name occurs twice.
-        category: (K,) uint8, Argoverse 2 index.
-        size: (K, 3) float64, metres: length (x), width (y), height (z).
-        pose: (K, 4, 4) float64 `T_ego_box`, box coordinates (origin at the centre) to the ego frame of the sweep.
-    """
-
-    track_id: Sequence[str]
-    category: np.ndarray
-    size: np.ndarray
+    track_id: Sequence[str]  # K names; an object keeps its name over time, and no name occurs twice
+    category: np.ndarray  # (K,) uint8, Argoverse 2 index
+    size: np.ndarray  # (K, 3) float64, metres: length (x), width (y), height (z)
+    # (K, 4, 4) float64 `T_ego_box`, box coordinates (origin at the centre) to the ego frame of the sweep.
     pose: np.ndarray
 
     def __post_init__(self) -> None:

@@ -24,19 +24,13 @@ GROUND_RULES: dict[str, tuple[float, Callable[[np.ndarray], Any]]] = {
 class GroundRaster:
     """Ground height on a grid of the city.
 
-    Args:
-        heights: (H, W) float64, metres, row from y, column from x; NaN = unknown.
-        rotation: (2, 2) float64.
-        translation: (2,) float64.
-        scale: cells per metre. The grid position of a city point is scale * (rotation @ xy + translation).
-
     Source: layout of the Argoverse 2 map folder, `*_ground_height_surface____*.npy` and `*___img_Sim2_city.json`.
     """
 
-    heights: np.ndarray
-    rotation: np.ndarray
-    translation: np.ndarray
-    scale: float
+    heights: np.ndarray  # (H, W) float64, metres, row from y, column from x; NaN = unknown
+    rotation: np.ndarray  # (2, 2) float64
+    translation: np.ndarray  # (2,) float64
+    scale: float  # cells per metre. The grid position of a city point is scale * (rotation @ xy + translation).
 
     def is_ground(self, points: np.ndarray, rule: str = "av2-api") -> np.ndarray:
         """Tell which of the (N, 3) points, metres in the CITY frame, lie on or below the ground.

@@ -18,35 +18,22 @@ from cflow_torch.ops.segments import segment_minmax
 
 @dataclass(frozen=True)
 class Pixels:
-    """Occupied pixels of clusters, one entry per pixel and sweep.
+    """Occupied pixels of clusters, one entry per pixel and sweep."""
 
-    Args:
-        cluster: (P,) int64.
-        step: (P,) int64, sweep that occupies the pixel: 0 = t+1, 1 = t, ...
-        row, col: (P,) int64, in the image of the window.
-    """
-
-    cluster: Tensor
-    step: Tensor
-    row: Tensor
-    col: Tensor
+    cluster: Tensor  # (P,) int64
+    step: Tensor  # (P,) int64, sweep that occupies the pixel: 0 = t+1, 1 = t, ...
+    row: Tensor  # (P,) int64, in the image of the window
+    col: Tensor  # (P,) int64, in the image of the window
 
 
 @dataclass(frozen=True)
 class Clusters:
-    """Clusters that have pixels at t+1 and before, in order of window, then of first pixel in raster order.
+    """Clusters that have pixels at t+1 and before, in order of window, then of first pixel in raster order."""
 
-    Args:
-        window: (M,) int64, window of each cluster, ascending.
-        first: (M, 2) int64, top-left (row, col) of the bounding box over all sweeps.
-        size: (M, 2) int64, height and width of the box.
-        pixels: all occupied pixels of the clusters.
-    """
-
-    window: Tensor
-    first: Tensor
-    size: Tensor
-    pixels: Pixels
+    window: Tensor  # (M,) int64, window of each cluster, ascending
+    first: Tensor  # (M, 2) int64, top-left (row, col) of the bounding box over all sweeps
+    size: Tensor  # (M, 2) int64, height and width of the box
+    pixels: Pixels  # all occupied pixels of the clusters
 
 
 def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Clusters, Tensor, Tensor]:

@@ -17,18 +17,12 @@ from cflow_torch.ops.segments import first_of_segment, segment_minmax
 
 @dataclass(frozen=True)
 class PixelIndices:
-    """Set pixels of padded images.
+    """Set pixels of padded images."""
 
-    Args:
-        pixel: (P,) int64, flat index into the padded images.
-        padded_row: (P,) int64, row of the padded images, counted through all of them.
-        row, col: (P,) int64, row and column in the image.
-    """
-
-    pixel: Tensor
-    padded_row: Tensor
-    row: Tensor
-    col: Tensor
+    pixel: Tensor  # (P,) int64, flat index into the padded images
+    padded_row: Tensor  # (P,) int64, row of the padded images, counted through all of them
+    row: Tensor  # (P,) int64, row in the image
+    col: Tensor  # (P,) int64, column in the image
 
 
 def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: ClusteringConfig) -> Tensor:

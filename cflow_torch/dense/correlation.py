@@ -30,19 +30,12 @@ _PER_CALL_GPU, _PER_RUN_GPU = 1 << 26, 1 << 26
 
 @dataclass(frozen=True)
 class Estimates:
-    """Motion of M clusters as estimated from each of K earlier sweeps, nearest sweep first.
+    """Motion of M clusters as estimated from each of K earlier sweeps, nearest sweep first."""
 
-    Args:
-        displacement: (M, K, 3) float64, metres m -> t+1.
-        score: (M, K) float32, NCC at the peak.
-        available: (M, K) bool, False = the cluster has no pixel in that sweep; displacement and score are 0 there.
-        intervals: (M, K) float64, sweep intervals from m to t+1.
-    """
-
-    displacement: Tensor
-    score: Tensor
-    available: Tensor
-    intervals: Tensor
+    displacement: Tensor  # (M, K, 3) float64, metres m -> t+1
+    score: Tensor  # (M, K) float32, NCC at the peak
+    available: Tensor  # (M, K) bool, False = the cluster has no pixel in that sweep; displacement and score are 0 there
+    intervals: Tensor  # (M, K) float64, sweep intervals from m to t+1
 
     def per_interval(self) -> Tensor:
         """(M, K, 3) float64, metres per sweep interval."""
@@ -122,17 +115,11 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
 
 
 class _Run(NamedTuple):
-    """Correlation counts of consecutive packed pairs.
+    """Correlation counts of consecutive packed pairs."""
 
-    Args:
-        pairs: the packed pairs.
-        counts: (A,) float, counts of all pairs, one pair after the other; the next run overwrites them.
-        pieces: views of the counts, (pairs, searched samples), one for each call of the correlation.
-    """
-
-    pairs: slice
-    counts: Tensor
-    pieces: list[Tensor]
+    pairs: slice  # the packed pairs
+    counts: Tensor  # (A,) float, counts of all pairs, one pair after the other; the next run overwrites them
+    pieces: list[Tensor]  # views of the counts, (pairs, searched samples), one for each call of the correlation
 
 
 def _correlation_runs(packing: Packing, engine: str, max_memory: float | None) -> Iterator[_Run]:

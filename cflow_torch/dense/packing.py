@@ -30,17 +30,12 @@ _BASE = 1 << 24
 
 @dataclass(frozen=True)
 class Search:
-    """Search range of each of K images: dy in [-low_y, high_y], dx in [-low_x, high_x].
+    """Search range of each of K images: dy in [-low_y, high_y], dx in [-low_x, high_x]."""
 
-    Args:
-        low, high: (2, K) int64, (y, x).
-        stride: (K,) int64, samples from one row of the image to the next, and so from one dy to the next.
-        searched: (K,) int64, number of leading samples that hold the search range; equal for all images of a class.
-    """
-
-    low: Tensor
-    high: Tensor
-    stride: Tensor
+    low: Tensor  # (2, K) int64, (y, x)
+    high: Tensor  # (2, K) int64, (y, x)
+    stride: Tensor  # (K,) int64, samples from one row of the image to the next, and so from one dy to the next
+    # (K,) int64, number of leading samples that hold the search range; equal for all images of a class.
     searched: Tensor
 
     def shift(self, sample: Tensor) -> Tensor:
@@ -50,21 +45,14 @@ class Search:
 
 
 class SizeClass(NamedTuple):
-    """Images of one shape.
+    """Images of one shape."""
 
-    Args:
-        templates, targets: number of templates and of targets.
-        height, width: Y, X, size of an image in samples.
-        searched: number of leading samples that hold the search range.
-        max_energy: largest number of set pixels of an image.
-    """
-
-    templates: int
-    targets: int
-    height: int
-    width: int
-    searched: int
-    max_energy: int
+    templates: int  # number of templates
+    targets: int  # number of targets
+    height: int  # Y, rows of an image in samples
+    width: int  # X, columns of an image in samples
+    searched: int  # number of leading samples that hold the search range
+    max_energy: int  # largest number of set pixels of an image
 
     @property
     def area(self) -> int:
@@ -74,29 +62,17 @@ class SizeClass(NamedTuple):
 
 @dataclass(frozen=True)
 class Packing:
-    """Templates and targets in the shape of their class, class after class, templates before targets.
+    """Templates and targets in the shape of their class, class after class, templates before targets."""
 
-    Args:
-        samples: (A,) bool, all images.
-        classes: size classes, in order.
-        target: (J,) int64, target of each packed pair, counted through the targets of its class.
-        target_on_host: `target` as a NumPy array.
-        search: search range of each packed pair.
-        pairs: (J,) int64, index of each packed pair among the pairs given.
-        clusters: (J,) int64, target of each packed pair, counted through the targets given.
-        energy: (J + N,) int64, set pixels of all templates, then of all targets, in the order given.
-        size: (N, 2) int64, height and width of all targets, as an array.
-    """
-
-    samples: Tensor
-    classes: list[SizeClass]
-    target: Tensor
-    target_on_host: np.ndarray
-    search: Search
-    pairs: Tensor
-    clusters: Tensor
-    energy: Tensor
-    size: np.ndarray
+    samples: Tensor  # (A,) bool, all images
+    classes: list[SizeClass]  # size classes, in order
+    target: Tensor  # (J,) int64, target of each packed pair, counted through the targets of its class
+    target_on_host: np.ndarray  # `target` as a NumPy array
+    search: Search  # search range of each packed pair
+    pairs: Tensor  # (J,) int64, index of each packed pair among the pairs given
+    clusters: Tensor  # (J,) int64, target of each packed pair, counted through the targets given
+    energy: Tensor  # (J + N,) int64, set pixels of all templates, then of all targets, in the order given
+    size: np.ndarray  # (N, 2) int64, height and width of all targets, as an array
 
 
 def pack(pairs: TemplatePairs) -> Packing:

@@ -14,21 +14,14 @@ from cflow_torch.windows.collation import Batch
 
 @dataclass(frozen=True)
 class ProjectedSweeps:
-    """Occupancy images of all sweeps of all windows.
+    """Occupancy images of all sweeps of all windows."""
 
-    Args:
-        batch: points of all windows.
-        grid: pixels of the bird's-eye view.
-        flow: (A, P) float64, metres per sweep interval, flow so far of every point before t+1. None = no flow yet.
-        occupancy: (B, S, H, W) bool; index 0 of S is sweep t+1.
-        pixel: (P,) int64, flat index into `occupancy`; its size for ignored points.
-    """
-
-    batch: Batch
-    grid: Grid
+    batch: Batch  # points of all windows
+    grid: Grid  # pixels of the bird's-eye view
+    # (A, P) float64, metres per sweep interval, flow so far of every point before t+1. None = no flow yet.
     flow: Tensor | None
-    occupancy: Tensor
-    pixel: Tensor
+    occupancy: Tensor  # (B, S, H, W) bool; index 0 of S is sweep t+1
+    pixel: Tensor  # (P,) int64, flat index into `occupancy`; its size for ignored points
 
     def positions(self) -> Tensor:
         """(A, P) float64, metres, frame of t+1: the warped positions of all points."""

@@ -14,39 +14,25 @@ from cflow_torch.windows.collation import Batch
 
 @dataclass(frozen=True)
 class Images:
-    """A set of small binary images, given by their set pixels.
+    """A set of small binary images, given by their set pixels."""
 
-    Args:
-        image: (P,) int64, image of each pixel.
-        row, col: (P,) int64, in the image, from 0.
-    """
-
-    image: Tensor
-    row: Tensor
-    col: Tensor
+    image: Tensor  # (P,) int64, image of each pixel
+    row: Tensor  # (P,) int64, in the image, from 0
+    col: Tensor  # (P,) int64, in the image, from 0
 
 
 @dataclass(frozen=True)
 class TemplatePairs:
-    """J pairs of a template and its target, in order of cluster, then of sweep, nearest sweep first.
+    """J pairs of a template and its target, in order of cluster, then of sweep, nearest sweep first."""
 
-    Args:
-        template: J images, a cluster in an earlier sweep; rows and columns count from the corner of the cluster's box.
-        target: M images, each cluster at t+1; rows and columns count from the same corner.
-        cluster: (J,) int64, cluster of each pair, which is also its target.
-        source: (J,) int64, sweep of the template: 0 = t, 1 = t-1, ...
-        size: (M, 2) int64, height and width of each cluster's box, and so of its images.
-        radius: (J,) float64, pixels, longest shift that is searched; None = half the box.
-        pixel: (P,) int64, position of each pixel of the templates in the list of those of the clusters; None = unknown.
-    """
-
+    # J images, a cluster in an earlier sweep; rows and columns count from the corner of the cluster's box.
     template: Images
-    target: Images
-    cluster: Tensor
-    source: Tensor
-    size: Tensor
-    radius: Tensor | None = None
-    pixel: Tensor | None = None
+    target: Images  # M images, each cluster at t+1; rows and columns count from the same corner
+    cluster: Tensor  # (J,) int64, cluster of each pair, which is also its target
+    source: Tensor  # (J,) int64, sweep of the template: 0 = t, 1 = t-1, ...
+    size: Tensor  # (M, 2) int64, height and width of each cluster's box, and so of its images
+    radius: Tensor | None = None  # (J,) float64, pixels, longest shift that is searched; None = half the box
+    pixel: Tensor | None = None  # (P,) int64, number of each pixel of the templates in the clusters; None = unknown
 
 
 def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max_speed: float | None) -> TemplatePairs:

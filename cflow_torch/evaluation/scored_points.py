@@ -16,35 +16,21 @@ CLOSE_RANGE = 35.0  # metres, half side of the square that Argoverse 2 calls "cl
 
 @dataclass(frozen=True)
 class ScoredPoints:
-    """The M scored points of one frame.
+    """The M scored points of one frame."""
 
-    Args:
-        error: (M,) float64, metres, length of predicted minus true residual.
-        speed: (M,) float64, metres per frame, length of the true residual.
-        category: (M,) int64, Argoverse 2 index.
-        in_region: (M,) bool, inside the region of the definition.
-        reach: (M,) float64, metres, distance by which regions are measured: max(|x|, |y|) for a box, else the radius.
-        is_close: (M,) bool, inside the 70 m x 70 m square around the ego at t.
-        distance: (M,) float64, metres, from the origin at t, including height.
-        true_flow: (M, 3) float64, metres, true flow that the three-way scores compare.
-        predicted_flow: (M, 3) float64, metres, predicted flow that the three-way scores compare.
-        is_dynamic: (M,) bool, whether the true residual reaches the dynamic threshold.
-        predicted_dynamic: (M,) bool, whether the predicted residual does.
-        num_nan: number of points that are ignored because of NaN.
-    """
-
-    error: np.ndarray
-    speed: np.ndarray
-    category: np.ndarray
-    in_region: np.ndarray
+    error: np.ndarray  # (M,) float64, metres, length of predicted minus true residual
+    speed: np.ndarray  # (M,) float64, metres per frame, length of the true residual
+    category: np.ndarray  # (M,) int64, Argoverse 2 index
+    in_region: np.ndarray  # (M,) bool, inside the region of the definition
+    # (M,) float64, metres, distance by which regions are measured: max(|x|, |y|) for a box, else the radius.
     reach: np.ndarray
-    is_close: np.ndarray
-    distance: np.ndarray
-    true_flow: np.ndarray
-    predicted_flow: np.ndarray
-    is_dynamic: np.ndarray
-    predicted_dynamic: np.ndarray
-    num_nan: int
+    is_close: np.ndarray  # (M,) bool, inside the 70 m x 70 m square around the ego at t
+    distance: np.ndarray  # (M,) float64, metres, from the origin at t, including height
+    true_flow: np.ndarray  # (M, 3) float64, metres, true flow that the three-way scores compare
+    predicted_flow: np.ndarray  # (M, 3) float64, metres, predicted flow that the three-way scores compare
+    is_dynamic: np.ndarray  # (M,) bool, whether the true residual reaches the dynamic threshold
+    predicted_dynamic: np.ndarray  # (M,) bool, whether the predicted residual does
+    num_nan: int  # number of points that are ignored because of NaN
 
 
 def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:

@@ -18,48 +18,28 @@ _UNITS_PER_WORKER = 2
 
 @dataclass(frozen=True)
 class Job:
-    """The description of a run that every worker gets, without its units.
+    """The description of a run that every worker gets, without its units."""
 
-    Args:
-        config: settings of the method.
-        identity: hash of method, data settings and versions, see `cflow_torch.fleet.manifest`.
-        reader: data set, a key of `catalog.DATA_SETS`.
-        settings: of its reader.
-        output: folder of the results; a path, or the address of an object store.
-        contents: of a flow file, names of `flow_file.CONTENTS` and `ON_REQUEST`.
-        batch: windows that are computed together.
-        redo: compute frames that exist already.
-    """
-
-    config: Config
-    identity: str
-    reader: str
-    settings: dict[str, Any]
-    output: str
-    contents: tuple[str, ...] = CONTENTS
-    batch: int = 1
-    redo: bool = False
+    config: Config  # settings of the method
+    identity: str  # hash of method, data settings and versions, see `cflow_torch.fleet.manifest`
+    reader: str  # data set, a key of `catalog.DATA_SETS`
+    settings: dict[str, Any]  # of its reader
+    output: str  # folder of the results; a path, or the address of an object store
+    contents: tuple[str, ...] = CONTENTS  # of a flow file, names of `flow_file.CONTENTS` and `ON_REQUEST`
+    batch: int = 1  # windows that are computed together
+    redo: bool = False  # compute frames that exist already
 
 
 @dataclass(frozen=True)
 class Unit:
-    """Consecutive frames of one log: the work that a worker gets at once.
+    """Consecutive frames of one log: the work that a worker gets at once."""
 
-    Args:
-        number: index among the units of a run.
-        source: one of `catalog.find_sources`.
-        first: share of the log's pairs before the first frame, 0 ... 1.
-        last: share before the end.
-        only: time stamps of the frames to do; None = all of them.
-        deaths: number of workers that have died on it.
-    """
-
-    number: int
-    source: Any
-    first: Fraction = Fraction(0)
-    last: Fraction = Fraction(1)
-    only: frozenset[int] | None = None
-    deaths: int = 0
+    number: int  # index among the units of a run
+    source: Any  # one of `catalog.find_sources`
+    first: Fraction = Fraction(0)  # share of the log's pairs before the first frame, 0 ... 1
+    last: Fraction = Fraction(1)  # share before the end
+    only: frozenset[int] | None = None  # time stamps of the frames to do; None = all of them
+    deaths: int = 0  # number of workers that have died on it
 
     def frames(self, num_pairs: int) -> range:
         """Indices of the sweeps t, in a log of `num_pairs` pairs."""

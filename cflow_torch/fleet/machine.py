@@ -24,15 +24,10 @@ CPU_BATCH, GPU_BATCH = 4, 32
 
 @dataclass(frozen=True)
 class Layout:
-    """The use of a machine by a run.
+    """The use of a machine by a run."""
 
-    Args:
-        devices: one per worker.
-        batch: windows that are computed together.
-    """
-
-    devices: tuple[str, ...]
-    batch: int
+    devices: tuple[str, ...]  # one per worker
+    batch: int  # windows that are computed together
 
 
 def frames_per_worker(config: Config) -> int:

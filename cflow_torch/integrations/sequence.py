@@ -26,21 +26,14 @@ from cflow_torch.windows.validation import read_positions
 
 @dataclass(frozen=True)
 class Frame:
-    """One sweep of a sequence.
+    """One sweep of a sequence."""
 
-    Args:
-        points: (N, 3) float, metres, in the frame of the sensor.
-        is_active: (N,) bool, False = ground, or outside the range of the data set.
-        sensor_to_ego: (4, 4) float64, `T_ego_sensor` of this sweep.
-        ego_to_global: (4, 4) float64, `T_global_ego`; "global" is any frame that all sweeps of a sequence share.
-        timestamp_ns: nanoseconds, None = unknown.
-    """
-
-    points: Array
-    is_active: Array
-    sensor_to_ego: np.ndarray
+    points: Array  # (N, 3) float, metres, in the frame of the sensor
+    is_active: Array  # (N,) bool, False = ground, or outside the range of the data set
+    sensor_to_ego: np.ndarray  # (4, 4) float64, `T_ego_sensor` of this sweep
+    # (4, 4) float64, `T_global_ego`; "global" is any frame that all sweeps of a sequence share.
     ego_to_global: np.ndarray
-    timestamp_ns: int | None = None
+    timestamp_ns: int | None = None  # nanoseconds, None = unknown
 
     def ego_points(self) -> Array:
         """Return (N, 3) points in the ego frame of this sweep, float64 if the sensor has a frame of its own."""

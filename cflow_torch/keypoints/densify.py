@@ -19,21 +19,13 @@ from cflow_torch.ops.segments import segment_median
 
 @dataclass(frozen=True)
 class DenseShift:
-    """Groups of pixels with a common shift, in order of window, then of first pixel (or key point) in raster order.
+    """Groups of pixels with a common shift, in order of window, then of first pixel (or key point) in raster order."""
 
-    Args:
-        pixel: (P,) int64, flat indices of the occupied pixels, ascending.
-        group: (P,) int64, group of each pixel, G = none.
-        shift: (G, 2) float64, (dy, dx) pixels; 0 for a group without a match.
-        id_in_window: (G,) int64, index of each group among those of its window.
-        score: (G,) float64, NCC; 0 for a group without a match.
-    """
-
-    pixel: Tensor
-    group: Tensor
-    shift: Tensor
-    id_in_window: Tensor
-    score: Tensor
+    pixel: Tensor  # (P,) int64, flat indices of the occupied pixels, ascending
+    group: Tensor  # (P,) int64, group of each pixel, G = none
+    shift: Tensor  # (G, 2) float64, (dy, dx) pixels; 0 for a group without a match
+    id_in_window: Tensor  # (G,) int64, index of each group among those of its window
+    score: Tensor  # (G,) float64, NCC; 0 for a group without a match
 
 
 def densify(

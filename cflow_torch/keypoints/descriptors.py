@@ -13,21 +13,14 @@ from cflow_torch.ops.patches import gather_patches
 
 @dataclass(frozen=True)
 class KeyPoints:
-    """Key points of one sweep of every window, in order of window, row and column.
+    """Key points of one sweep of every window, in order of window, row and column."""
 
-    Args:
-        pixel: (K,) int64, flat indices into the images, ascending.
-        window, row, col: (K,) int64, the window and the row and column in its image.
-        patch: (K, L * L) uint8, zeros and ones.
-        energy: (K,) int64, number of ones, at least 1.
-    """
-
-    pixel: Tensor
-    window: Tensor
-    row: Tensor
-    col: Tensor
-    patch: Tensor
-    energy: Tensor
+    pixel: Tensor  # (K,) int64, flat indices into the images, ascending
+    window: Tensor  # (K,) int64
+    row: Tensor  # (K,) int64, row in the image of the window
+    col: Tensor  # (K,) int64, column in the image of the window
+    patch: Tensor  # (K, L * L) uint8, zeros and ones
+    energy: Tensor  # (K,) int64, number of ones, at least 1
 
 
 def detect(occupancy: Tensor) -> Tensor:

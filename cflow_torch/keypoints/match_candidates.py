@@ -46,20 +46,13 @@ def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Te
 
 @dataclass(frozen=True)
 class Pairing:
-    """Groups of key points and their match candidates, in order of falling number of candidates.
+    """Groups of key points and their match candidates, in order of falling number of candidates."""
 
-    Args:
-        member: (G, S) int64, key points of each group, padded with the number of key points.
-        candidate: (C,) int64, candidates of all groups, one group after the other.
-        first, count: (G,) int64, the range of `candidate` that belongs to each group.
-        limit: (G,) int32, largest squared distance of a match, pixels.
-    """
-
-    member: Tensor
-    candidate: Tensor
-    first: Tensor
-    count: Tensor
-    limit: Tensor
+    member: Tensor  # (G, S) int64, key points of each group, padded with the number of key points
+    candidate: Tensor  # (C,) int64, candidates of all groups, one group after the other
+    first: Tensor  # (G,) int64, start of the range of `candidate` that belongs to each group
+    count: Tensor  # (G,) int64, length of that range
+    limit: Tensor  # (G,) int32, largest squared distance of a match, pixels
 
 
 def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:

@@ -36,17 +36,11 @@ _CONTENDERS_AT_ONCE = 1 << 22
 
 @dataclass(frozen=True)
 class Matches:
-    """Accepted matches, in order of the key points of t.
+    """Accepted matches, in order of the key points of t."""
 
-    Args:
-        source: (M,) int64, key point of t.
-        shift: (M, 2) int64, (dy, dx) pixels to the key point of t+1.
-        score: (M,) float64, NCC of the two descriptors (Eq. descriptor_ncc).
-    """
-
-    source: Tensor
-    shift: Tensor
-    score: Tensor
+    source: Tensor  # (M,) int64, key point of t
+    shift: Tensor  # (M, 2) int64, (dy, dx) pixels to the key point of t+1
+    score: Tensor  # (M,) float64, NCC of the two descriptors (Eq. descriptor_ncc)
 
 
 def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> Matches:

@@ -17,31 +17,18 @@ MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
 
 @dataclass(frozen=True)
 class Scene:
-    """One pair, without points at infinity.
+    """One pair, without points at infinity."""
 
-    Args:
-        index: of sweep t.
-        timestamp_ns: of sweep t, None = unknown.
-        interval: seconds from t to t+1.
-        position: (N, 3) float64, metres, points of t in the ego frame of t+1: moved by the ego motion only.
-        residual: (N, 3) float64, metres per sweep.
-        truth: (N, 3) float64, true residual flow, NaN where unknown; None = the pair has no labels.
-        cluster: (N,) int64, -1 = none.
-        confidence: (N,) float64, or None.
-        is_ground: (N,) bool.
-        pose: (4, 4) float64 `T_world_ego` of t+1, or None.
-    """
-
-    index: int
-    timestamp_ns: int | None
-    interval: float
-    position: np.ndarray
-    residual: np.ndarray
-    truth: np.ndarray | None
-    cluster: np.ndarray
-    confidence: np.ndarray | None
-    is_ground: np.ndarray
-    pose: np.ndarray | None
+    index: int  # of sweep t
+    timestamp_ns: int | None  # of sweep t, None = unknown
+    interval: float  # seconds from t to t+1
+    position: np.ndarray  # (N, 3) float64, metres, points of t in the ego frame of t+1: moved by the ego motion only
+    residual: np.ndarray  # (N, 3) float64, metres per sweep
+    truth: np.ndarray | None  # (N, 3) float64, true residual flow, NaN where unknown; None = the pair has no labels
+    cluster: np.ndarray  # (N,) int64, -1 = none
+    confidence: np.ndarray | None  # (N,) float64, or None
+    is_ground: np.ndarray  # (N,) bool
+    pose: np.ndarray | None  # (4, 4) float64 `T_world_ego` of t+1, or None
 
     @classmethod
     def of(cls, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> Scene:

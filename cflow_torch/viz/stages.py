@@ -38,18 +38,12 @@ COLORS = {"sweep t": (79, 134, 217), "sweep t+1": (232, 96, 76), "both": (43, 33
 
 @dataclass(frozen=True)
 class Occupancy:
-    """Occupancy images of a pair of sweeps from above.
+    """Occupancy images of a pair of sweeps from above."""
 
-    Args:
-        t, t1: (H, W) bool, sweep t moved by the flow so far, and sweep t+1; row from y, column from x.
-        lower: (2,) float64, metres, corner (x, y) of pixel (0, 0), frame of t+1.
-        pixel_size: metres.
-    """
-
-    t: np.ndarray
-    t1: np.ndarray
-    lower: np.ndarray
-    pixel_size: float
+    t: np.ndarray  # (H, W) bool, sweep t moved by the flow so far; row from y, column from x
+    t1: np.ndarray  # (H, W) bool, sweep t+1
+    lower: np.ndarray  # (2,) float64, metres, corner (x, y) of pixel (0, 0), frame of t+1
+    pixel_size: float  # metres
 
     def rgb(self, fade: float = 0.0) -> np.ndarray:
         """(H, W, 3) uint8 RGB; white where neither sweep has a point."""
@@ -73,15 +67,10 @@ class Occupancy:
 
 @dataclass(frozen=True)
 class Scale:
-    """One scale of a coarse-to-fine run.
+    """One scale of a coarse-to-fine run."""
 
-    Args:
-        sweeps: the input of this scale: the one window, warped by the flow of the coarser scales.
-        flow: (N, 3) float64, residual flow of the rows of pc0 after this scale, metres per sweep interval.
-    """
-
-    sweeps: ProjectedSweeps
-    flow: np.ndarray
+    sweeps: ProjectedSweeps  # the input of this scale: the one window, warped by the flow of the coarser scales
+    flow: np.ndarray  # (N, 3) float64, residual flow of the rows of pc0 after this scale, metres per sweep interval
 
     def seen(self) -> Occupancy:
         """The input of this scale: sweep t is moved by the flow of the coarser scales."""
@@ -97,40 +86,26 @@ class Scale:
 
 @dataclass(frozen=True)
 class ClusterCorrelation:
-    """Normalised cross-correlation of one cluster between t and t+1, at the finest scale (Eq. norm_correlation).
+    """Normalised cross-correlation of one cluster between t and t+1, at the finest scale (Eq. norm_correlation)."""
 
-    Args:
-        cluster_id: as in `FlowResult`.
-        images: template (t) and target (t+1): the pixels of the cluster in its box.
-        ncc: (H, W) float64 of each shift (dy, dx) at [dy + H // 2, dx + W // 2], 0 ... 1; NaN = not searched.
-        shift: (2,) int64, (dy, dx) that the method chooses, pixels.
-        score: NCC at that shift.
-        flow: (3,) float64, residual flow of the cluster, metres per sweep interval: the shift times the pixel size,
-            combined with the estimates from coarser scales and older sweeps.
-    """
-
-    cluster_id: int
-    images: Occupancy
-    ncc: np.ndarray
-    shift: np.ndarray
-    score: float
+    cluster_id: int  # as in `FlowResult`
+    images: Occupancy  # template (t) and target (t+1): the pixels of the cluster in its box
+    ncc: np.ndarray  # (H, W) float64 of each shift (dy, dx) at [dy + H // 2, dx + W // 2], 0 ... 1; NaN = not searched
+    shift: np.ndarray  # (2,) int64, (dy, dx) that the method chooses, pixels
+    score: float  # NCC at that shift
+    # (3,) float64, residual flow of the cluster, metres per sweep interval: the shift times the pixel size, combined
+    # with the estimates from coarser scales and older sweeps.
     flow: np.ndarray
 
 
 @dataclass(frozen=True)
 class KeyPointMatches:
-    """Key points of sweep t and the matches that the ratio test accepts, at the finest scale.
+    """Key points of sweep t and the matches that the ratio test accepts, at the finest scale."""
 
-    Args:
-        images: occupancy of both sweeps.
-        key_points: (K, 2) float64, (x, y), metres, frame of t+1: the middle of the pixel of each key point.
-        start, end: (M, 2) float64, (x, y), metres, frame of t+1: key points of t and of t+1 of each match.
-    """
-
-    images: Occupancy
-    key_points: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
+    images: Occupancy  # occupancy of both sweeps
+    key_points: np.ndarray  # (K, 2) float64, (x, y), metres, frame of t+1: the middle of the pixel of each key point
+    start: np.ndarray  # (M, 2) float64, (x, y), metres, frame of t+1: key point of t of each match
+    end: np.ndarray  # (M, 2) float64, (x, y), metres, frame of t+1: key point of t+1 of each match
 
 
 def scales(window: Window, config: Config) -> tuple[list[Scale], FlowResult]:

@@ -19,17 +19,11 @@ LONGEST_SIDE = 2**15
 
 @dataclass(frozen=True)
 class Grid:
-    """A BEV grid of square pixels; row from y, column from x.
+    """A BEV grid of square pixels; row from y, column from x."""
 
-    Args:
-        pixel_size: s, metres.
-        lower: (x0, y0, z0), p^-, metres, lower end of the region, frame of t+1.
-        upper: (x1, y1, z1), p^+, upper end; both ends belong to the region.
-    """
-
-    pixel_size: float
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
+    pixel_size: float  # s, metres
+    lower: tuple[float, ...]  # (x0, y0, z0), p^-, metres, lower end of the region, frame of t+1
+    upper: tuple[float, ...]  # (x1, y1, z1), p^+, upper end; both ends belong to the region
 
     def __post_init__(self) -> None:
         # `height` and `width` would raise here: a side may be infinite.

@@ -26,42 +26,28 @@ class Batch:
     The batch holds the active points: finite, not ground, not of the vehicle itself, inside the images. Of pc0 it holds
     every row, so that results are read off in the order of the input. The images may be larger than the region: points
     in the margin are active, but have no result.
-
-    Args:
-        positions: (A, P) float64, metres, frame of t+1 of the point's window. A = 2, x and y, for methods that do not
-            need z, else 3.
-        is_active: (P,) bool, False = a row of pc0 that is not active; its position is undefined.
-        has_result: (P,) bool, False = a row of pc0 that is not active or lies outside the region.
-        image: (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, .... Steps of
-            sweeps after t+1 follow those of the longest history.
-        num_newest: number of points of t+1, the first ones; they are never warped.
-        num_windows: B.
-        num_steps: S, 1 + the longest list of sweeps up to t + the longest list of sweeps after t+1.
-        elapsed: (B, S) float64, sweep intervals from the sweep to t+1, the k that divides an estimate and scales a
-            warp. 0 for step 0 and for sweeps that a window lacks, negative for sweeps after t+1.
-        seconds: (B, S) float64, `elapsed` in seconds, for `max_speed`.
-        origin: (B, S, 3) float64, metres, frame of t+1: origin of the ego frame of each sweep.
-        rows: for each window the slice of the P points that holds its pc0.
-        pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p of all rows of pc0; 0 for points that are not finite.
-        ground: heights of the ground points of t; None = the method does not need them.
-        point_times: (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point,
-            multiples of 2^-20; 0 in windows of which a sweep has no times. None = no window has them, or the method
-            does not need them.
     """
 
+    # (A, P) float64, metres, frame of t+1 of the point's window. A = 2 (x and y) if the method needs no z, else 3.
     positions: Tensor
-    is_active: Tensor
-    has_result: Tensor
+    is_active: Tensor  # (P,) bool, False = a row of pc0 that is not active; its position is undefined
+    has_result: Tensor  # (P,) bool, False = a row of pc0 that is not active or lies outside the region
+    # (P,) int32, window * num_steps + step of each point; step 0 = sweep t+1, 1 = t, 2 = t-1, .... Steps of sweeps
+    # after t+1 follow those of the longest history.
     image: Tensor
-    num_newest: int
-    num_windows: int
-    num_steps: int
+    num_newest: int  # number of points of t+1, the first ones; they are never warped
+    num_windows: int  # B
+    num_steps: int  # S, 1 + the longest list of sweeps up to t + the longest list of sweeps after t+1
+    # (B, S) float64, sweep intervals from the sweep to t+1, the k that divides an estimate and scales a warp. 0 for
+    # step 0 and for sweeps that a window lacks, negative for sweeps after t+1.
     elapsed: Tensor
-    seconds: Tensor
-    origin: Tensor
-    rows: tuple[slice, ...]
-    pose_flow: Tensor
-    ground: GroundHeights | None = None
+    seconds: Tensor  # (B, S) float64, `elapsed` in seconds, for `max_speed`
+    origin: Tensor  # (B, S, 3) float64, metres, frame of t+1: origin of the ego frame of each sweep
+    rows: tuple[slice, ...]  # for each window the slice of the P points that holds its pc0
+    pose_flow: Tensor  # (N, 3) float32, metres, T_ego1_ego0 p - p of all rows of pc0; 0 for points that are not finite
+    ground: GroundHeights | None = None  # heights of the ground points of t; None = the method does not need them
+    # (P,) float32, sweep intervals from the instant of its sweep to the measurement of each point, multiples of 2^-20;
+    # 0 in windows of which a sweep has no times. None = no window has them, or the method does not need them.
     point_times: Tensor | None = None
 
     def with_empty_windows(self) -> Batch:

@@ -25,18 +25,12 @@ _FEWEST_PAIRS, _SMALLEST_SHARE = 20, 6
 
 @dataclass(frozen=True)
 class Plane:
-    """The ground near the vehicle, one plane per sweep.
+    """The ground near the vehicle, one plane per sweep."""
 
-    Args:
-        is_there: (B,) bool, False = no ground was found; then the rest is undefined.
-        step_x, step_y: (B,) int64, rise in mm per 4096 mm.
-        height: (B,) int64, mm, at the origin.
-    """
-
-    is_there: Tensor
-    step_x: Tensor
-    step_y: Tensor
-    height: Tensor
+    is_there: Tensor  # (B,) bool, False = no ground was found; then the rest is undefined
+    step_x: Tensor  # (B,) int64, rise in mm per 4096 mm along x
+    step_y: Tensor  # (B,) int64, rise in mm per 4096 mm along y
+    height: Tensor  # (B,) int64, mm, at the origin
 
     def at(self, x: Tensor, y: Tensor, sweep: Tensor) -> Tensor:
         """(N,) int64 height in mm at x, y (N,) int64 mm."""

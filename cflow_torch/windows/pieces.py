@@ -22,40 +22,28 @@ from cflow_torch.windows.validation import read_ground, read_point_times, read_p
 
 
 class Piece(NamedTuple):
-    """Points of one sweep, or of all sweeps of a kind: the K active points, or all K points of sweep t.
+    """Points of one sweep, or of all sweeps of a kind: the K active points, or all K points of sweep t."""
 
-    Args:
-        step: smallest step of the sweeps.
-        positions, is_active, has_result, image, point_times: as in `Batch`.
-        pose_flow: (K, 3) float32, metres, T_ego1_ego0 p - p of sweep t, 0 for points that are not finite; None for
-            other sweeps.
-    """
-
-    step: int
-    positions: Tensor
+    step: int  # smallest step of the sweeps
+    positions: Tensor  # this and the next four as in `Batch`
     is_active: Tensor
     has_result: Tensor
     image: Tensor
     point_times: Tensor | None
+    # (K, 3) float32, metres, T_ego1_ego0 p - p of sweep t, 0 for points that are not finite; None for other sweeps.
     pose_flow: Tensor | None
 
 
 @dataclass(frozen=True)
 class PieceReader:
-    """Reads the points of all sweeps of a timeline.
+    """Reads the points of all sweeps of a timeline."""
 
-    Args:
-        timeline: the sweeps.
-        config, grid, device, num_axes: as for `make_batch`.
-        ground: where the ground points of t are counted; None = nowhere.
-    """
-
-    timeline: Timeline
-    config: Config
+    timeline: Timeline  # the sweeps
+    config: Config  # this and the next three as for `make_batch`
     grid: Grid
     device: torch.device
     num_axes: int
-    ground: GroundHeights | None
+    ground: GroundHeights | None  # where the ground points of t are counted; None = nowhere
 
     def pieces(self) -> Iterator[Piece]:
         """Yield the pieces in the order of the timeline.

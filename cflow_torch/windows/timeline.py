@@ -21,51 +21,32 @@ _FIRST_POINTS = 64
 
 
 class Source(NamedTuple):
-    """A sweep other than t+1 that the flow is estimated from.
+    """A sweep other than t+1 that the flow is estimated from."""
 
-    Args:
-        name: as users know it, for errors.
-        sweep: the sweep.
-        intervals: sweep intervals from it to t+1, counted by its position in the window: 1 for t, 2 for t-1, ..., and
-            -1 for t+2, -2 for t+3, ...
-    """
-
-    name: str
-    sweep: Sweep
+    name: str  # as users know it, for errors
+    sweep: Sweep  # the sweep
+    # Sweep intervals from it to t+1, counted by its position in the window: 1 for t, 2 for t-1, ..., and -1 for t+2, -2
+    # for t+3, ...
     intervals: int
 
 
 class Entry(NamedTuple):
-    """One sweep of one window.
+    """One sweep of one window."""
 
-    Args:
-        step: 0 = t+1, 1 = t, 2 = t-1, ..., then t+2, t+3, ...
-        window: index of the window.
-        name: as users know it, for errors.
-        sweep: the sweep.
-        T_ego1_ego: (4, 4) float64; None = its points lie in the frame of t+1.
-        interval: seconds from t to t+1; None = the times of its points are not used.
-    """
-
-    step: int
-    window: int
-    name: str
-    sweep: Sweep
-    T_ego1_ego: np.ndarray | None
-    interval: float | None
+    step: int  # 0 = t+1, 1 = t, 2 = t-1, ..., then t+2, t+3, ...
+    window: int  # index of the window
+    name: str  # as users know it, for errors
+    sweep: Sweep  # the sweep
+    T_ego1_ego: np.ndarray | None  # (4, 4) float64; None = its points lie in the frame of t+1
+    interval: float | None  # seconds from t to t+1; None = the times of its points are not used
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """All sweeps of B windows: t+1 of every window first, then t of every window, then t-1, ...
+    """All sweeps of B windows: t+1 of every window first, then t of every window, then t-1, ..."""
 
-    Args:
-        entries: the sweeps.
-        table: (5, B, S) float64: `elapsed`, `seconds` and x, y, z of `origin`, as in `Batch`.
-    """
-
-    entries: list[Entry]
-    table: np.ndarray
+    entries: list[Entry]  # the sweeps
+    table: np.ndarray  # (5, B, S) float64: `elapsed`, `seconds` and x, y, z of `origin`, as in `Batch`
 
     @staticmethod
     def of(windows: Sequence[Window], config: Config, grid: Grid, needs_times: bool) -> Timeline:

@@ -44,19 +44,12 @@ PANDASET = {part: Path("pandaset-002", f"panda-002-{part}.h5") for part in ("a1"
 
 @dataclass(frozen=True)
 class Item:
-    """One window and its truth.
+    """One window and its truth."""
 
-    Args:
-        window: sweeps with poses.
-        labels: truth, rows of `window.pc0`.
-        pose_flow: (N, 3) float32, metres, axes of t+1: the part of the true flow that ego motion causes.
-        eval_mask: (N,) bool, True = scored; None = all valid points that are not ground.
-    """
-
-    window: Window
-    labels: FlowLabels
-    pose_flow: np.ndarray
-    eval_mask: np.ndarray | None = None
+    window: Window  # sweeps with poses
+    labels: FlowLabels  # truth, rows of `window.pc0`
+    pose_flow: np.ndarray  # (N, 3) float32, metres, axes of t+1: the part of the true flow that ego motion causes
+    eval_mask: np.ndarray | None = None  # (N,) bool, True = scored; None = all valid points that are not ground
 
     def frame(self, residual_flow: Any) -> EvalFrame:
         """The input of the metrics, for (N, 3) estimated residual flow."""
@@ -67,27 +60,16 @@ class Item:
 
 @dataclass(frozen=True)
 class ScoredSet:
-    """A set of windows that are scored together.
+    """A set of windows that are scored together."""
 
-    Args:
-        name: for example "kitti h=4" or "sim waymo 100-103 h=4"; unique.
-        group: one of `GROUPS`.
-        history: number of older sweeps.
-        half_side: metres, of the region of the estimate; None = that of the preset.
-        load: function that returns the windows.
-        step: sweeps of the recording from t to t+1.
-        reach: metres, half side of the scored box.
-        mean: name of the mean over the sensors to which the set belongs, "" = none.
-    """
-
-    name: str
-    group: str
-    history: int
-    half_side: float | None
-    load: Callable[[], list[Item]]
-    step: int = 1
-    reach: float = NEAR
-    mean: str = ""
+    name: str  # for example "kitti h=4" or "sim waymo 100-103 h=4"; unique
+    group: str  # one of `GROUPS`
+    history: int  # number of older sweeps
+    half_side: float | None  # metres, of the region of the estimate; None = that of the preset
+    load: Callable[[], list[Item]]  # function that returns the windows
+    step: int = 1  # sweeps of the recording from t to t+1
+    reach: float = NEAR  # metres, half side of the scored box
+    mean: str = ""  # name of the mean over the sensors to which the set belongs, "" = none
 
     def items(self) -> list[Item]:
         """The windows, with `history` older sweeps."""

@@ -24,29 +24,18 @@ _SMALLEST_SCORE = 1e-5
 
 
 class Cloud(NamedTuple):
-    """Active points of one sweep.
+    """Active points of one sweep."""
 
-    Args:
-        xy: (2, N) float64, metres, frame of t+1.
-        steps: k, sweep intervals to t+1.
-        rows: (N,) int64, rows of these points in the sweep.
-    """
-
-    xy: np.ndarray
-    steps: float
-    rows: np.ndarray
+    xy: np.ndarray  # (2, N) float64, metres, frame of t+1
+    steps: float  # k, sweep intervals to t+1
+    rows: np.ndarray  # (N,) int64, rows of these points in the sweep
 
 
 class Clusters(NamedTuple):
-    """Clusters with pixels both at t+1 and before.
+    """Clusters with pixels both at t+1 and before."""
 
-    Args:
-        number: (H, W) int32, cluster of every occupied pixel; -1 elsewhere and in other components.
-        boxes: M times (top, left, height, width), pixels.
-    """
-
-    number: np.ndarray
-    boxes: list[list[int]]
+    number: np.ndarray  # (H, W) int32, cluster of every occupied pixel; -1 elsewhere and in other components
+    boxes: list[list[int]]  # M times (top, left, height, width), pixels
 
 
 def opencv() -> Any:

@@ -62,20 +62,13 @@ Method = Callable[["Case"], np.ndarray]
 
 
 class Case(NamedTuple):
-    """A window with its truth, and what the methods get.
+    """A window with its truth, and what the methods get."""
 
-    Args:
-        item: the window, with ground masks.
-        T_ego1_ego0: (4, 4) float64.
-        rows: (N0',) int64, rows of sweep t that are not ground and within reach.
-        pc0, pc1: (N0', 3), (N1', 3) float32 metres, frame of t+1.
-    """
-
-    item: Item
-    T_ego1_ego0: np.ndarray
-    rows: np.ndarray
-    pc0: np.ndarray
-    pc1: np.ndarray
+    item: Item  # the window, with ground masks
+    T_ego1_ego0: np.ndarray  # (4, 4) float64
+    rows: np.ndarray  # (N0',) int64, rows of sweep t that are not ground and within reach
+    pc0: np.ndarray  # (N0', 3) float32 metres, frame of t+1
+    pc1: np.ndarray  # (N1', 3) float32 metres, frame of t+1
 
 
 def cases(path: Path, given: argparse.Namespace) -> Iterator[tuple[str, str, Case]]:

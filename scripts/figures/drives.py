@@ -29,21 +29,13 @@ View = Tuple[float, float, float, float]
 
 
 class Staged(NamedTuple):
-    """A drive, and the part of it that is scored and drawn.
+    """A drive, and the part of it that is scored and drawn."""
 
-    Args:
-        drive: the scored pair is (PAIR, PAIR + 1).
-        title: the difficulty, a line.
-        whose: names of the scored objects.
-        bodies: their indices in the scene.
-        view: (x0, y0, x1, y1) metres, frame of t, region of the picture.
-    """
-
-    drive: Drive
-    title: str
-    whose: str
-    bodies: Sequence[int]
-    view: View = (-6, -6, 20, 13)
+    drive: Drive  # the scored pair is (PAIR, PAIR + 1)
+    title: str  # the difficulty, a line
+    whose: str  # names of the scored objects
+    bodies: Sequence[int]  # their indices in the scene
+    view: View = (-6, -6, 20, 13)  # (x0, y0, x1, y1) metres, frame of t, region of the picture
 
 
 def drive_past(

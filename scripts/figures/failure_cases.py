@@ -38,17 +38,11 @@ WIDE = (-100.0, -100.0, -math.inf, 100.0, 100.0, math.inf)
 
 
 class Attempt(NamedTuple):
-    """The result of one setting.
+    """The result of one setting."""
 
-    Args:
-        name: preset and overrides.
-        residual: (N, 3) estimated total flow minus the flow of the TRUE ego motion, metres per sweep.
-        confidence: (N,) 0 ... 1, None if the method has none.
-    """
-
-    name: str
-    residual: np.ndarray
-    confidence: np.ndarray | None
+    name: str  # preset and overrides
+    residual: np.ndarray  # (N, 3) estimated total flow minus the flow of the TRUE ego motion, metres per sweep
+    confidence: np.ndarray | None  # (N,) 0 ... 1, None if the method has none
 
 
 @dataclass(frozen=True)

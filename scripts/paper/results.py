@@ -29,19 +29,12 @@ STAGES = {"views": ("correlate", "pool"), "clustering": ("cluster",)}  # stages 
 
 @dataclass(frozen=True)
 class Run:
-    """One results file.
+    """One results file."""
 
-    Args:
-        experiment: name of the table or figure.
-        data_set: its name in the tables.
-        row: row of the table, or point of the figure.
-        record: content of results.json.
-    """
-
-    experiment: str
-    data_set: str
-    row: str
-    record: dict[str, Any]
+    experiment: str  # name of the table or figure
+    data_set: str  # its name in the tables
+    row: str  # row of the table, or point of the figure
+    record: dict[str, Any]  # content of results.json
 
     def values(self) -> list[float]:
         """Dynamic bucket-normalised error of CAR, OTHER, PED, VRU, and their mean; NaN = no moving points."""

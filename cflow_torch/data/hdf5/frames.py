@@ -21,15 +21,10 @@ _ARGOVERSE2_EGO_T_UP_LIDAR = np.array(
 
 
 class StoredMotion(NamedTuple):
-    """The ego motion that the harness uses for a pair of sweeps.
+    """The ego motion that the harness uses for a pair of sweeps."""
 
-    Args:
-        T_ego1_ego0: (4, 4) float32, from `harness_motion`.
-        of_points: whether the poses are those of the frame of the points; False = `ego_T_lidar` lies between.
-    """
-
-    T_ego1_ego0: np.ndarray
-    of_points: bool
+    T_ego1_ego0: np.ndarray  # (4, 4) float32, from `harness_motion`
+    of_points: bool  # whether the poses are those of the frame of the points; False = `ego_T_lidar` lies between
 
 
 def is_argoverse2(timestamp: int) -> bool:

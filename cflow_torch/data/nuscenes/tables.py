@@ -40,56 +40,35 @@ FIELDS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class SceneSource:
-    """The location of a scene.
+    """The location of a scene."""
 
-    Args:
-        root: data root, to which `sample_data.filename` is relative.
-        version: folder of the tables, for example "v1.0-mini".
-        name: name of the scene.
-        tables: the tables of `version`. Scenes share them, so they are read once; None = read them again.
-    """
-
-    root: Path
-    version: str
-    name: str
+    root: Path  # data root, to which `sample_data.filename` is relative
+    version: str  # folder of the tables, for example "v1.0-mini"
+    name: str  # name of the scene
+    # The tables of `version`. Scenes share them, so they are read once; None = read them again.
     tables: Tables | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
 class LidarChain:
-    """The M sweeps of one LiDAR in one scene, ordered by time.
+    """The M sweeps of one LiDAR in one scene, ordered by time."""
 
-    Args:
-        times: (M,) int64, microseconds.
-        is_key_frame: (M,) bool.
-        files: relative to the data root.
-        ego: (M, 4, 4) float64 `T_world_ego` at each sweep's own time.
-        mount: (M, 4, 4) float64 `T_ego_sensor`.
-    """
-
-    times: np.ndarray
-    is_key_frame: np.ndarray
-    files: tuple[str, ...]
-    ego: np.ndarray
-    mount: np.ndarray
+    times: np.ndarray  # (M,) int64, microseconds
+    is_key_frame: np.ndarray  # (M,) bool
+    files: tuple[str, ...]  # relative to the data root
+    ego: np.ndarray  # (M, 4, 4) float64 `T_world_ego` at each sweep's own time
+    mount: np.ndarray  # (M, 4, 4) float64 `T_ego_sensor`
 
 
 @dataclass(frozen=True)
 class Annotations:
-    """The A boxes of one scene, at its samples.
+    """The A boxes of one scene, at its samples."""
 
-    Args:
-        time: (A,) int64, microseconds.
-        track, category: A instance tokens, A names of the data set.
-        size: (A, 3) float64, metres: length, width, height.
-        pose: (A, 4, 4) float64 `T_world_box`.
-    """
-
-    time: np.ndarray
-    track: Sequence[str]
-    category: Sequence[str]
-    size: np.ndarray
-    pose: np.ndarray
+    time: np.ndarray  # (A,) int64, microseconds
+    track: Sequence[str]  # A instance tokens
+    category: Sequence[str]  # A names of the data set
+    size: np.ndarray  # (A, 3) float64, metres: length, width, height
+    pose: np.ndarray  # (A, 4, 4) float64 `T_world_box`
 
 
 def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list[SceneSource]:

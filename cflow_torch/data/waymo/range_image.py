@@ -21,18 +21,13 @@ RANGE, INTENSITY, ELONGATION, NO_LABEL_ZONE = range(4)
 
 @dataclass(frozen=True)
 class LaserCalibration:
-    """Mounting of one laser and the inclinations of its rows.
+    """Mounting of one laser and the inclinations of its rows."""
 
-    Args:
-        T_ego_sensor: (4, 4) float64, laser coordinates to the vehicle's.
-        inclinations: (H,) float64 radians, ascending; None = evenly spaced between `low` and `high`.
-        low, high: radians, outer edges of the lowest and the highest row, used if `inclinations` is None.
-    """
-
-    T_ego_sensor: np.ndarray
+    T_ego_sensor: np.ndarray  # (4, 4) float64, laser coordinates to the vehicle's
+    # (H,) float64 radians, ascending; None = evenly spaced between `low` and `high`.
     inclinations: np.ndarray | None = None
-    low: float = 0.0
-    high: float = 0.0
+    low: float = 0.0  # radians, outer edge of the lowest row, used if `inclinations` is None
+    high: float = 0.0  # radians, outer edge of the highest row, used if `inclinations` is None
 
     def row_inclinations(self, num_rows: int) -> np.ndarray:
         """Return (H,) float64 radians above the laser's xy plane; row 0 is the highest.

@@ -30,19 +30,13 @@ _EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can store
 
 @dataclass(frozen=True)
 class SubmissionVersion:
-    """One submission format.
+    """One submission format."""
 
-    Args:
-        number: 1 or 3, as OpenSceneFlow numbers them.
-        server: the leaderboard that accepts it.
-        columns: column -> dtype, in order.
-        is_masked: True: total flow (ego motion included) of the points of the evaluation mask, in the order of the
-            mask. False: residual flow (motion of objects alone) of every point of the sweep.
-    """
-
-    number: int
-    server: str
-    columns: Mapping[str, str]
+    number: int  # 1 or 3, as OpenSceneFlow numbers them
+    server: str  # the leaderboard that accepts it
+    columns: Mapping[str, str]  # column -> dtype, in order
+    # True: total flow (ego motion included) of the points of the evaluation mask, in the order of the mask. False:
+    # residual flow (motion of objects alone) of every point of the sweep.
     is_masked: bool
 
 

@@ -16,21 +16,15 @@ from cflow_torch.windows.ego_motion import relative_transform, rigid_transform
 
 @dataclass(frozen=True)
 class Sample:
-    """One pair of sweeps of a batch, with its history.
+    """One pair of sweeps of a batch, with its history."""
 
-    Args:
-        window: points that are finite and not ground, with the poses of the frame of the points. If the batch has the
-            whole sweep t as "origin_pc0", its ground points follow those of pc0, with a mask.
-        rows0: (K,) int64, rows of batch["pc0"] that are in `window.pc0`.
-        rows1: (K1,) int64, rows of batch["pc1"] that are in `window.pc1`.
-        T_ego1_ego0: (4, 4) float32, motion that the harness computes from the poses and adds itself.
-        T_lidar1_lidar0: (4, 4) float64, motion of the frame of the points; None = `T_ego1_ego0` is that motion.
-    """
-
+    # Points that are finite and not ground, with the poses of the frame of the points. If the batch has the whole sweep
+    # t as "origin_pc0", its ground points follow those of pc0, with a mask.
     window: Window
-    rows0: Tensor
-    rows1: Tensor
-    T_ego1_ego0: np.ndarray
+    rows0: Tensor  # (K,) int64, rows of batch["pc0"] that are in `window.pc0`
+    rows1: Tensor  # (K1,) int64, rows of batch["pc1"] that are in `window.pc1`
+    T_ego1_ego0: np.ndarray  # (4, 4) float32, motion that the harness computes from the poses and adds itself
+    # (4, 4) float64, motion of the frame of the points; None = `T_ego1_ego0` is that motion.
     T_lidar1_lidar0: np.ndarray | None
 
 
