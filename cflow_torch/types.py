@@ -13,6 +13,7 @@ from torch import Tensor
 
 from cflow_torch.errors import CFlowError as CFlowError
 from cflow_torch.errors import CFlowWarning as CFlowWarning
+from cflow_torch.errors import import_optional
 
 Array = Union[np.ndarray, Tensor]
 # Names in flow files and data frames -> fields of `FlowResult`.
@@ -201,12 +202,8 @@ class FlowResult:
         Raises:
             CFlowError: pandas is not installed, or the number of points differs.
         """
-        try:
-            import pandas
-        except ImportError:
-            raise CFlowError(
-                "to_pandas needs pandas: pip install pandas; columns() returns the same as arrays"
-            ) from None
+        need = "to_pandas needs pandas: pip install pandas; columns() returns the same as arrays"
+        pandas = import_optional("pandas", need)
         positions = {} if points is None else dict(zip("xyz", self._positions(points).T))
         return pandas.DataFrame({**positions, **self.columns()})
 
@@ -223,11 +220,10 @@ class FlowResult:
             >>> cloud = result.to_open3d(points)
             >>> cloud.point.colors = flow_to_rgb(result.residual_flow.numpy(), 1.0)  # of cflow_torch.viz
         """
-        try:
-            from open3d.t.geometry import PointCloud
-        except ImportError:
-            raise CFlowError("to_open3d needs Open3D: pip install open3d; numpy() returns the same as arrays") from None
-        cloud = PointCloud(np.ascontiguousarray(self._positions(points), np.float32))
+        need = "to_open3d needs Open3D: pip install open3d; numpy() returns the same as arrays"
+        cloud = import_optional("open3d", need).t.geometry.PointCloud(
+            np.ascontiguousarray(self._positions(points), np.float32)
+        )
         for name, values in self.numpy().items():
             cloud.point[name] = values.reshape(len(values), -1)
         return cloud

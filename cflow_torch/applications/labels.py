@@ -18,6 +18,7 @@ from cflow_torch.applications.moving_groups import MOVING, pose_of
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.results import write_hdf5_labels
 from cflow_torch.data.log import CachedLog, Log, windows
+from cflow_torch.errors import import_optional
 from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
@@ -90,7 +91,8 @@ def find_labels(
 
     Cost: reads the log twice; two nearest-neighbour searches a sweep, one of all points, one of the moving points.
     """
-    tree, log = _import_tree(), CachedLog(log, 3)
+    tree: Callable[..., Any] = import_optional("scipy.spatial", "labels need SciPy: pip install scipy").cKDTree
+    log = CachedLog(log, 3)
     dynamic: list[DynamicPoints] = []
     groups: list[np.ndarray] = []
     for index, result in enumerate(_with_last(log, flows, model)):
@@ -219,11 +221,3 @@ def _has_moved_by_nearest(tree: Callable[..., Any], sweep: Sweep, other: Sweep, 
     distance, _ = nearest.query(points[is_finite], distance_upper_bound=_NND[1], workers=workers)
     nnd[is_finite] = (distance >= _NND[0]) & (distance < _NND[1])
     return nnd
-
-
-def _import_tree() -> Callable[..., Any]:
-    try:
-        from scipy.spatial import cKDTree
-    except ImportError:
-        raise CFlowError("labels need SciPy: pip install scipy") from None
-    return cKDTree

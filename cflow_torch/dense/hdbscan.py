@@ -9,9 +9,9 @@ from torch import Tensor
 from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters, Pixels
 from cflow_torch.dense.projection import ProjectedSweeps
+from cflow_torch.errors import import_optional
 from cflow_torch.ops.indices import renumber
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
-from cflow_torch.types import CFlowError
 
 
 def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[Clusters, Tensor, Tensor]:
@@ -70,8 +70,5 @@ def _labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:
     """(N,) int64 label of each of (N, 3) points: 0 ... L - 1, -1 = noise."""
     if len(points) <= min_cluster_size:  # the library cannot build its tree from so few points
         return np.full(len(points), -1, dtype=np.int64)
-    try:
-        from hdbscan import HDBSCAN
-    except ImportError:
-        raise CFlowError("clustering='hdbscan' needs the hdbscan package: pip install hdbscan") from None
-    return HDBSCAN(min_cluster_size=min_cluster_size).fit_predict(points).astype(np.int64)
+    hdbscan = import_optional("hdbscan", "clustering='hdbscan' needs the hdbscan package: pip install hdbscan")
+    return hdbscan.HDBSCAN(min_cluster_size=min_cluster_size).fit_predict(points).astype(np.int64)

@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.data.paths import as_path, is_remote
+from cflow_torch.errors import import_optional
 from cflow_torch.fleet.dispatch import dispatch
 from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
@@ -59,10 +60,7 @@ def run_ray(
         raise CFlowError(f"engine.retries={retries!r}: give a whole number of at least 0")
     if not units:
         return
-    try:
-        import ray
-    except ImportError as error:
-        raise CFlowError(f"engine=ray needs Ray ({error}): pip install ray") from None
+    ray = import_optional("ray", "engine=ray needs Ray: pip install ray")
     is_gpu = layout.devices[0].startswith("cuda")
     needs = {
         "CPU": _number("num_cpus", num_cpus, int(not is_gpu)),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Iterable, Iterator, Sequence
 import numpy as np
 
 from cflow_torch.data.atomic import atomic_name
+from cflow_torch.errors import import_optional
 from cflow_torch.types import Array, CFlowError, FlowResult
 from cflow_torch.viz.bev import longest_flow, plot_flow, point_rows, split_sweep
 from cflow_torch.viz.wheel import wheel_image
@@ -154,10 +155,8 @@ def _write_mp4(path: Path, figures: Iterator[Figure], frames_per_second: float) 
     from matplotlib import rc_context
     from matplotlib.animation import FFMpegWriter
 
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise CFlowError(".mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or save a .gif") from error
+    need = ".mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or save a .gif"
+    imageio_ffmpeg = import_optional("imageio_ffmpeg", need)
     first = next(figures)
     options = "-pix_fmt yuv420p -crf 18 -movflags +faststart -f mp4"
     rate: Any = frames_per_second  # not only int

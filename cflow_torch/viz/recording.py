@@ -10,6 +10,7 @@ import numpy as np
 
 from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.log import Log
+from cflow_torch.errors import import_optional
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 from cflow_torch.viz.clusters import cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MOVING
@@ -94,11 +95,7 @@ def record_log(
 
 def load_rerun() -> Any:
     """Import rerun; a missing package is a `CFlowError`."""
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise CFlowError("recordings need rerun-sdk (Python 3.9 or newer): pip install 'rerun-sdk>=0.23'") from error
-    return rr
+    return import_optional("rerun", "recordings need rerun-sdk (Python 3.9 or newer): pip install 'rerun-sdk>=0.23'")
 
 
 class _Drive:

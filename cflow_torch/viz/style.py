@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import import_optional
 from cflow_torch.viz.wheel import wheel_image
 
 if TYPE_CHECKING:
@@ -23,11 +23,10 @@ _TITLE = 7.2  # characters of a heading per inch
 
 def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
     """Create an empty white figure without touching pyplot's state; a missing matplotlib is a `CFlowError`."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise CFlowError("pictures need matplotlib: pip install matplotlib") from error
+    import_optional("matplotlib", "pictures need matplotlib: pip install matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=inches, dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure

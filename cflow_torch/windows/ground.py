@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.errors import import_optional
 from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.types import Array, CFlowError, Sweep, Window, check_points
@@ -175,10 +176,8 @@ def _stack(clouds: Sequence[Array], device: Any) -> tuple[Tensor, Tensor]:
 
 def _patchwork(positions: Tensor, sweep: Tensor, num_sweeps: int) -> Tensor:
     """(N,) bool by Patchwork++ with its default settings. We lift the cloud to the sensor height that they assume."""
-    try:
-        import pypatchworkpp
-    except ImportError:
-        raise CFlowError("method='patchwork' needs Patchwork++: pip install pypatchworkpp, or method='grid'") from None
+    need = "method='patchwork' needs Patchwork++: pip install pypatchworkpp, or method='grid'"
+    pypatchworkpp = import_optional("pypatchworkpp", need)
     points, inside = millimetres(positions)
     plane = near_plane(points, sweep, inside, num_sweeps)
     result = np.zeros(positions.shape[1], dtype=bool)
