@@ -111,9 +111,6 @@ class AevaScenesLog(BoxLog):
 
         In compensated clouds the motion of the vehicle is removed, so static points have about 0. Third parties
         measured the sign, which contradicts a comment in the SDK.
-
-        Raises:
-            CFlowError: no such sweep, or a cloud is missing or cannot be read.
         """
         return np.concatenate([cloud.column("velocity", np.floating) for cloud in self._clouds_of(index)])
 
@@ -161,11 +158,9 @@ class AevaScenesLog(BoxLog):
 
 
 class Cloud:
-    """One .npz file in memory. If a file or an array is missing or damaged, a `CFlowError` says so.
+    """One .npz file in memory; a missing or damaged file or array is a `CFlowError`.
 
-    Attributes:
-        keys: names of its arrays.
-        points: (N, 3) float32, metres, frame of the LiDAR.
+    Attributes: `keys`, the names of its arrays, and `points`, (N, 3) float32 metres in the frame of the LiDAR.
     """
 
     def __init__(self, file: Path) -> None:

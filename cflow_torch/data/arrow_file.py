@@ -13,19 +13,12 @@ from cflow_torch.types import CFlowError
 
 
 class FeatherFile:
-    """A feather file in memory.
+    """A feather file in memory, with the `names` of its columns and `num_rows`; a damaged one is a `CFlowError`.
 
     Args:
         file: its path; if you pass `data`, only its name in messages.
         data: its contents; None = read them from `file`, all at once, so that a file that shrinks meanwhile does no
             harm.
-
-    Attributes:
-        names: names of the columns.
-        num_rows: rows of the table.
-
-    Raises:
-        CFlowError: the file is missing, cannot be reached, or is damaged.
     """
 
     def __init__(self, file: Any, data: bytes | None = None) -> None:
@@ -43,11 +36,7 @@ class FeatherFile:
         return self._table.select(list(columns))
 
     def floats(self, columns: Sequence[str], dtype: type = np.float64) -> np.ndarray:
-        """Return K floating-point columns as (rows, K).
-
-        Raises:
-            CFlowError: a column is missing, occurs twice, has another type or an empty entry.
-        """
+        """Return K floating-point columns as (rows, K); another type or an empty entry is a `CFlowError`."""
         check_columns(self.file, self.names, columns)
         values: np.ndarray = np.empty((self.num_rows, len(columns)), dtype)
         for position, name in enumerate(columns):

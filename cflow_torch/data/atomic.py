@@ -94,8 +94,7 @@ def _put_file(path: Any) -> Iterator[IO[bytes]]:
 def new_folder(root: PathLike, name: str) -> Iterator[Path]:
     """Create the folder `root/name`, which takes its name only when the block ends; if that raises, it is removed.
 
-    Raises:
-        CFlowError: the folder exists, would be remote, or `name` cannot be used as a folder name.
+    A folder that exists, a remote one and a name that is not safe are a `CFlowError`.
     """
     folder = as_path(root) / safe_name(name, "log_id")
     if is_remote(folder):
@@ -119,9 +118,6 @@ def remove_stale(folder: PathLike) -> list[str]:
 
     They count as left if they have not changed for an hour: a shorter time could hit another process that still writes.
     The folder may be remote. Its subfolders are not searched.
-
-    Raises:
-        OSError: the folder cannot be listed, or a file in it cannot be removed.
     """
     folder, removed = as_path(folder), []
     forget_listings(folder)

@@ -44,12 +44,7 @@ def make_boxes(track_id: Sequence[str], category: Sequence[int], size: Any, pose
 
 
 def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int]:
-    """Return the Argoverse 2 indices of K boxes.
-
-    Args:
-        names: their categories in the words of the data set. Unknown ones are a `CFlowError`.
-        known: category of the data set -> category of Argoverse 2.
-    """
+    """Return the Argoverse 2 indices of K boxes, from their own categories and a map to those of Argoverse 2."""
     unknown = sorted(set(names) - set(known))
     if unknown:
         raise CFlowError(f"the categories {shortened(unknown[:_LISTED])} are unknown; known are {list(known)}")
@@ -76,11 +71,7 @@ def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.
 
 
 class BoxLog(Log):
-    """Base class of logs whose truth comes from tracked boxes.
-
-    Attributes:
-        _poses: (K, 4, 4) float64 `T_world_ego`.
-    """
+    """Base class of logs whose truth comes from tracked boxes. `_poses` is (K, 4, 4) float64 `T_world_ego`."""
 
     _poses: np.ndarray
 

@@ -103,15 +103,12 @@ def _has_logs(name: str, root: Any) -> bool:
 
 
 def find_user_sources(target: str, settings: Mapping[str, Any]) -> list[UserSource]:
-    """Return one source per log that your own reader returns, for `open_log`.
+    """Return one source per log that your own reader returns, for `open_log`; a reader that fails is a `CFlowError`.
 
     Args:
         target: name of a class or function, as "package.module.name". It returns a log (`cflow_torch.data.log.Log`), or
             a sequence of logs, which may open them lazily.
         settings: its keyword arguments, and those of `open_log`.
-
-    Raises:
-        CFlowError: the target does not exist, fails, or returns no log.
     """
     logs = _user_logs(target, {key: value for key, value in settings.items() if key not in _OF_ALL})
     if len(logs) == 0:

@@ -71,17 +71,7 @@ _META_OF_CATEGORY = np.array(
 
 
 def meta_class(category: np.ndarray) -> np.ndarray:
-    """Return the meta class of each point.
-
-    Args:
-        category: (N,) integer, Argoverse 2 index 0 ... 30.
-
-    Returns:
-        (N,) int64 index into `META_NAMES`; -1 = the category has no meta class.
-
-    Raises:
-        CFlowError: an index outside 0 ... 30.
-    """
+    """Return (N,) int64 indices into `META_NAMES` of (N,) categories 0 ... 30; -1 = it has no meta class."""
     if category.size and (category.min() < 0 or category.max() >= len(CATEGORIES)):
         raise CFlowError(
             f"category indices are 0 ... {len(CATEGORIES) - 1} (0 = background), got "

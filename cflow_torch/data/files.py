@@ -26,9 +26,6 @@ def file_errors(file: Any, hint: str = "copy it again", doing: str = "read") -> 
         file: a path, or a text that begins with one.
         hint: what the user can do; it ends the message.
         doing: what is done with the file, for the message.
-
-    Raises:
-        CFlowError: the block raises an exception.
     """
     try:
         yield
@@ -70,20 +67,14 @@ def read_npy(path: Path, hint: str) -> np.ndarray:
 
 
 def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Test = lambda folder: True) -> list[Path]:
-    """Find the folders that are logs, `root` among them. Folders below a log are not searched.
+    """Find the folders that are logs, `root` among them, sorted. Folders below a log and hidden ones are not searched.
 
     Args:
-        root: where the search begins.
+        root: where the search begins; a path that is not a folder is a `CFlowError`.
         is_log: whether a folder is a log.
         depth: levels below `root` that are searched.
         what: what the user should pass instead, for the error.
-        is_passed: whether to search a folder; hidden folders are never searched.
-
-    Returns:
-        Sorted folders; empty if there are none.
-
-    Raises:
-        CFlowError: `root` is not a folder.
+        is_passed: whether to search a folder.
     """
     if not root.is_dir():
         raise CFlowError(f"{root} is not a folder; pass {what}")

@@ -33,11 +33,9 @@ class GroundRaster:
     scale: float  # cells per metre. The grid position of a city point is scale * (rotation @ xy + translation).
 
     def is_ground(self, points: np.ndarray, rule: str = "av2-api") -> np.ndarray:
-        """Tell which of the (N, 3) points, metres in the CITY frame, lie on or below the ground.
+        """Return (N,) bool: which of (N, 3) points, metres in the CITY frame, are on or below the ground by a rule.
 
-        Returns:
-            (N,) bool: within the threshold of a rule in `GROUND_RULES` of the surface (limit included) or below it.
-            False outside the raster and where its height is NaN.
+        False outside the raster and where its height is NaN.
         """
         threshold, to_cell = GROUND_RULES[rule]
         xyz: np.ndarray = np.asarray(points, dtype=np.float64)
@@ -53,11 +51,7 @@ class GroundRaster:
 
 
 def read_ground_raster(map_folder: Path) -> GroundRaster | None:
-    """Read the raster of a log from its folder `map`; None if the folder or its raster is missing.
-
-    Raises:
-        CFlowError: there are several rasters, the Sim(2) file is missing, or either file cannot be read.
-    """
+    """Read the raster of a log from its folder `map`; None if there is none, a `CFlowError` if there are several."""
     rasters = sorted(map_folder.glob("*_ground_height_surface____*.npy"))
     if not rasters:
         return None

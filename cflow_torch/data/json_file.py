@@ -15,16 +15,10 @@ _SHOWN = 5  # differences that a message lists
 
 
 def read_json(file: Path, use: Callable[[dict[str, Any]], Any] | None = None) -> Any:
-    """Read a JSON file.
+    """Read a JSON file in UTF-8, with or without a byte order mark; `use` replaces each object, inner ones first.
 
-    Args:
-        file: UTF-8, with or without a byte order mark. NaN and Infinity are accepted, as Python writes them; check the
-            numbers where they must be finite (1e999 is infinite, too).
-        use: called with each object, inner ones first; its result replaces the object.
-
-    Raises:
-        CFlowError: the file is not UTF-8 or not JSON, or `use` raises.
-        OSError: as `read_bytes`.
+    NaN and Infinity are accepted, as Python writes them; check the numbers where they must be finite (1e999 is
+    infinite, too).
     """
     content = read_bytes(file)
     with file_errors(f"{file} as JSON"):

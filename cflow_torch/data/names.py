@@ -29,9 +29,8 @@ def safe_name(name: Any, what: str) -> str:
 def path_inside(folder: Path, relative: Any, what: str) -> Path:
     """Return the path of a file that a table names, below a folder. Links are followed: users link data sets.
 
-    Raises:
-        CFlowError: `relative` is not a text, is empty or absolute, or a name in it is not safe, such as `..`. The
-            message begins with `what`.
+    A text that is empty or absolute, or has a name that is not safe, such as `..`, is a `CFlowError` that begins with
+    `what`.
     """
     names = relative.split("/") if isinstance(relative, str) else [""]
     named = [name for name in names if name not in ("", ".")]

@@ -77,9 +77,8 @@ class Odometry:
     def next_pose(self, points: np.ndarray, name: str) -> np.ndarray:
         """Return the (4, 4) float64 `T_world_ego` of the next sweep; the world is the ego frame of the first.
 
-        Args:
-            points: (N, 3+) float, metres. Fewer than 100 finite ones in range are a `CFlowError`.
-            name: of the sweep, for an error.
+        The (N, 3+) points are in metres; fewer than 100 finite ones in range are a `CFlowError` with the `name` of the
+        sweep.
         """
         points = points[:, :3].astype(np.float64)
         points = points[np.isfinite(points).all(1)]

@@ -30,18 +30,11 @@ _KEPT_COPIES = 4  # files of `source_for_mmap`: two of the current Waymo segment
 
 
 def as_path(path: PathLike) -> Path:
-    """Convert a text to a path.
+    """Convert a text to a `pathlib.Path`, or to a `upath.UPath`, which has the same interface.
 
-    Args:
-        path: "scheme://..." for a file system of fsspec; "file://..." and everything else is a path on this machine.
-            Paths of pathlib and of universal_pathlib (for example with storage options of their own) stay unchanged.
-
-    Returns:
-        A `pathlib.Path`, or a `upath.UPath`, which has the same interface.
-
-    Raises:
-        CFlowError: it is not a path; the extra `remote` or the package of the scheme's file system is missing; or
-            fsspec does not know the scheme.
+    "scheme://..." is a file system of fsspec; "file://..." and everything else is a path on this machine. Paths of
+    pathlib and of universal_pathlib (for example with storage options of their own) stay unchanged. A missing package
+    or a scheme that fsspec does not know is a `CFlowError`.
     """
     if not is_path_like(path) or path == "" or "\0" in str(path):
         raise CFlowError(f"{str(path)[:80]!r} is not a valid path: pass a string, a Path or 'scheme://...'")

@@ -25,12 +25,7 @@ _ALLOWED = {
 
 
 class Placeholder:
-    """Stands for an object that a pickle wants to build: it keeps what the object would be made of, and does nothing.
-
-    Attributes:
-        arguments: of the call.
-        state: argument of `__setstate__`; None = none.
-    """
+    """Stands for an object that a pickle wants to build: it keeps the `arguments` of the call and the `state`."""
 
     arguments: tuple[Any, ...]
     state: Any = None

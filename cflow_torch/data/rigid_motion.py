@@ -13,18 +13,12 @@ QUATERNION_TOLERANCE = 1e-3  # only quaternions of length 1 are rotations; those
 
 
 def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[int], str]) -> np.ndarray:
-    """Build poses from translations and quaternions, as files store them.
+    """Build (K, 4, 4) float64 poses from translations and quaternions, as files store them.
 
     Args:
         translation: (K, 3) numbers, metres; an empty list is K = 0.
         quaternion: (K, 4) numbers, scalar first (w, x, y, z), of length 1 within `QUATERNION_TOLERANCE`.
-        what: row -> where it comes from, for the message.
-
-    Returns:
-        (K, 4, 4) float64.
-
-    Raises:
-        CFlowError: a row is not finite, or its quaternion has another length.
+        what: row -> where it comes from, for the message of the `CFlowError` about a row that is not a pose.
     """
     shift = np.asarray(translation, dtype=np.float64).reshape(-1, 3)
     rotation = np.asarray(quaternion, dtype=np.float64).reshape(-1, 4)
@@ -45,15 +39,9 @@ def poses_from_json(nodes: Sequence[Any], translation: str, rotation: str, what:
 
 
 def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Interpolate poses at any times; before the first and after the last pose the motion continues at a constant rate.
+    """Interpolate (M, 4, 4) poses, M >= 2, at (K,) int64 times; `known_times` (M,) ascend and have the same unit.
 
-    Args:
-        times: (K,) int64.
-        known_times: (M,) int64 of the same unit, ascending, M >= 2.
-        poses: (M, 4, 4) float64 at `known_times`.
-
-    Returns:
-        (K, 4, 4) float64.
+    Before the first and after the last pose the motion continues at a constant rate.
     """
     left = np.clip(np.searchsorted(known_times, times, side="right") - 1, 0, len(known_times) - 2)
     fraction = (times - known_times[left]) / (known_times[left + 1] - known_times[left])

@@ -55,11 +55,10 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
 
 
 def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, np.ndarray]:
-    """Read the other columns of a point cloud, such as intensity, ring and time; arguments and errors of `read_cloud`.
+    """Read the other columns of a cloud, name -> (N,) bool, integers or floats as stored; errors as `read_cloud`.
 
-    Returns:
-        Name -> (N,) bool, integers or floats as stored. Columns without a name, those of `.bin` files and of plain
-        arrays, are called column_3, column_4, ... Texts, objects and columns of several numbers per point are left out.
+    Columns without a name, those of `.bin` files and of plain arrays, are called column_3, column_4, ... Texts, objects
+    and columns of several numbers per point are left out.
     """
     path, kept = as_path(path), {}
     with file_errors(path, _hint(path)):

@@ -13,18 +13,10 @@ from cflow_torch.errors import import_optional
 
 
 def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
-    """Read the fields of a `.pcd` file of version 0.7: text, binary or compressed.
+    """Read a `.pcd` file of version 0.7: field -> (N,) array of the stated dtype; another file raises any exception.
 
-    Returns:
-        Field name -> (N,) array of the dtype that SIZE and TYPE state, in the order of the file.
-
-    Convention:
-        Organised clouds (HEIGHT above 1) are flattened row by row. Padding and fields of several values (COUNT above 1)
-        are left out. VIEWPOINT is not applied, so points stay in their stored frame. NaN points stay.
-
-    Raises:
-        CFlowError: pypcd4 is missing.
-        Exception: of any type, if it is not a PCD file of version 0.7, or has less data than its header states.
+    Organised clouds (HEIGHT above 1) are flattened row by row. Padding and fields of several values (COUNT above 1) are
+    left out. VIEWPOINT is not applied, so points stay in their stored frame. NaN points stay.
     """
     cloud = _pypcd4().PointCloud.from_fileobj(io.BytesIO(content))
     header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)

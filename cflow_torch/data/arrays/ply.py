@@ -28,15 +28,9 @@ _LONGEST_HEADER = 65536  # bytes
 
 
 def ply_fields(content: bytes) -> dict[str, np.ndarray]:
-    """Read all properties of the vertices of a `.ply` file, whose first element must be `vertex`. Faces are not read.
+    """Read the vertices of a `.ply` file: property -> (N,) array of the stated type; another file raises any exception.
 
-    Returns:
-        Property name -> (N,) array of the type that the header states, in the byte order of the machine.
-
-    Raises:
-        Exception: of any type, if it is not a PLY file, has an invalid header, or has less data than the header states.
-
-    Source: G. Turk, "The PLY Polygon File Format".
+    The first element must be `vertex`. Faces are not read. Source: G. Turk, "The PLY Polygon File Format".
     """
     header = re.match(rb"ply\s(.*?)\nend_header\s*?\n", content[:_LONGEST_HEADER], re.DOTALL)
     if header is None:

@@ -75,9 +75,6 @@ def read_calibration(path: PathLike) -> np.ndarray:
     """Read the (4, 4) float64 `T_cam0_lidar` of KITTI's `calib.txt`: the line `Tr: ` and 12 numbers.
 
     It converts the poses P of KITTI's camera to poses of the LiDAR: inv(T) P T.
-
-    Raises:
-        CFlowError: no such file, no such line, or not a rigid motion.
     """
     with file_errors(path, f"pass a file with a line {' or '.join(CALIBRATION_KEYS)} and 12 numbers"):
         lines = [line.replace(":", " ").split() for line in read_bytes(as_path(path)).decode("utf-8").splitlines()]
@@ -113,18 +110,10 @@ def write_times(path: PathLike, times_ns: Sequence[int]) -> None:
 
 
 def covered_poses(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np.ndarray:
-    """Interpolate poses at given times: positions linearly, rotations at a constant rate.
+    """Interpolate poses at (M,) nanoseconds: positions linearly, rotations at a constant rate.
 
-    Args:
-        trajectory: with times.
-        times_ns: (M,) nanoseconds.
-        source: name of the trajectory in an error.
-
-    Returns:
-        (M, 4, 4) float64; a pose at exactly its time is returned unchanged.
-
-    Raises:
-        CFlowError: a time before the first or after the last pose, or in a gap of more than half a second.
+    A time before the first pose, after the last one, or in a gap of more than half a second is a `CFlowError` that
+    names the `source`. A pose at exactly its time is returned unchanged.
     """
     known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
     after = np.searchsorted(known, wanted).clip(0, len(known) - 1)  # the first pose that is not before

@@ -29,12 +29,9 @@ _FIRST_NANOSECOND = 10**17
 
 
 def find_array_logs(root: PathLike) -> list[Path]:
-    """Find the folders of all logs, at most four levels down, sorted.
+    """Find the folders of all logs, at most four levels below a folder, sorted.
 
     A log has two or more clouds, in the folder itself or in its subfolder points, lidar, velodyne or clouds.
-
-    Raises:
-        CFlowError: `root` is not a folder.
     """
     what = "a folder with one point cloud per file, or a folder of such"
     is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)

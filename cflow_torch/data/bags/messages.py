@@ -17,18 +17,10 @@ _SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 
 
 
 def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points of a cloud. Points that are not finite or at the origin are left out: they mean "no return".
+    """Return the points of a PointCloud2, (N, 3) float64 metres in its frame, and their times as `seconds_after`.
 
-    Args:
-        message: PointCloud2 as rosbags reads it.
-        stamp_ns: time of the sweep.
-
-    Returns:
-        (N, 3) float64 metres in the frame of the message; (N,) float64 seconds after the stamp (see `seconds_after`),
-        or None if they are unknown.
-
-    Raises:
-        ValueError: a field x, y or z is missing, a type is unknown, or there is less data than the message states.
+    Points that are not finite or at the origin are left out: they mean "no return". A cloud without x, y or z, or with
+    less data than it states, is a ValueError.
     """
     fields = {field.name: field for field in message.fields}
     names = [*"xyz", *[name for name in _TIME_FIELDS if name in fields][:1]]
@@ -63,18 +55,11 @@ def _returns(message: Any, names: list[str]) -> tuple[np.ndarray, np.ndarray, np
 
 
 def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:
-    """Convert the times of points to seconds after the stamp of their sweep.
+    """Convert (N,) times of any unit to (N,) float64 seconds after the stamp of their sweep; None if that fails.
 
-    Args:
-        values: (N,) as stored, of any unit.
-        stamp_ns: time of the sweep.
-
-    Returns:
-        (N,) float64; None if they are all equal, or if no unit gives the duration of a sweep.
-
-    Convention: the unit, from seconds to nanoseconds, is the one in which they span 5 ms to 5 s. Values of at most 5 s
-    count from the stamp, larger ones from 1970. If the latter are more than 5 s away from the stamp, they come from
-    another clock, and we assume that the first shot was at the stamp.
+    The unit, from seconds to nanoseconds, is the one in which they span 5 ms to 5 s. Values of at most 5 s count from
+    the stamp, larger ones from 1970. If the latter are more than 5 s away from the stamp, they come from another clock,
+    and we assume that the first shot was at the stamp.
     """
     if not len(values):
         return None
@@ -95,12 +80,7 @@ Sample = Tuple[float, ...]  # nanoseconds (int), x, y, z, and the quaternion w, 
 
 
 class Frames:
-    """A tree of frames.
-
-    Args:
-        parents: frame -> its parent frame.
-        samples: frame -> `T_parent_frame` over time.
-    """
+    """A tree of frames, from the parent of each frame, and from samples of `T_parent_frame` over time."""
 
     def __init__(self, parents: dict[str, str], samples: dict[str, list[Sample]]) -> None:
         self._parents = parents

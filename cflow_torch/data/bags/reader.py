@@ -30,13 +30,9 @@ _SLICE = 1e-4  # seconds during which we use one pose of the vehicle: 3 mm at 30
 
 
 def find_bags(root: PathLike) -> list[Path]:
-    """Find all bags, sorted: files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2).
+    """Find all bags in a folder, at most three levels down, sorted; or return the given bag.
 
-    Args:
-        root: a bag, or a folder at most three levels above the bags.
-
-    Raises:
-        CFlowError: `root` does not exist.
+    Bags are files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2).
     """
     root = as_path(root)
     if root.is_file():

@@ -34,15 +34,12 @@ def is_argoverse2(timestamp: int) -> bool:
 
 
 def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndarray | None) -> np.ndarray:
-    """Recognise the frame of a scene's points from one of its sweeps.
+    """Recognise ego_T_lidar, (4, 4) float64, which maps the points of a scene to the frame whose poses it stores.
 
     Args:
-        timestamp: name of the sweep.
+        timestamp: name of a sweep.
         points: (N, 3+) float, metres, as stored.
         is_ground: (N,) bool, True = ground; None = unknown.
-
-    Returns:
-        (4, 4) float64 ego_T_lidar, which maps the points to the frame whose poses the scene stores.
 
     Convention:
         Argoverse 2 sweeps (by their time stamp) with ground more than 1.2 m below the origin have points in the frame
@@ -60,17 +57,10 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndar
 
 
 def harness_motion(pose0: Any, pose1: Any) -> np.ndarray:
-    """Compute T_ego1_ego0 from two stored poses as the harness does.
+    """Compute T_ego1_ego0, (4, 4) float32, from two stored poses T_world_ego as the harness does.
 
-    Args:
-        pose0, pose1: (4, 4) T_world_ego of t and t+1, arrays or tensors, float32 or float64.
-
-    Returns:
-        (4, 4) float32.
-
-    Convention:
-        The inverse of a rotation is its transpose, and the translation of the inverse is summed in the precision of the
-        poses. With float32 and coordinates of kilometres this is off by up to half a millimetre, and so are its scores.
+    The inverse of a rotation is its transpose, and the translation of the inverse is summed in the precision of the
+    poses. With float32 and coordinates of kilometres this is off by up to half a millimetre, and so are its scores.
     """
     start, end = (torch.as_tensor(pose).detach().cpu() for pose in (pose0, pose1))
     inverse = torch.eye(4, dtype=torch.float64)
@@ -80,12 +70,7 @@ def harness_motion(pose0: Any, pose1: Any) -> np.ndarray:
 
 
 def harness_pose_flow(points: Tensor, T_ego1_ego0: np.ndarray) -> Tensor:
-    """Return the (N, 3) float32 flow that the harness adds to a model's flow and subtracts from the truth.
-
-    Args:
-        points: (N, 3) float32, metres.
-        T_ego1_ego0: (4, 4) float32, from `harness_motion`.
-    """
+    """Return the pose flow of the harness, (N, 3) float32 metres, of (N, 3) points and a `harness_motion`."""
     transform = torch.from_numpy(T_ego1_ego0).to(points.device)
     return points @ transform[:3, :3].t() + transform[:3, 3] - points
 
@@ -100,9 +85,6 @@ def residual_for_harness(
         points: (N, 3) float32, metres, frame of the LiDAR at t.
         T_ego1_ego0: (4, 4) float32, from `harness_motion`.
         T_lidar1_lidar0: (4, 4) float64, the motion of the frame of the points.
-
-    Returns:
-        (N, 3) float32: residual + (T_lidar1_lidar0 p - p) - (T_ego1_ego0 p - p).
     """
     positions = points.t().double()
     correction = compensate(positions, T_lidar1_lidar0) - compensate(positions, T_ego1_ego0.astype(np.float64))

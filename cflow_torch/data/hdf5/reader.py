@@ -234,16 +234,10 @@ def open_scene(file: Path) -> Any:
 
 
 def member(group: Any, name: str, where: PathLike) -> Any | None:
-    """Return a group or an array of numbers from a group of h5py; None if there is nothing of that name.
+    """Return the group or the array of numbers of a name in a group of h5py; None if there is none.
 
-    Args:
-        group: the group, or the file.
-        name: in the group itself.
-        where: begins the message.
-
-    Raises:
-        CFlowError: it is a link or lies in another file, which is never opened; it is not an array of plain numbers; or
-            it cannot be opened.
+    A link, data in another file (which is never opened), and an array of another type are a `CFlowError` that begins
+    with `where`.
     """
     h5py = import_h5py()
     if not name or "/" in name or name == ".":

@@ -218,14 +218,9 @@ class NuScenesLog(Log):
 
 
 def pcd_bin_points(content: bytes, file: PathLike) -> np.ndarray:
-    """Return the (N, 3) float32 points of a nuScenes LiDAR sweep.
+    """Return the (N, 3) float32 points, metres in the frame of the LiDAR, in the content of a `.pcd.bin`.
 
-    Args:
-        content: of a `.pcd.bin`: rows of little-endian float32 x, y, z (metres, frame of the LiDAR), intensity, ring.
-        file: name, for messages.
-
-    Raises:
-        CFlowError: it is empty, is not a whole number of rows, or its last column is not a ring index.
+    Its rows are little-endian float32 x, y, z, intensity and ring; other content is a `CFlowError` that names the file.
     """
     if not content or len(content) % (_COLUMNS * _ROW.itemsize):
         raise CFlowError(

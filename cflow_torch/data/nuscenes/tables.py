@@ -79,9 +79,6 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
             above data roots.
         foreign: tables of the related data set; a version that has one of them is not this data set.
         data_set: its name.
-
-    Raises:
-        CFlowError: `root` is not a folder, a scene.json cannot be read, or all versions are of the other data set.
     """
     what = "the data root, which holds v1.0-mini or the like"
     versions = find_folders(
@@ -99,12 +96,7 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
 
 
 def read_table(folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> list[Row]:
-    """Read the rows of a table with the fields of `FIELDS`.
-
-    Args:
-        folder: of the version.
-        table: name in `FIELDS`.
-        key, values: keep only rows whose field `key` is one of `values`; no key = all rows.
+    """Read the rows of a table with the fields of `FIELDS`; if `key` is given, those whose `key` is one of `values`.
 
     Cost: memory of twice the file, and of the rows that are kept.
     """
@@ -126,10 +118,7 @@ def _by_token(rows: Sequence[Row]) -> dict[str, Row]:
 
 
 class Tables:
-    """The tables of one version, each read once when it is needed. Only rows of LiDARs are kept.
-
-    Args:
-        folder: `<data root>/<version>`.
+    """The tables of one version, `<data root>/<version>`, each read once when it is needed, with rows of LiDARs only.
 
     Cost: about 5 s per million rows (measured on one core); rows of cameras and radars are dropped while reading.
     """
@@ -149,13 +138,10 @@ class Tables:
         return dict(sorted(scenes.items()))
 
     def scene(self, name: str) -> tuple[np.ndarray, dict[str, LidarChain], Annotations]:
-        """Return all rows of a scene, linked and checked.
+        """Return the rows of a scene, linked and checked: sample times, LiDARs by channel as in sensor.json, and boxes.
 
-        They are its sample times (ascending int64, microseconds), LiDARs by channel in the order of sensor.json, boxes.
-
-        Raises:
-            CFlowError: no such scene; a table that is missing, truncated, or not of this format; a row that refers to
-                one that does not exist; two sweeps of a LiDAR, or two samples, at one time.
+        The times are ascending int64 microseconds. Rows that refer to missing ones, and two sweeps of a LiDAR or two
+        samples at one time, are a `CFlowError`.
         """
         if name not in self.scenes:
             raise CFlowError(f"{self.folder / 'scene.json'} has no scene {name!r}; it has {list(self.scenes)[:5]} ...")

@@ -28,15 +28,7 @@ Key = Tuple[int, int]  # frame time in microseconds, laser
 
 
 class Component:
-    """One of the parquet files of a segment, opened when it is needed.
-
-    Args:
-        segment: `<split>/lidar/<segment>.parquet`.
-        tag: name of the component, of its folder.
-
-    Attributes:
-        file: `<split>/<tag>/<segment>.parquet`.
-    """
+    """The file `<split>/<tag>/<segment>.parquet` of a segment, opened when it is needed."""
 
     def __init__(self, segment: Path, tag: str) -> None:
         self.file = segment.parent.parent / tag / segment.name
@@ -59,12 +51,8 @@ class Component:
     def images(self, keys: Sequence[Key], column: str, channels: int) -> dict[Key, np.ndarray | None]:
         """Read the range images of some rows: frame time and laser -> (H, W, channels), None if the file has a null.
 
-        Args:
-            keys: frame times and lasers; a `CFlowError` if one has no row.
-            column: name without its `.values` and `.shape`.
-            channels: of each image.
-
-        Cost: decodes every row group that holds a wanted row, a few rows at a time.
+        The name of the column has no `.values` or `.shape`. Cost: decodes every row group that holds a wanted row, a
+        few rows at a time.
         """
         missing = [key for key in keys if key not in self.frame_lasers()]
         if missing:

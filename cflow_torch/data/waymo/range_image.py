@@ -30,11 +30,7 @@ class LaserCalibration:
     high: float = 0.0  # radians, outer edge of the highest row, used if `inclinations` is None
 
     def row_inclinations(self, num_rows: int) -> np.ndarray:
-        """Return (H,) float64 radians above the laser's xy plane; row 0 is the highest.
-
-        Raises:
-            CFlowError: the calibration has another number of rows than the image, or an entry that is not finite.
-        """
+        """Return (H,) float64 radians above the laser's xy plane; row 0 is the highest. Another H is a `CFlowError`."""
         ascending = self.inclinations
         if ascending is None:
             ascending = self.low + (np.arange(num_rows) + 0.5) / num_rows * (self.high - self.low)
