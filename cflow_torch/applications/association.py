@@ -143,14 +143,9 @@ def link_in_voxels(
 
 
 def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Tensor:
-    """(N,) int64 index of the first box that holds each point, -1 = none.
+    """(N,) int64 index of the first of K upright boxes that holds each of (N, 3) float64 points, -1 = none.
 
-    Args:
-        points: (N, 3) float64, metres.
-        centre, size: (K, 3) metres; size is length along the heading, width, height.
-        heading: (K,) radians from +x.
-
-    Cost: K * N comparisons.
+    The (K, 3) sizes are length along the heading (K,), width and height. Cost: K * N comparisons.
     """
     none = torch.full((len(points),), -1, device=points.device)
     if not len(centre) or not len(points):

@@ -127,12 +127,7 @@ def find_labels(
 def flow_back(log: Log, model: FlowModel) -> FlowResult:
     """Estimate the flow of the last sweep to the one before it, by playing the log backwards.
 
-    Args:
-        log: two sweeps or more.
-        model: the method; the sweeps further back take the place of its `num_future`.
-
-    Returns:
-        The result, in the axes of the sweep before the last.
+    The sweeps further back take the place of `num_future`. The result has the axes of the sweep before the last.
     """
     last = len(log.timestamps) - 1
     first = max(last - 1 - model.config.num_future, 0)

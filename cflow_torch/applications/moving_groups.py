@@ -52,11 +52,7 @@ class MovingGroups:
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
     def divide(self, piece: Tensor) -> MovingGroups:
-        """Divide the groups into pieces, which keep the cluster and the confidence of their group.
-
-        Args:
-            piece: for each moving point, the piece of its group that it belongs to, from 0.
-        """
+        """Divide the groups by the (M,) piece of each moving point; pieces keep cluster and confidence."""
         moves = self.group >= 0
         pairs = torch.stack([self.group[moves], piece])
         (origin, _), index, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)

@@ -39,12 +39,7 @@ class States:
         return States(self.position + seconds * self.velocity, self.velocity, covariance)
 
     def update(self, position: Tensor, velocity: Tensor, noise: Tensor) -> States:
-        """States after a measurement of position and velocity.
-
-        Args:
-            position, velocity: (K, 3) float64, measured.
-            noise: (K, 2) float64, standard deviations of the two, per axis.
-        """
+        """States after a measurement of position and velocity, (K, 3), with standard deviations (K, 2) per axis."""
         residual = torch.stack([position - self.position, velocity - self.velocity], 1)  # (K, 2, 3)
         spread = self.covariance + torch.diag_embed(noise**2)
         gain = torch.linalg.solve(spread, self.covariance).transpose(1, 2)  # both are symmetric

@@ -58,15 +58,10 @@ def read_tracks(path: PathLike) -> Table:
 
 
 def write_mot(path: PathLike, table: Table, log: Log) -> None:
-    """Write tracks in the format of the MOT Challenge 3D.
+    """Write tracks as text of the MOT Challenge 3D: lines `frame,id,-1,-1,-1,-1,confidence,x,y,z`.
 
-    Args:
-        path: text file with a line `frame,id,-1,-1,-1,-1,confidence,x,y,z` per row of the table.
-        table: of `track`.
-        log: not used.
-
-    Convention: frames and ids count from 1; x, y, z is the centre of the box, metres in the world; confidence 1 where
-        the method has none.
+    Frames and ids count from 1; x, y, z is the centre of the box, metres in the world; confidence is 1 where the method
+    has none. The log is not used.
     """
     confidence = np.where(np.isnan(table["confidence"]), 1.0, table["confidence"])
     rows = zip(table["sweep"] + 1, table["id"] + 1, confidence, *(table[axis] for axis in "xyz"))
@@ -77,18 +72,11 @@ def write_mot(path: PathLike, table: Table, log: Log) -> None:
 
 
 def write_kitti(path: PathLike, table: Table, log: Log) -> None:
-    """Write tracks in the format of KITTI's tracking benchmark.
+    """Write tracks as text of KITTI's tracking benchmark, with poses from the log: a line of 18 columns per row.
 
-    Args:
-        path: text file with a line of 18 columns per row of the table.
-        table: of `track`.
-        log: the drive, for its poses.
-
-    Convention: frames and ids count from 0; the type is Misc, because tracks have no class; unknown columns are -1. The
-        camera is at the origin of the ego frame of the sweep, looks to +x, and has KITTI's axes: x to the right, y
-        down, z ahead. The position is the middle of the lower face of the box.
-
-    Cost: reads every sweep that has tracks.
+    Frames and ids count from 0; the type is Misc, because tracks have no class; unknown columns are -1. The camera is
+    at the origin of the ego frame of the sweep, looks to +x, and has KITTI's axes: x to the right, y down, z ahead. The
+    position is the middle of the lower face of the box.
 
     Source: development kit of the KITTI tracking benchmark (2012).
     """

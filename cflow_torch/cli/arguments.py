@@ -16,11 +16,9 @@ _GRAMMAR = re.compile(r"['\"\[{]|(choice|glob|range|shuffle|sort|str|tag)\(|.*\$
 def split(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Split the arguments of a command into settings, with quoted names, and options with their values.
 
-    Hydra accepts them in this order only: no `-m` between two settings.
-
-    Args:
-        arguments: a path by itself means data.root. Without quotes, Hydra would read the Waymo segment
-            log=10203656353524179475_7625_000_7645_000 as a whole number, and reject output=Ausgänge.
+    Hydra accepts them in this order only: no `-m` between two settings. A path by itself means data.root. Without
+    quotes, Hydra would read the Waymo segment log=10203656353524179475_7625_000_7645_000 as a whole number, and reject
+    output=Ausgänge.
     """
     overrides, options = [], []
     for before, word in zip(["", *arguments], arguments):

@@ -50,7 +50,7 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
     Args:
         model: the method.
         windows: at least one; a larger batch repeats them.
-        repeats: timed runs of each window and of each batch, after one that warms up.
+        repeats: timed runs of each window and of each batch size, after one that warms up.
         batches: batch sizes.
 
     Returns:

@@ -46,11 +46,10 @@ class Comparison(Callback):
 
 
 def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
-    """Compare all jobs with results below a folder.
+    """Compare all jobs with results below a folder: a header, and a row for each job.
 
-    Returns:
-        The header, and a row for each job: the swept settings, the digest of the scored data if the jobs have scored
-        different data, then the scores; "" = no value.
+    A row has the swept settings, the digest of the scored data if the jobs have scored different data, then the scores;
+    "" = no value.
     """
     jobs: list[tuple[dict[str, str], list[Any]]] = []
     for file in sorted(output.glob(f"*/**/{RESULTS}")):
@@ -81,15 +80,10 @@ def _order(cell: str) -> tuple[bool, float, str]:
 
 
 def headline(results: dict[str, Any], seconds: dict[str, Any]) -> dict[str, float]:
-    """The most important scores; NaN where the definition does not have them or there are no points.
+    """The most important scores of `SceneFlowMetrics.compute` and of `TimedModel.report`; NaN = there is none.
 
-    Args:
-        results: from `SceneFlowMetrics.compute`, or from results.json.
-        seconds: from `TimedModel.report`.
-
-    Returns:
-        "dynamic_error" (mean over classes, and over ranges if the definition has them), "static_epe" (mean over
-        classes), "epe_fd" and "epe_bs" in metres, "seconds" (median per pair).
+    "dynamic_error" (mean over classes, and over ranges if the definition has them), "static_epe" (mean over classes),
+    "epe_fd" and "epe_bs" in metres, "seconds" (median per pair).
     """
     bucketed, three_way = results.get("bucketed", {}).get("mean", {}), results.get("three_way", {})
     found = {

@@ -86,19 +86,10 @@ def task(cfg: DictConfig) -> None:
 def compute(
     cfg: DictConfig, shard: Shard, contents: tuple[str, ...], check: Callable[[Job, Sources], None] | None = None
 ) -> FlowRun | None:
-    """Estimate the flow of all logs of a shard into files, or count the frames.
+    """Estimate the flow of all logs of a shard into files; with dry_run=true count the frames, and return None.
 
-    Args:
-        cfg: settings of `cflow flow`.
-        shard: which share of the logs to do.
-        contents: columns of a flow file.
-        check: raises an error if the logs are not usable; called before anything is computed.
-
-    Returns:
-        The run; None with dry_run=true.
-
-    Raises:
-        CFlowError: a setting, the logs or the output folder cannot be used.
+    `contents` are the columns of a flow file. `check` is called before anything is computed, and raises an error if the
+    logs are not usable.
     """
     output = run.output_folder(cfg)
     settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
@@ -139,17 +130,9 @@ def compute(
 
 
 def finish(done: FlowRun, shard: Shard, failures: Failures, verbose: bool) -> None:
-    """Print the report, and exit with its status if something is missing.
+    """Print the report, with `verbose` also the times of the stages, and exit with its status if something is missing.
 
-    Args:
-        done: the run.
-        shard: its share.
-        failures: of later steps, such as tracks.
-        verbose: also print the times of the stages.
-
-    Raises:
-        SystemExit: something is missing.
-        UnfinishedJob: something is missing, in a job of a sweep.
+    `failures` are those of later steps, such as tracks. A job of a sweep raises `UnfinishedJob` instead.
     """
     report, file = done.report, report_file(done.job.output, shard)
     status = report["exit_status"] or int(bool(failures))

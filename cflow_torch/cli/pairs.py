@@ -38,9 +38,6 @@ def for_each_pair(
         pairs: those of a log lie next to each other.
         model: the method; it receives the times of all pairs. Results do not depend on the number of processes.
         use: called with the log, the index of the pair, its window and its result.
-
-    Returns:
-        (frame, message) of every pair that failed.
     """
     failures: Failures = []
     for (log, index), answer in _answers(pairs, model):

@@ -45,16 +45,9 @@ class Scores:
             self._digest.update(np.ascontiguousarray(values).tobytes())
 
     def report(self, folder: Path, logs: Sequence[Log], seconds: dict[str, Any], failures: Failures) -> dict[str, Any]:
-        """Print the scores, and write `folder/results.json` and `folder/config.yaml`.
+        """Print and return the scores, and write `folder/results.json` and `folder/config.yaml`.
 
-        Args:
-            folder: created if missing.
-            logs: the scored logs.
-            seconds: returned by `TimedModel.report`.
-            failures: pairs and logs that could not be used.
-
-        Returns:
-            The scores, see `SceneFlowMetrics.compute`.
+        The seconds are those of `TimedModel.report`.
         """
         results = self.metrics.compute()
         data = {
@@ -82,10 +75,9 @@ class Scores:
 
 
 def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
-    """The record of an earlier run with the same settings and versions; None if there is none.
+    """The record of an earlier run with the same settings and versions; None if there is none or `overwrite` is set.
 
-    Raises:
-        CFlowError: the folder has results of other settings, and `overwrite` is not set.
+    Results of other settings are a `CFlowError`.
     """
     file = folder / RESULTS
     if cfg.overwrite or not file.exists():

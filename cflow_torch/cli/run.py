@@ -115,12 +115,7 @@ def complete_data(data: DictConfig) -> DictConfig:
 def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
     """Function log -> indices of the pairs that the settings `first`, `step` and, if it exists, `count` choose.
 
-    Args:
-        cfg: resolved settings.
-        group: prefix of the names of the first two: "" or "data.".
-
-    Raises:
-        CFlowError: one of them is not a whole number, or too small.
+    `group` is the prefix of the names of the first two: "" or "data.".
     """
     first, step = whole_number(cfg, f"{group}first", 0), whole_number(cfg, f"{group}step", 1)
     count = None if OmegaConf.select(cfg, "count") is None else whole_number(cfg, "count", 1)
@@ -188,15 +183,7 @@ def open_logs(cfg: DictConfig) -> tuple[list[Log], Failures]:
 
 
 def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], FlowResult]:
-    """Function that reads the flow of a pair from the output of `cflow flow`.
-
-    Args:
-        folder: the output.
-        needed: fields of `FlowResult` that each file must contain.
-
-    Raises:
-        CFlowError: the folder does not exist; from the function, a file is missing or lacks a field.
-    """
+    """Function that reads the flow of a pair from the output of `cflow flow`; each file must have the needed fields."""
     output = as_path(folder)
     if not output.is_dir():
         raise CFlowError(f"flow={folder} is not a folder: give the output of `cflow flow`")
@@ -225,9 +212,7 @@ def collect_failures(failures: Failures, name: str) -> Iterator[None]:
 def finish(failures: Failures) -> None:
     """Print the failures, and exit with status 1 if there are any.
 
-    Raises:
-        SystemExit: something failed.
-        UnfinishedJob: something failed in a job of a sweep. Hydra runs the other jobs before it exits with status 1.
+    A job of a sweep raises `UnfinishedJob`: Hydra runs the other jobs before it exits with status 1.
     """
     if failures:
         print(f"{len(failures)} failed:", file=sys.stderr)

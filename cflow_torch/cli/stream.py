@@ -43,7 +43,7 @@ def task(cfg: DictConfig) -> None:
 
 
 def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> dict[str, Any]:
-    """Push the sweeps of a log.
+    """Push the sweeps of a log, at most `count`.
 
     Args:
         stream: receives the sweeps.

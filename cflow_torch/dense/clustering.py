@@ -96,10 +96,7 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
 def _can_move(component: Tensor, num_components: int, occupied: Tensor) -> Tensor:
     """(C,) bool: the component has a pixel at t+1 and a pixel before.
 
-    Args:
-        component: (P,) int64.
-        num_components: C, more than the largest component.
-        occupied: (S, P) bool, sweeps that occupy each pixel, at least one; index 0 is t+1.
+    `component` is (P,) int64, below C; `occupied` is (S, P) bool, the sweeps that occupy each pixel, index 0 = t+1.
     """
     newest, *older = occupied.unbind(0)
     before = reduce(torch.bitwise_or, older, torch.zeros_like(newest))

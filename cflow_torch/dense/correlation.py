@@ -50,13 +50,7 @@ class Estimates:
 def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) -> Estimates:
     """Estimate the displacement m -> t+1 of every cluster from every earlier sweep m (Alg. scene_flow_1view, BEV).
 
-    Args:
-        clusters: clusters of the sweeps.
-        sweeps: give the elapsed time of each sweep and the pixel size.
-        config: `max_speed`, `correlation`, `max_memory`.
-
-    Returns:
-        The estimates; z is 0.
+    The estimates have z = 0.
     """
     batch, pixel_size = sweeps.batch, sweeps.grid.pixel_size
     pairs = make_pairs(clusters, batch, pixel_size, config.max_speed)

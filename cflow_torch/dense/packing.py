@@ -76,13 +76,7 @@ class Packing:
 
 
 def pack(pairs: TemplatePairs) -> Packing:
-    """Pack all templates and targets.
-
-    Args:
-        pairs: at least one.
-
-    Raises:
-        CFlowError: a cluster is too long, or needs more memory than there is.
+    """Pack all templates and targets. A cluster that is too long or needs too much memory is a `CFlowError`.
 
     An image takes H + low_y rows of W + low_x samples, and a target begins at row low_y and column low_x. Then sample
     (dy + low_y) * stride + dx + low_x of the correlation belongs to shift (dy, dx), and no other pair of pixels adds to

@@ -32,16 +32,9 @@ class ProjectedSweeps:
 
 
 def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
-    """Warp every sweep m by (t+1-m) times its flow so far and draw it.
+    """Warp every sweep m by (t+1-m) times its flow so far and draw it; `flow` as in `ProjectedSweeps`.
 
-    Args:
-        batch: points of all windows.
-        flow: (A, P) float64, metres per sweep interval, or None, see `ProjectedSweeps`.
-        grid: pixels of the bird's-eye view.
-
-    Convention: points that are warped out of the region are ignored at this scale.
-
-    Cost: linear in points.
+    Points that are warped out of the region are ignored at this scale.
     """
     num_images, num_points = batch.num_windows * batch.num_steps, len(batch.image)
     pixel = torch.empty(num_points, dtype=torch.int64, device=batch.image.device)

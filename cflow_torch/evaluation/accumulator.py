@@ -15,12 +15,7 @@ from cflow_torch.types import CFlowError
 class Accumulator(ABC):
     """Counts points and sums their values per cell; frames come in any order.
 
-    Args:
-        definition: name or `Definition`.
-
-    Attributes:
-        count: int64, number of points of each cell.
-        sums: float64, one array of the shape of `count` per quantity.
+    `count` is the int64 number of points of each cell, and `sums` has a float64 array of its shape per quantity.
     """
 
     totals: tuple[str, ...] = ("count", "sums")  # attributes that add up over frames

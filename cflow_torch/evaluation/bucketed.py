@@ -92,11 +92,8 @@ class BucketedEPE(Accumulator):
 class BucketedByRange(Accumulator):
     """`BucketedEPE` of every range between the definition's `region_edges`, in one pass.
 
-    Args:
-        definition: name or `Definition`. Its `region` ("box" or "disc"), `region_axes` and `closed` define how a range
-            is measured; its `max_range` does not apply.
-
-    Convention: each point is in at most one range. The scores of a range are those of a `BucketedEPE` of its points.
+    The definition's `region` ("box" or "disc"), `region_axes` and `closed` define how a range is measured; its
+    `max_range` does not apply. Each point is in at most one range.
     """
 
     def shape(self) -> tuple[int, ...]:

@@ -142,15 +142,9 @@ def get_definition(definition: Union[str, Definition]) -> Definition:
 
 
 def interval_of(values: np.ndarray, edges: Sequence[float], closed: bool = False) -> np.ndarray:
-    """Return the index of the interval between ascending edges that each value lies in.
+    """Return (M,) int64, the interval between ascending edges that each of (M,) values lies in; -1 = outside all.
 
-    Args:
-        values: (M,) float.
-        edges: ascending.
-        closed: False: an interval contains its lower edge. True: its upper edge, and the first interval also 0.
-
-    Returns:
-        (M,) int64; -1 = outside all intervals.
+    An interval contains its lower edge; if `closed`, its upper edge, and the first interval also 0.
     """
     index = np.searchsorted(np.asarray(edges), values, side="left" if closed else "right") - 1
     if closed and edges[0] == 0:

@@ -15,14 +15,10 @@ from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
 
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
-    """Compute the flow of a static world, T p - p, (N, 3) float32 metres in the axes of ego1.
+    """Compute the flow of a static world, T p - p, (N, 3) float32 metres in the axes of ego1, of (N, 3) points of t.
 
     It is computed in float64 and rounded once, because the difference of two float32 positions at 100 m has 1e-5 m of
     noise.
-
-    Args:
-        points: (N, 3) float, metres, ego frame of t.
-        T_ego1_ego0: (4, 4), ego coordinates of t to those of t+1.
     """
     return (transform_points(points, np.asarray(T_ego1_ego0, np.float64)) - points).astype(np.float32)
 

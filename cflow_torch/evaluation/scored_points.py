@@ -36,12 +36,9 @@ class ScoredPoints:
 def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     """Select the points of a frame that a definition scores, and compare prediction and truth there.
 
-    Convention: rounding follows the evaluator that the definition is named after. Totals and residuals are float32. A
-    predicted residual is processed as the harnesses do: pose flow is added and subtracted again. Lengths are computed
-    in `norm_dtype`. Rows without a valid label are never read.
-
-    Raises:
-        CFlowError: NaN where the definition does not allow it; `T_ego1_ego0` is missing where it is needed.
+    Rounding follows the evaluator that the definition is named after. Totals and residuals are float32. A predicted
+    residual is processed as the harnesses do: pose flow is added and subtracted again. Lengths are computed in
+    `norm_dtype`. Rows without a valid label are never read.
     """
     points, true_total = as_numpy(frame.points), frame.labels.flow
     pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]

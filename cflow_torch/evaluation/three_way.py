@@ -26,15 +26,10 @@ _META_GROUPS: dict[str, Any] = {name: [CATEGORY_INDEX[c] for c in members] for n
 
 
 def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: float) -> np.ndarray:
-    """Compute the error measures of each point.
+    """Compute the error measures of each point, (4, M) float64, of (M, 3) float64 metres per frame.
 
-    Args:
-        predicted, true: (M, 3) float64, metres per frame.
-        sweep_interval: seconds, fourth component of the space-time vectors whose angle is measured.
-
-    Returns:
-        (4, M) float64, rows as in `QUANTITIES`: end-point error in metres; 1 where the error or error / true length is
-        below 0.05; the same below 0.1; angle in radians.
+    The rows are `QUANTITIES`: end-point error in metres; 1 where the error or error / true length is below 0.05; the
+    same below 0.1; angle in radians between space-time vectors whose fourth component is `sweep_interval`, seconds.
     """
     error = np.linalg.norm(predicted - true, axis=1)
     share = error / (np.linalg.norm(true, axis=1) + ACCURACY_EPS)
@@ -50,13 +45,10 @@ def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: fl
 class ThreeWayEPE(Accumulator):
     """Three-way EPE: foreground dynamic, foreground static, background static, and their mean.
 
-    Args:
-        definition: name or `Definition`.
-
-    Convention: a point is dynamic if its true residual is at least `dynamic_threshold`. With average "points" all
-    means are over all points, and a set without points is NaN. With "frames" the three errors and the IoU are means
-    over frames, where an absent set counts as 0; so frames without dynamic points lower `epe_fd` and the IoU. The
-    breakdowns are over points in both cases.
+    A point is dynamic if its true residual is at least `dynamic_threshold`. With average "points" all means are over
+    all points, and a set without points is NaN. With "frames" the three errors and the IoU are means over frames, where
+    an absent set counts as 0; so frames without dynamic points lower `epe_fd` and the IoU. The breakdowns are over
+    points in both cases.
     """
 
     totals = ("count", "sums", "num_frames", "frame_sums")

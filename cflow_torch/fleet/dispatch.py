@@ -26,7 +26,7 @@ _MAX_DEATHS = 10
 def dispatch(
     processes: Sequence[ChildProcess], units: Sequence[Unit], stop: Callable[[], bool], retries: int
 ) -> Iterator[Event]:
-    """Do all units.
+    """Do all units, and yield events as they happen. If no worker can start, that is a `CFlowError`.
 
     When a process dies, its unit is repeated, then each of the unit's frames by itself. This does no harm: files are
     written as a whole or not at all, and complete ones are skipped.
@@ -37,12 +37,6 @@ def dispatch(
         units: numbered as in `split`.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
         retries: how often a unit, and then each of its frames by itself, is repeated.
-
-    Yields:
-        Events as they happen.
-
-    Raises:
-        CFlowError: no worker can start.
     """
     processes = processes[: len(units)]
     todo: Queue[Unit | None] = Queue()

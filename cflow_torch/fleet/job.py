@@ -128,16 +128,10 @@ class Shard:
 
 
 def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
-    """Return the shard of this process.
+    """Return the shard of this process; `index` counts from 0, and it and `count` may be "auto".
 
-    Args:
-        index: from 0, or "auto".
-        count: number of shards, or "auto".
-        environ: environment variables. "auto" takes RANK and WORLD_SIZE of torchrun, or the task of an `srun` step,
-            combined with the task of a SLURM array if there is one. Without any of them this is the only shard.
-
-    Raises:
-        CFlowError: not a number, out of range, an index without a count, or a count that the environment contradicts.
+    "auto" takes RANK and WORLD_SIZE of torchrun, or the task of an `srun` step, combined with the task of a SLURM array
+    if there is one, from the environment variables. Without any of them this is the only shard.
     """
     if index != AUTO and count == AUTO:
         raise CFlowError(f"shard.index={index} is given without shard.count: give both")

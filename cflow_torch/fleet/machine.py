@@ -48,9 +48,6 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
         environ: environment variables. LOCAL_RANK or SLURM_LOCALID choose the GPU where several processes share a
             machine; LOCAL_WORLD_SIZE and SLURM_CPUS_PER_TASK limit the cores.
         most: limit of "auto" on a CPU, for a run with few frames; None = no limit.
-
-    Raises:
-        CFlowError: not a whole number of at least 1, or a GPU that does not exist.
     """
     gpus = _gpus(device, environ)
     if workers != AUTO:

@@ -57,7 +57,7 @@ def make_identity(
 
 
 def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
-    """Make sure that a folder has results of this identity only, and write its manifest.
+    """Make sure that a folder has results of this identity only, and write its manifest; others are a `CFlowError`.
 
     Args:
         output: folder of the run.
@@ -65,9 +65,6 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
         resume: continue an earlier run of the same identity.
         overwrite: remove the results of earlier runs.
         alone: True = no other shard works in this folder.
-
-    Raises:
-        CFlowError: the folder has results that must not be mixed with these.
     """
     forget_listings(output)
     why = find_conflict(output, identity, resume or overwrite)
@@ -96,10 +93,7 @@ def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> st
 def claim_log(folder: Path, log: Log, run: str) -> None:
     """Make sure that the frames in a log's folder were computed from this log, and write its manifest.
 
-    Raises:
-        CFlowError: the log has changed since, or another log has its name.
-
-    Cost: reads three sweeps.
+    A log that has changed since, and another one of its name, are a `CFlowError`. Cost: reads three sweeps.
     """
     now = _describe_log(log, run)
     if _read(folder / MANIFEST) is None:
@@ -127,12 +121,10 @@ def _describe_log(log: Log, run: str) -> dict[str, Any]:
 
 
 def complete_frames(folder: Path) -> set[int]:
-    """Return the time stamps whose flow is in a log's folder.
+    """Return the time stamps whose flow is in a log's folder. Cost: reads the last bytes of every local file.
 
-    Files without the log's manifest do not count, because their input is unknown. Incomplete files, such as
-    those of an interrupted copy, do not count either.
-
-    Cost: reads the last bytes of every local file.
+    Files without the log's manifest do not count, because their input is unknown. Incomplete files, such as those of an
+    interrupted copy, do not count either.
     """
     forget_listings(folder)
     with remote_errors(folder):

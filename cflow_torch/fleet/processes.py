@@ -35,11 +35,10 @@ class ChildProcess:
         self._pipe: Any = None
 
     def start(self) -> None:
-        """Start the process and wait until `make` has returned.
+        """Start the process and wait until `make` has returned; `WorkerDied` if it has ended, or cannot be started.
 
-        Raises:
-            WorkerDied: the process has ended, or cannot be started.
-            CFlowError, OSError: raised by `make`. Any other error is a RuntimeError with the child's traceback.
+        `CFlowError` and OSError of `make` are raised here. Any other error is a RuntimeError with the child's
+        traceback.
         """
         context = multiprocessing.get_context("spawn")  # threads and CUDA do not survive a fork
         self._pipe, pipe = context.Pipe()
@@ -54,11 +53,7 @@ class ChildProcess:
         list(self._answers())
 
     def call(self, *arguments: Any) -> Iterator[Any]:
-        """Yield what a call yields, as it happens. If there is no process, one is started first.
-
-        Raises:
-            WorkerDied, CFlowError, OSError, RuntimeError: as `start`, also from the call.
-        """
+        """Yield what a call yields, as it happens; start a process if there is none. Errors as in `start`."""
         if self._process is None:
             self.start()
         with suppress(OSError):  # the process has died: `_answers` finds out how

@@ -40,9 +40,7 @@ class _Lines(_Stderr):
 class Progress(tqdm):  # type: ignore[type-arg]
     """Counts frames and shows the count on stderr. It is a context manager, as every bar of tqdm.
 
-    Args:
-        total: number of frames; None = not known yet. It may be set later.
-        name: of the work, shown before the count; "" = none.
+    The `total` is None while it is not known, and may be set later. The `name` is shown before the count.
     """
 
     def __init__(self, total: int | None = None, name: str = "") -> None:

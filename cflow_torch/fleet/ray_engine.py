@@ -51,10 +51,6 @@ def run_ray(
         num_cpus: CPUs of the cluster that a worker takes; "auto" = 1 without a GPU, 0 with one.
         num_gpus: GPUs that a worker takes, may be a fraction; "auto" = 1 if the device is a GPU.
         retries: how often a unit, and then each of its frames by itself, is repeated after a worker died on it.
-
-    Raises:
-        CFlowError: Ray is not installed, there is no cluster or no room for one worker in it, no worker can start, or a
-            setting is out of range.
     """
     if isinstance(retries, bool) or not isinstance(retries, int) or retries < 0:
         raise CFlowError(f"engine.retries={retries!r}: give a whole number of at least 0")

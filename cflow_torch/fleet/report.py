@@ -52,11 +52,7 @@ def _count(job: Job, unit: Unit) -> tuple[str, int, int]:
 
 
 class Counters:
-    """Counts the frames of a run.
-
-    Args:
-        units: all units of the run.
-    """
+    """Counts the frames of a run, from all its units."""
 
     def __init__(self, units: Sequence[Unit]) -> None:
         self.failures: list[tuple[str, str]] = []  # (frame or log, message)
@@ -103,14 +99,7 @@ class Counters:
         return int(event.timestamp is not None)
 
     def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
-        """Return all figures of a run.
-
-        Args:
-            seconds: from the start of the engine to its end.
-            layout: workers and batch size.
-            shard: the share of the work.
-            engine: "local" or "ray".
-            signal_name: of the signal that stopped the run, "" = none.
+        """Return all figures of a run that took `seconds` and was stopped by a signal, "" = none.
 
         Returns:
             "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",

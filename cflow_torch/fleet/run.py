@@ -35,7 +35,9 @@ def run_local(
     timeout: float = 600.0,
     memory: float | None = None,
 ) -> Iterator[Event]:
-    """Do all units with processes of this machine.
+    """Do all units with processes of this machine, and yield events as they happen.
+
+    A worker that dies is replaced and its unit is repeated, see `dispatch`.
 
     Args:
         job: the run; its folder is claimed already (`manifest.claim_folder`).
@@ -45,12 +47,6 @@ def run_local(
         timeout: seconds after which a worker process that has not answered is replaced.
         memory: bytes of address space that each worker process may use, of which Python and torch need about 3e9;
             None = no limit. Use it on a CPU only: the driver of a GPU reserves far more than it uses.
-
-    Yields:
-        Events as they happen. A worker that dies is replaced and its unit is repeated, see `dispatch`.
-
-    Raises:
-        CFlowError: no worker can start, or a setting is out of range.
     """
     for name, value in (("timeout", timeout), ("memory", 1 if memory is None else memory)):
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:

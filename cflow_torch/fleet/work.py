@@ -48,15 +48,9 @@ class _Frame:
 
 
 class Worker:
-    """Computes units with one method and keeps the log of the last one open.
+    """Computes units with one method, None = that of the job, and keeps the log of the last one open.
 
-    Args:
-        job: the run.
-        device: where to compute.
-        model: the method; None = that of the job.
-
-    Raises:
-        CFlowError: the device does not exist or cannot be used.
+    A device that cannot be used is a `CFlowError`.
     """
 
     def __init__(self, job: Job, device: str, model: FlowModel | None = None) -> None:
@@ -74,18 +68,13 @@ class Worker:
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
 
     def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
-        """Do those frames of a unit that are not complete.
+        """Do those frames of a unit that are not complete. `DeviceLost` if the GPU can no longer be used.
 
-        Args:
-            unit: what to do.
-            stop: called before each batch. Once it returns True, computed frames are written and no others begin.
+        Once `stop`, which is called before each batch, returns True, computed frames are written and no others begin.
 
         Yields:
             `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something other than a
             frame fails, `Failed` has no time stamp.
-
-        Raises:
-            DeviceLost: the GPU can no longer be used.
         """
         try:
             yield from self._run(unit, stop)
@@ -210,15 +199,9 @@ class Worker:
 def make_worker(
     job: Job, device: str, memory: float | None = None
 ) -> Callable[[Unit, Callable[[], bool]], Iterator[Event]]:
-    """Make a worker in its own process, which on a CPU computes on one thread: other workers use the other cores.
+    """Make a worker in its own process, and return its `run`, which ends the process if its GPU is lost.
 
-    Args:
-        job: the run.
-        device: where to compute.
-        memory: bytes of address space that the process may use; None = no limit.
-
-    Returns:
-        `Worker.run`, which ends the process if its GPU is lost.
+    On a CPU it computes on one thread: other workers use the other cores. `memory` limits the bytes of address space.
     """
     if memory is not None:
         import resource  # not available on Windows

@@ -127,8 +127,8 @@ class SequenceFlow(nn.Module):
 def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Tensor:
     """Rotate (N, 3) residual flow from the axes of ego1 to those of the points of t; `now`, `following` are t, t+1.
 
-    The rotation is (R_global_ego0 R_ego_sensor)^T R_global_ego1, in float64. A flow is not translated, because it is a
-    difference of positions.
+    The rotation is (R_global_ego0 R_ego_sensor)^T R_global_ego1, in float64; a difference of positions is not
+    translated.
     """
     rotation = np.eye(4)
     global_R_sensor = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]

@@ -24,16 +24,10 @@ class KeyPoints:
 
 
 def detect(occupancy: Tensor) -> Tensor:
-    """Find the key points: occupied pixels at distance 1 from the background (Sec. Keypoints).
+    """Find the key points of (..., H, W) bool images: pixels at distance 1 from the background (Sec. Keypoints).
 
-    Args:
-        occupancy: (..., H, W) bool.
-
-    Returns:
-        (..., H, W) bool.
-
-    Convention: the distance is Euclidean, so a key point has a free pixel among its four neighbours. The outside of the
-        image is background.
+    The distance is Euclidean, so a key point has a free pixel among its four neighbours. The outside of the image is
+    background.
     """
     return occupancy & ~erode_cross(occupancy)
 

@@ -56,14 +56,7 @@ class Pairing:
 
 
 def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
-    """Find the candidates among `target` of groups of `source`: all within reach of a group, and a few more.
-
-    Args:
-        source, target: key points of the same windows, at least one each.
-        reach: (B,) float64, pixels.
-
-    Cost: linear in key points plus candidates.
-    """
+    """Find the candidates among `target` of groups of `source`, all within `reach` pixels and a few more."""
     member = _group(source)
     candidate, count, limit = _candidates(source, member, target, reach)
     first = count.cumsum(0) - count

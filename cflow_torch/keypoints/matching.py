@@ -178,15 +178,9 @@ def _pack(patch: Tensor, swapped: bool) -> tuple[Tensor, ...]:
 
 
 def _overlap(patch0: Sequence[Tensor], member: Tensor, patch1: Sequence[Tensor], candidate: Tensor) -> Tensor:
-    """Count the pixels that are set in both descriptors, times 128.
+    """Count the pixels that are set in both descriptors, times 128: (G, S, C) int32.
 
-    Args:
-        patch0, patch1: strips of the descriptors, as `_pack` makes them.
-        member: (G, S) int64, rows of `patch0`.
-        candidate: (G * C,) int64, rows of `patch1`.
-
-    Returns:
-        (G, S, C) int32.
+    The descriptors are strips of `_pack`; `member` (G, S) and `candidate` (G * C,) are their rows.
     """
     num_groups, size = member.shape
     width = patch1[0].shape[1]

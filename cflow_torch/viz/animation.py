@@ -47,7 +47,7 @@ def flow_figures(
     legend: str = "upper right",
     width: int = 1000,
 ) -> Iterator[Figure]:
-    """Draw each pair with `plot_flow`, all with the same view, colours and legend.
+    """Draw each pair with `plot_flow`, all with the same view, colours and legend, for `save_animation`.
 
     Args:
         frames: at least one pair, in order.
@@ -55,12 +55,6 @@ def flow_figures(
         max_flow: residual flow at the rim of the colour wheel, metres per sweep; None = the longest of all frames.
         legend: corner of the colour wheel, see `plot_flow`.
         width: of a picture, pixels, 200 ... 4000.
-
-    Yields:
-        Figures of one size, one at a time, for `save_animation`.
-
-    Raises:
-        CFlowError: the width is not allowed, or as `plot_flow`.
     """
     if not 200 <= width <= 4000:
         raise CFlowError(f"width={width}: give 200 ... 4000 pixels")

@@ -71,18 +71,15 @@ def plot_clusters(
 
 
 def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Sequence[int]) -> np.ndarray:
-    """Choose a colour for each cluster, so that neighbours differ.
+    """Choose a colour for each cluster, so that neighbours differ: (N, 3) uint8 RGB.
+
+    The largest cluster is coloured first. Each cluster gets the colour of `PALETTE` whose nearest cluster is farthest
+    away, measured between bounding boxes. Ties: the colour that fewest clusters have.
 
     Args:
         position: (N, 2+) float64, metres, finite; x and y count.
         cluster_id: (N,) integers, negative = in no cluster.
         no_cluster: RGB, 0 ... 255, of points in no cluster.
-
-    Returns:
-        (N, 3) uint8 RGB.
-
-    Convention: the largest cluster is coloured first. Each cluster gets the colour of `PALETTE` whose nearest cluster
-        is farthest away, measured between bounding boxes. Ties: the colour that fewest clusters have.
 
     Cost: quadratic in the number of clusters, about 0.1 s for a thousand.
     """

@@ -19,12 +19,7 @@ _RAMP = np.array([(66, 125, 245), (38, 190, 205), (112, 205, 80), (250, 200, 40)
 
 
 def make_colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
-    """All colourings of the page, with palettes and legends.
-
-    Args:
-        max_flow: metres per sweep, rim of the wheel.
-        interval: seconds from sweep to sweep.
-    """
+    """All colourings of the page, with palettes and legends; the rim of the wheel is `max_flow`, metres per sweep."""
     speed = max_flow / interval
     rim = f"right: ahead of the vehicle; rim: {max_flow:.4g} m per sweep, {speed:.3g}\u00a0m/s"
     wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), np.concatenate([PALETTE, _faded()]).tolist()
@@ -74,15 +69,9 @@ def _faded() -> np.ndarray:
 
 
 def object_entry(position: np.ndarray, cluster: np.ndarray, moving: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """Colour clusters, neighbours differently. A cluster is static unless at least half of its points move.
+    """Colour clusters, -1 = none, neighbours differently: (N,) uint8 entries of the palette of objects.
 
-    Args:
-        position: (N, 3), metres.
-        cluster: (N,) int64, -1 = none.
-        moving, ground: (N,) bool.
-
-    Returns:
-        (N,) uint8 entries of the palette of objects: its colours, then the pale ones of static objects.
+    A cluster has the pale colours of static objects unless at least half of its points move.
     """
     entry = np.where(ground, GROUND, STATIC).astype(np.uint8)
     has_one = cluster >= 0

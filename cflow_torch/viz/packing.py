@@ -23,9 +23,7 @@ _FLOOR_RADIUS = 15.0  # metres; the ground near the vehicle has the height of th
 class PackedDrive:
     """Thinned scenes of one drive, and their colours as entries of palettes.
 
-    Args:
-        max_flow: metres per sweep, full colour.
-        voxel: metres, side of the cubes of which each keeps one static point.
+    `max_flow` has full colour, metres per sweep. Of each cube of `voxel` metres, one static point is kept.
     """
 
     def __init__(self, max_flow: float, voxel: float) -> None:

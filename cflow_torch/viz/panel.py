@@ -44,9 +44,6 @@ def new_figure(
             empty space along its long sides.
         title: heading of the figure, None = none.
         caption: one line below the panels that explains the colours. The distance of the rings is added.
-
-    Raises:
-        CFlowError: matplotlib is not installed.
     """
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
@@ -84,12 +81,8 @@ def draw_ground(axes: Axes, position: np.ndarray) -> None:
 def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.ndarray | None, max_flow: float) -> None:
     """Draw static points in grey, moving points in colour, one arrow per moving cluster, and the ego vehicle.
 
-    Args:
-        axes: a panel.
-        position: (N, 3) float64, metres.
-        flow: (N, 3) float64 residual flow, metres per sweep; NaN is drawn as static.
-        cluster: (N,) int64, -1 = none; None = groups of moving points near each other.
-        max_flow: metres per sweep, full colour.
+    Positions (N, 3) are in metres, residual flow (N, 3) in metres per sweep; NaN is drawn as static. Clusters (N,) are
+    -1 = none; without them, moving points near each other form groups. `max_flow` has full colour.
     """
     moves = np.linalg.norm(flow, axis=1) > MOVING  # False for NaN
     dot = dot_area(axes)
@@ -125,11 +118,7 @@ def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.nd
 def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.ndarray) -> None:
     """Draw the end-point error of every point with known truth, on the field's scale from black (none) to white.
 
-    Args:
-        axes: a panel.
-        position: (N, 3) float64, metres.
-        flow: (N, 3) float64 residual flow, metres per sweep.
-        truth: (N, 3) float64 true residual flow, NaN = unknown.
+    Positions (N, 3) are in metres, residual and true residual flow (N, 3) in metres per sweep, NaN = unknown.
     """
     error = np.linalg.norm(flow - truth, axis=1)
     is_known = np.isfinite(error)
@@ -147,18 +136,12 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
 
 
 def group_medians(group: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Median of each column within each group.
-
-    Args:
-        group: (N,) int64; negative = in no group.
-        values: (N, C) float64.
+    """Median of each column of (N, C) values within each group (N,), negative = in no group.
 
     Returns:
         number: (G,) int64, the groups, ascending.
         median: (G, C) float64, the upper one of an even count.
         count: (G,) int64, rows of each group.
-
-    Cost: one sort per column.
     """
     values, group = values[group >= 0], group[group >= 0]
     number, start, count = np.unique(np.sort(group), return_index=True, return_counts=True)

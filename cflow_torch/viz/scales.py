@@ -115,11 +115,7 @@ def _draw_flows(
     result: FlowResult,
     alone: FlowResult,
 ) -> float:
-    """Draw the flow so far after each scale, and in the last panel that of the finest scale alone.
-
-    Returns:
-        Metres per sweep, full colour.
-    """
+    """Draw the flow after each scale, and that of the finest alone; return the metres per sweep of full colour."""
     view, is_inside = view_of(position, config.point_cloud_range)
     keep = is_inside & result.is_valid.numpy()
     flows = [scale.flow[keep] for scale in found]

@@ -53,13 +53,7 @@ class Occupancy:
         return image
 
     def draw(self, axes: Axes, fade: float = 0.0, **settings: Any) -> None:
-        """Draw the pixels at their positions in metres.
-
-        Args:
-            axes: any axes.
-            fade: 0 ... 1, how far the colours go towards white.
-            settings: of `Axes.imshow`.
-        """
+        """Draw the pixels at their positions in metres; `fade`, 0 ... 1, is how far the colours go towards white."""
         (height, width), (x, y) = self.t.shape, self.lower
         extent = (x, x + width * self.pixel_size, y, y + height * self.pixel_size)
         axes.imshow(self.rgb(fade), extent=extent, origin="lower", interpolation="nearest", **settings)
@@ -131,16 +125,7 @@ def scales(window: Window, config: Config) -> tuple[list[Scale], FlowResult]:
 
 @torch.inference_mode()
 def cluster_correlation(window: Window, config: Config, cluster_id: int | None = None) -> ClusterCorrelation:
-    """Run the dense method and return the correlation of one cluster.
-
-    Args:
-        window: sweeps.
-        config: a `DenseConfig`, clusters by components.
-        cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
-
-    Raises:
-        CFlowError: the method has no such map, there is no such cluster, or the input is invalid.
-    """
+    """Run the dense method and return the correlation of one cluster, by default the one of `choose_cluster`."""
     if not isinstance(config, DenseConfig) or config.clustering != "components":
         raise _not_drawable(config, "correlation map per cluster", "paper")
     (*_, last), result = scales(window, config)
@@ -173,13 +158,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
 def choose_cluster(of_point: np.ndarray, flow: np.ndarray, cluster_id: int | None = None) -> int | None:
     """The given cluster, or else that with the largest product of points and metres of flow; None = there is none.
 
-    Args:
-        of_point: (N,) int64 cluster of each point, -1 = none.
-        flow: (N, 3) float64 residual flow, metres per sweep interval.
-        cluster_id: a cluster.
-
-    Raises:
-        CFlowError: no point is in the given cluster.
+    `of_point` is the (N,) cluster of each point, -1 = none, and `flow` its residual flow.
     """
     numbers, median, count = group_medians(of_point, flow)
     if cluster_id is None:

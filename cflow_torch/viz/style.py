@@ -132,12 +132,7 @@ def legend_box(
 ) -> Axes:
     """Add an empty white box in the corner where it covers the fewest points; an important point counts twenty-fold.
 
-    Args:
-        axes: a panel.
-        position: (N, 3) float64, metres.
-        is_important: (N,) bool.
-        inches: width and height.
-        corner: one of `CORNERS`; None = the one that covers the fewest.
+    The size is in inches. `corner` is one of `CORNERS`; None = the one that covers the fewest.
     """
     panel = inches_of(axes)
     size, margin = np.minimum(np.array(inches) / panel, 0.5), 0.1 / panel

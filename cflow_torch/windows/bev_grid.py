@@ -51,13 +51,9 @@ class Grid:
         return pixel.double().add_(0.5).mul_(self.pixel_size).add_(lower[:, None])
 
     def contains(self, positions: Tensor) -> Tensor:
-        """Test whether positions are finite and inside the region, both ends included.
+        """(N,) bool: positions, (2, N) or (3, N) float64 metres, are finite and inside the region, both ends included.
 
-        Args:
-            positions: (2, N) or (3, N) float64, metres, frame of t+1; without z every height is inside.
-
-        Returns:
-            (N,) bool.
+        Without z every height is inside.
         """
         # A value is inside if clamping keeps it; NaN and infinity fail. eq_ writes ones and zeros in place: on the CPU
         # two comparisons that write bools take almost twice as long.
@@ -71,17 +67,10 @@ class Grid:
         return inside.bool()
 
     def pixel(self, positions: Tensor) -> Tensor:
-        """Raster index row * W + col of each position (Eq. 3d_to_bev).
+        """(N,) int32 raster index row * W + col of (2, N) or (3, N) float64 metres (Eq. 3d_to_bev); undefined outside.
 
-        Args:
-            positions: (2, N) or (3, N) float64, metres, frame of t+1.
-
-        Returns:
-            (N,) int32; undefined for positions outside the region.
-
-        Convention:
-            floor((p - p_lower) / s) with a true division in float64. The divisor is a tensor, because a GPU multiplies
-            by the reciprocal of a plain number, which rounds differently.
+        It is floor((p - p_lower) / s) with a true division in float64. The divisor is a tensor, because a GPU
+        multiplies by the reciprocal of a plain number, which rounds differently.
         """
         size = constant((self.pixel_size,), positions.dtype, positions.device)
         # Inside the region nothing is below the lower end, so int() rounds down.

@@ -19,19 +19,12 @@ _ORTHOGONALITY = 1e-3
 
 
 def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
-    """Check a rigid transform and convert it to float64.
+    """Check a rigid transform and convert it to (4, 4) float64; another matrix is a `CFlowError`.
 
     Args:
-        matrix: (4, 4) array or tensor.
+        matrix: (4, 4) array or tensor, whose type must resolve a centimetre.
         name: its name in errors, for example "T_ego1_ego0".
         reach: largest distance of a point from the origin, metres.
-
-    Returns:
-        (4, 4) float64.
-
-    Raises:
-        CFlowError: wrong shape, not finite, not a rotation with a translation, or a type that does not resolve a
-            centimetre.
     """
     dtype = getattr(matrix, "dtype", None)
     try:

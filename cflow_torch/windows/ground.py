@@ -70,15 +70,7 @@ def find_ground_batch(
 ) -> list[Array]:
     """Segment the ground points of several sweeps at once. The results equal those of `find_ground`.
 
-    Args:
-        clouds: B clouds, (N, 3+) each; tensors must be on one device.
-        method, threshold, device: as in `find_ground`.
-
-    Returns:
-        B masks, (N,) bool each, array or tensor like the cloud.
-
-    Raises:
-        CFlowError: as `find_ground`, or tensors on several devices.
+    Tensors must be on one device.
 
     Cost: two sorts of all points, some 60 passes over 256 x 256 cells per sweep; 100,000 points take 20 ms on one CPU
     thread (docs/data.md).
@@ -102,18 +94,9 @@ def find_ground_batch(
 
 @one_thread()
 def has_ground(clouds: Sequence[Array]) -> list[bool]:
-    """Test whether each of several sweeps contains ground, from some of its points.
+    """Test whether each of several sweeps contains ground, from at most 30,000 of its points.
 
-    Args:
-        clouds: B clouds, (N, 3+) each; tensors must be on one device.
-
-    Returns:
-        B bools.
-
-    Raises:
-        CFlowError: wrong shape or dtype, tensors on several devices.
-
-    Cost: the first third of `find_ground`, on at most 30,000 points a sweep.
+    Cost: the first third of `find_ground`.
     """
     if not clouds:
         return []
@@ -123,13 +106,7 @@ def has_ground(clouds: Sequence[Array]) -> list[bool]:
 
 @one_thread()
 def is_upside_down(cloud: Array) -> bool:
-    """Test whether z points down: nearly all points more than half a metre from the ground are below it.
-
-    Args:
-        cloud: (N, 3+).
-
-    Raises, Cost: as `has_ground`.
-    """
+    """Test whether z points down: nearly all points more than half a metre from the ground are below it."""
     points, sweep, inside = _thinned([cloud])
     plane = near_plane(points, sweep, inside, 1)
     above = points[2] - plane.at(points[0], points[1], sweep)

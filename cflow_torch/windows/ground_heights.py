@@ -29,13 +29,7 @@ _UNKNOWN = -(1 << 40)
 
 
 class GroundHeights:
-    """Sums of heights in blocks of 2 m x 2 m. They are integers, so the order of points and pieces does not matter.
-
-    Args:
-        num_windows: B.
-        grid: the region.
-        device: device of the sums.
-    """
+    """Sums of heights in blocks of 2 m x 2 m. They are integers, so the order of points and pieces does not matter."""
 
     def __init__(self, num_windows: int, grid: Grid, device: torch.device) -> None:
         self._lower = grid.lower
@@ -67,12 +61,9 @@ class GroundHeights:
         return mean.masked_fill_(count < _FEWEST_POINTS, _UNKNOWN)
 
     def at(self, positions: Tensor, window: Tensor, mean: Tensor) -> Tensor:
-        """(N,) float64, centimetres: height of the ground around points; undefined outside the region.
+        """(N,) float64, centimetres: height of the ground around points, (3, N) metres, given the result of `mean`.
 
-        Args:
-            positions: (3, N) float64, metres.
-            window: (N,) int64.
-            mean: the result of `mean`.
+        Undefined outside the region.
         """
         block = torch.add(self._block(positions), window, alpha=mean.shape[1] * mean.shape[2])
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))

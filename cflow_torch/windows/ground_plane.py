@@ -39,15 +39,13 @@ class Plane:
 
 
 def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int) -> Plane:
-    """Fit the plane on which most flat spots near the vehicle lie.
+    """Fit the plane on which most flat spots near the vehicle lie. Ties: the lowest height.
 
     Args:
         points: (3, N) int64, mm.
         sweep: (N,) int64, sweep of each point.
         is_active: (N,) bool, False = leave the point out.
         num_sweeps: B.
-
-    Convention: ties: the lowest height.
     """
     size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
     col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)

@@ -24,14 +24,7 @@ _BYTES_ON_CPU = 1 << 29
 def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str) -> None:
     """Raise before an allocation that does not fit, because a system that runs out of memory kills the process.
 
-    Args:
-        num_bytes: needed memory.
-        device: CPU or GPU.
-        what: subject of the message, for example "a window of ...".
-        remedy: end of the message, what to do.
-
-    Raises:
-        CFlowError: more is needed than is free.
+    `what` is the subject of the message, for example "a window of ...", and `remedy`, what to do, is its end.
     """
     if num_bytes <= _MUCH:
         return
@@ -86,17 +79,11 @@ def split_windows(
     """Split windows into groups that fit into memory, in order. Results do not depend on the grouping.
 
     Args:
-        windows: B windows, checked.
+        windows: B windows, checked. One that does not fit by itself is a `CFlowError`.
         grid: the finest scale, whose images are the largest.
         device: on a CPU large groups are slower.
         bytes_per_point: working memory of a method per point.
         max_memory: bytes; None = no limit on a GPU, 512 MiB per group on a CPU.
-
-    Returns:
-        Groups of at least one window; an empty list for no windows.
-
-    Raises:
-        CFlowError: a single window does not fit.
     """
     groups: list[list[Window]] = []
     if max_memory is None and device.type == "cpu":

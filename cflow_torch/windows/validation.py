@@ -23,15 +23,7 @@ _log = logging.getLogger(__name__)
 
 
 def check_windows(windows: Any, config: Config) -> None:
-    """Check that this is a list of windows whose points are fine enough.
-
-    Args:
-        windows: anything.
-        config: settings whose region and finest pixels the points must be fine enough for.
-
-    Raises:
-        CFlowError: what is wrong, by the name that users know it by.
-    """
+    """Check that this is a list of windows whose points are fine enough for the region and the finest pixels."""
     if isinstance(windows, (Window, Sweep)) or not isinstance(windows, (list, tuple)):
         raise CFlowError(f"got {type(windows).__name__}: give a list of cflow_torch.Window, also for one window")
     for window in windows:
@@ -72,11 +64,7 @@ def _check_resolution(dtype: Any, name: str, config: Config) -> None:
 
 
 def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
-    """The given device. For "auto": the device of the tensors, else a GPU if there is one, else the CPU.
-
-    Raises:
-        CFlowError: a device that cannot be used, or tensors on several devices.
-    """
+    """The given device. For "auto": the device of the tensors, else a GPU if there is one, else the CPU."""
     if not (isinstance(device, str) and device == "auto"):
         try:
             torch.empty(0, device=device)
@@ -127,14 +115,8 @@ def _together(columns: Sequence[Array], dtype: Any, device: torch.device) -> Ten
 def read_point_times(sweep: Sweep, name: str, interval: float | None, device: torch.device) -> Tensor:
     """Return the times of the points, (N,) float64, in sweep intervals, rounded to multiples of 2^-20.
 
-    Args:
-        sweep: a sweep, checked.
-        name: its name in messages.
-        interval: seconds from t to t+1; None = the times are not used, and the result is 0.
-        device: device of the result.
-
-    Raises:
-        CFlowError: a time is not finite, or too far from the sweep's time stamp.
+    The interval is the seconds from t to t+1; None = the times are not used, and the result is 0. Times that are not
+    finite or too far from the time stamp are a `CFlowError` with the name of the sweep.
     """
     if interval is None:
         return torch.zeros(sweep.points.shape[0], dtype=torch.float64, device=device)

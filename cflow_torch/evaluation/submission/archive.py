@@ -69,7 +69,7 @@ def encode(
 
     Args:
         version: the format.
-        result: flow of the N points of sweep t.
+        result: flow of the N points of sweep t; values that are NaN, infinite or beyond float16 are a `CFlowError`.
         is_ground: (N,) bool, True = ground; None = no point is ground.
         mask: (N,) bool, points to write; None = all, for versions without a mask.
 
@@ -80,9 +80,6 @@ def encode(
     Convention:
         A residual flow is in the axes of t+1, as OpenSceneFlow writes it, and 0 for ground points. `is_dynamic` is
         True where the unrounded residual is 0.05 m or longer.
-
-    Raises:
-        CFlowError: the mask is missing or not allowed; a value is NaN, infinite or beyond float16.
     """
     if (mask is not None) != version.is_masked:
         raise CFlowError(f"submission version {version.number} needs {'a' if version.is_masked else 'no'} mask")
@@ -101,11 +98,7 @@ def encode(
 
 
 def to_half(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Round a flow, (M, 3) metres, to float16; also return the (M,) float64 metres by which each row is off.
-
-    Raises:
-        CFlowError: a value is NaN, infinite, or larger than float16 can hold.
-    """
+    """Round a flow, (M, 3) metres, to float16; also return the (M,) float64 metres by which each row is off."""
     bad = ~(np.abs(flow) <= LARGEST).all(axis=1)
     if bad.any():
         raise CFlowError(f"the flow of {bad.sum()} points is NaN, infinite or beyond float16 ({LARGEST:g} m)")
@@ -130,8 +123,8 @@ def is_complete(folder: str | Path, name: str, rows: int, version: SubmissionVer
 def pack(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
     """Zip the named files of a submission folder, atomically. If one is missing, no zip is written.
 
-    Convention: entries are sorted by name, dated 1980-01-01, mode 0644, deflated. So the same files and the same zlib
-        give the same bytes.
+    Entries are sorted by name, dated 1980-01-01, mode 0644, deflated. So the same files and the same zlib give the same
+    bytes.
     """
     with atomic_file(file) as raw, zipfile.ZipFile(raw, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in sorted(set(names)):
@@ -142,16 +135,13 @@ def pack(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
 
 
 def check_submission(path: str | Path, version: SubmissionVersion, expected: Mapping[str, int]) -> list[str]:
-    """Compare an archive with what it must contain. Nothing is extracted.
+    """Compare an archive with what it must contain: all problems, one line each. Nothing is extracted.
 
     Args:
         path: a zip, or the folder that it is made from. Hidden files of a folder are skipped, because an interrupted
             writer leaves some and `pack` does not pack them.
         version: the format.
         expected: name -> number of rows of each file. The archive must contain exactly these files.
-
-    Returns:
-        All problems, one line each; empty if there are none.
 
     Convention: the order of columns is free. Values are only checked for being finite. Ground rows are not compared
         with 0, because any finite flow is a valid submission.

@@ -28,14 +28,7 @@ _HALF_SIDE = 50.0  # metres; the official masks contain the points that are not 
 class MaskArchive:
     """The official evaluation masks: a zip of `<log>/<time stamp>.feather`, each with one bool column.
 
-    Args:
-        file: the zip.
-
-    Attributes:
-        frames: log id -> time stamps that are evaluated.
-
-    Raises:
-        CFlowError: the file is not a zip, or contains no masks.
+    `frames` maps log ids to the time stamps that are evaluated.
     """
 
     def __init__(self, file: str | Path) -> None:
@@ -70,9 +63,6 @@ def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = N
     """Return the (N,) bool mask of the points of sweep `index` that are evaluated.
 
     It is the official mask, else the log's own (`log_mask`), else the official rule: not ground, |x| and |y| <= 50 m.
-
-    Raises:
-        CFlowError: the number of rows differs from that of the sweep; neither a mask nor the ground is known.
     """
     points = as_numpy(sweep.points)
     mask = log_mask(log, index) if masks is None else masks.mask(log.log_id, log.timestamps[index])
@@ -107,14 +97,9 @@ class Frame:
 def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> list[Frame]:
     """List the frames of one log that a submission needs, in the order of time.
 
-    Args:
-        log: one drive.
-        listed: log id -> time stamps of exactly the frames to submit (a frame list, or `frames` of a mask archive).
-            None = the sweeps that have an evaluation mask if the log has any, else the pairs 0, 5, 10 ... The last
-            sweep is left out, because it has no successor; OpenSceneFlow writes no file for it either.
-
-    Raises:
-        CFlowError: a listed time stamp is not in the log, or is its last; the log's name cannot be a folder's.
+    `listed` maps log ids to the time stamps of exactly the frames to submit. None = the sweeps that have an evaluation
+    mask if the log has any, else the pairs 0, 5, 10 ... The last sweep is left out, because it has no successor;
+    OpenSceneFlow writes no file for it either.
     """
     safe_name(log.log_id, "the log")
     pairs = range(len(log.timestamps) - 1)
