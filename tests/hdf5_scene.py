@@ -8,6 +8,8 @@ from typing import Any, Sequence
 import numpy as np
 import pytest
 
+from cflow_torch.data.rigid_motion import transform_points
+
 STAMPS = (1_533_279_682_150_532, 1_533_279_682_250_532, 1_533_279_682_350_532)  # microseconds
 
 
@@ -43,3 +45,22 @@ def write_scene(
                 if value is not None:
                     group[key] = value
     return file
+
+
+def move_to_sensor(file: Path, ego_T_lidar: np.ndarray, is_stated: bool = False) -> None:
+    """Move the points and the flow of a scene to the frame of a LiDAR; poses and ego motion stay those of the vehicle.
+
+    Unless the extrinsics are stated, the scene is like OpenSceneFlow's of Argoverse 2: without them, float32 poses."""
+    h5py, inverse = pytest.importorskip("h5py"), np.linalg.inv(ego_T_lidar)
+    with h5py.File(file, "r+") as scene:
+        del scene.attrs["ego_T_lidar"]
+        if is_stated:
+            scene.attrs["ego_T_lidar"] = ego_T_lidar
+        for group in scene.values():
+            group["lidar"][...] = transform_points(group["lidar"][()], inverse)
+            if "flow" in group:
+                group["flow"][...] = group["flow"][()].astype(np.float64) @ inverse[:3, :3].T
+            if not is_stated:
+                pose = group["pose"][()].astype(np.float32)
+                del group["pose"]
+                group["pose"] = pose

@@ -52,7 +52,7 @@ class MovingGroups:
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
     def divide(self, piece: Tensor) -> MovingGroups:
-        """Divide the groups by the (M,) piece of each moving point; pieces keep cluster and confidence."""
+        """Divide the groups by the piece of each moving point, from 0; pieces keep cluster and confidence."""
         moves = self.group >= 0
         pairs = torch.stack([self.group[moves], piece])
         (origin, _), index, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)

@@ -6,7 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hdf5_scene import STAMPS, write_scene
+from hdf5_scene import STAMPS, move_to_sensor, write_scene
 
 from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
@@ -141,8 +141,10 @@ def drive():
 @pytest.mark.parametrize("points_frame", ["ego", "sensor"])
 def test_a_simulated_drive_comes_back(drive, tmp_path, points_frame):
     file = tmp_path / "scene.h5"
-    write_hdf5_scene(drive, file, points_frame, eval_step=2)
+    write_hdf5_scene(drive, file, eval_step=2)
     extrinsics = drive.units(0)[0].T_ego_sensor if points_frame == "sensor" else np.eye(4)
+    if points_frame == "sensor":
+        move_to_sensor(file, extrinsics, is_stated=True)
     step = 0.0 if points_frame == "ego" else 1e-5  # float32 at 100 m
     with HDF5Log(file) as log:
         assert list(log.timestamps) == list(drive.timestamps) and np.array_equal(log.ego_T_lidar, extrinsics)
@@ -176,7 +178,8 @@ def test_argoverse_scenes_without_extrinsics_are_recognised(drive, tmp_path):
     mount = drive.units(0)[0].T_ego_sensor
     for frame in ("sensor", "ego"):
         file = tmp_path / f"{frame}.h5"
-        write_hdf5_scene(drive, file, frame, store_extrinsics=False, pose_dtype="float32")
+        write_hdf5_scene(drive, file)
+        move_to_sensor(file, mount if frame == "sensor" else np.eye(4))
         with HDF5Log(file) as log, HDF5Log(file, ego_T_lidar=mount) as told, HDF5Log(file, ego_T_lidar=None) as plain:
             if frame == "ego":
                 assert np.array_equal(log.ego_T_lidar, np.eye(4))

@@ -31,6 +31,7 @@ pytest.importorskip("h5py")
 
 import h5py
 from command_line import cflow
+from hdf5_scene import move_to_sensor
 from pyarrow import feather
 
 from cflow_torch.data.av2 import AV2Log
@@ -156,8 +157,9 @@ def up_lidar(log_folder: Path) -> np.ndarray:
 @pytest.mark.slow
 def test_eval_of_the_real_pair(harness: Harness, checkpoint: Path, av2_folder: Path, tmp_path: Path) -> None:
     """Points are of the upper LiDAR and poses of the vehicle, which the module recognises."""
-    layout = {"points_frame": "sensor", "ego_T_lidar": up_lidar(av2_folder), "store_extrinsics": False}
-    write_hdf5_scene(AV2Log(av2_folder), tmp_path / "val" / f"{av2_folder.name}.h5", **layout, pose_dtype="float32")
+    file = tmp_path / "val" / f"{av2_folder.name}.h5"
+    write_hdf5_scene(AV2Log(av2_folder), file)
+    move_to_sensor(file, up_lidar(av2_folder))
     write_index_files(tmp_path / "val")
     scores = read_scores(harness.run("real", "eval.py", *inputs(checkpoint, tmp_path)))
     assert scores == evaluated(tmp_path / "val", tmp_path / "out", *OURS)

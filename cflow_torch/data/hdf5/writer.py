@@ -12,65 +12,35 @@ from cflow_torch.data.atomic import atomic_file, atomic_name
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes, import_h5py
 from cflow_torch.data.log import Log
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.ego_motion import rigid_transform
 
 
-def write_hdf5_scene(
-    log: Log,
-    file: str | Path,
-    points_frame: str = "ego",
-    ego_T_lidar: Any = None,
-    store_extrinsics: bool = True,
-    pose_dtype: str = "float64",
-    eval_step: int = 5,
-) -> None:
-    """Write a log as one scene: one group per sweep, named by its time stamp.
+def write_hdf5_scene(log: Log, file: str | Path, eval_step: int = 5) -> None:
+    """Write a log as one scene in the ego frame: one group per sweep, named by its time stamp.
 
     Args:
         log: any log with poses; a `Recording` also provides lidar_id, lidar_dt, lidar_center and flow_instance_id.
         file: `<scene>.h5`.
-        points_frame: "ego", or "sensor" = points and flow in the LiDAR's frame while poses and ego_motion stay those of
-            the ego frame, as in OpenSceneFlow's Argoverse 2 scenes.
-        ego_T_lidar: (4, 4) for "sensor"; None = that of a recording's first unit.
-        store_extrinsics: store `ego_T_lidar` as an attribute of the scene, which `HDF5Log` reads; the harness's own
-            files have none.
-        pose_dtype: "float64" (Waymo, nuScenes, TruckScenes) or "float32" (Argoverse 2, ZOD).
         eval_step: every how many labelled sweeps get an `eval_mask` (valid and not ground); 0 = none.
 
     Convention:
-        lidar, flow, ego_motion, lidar_dt, lidar_center are float32, masks bool, flow_category_indices and lidar_id
-        uint8, flow_instance_id int16. eval_mask is (N, 1). The last sweep has no flow and no ego_motion. Arrays are
-        neither chunked nor compressed. The file appears complete or not at all.
+        lidar, flow, ego_motion, lidar_dt, lidar_center are float32, poses float64, masks bool, flow_category_indices
+        and lidar_id uint8, flow_instance_id int16. eval_mask is (N, 1). The last sweep has no flow and no ego_motion.
+        Arrays are neither chunked nor compressed. The attribute `ego_T_lidar`, which the harness's own files lack, is
+        the identity. The file appears complete or not at all.
 
     Raises:
-        CFlowError: h5py is missing, a sweep has no pose, there is no extrinsic for "sensor", a setting that does not
-            exist, or time stamps that are not distinct numbers.
+        CFlowError: h5py is missing, a sweep has no pose, or time stamps are not distinct numbers.
     """
     h5py = import_h5py()
-    if points_frame not in ("ego", "sensor") or pose_dtype not in ("float32", "float64") or eval_step < 0:
-        raise CFlowError(
-            f"points_frame={points_frame!r}, pose_dtype={pose_dtype!r}, eval_step={eval_step}: pass 'ego' or 'sensor', "
-            "'float32' or 'float64', and a step of at least 0"
-        )
-    extrinsics = np.eye(4)
-    if points_frame == "sensor":
-        if ego_T_lidar is None and hasattr(log, "units"):
-            ego_T_lidar = log.units(0)[0].T_ego_sensor
-        if ego_T_lidar is None:
-            raise CFlowError(f"points_frame='sensor' needs ego_T_lidar, because log {log.log_id} does not have it")
-        extrinsics = rigid_transform(ego_T_lidar, "ego_T_lidar")
     if len(set(log.timestamps)) < len(log.timestamps) or min(log.timestamps, default=0) < 0:
         raise CFlowError(f"log {log.log_id}: time stamps must be distinct and at least 0, because they name the groups")
-    file = Path(file)
     identity: dict[str, int] = {}
-    with atomic_name(file) as new, h5py.File(new, "w") as scene:
-        if store_extrinsics:
-            scene.attrs[EXTRINSIC] = extrinsics
+    with atomic_name(Path(file)) as new, h5py.File(new, "w") as scene:
+        scene.attrs[EXTRINSIC] = np.eye(4)
         for index, stamp in enumerate(log.timestamps):
             group = scene.create_group(str(int(stamp)))
-            for key, value in _sweep(log, index, extrinsics, pose_dtype, eval_step, identity).items():
+            for key, value in _sweep(log, index, eval_step, identity).items():
                 group.create_dataset(key, data=value)
 
 
@@ -94,25 +64,20 @@ def write_index_files(folder: str | Path) -> None:
             pickle.dump(entries, index, protocol=4)
 
 
-def _sweep(
-    log: Log, index: int, extrinsics: np.ndarray, pose_dtype: str, eval_step: int, identity: dict[str, int]
-) -> dict[str, np.ndarray]:
+def _sweep(log: Log, index: int, eval_step: int, identity: dict[str, int]) -> dict[str, np.ndarray]:
     """Return the keys and values of one group."""
     sweep, labels = log.sweep(index), log.labels(index)
     if sweep.pose is None:
         raise CFlowError(f"sweep {index} of log {log.log_id} has no pose, which the layout needs")
-    ego_points = np.asarray(sweep.points)[:, :3]
-    inverse = np.linalg.inv(extrinsics)
-    points = transform_points(ego_points, inverse)
-    pose = np.asarray(sweep.pose, np.float64)
-    values: dict[str, np.ndarray] = {"lidar": points.astype(np.float32), "pose": pose.astype(pose_dtype)}
+    points, pose = np.asarray(sweep.points)[:, :3].astype(np.float32), np.asarray(sweep.pose, np.float64)
+    values: dict[str, np.ndarray] = {"lidar": points, "pose": pose}
     if sweep.is_ground is not None:
         values["ground_mask"] = np.asarray(sweep.is_ground, bool)
     if index < len(log.timestamps) - 1:
         following = np.asarray(log.sweep(index + 1).pose, np.float64)
         values["ego_motion"] = (np.linalg.inv(following) @ pose).astype(np.float32)
     if labels is not None:
-        values["flow"] = (labels.flow.astype(np.float64) @ inverse[:3, :3].T).astype(np.float32)
+        values["flow"] = labels.flow.astype(np.float32)
         values["flow_is_valid"] = labels.is_valid
         values["flow_category_indices"] = labels.category.astype(np.uint8)
         if eval_step and index % eval_step == 0:
@@ -121,7 +86,7 @@ def _sweep(
     if hasattr(log, "units"):
         values.update(_units(log.units(index)))
     if hasattr(log, "boxes"):
-        values["flow_instance_id"] = _instances(log.boxes(index), ego_points, identity)
+        values["flow_instance_id"] = _instances(log.boxes(index), points, identity)
     return values
 
 
