@@ -24,14 +24,6 @@ def mean_of_present(values: np.ndarray) -> float:
     return float(np.nansum(values) / count) if count else float("nan")
 
 
-def bucket_cells(scored: ScoredPoints, definition: Definition) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (M,) int64 cell of each point, class * number of buckets + bucket, and (M,) bool, False = no cell."""
-    meta, bucket = meta_class(scored.category), interval_of(scored.speed, definition.speed_edges)
-    if definition.background == "static":
-        bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
-    return meta * (len(definition.speed_edges) - 1) + bucket, (meta >= 0) & (bucket >= 0)
-
-
 def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarray) -> dict[str, Any]:
     """Compute "classes" and "mean" of `BucketedEPE.compute` from sums of shape (classes, buckets)."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -57,38 +49,6 @@ def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarra
     return {"classes": classes, "mean": mean}
 
 
-class BucketedEPE(Accumulator):
-    """Dynamic bucket-normalised EPE.
-
-    Let e and v be the mean end-point error and the mean true speed of all points of a class in a bucket, over all
-    frames. `static_epe` is e of the first bucket, in metres. `dynamic_error` is the mean of e / v over the other
-    buckets that have points, each bucket with the same weight. It is exactly 1 if every residual is predicted as 0.
-
-    Convention: a bucket contains its lower edge, not its upper one. Classes without points are NaN and are not part of
-    the mean over classes.
-    """
-
-    def shape(self) -> tuple[int, ...]:
-        """Return (classes, buckets)."""
-        return len(META_NAMES), len(self.definition.speed_edges) - 1
-
-    def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Cells are class and bucket; quantities are error and speed."""
-        cell, keep = bucket_cells(scored, self.definition)
-        keep &= scored.in_region
-        return cell[keep], (scored.error[keep], scored.speed[keep])
-
-    def compute(self) -> dict[str, Any]:
-        """Return the scores so far.
-
-        Returns:
-            "classes": per meta class `static_epe` (metres), `dynamic_error` (ratio), `num_static`, `num_dynamic`
-            (points) and "buckets" (`count`, `epe`, `speed`, `normalized` per bucket); "mean": `static_epe`,
-            `dynamic_error`; "speed_edges": metres per frame.
-        """
-        return {**bucket_scores(self.count, *self.sums), "speed_edges": list(self.definition.speed_edges)}
-
-
 class BucketedByRange(Accumulator):
     """`BucketedEPE` of every range between the definition's `region_edges`, in one pass.
 
@@ -96,16 +56,23 @@ class BucketedByRange(Accumulator):
     `max_range` does not apply. Each point is in at most one range.
     """
 
-    def shape(self) -> tuple[int, ...]:
-        """Return (ranges, classes, buckets)."""
-        return len(self.definition.region_edges) - 1, len(META_NAMES), len(self.definition.speed_edges) - 1
+    def __init__(self, definition: Definition, num_ranges: int | None = None) -> None:
+        num_ranges = num_ranges or len(definition.region_edges) - 1
+        super().__init__(definition, (num_ranges, len(META_NAMES), len(definition.speed_edges) - 1))
+
+    def ranges(self, scored: ScoredPoints) -> np.ndarray:
+        """Return the (M,) range of each point, -1 = none."""
+        return interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Cells are range, class and bucket; quantities are error and speed."""
-        cell, keep = bucket_cells(scored, self.definition)
-        ring = interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
-        keep &= ring >= 0
-        return (ring * self.count[0].size + cell)[keep], (scored.error[keep], scored.speed[keep])
+        meta, bucket = meta_class(scored.category), interval_of(scored.speed, self.definition.speed_edges)
+        if self.definition.background == "static":
+            bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
+        place = np.stack([self.ranges(scored), meta, bucket])
+        keep = (place >= 0).all(axis=0)
+        cell = np.ravel_multi_index(tuple(place[:, keep]), self.count.shape)
+        return cell, (scored.error[keep], scored.speed[keep])
 
     def compute(self) -> dict[str, Any]:
         """Return the scores so far.
@@ -120,6 +87,35 @@ class BucketedByRange(Accumulator):
         return {"ranges": ranges, "mean": mean, "speed_edges": list(self.definition.speed_edges)}
 
 
+class BucketedEPE(BucketedByRange):
+    """Dynamic bucket-normalised EPE of the definition's region.
+
+    Let e and v be the mean end-point error and the mean true speed of all points of a class in a bucket, over all
+    frames. `static_epe` is e of the first bucket, in metres. `dynamic_error` is the mean of e / v over the other
+    buckets that have points, each bucket with the same weight. It is exactly 1 if every residual is predicted as 0.
+
+    Convention: a bucket contains its lower edge, not its upper one. Classes without points are NaN and are not part of
+    the mean over classes.
+    """
+
+    def __init__(self, definition: Definition) -> None:
+        super().__init__(definition, num_ranges=1)
+
+    def ranges(self, scored: ScoredPoints) -> np.ndarray:
+        """Return 0 for points in the region, -1 for others."""
+        return scored.in_region.astype(np.int64) - 1
+
+    def compute(self) -> dict[str, Any]:
+        """Return the scores so far.
+
+        Returns:
+            "classes": per meta class `static_epe` (metres), `dynamic_error` (ratio), `num_static`, `num_dynamic`
+            (points) and "buckets" (`count`, `epe`, `speed`, `normalized` per bucket); "mean": `static_epe`,
+            `dynamic_error`; "speed_edges": metres per frame.
+        """
+        return {**bucket_scores(self.count[0], *self.sums[:, 0]), "speed_edges": list(self.definition.speed_edges)}
+
+
 class RangeWiseEPE(Accumulator):
     """Range-wise EPE of all categories. The definition's region does not apply.
 
@@ -127,11 +123,8 @@ class RangeWiseEPE(Accumulator):
     of all frames; "mean" gives every range that has points the same weight.
     """
 
-    num_quantities = 1
-
-    def shape(self) -> tuple[int, ...]:
-        """Return (ranges, static / dynamic)."""
-        return len(self.definition.range_edges) - 1, 2
+    def __init__(self, definition: Definition) -> None:
+        super().__init__(definition, (len(definition.range_edges) - 1, 2), num_quantities=1)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Cells are range and motion; the quantity is the error."""

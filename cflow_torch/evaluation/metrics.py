@@ -36,7 +36,9 @@ class SceneFlowMetrics:
 
     def __init__(self, definition: str | Definition = "opensceneflow") -> None:
         self.definition = get_definition(definition)
-        self.parts: dict[str, Any] = {name: _ACCUMULATORS[name](self.definition) for name in self.definition.metrics}
+        self.parts: dict[str, Accumulator] = {
+            name: _ACCUMULATORS[name](self.definition) for name in self.definition.metrics
+        }
         self.num_frames = self.num_points = self.num_nan = 0
 
     def update(self, frame: EvalFrame) -> None:
@@ -50,6 +52,8 @@ class SceneFlowMetrics:
 
     def merge(self, other: SceneFlowMetrics) -> None:
         """Add the frames of another accumulator; a `CFlowError` if its definition is another one."""
+        if other.definition != self.definition:
+            raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
         for metric, another in zip(self.parts.values(), other.parts.values()):
             metric.merge(another)
         self.num_frames += other.num_frames

@@ -51,17 +51,11 @@ class ThreeWayEPE(Accumulator):
     points in both cases.
     """
 
-    totals = ("count", "sums", "num_frames", "frame_sums")
-    num_quantities = len(QUANTITIES) + 1  # the last one: 1 where a point is predicted as dynamic
-
-    def __init__(self, definition: str | Definition = "opensceneflow") -> None:
-        super().__init__(definition)
+    def __init__(self, definition: Definition) -> None:
+        # The last quantity is 1 where a point is predicted as dynamic.
+        super().__init__(definition, (len(CATEGORIES), len(MOTIONS), len(DISTANCES)), len(QUANTITIES) + 1)
         self.num_frames = 0
         self.frame_sums = np.zeros(len(_SETS) + 1, dtype=np.float64)  # per-frame values of the sets and the IoU
-
-    def shape(self) -> tuple[int, ...]:
-        """Return (categories, motions, distances)."""
-        return len(CATEGORIES), len(MOTIONS), len(DISTANCES)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Cells are category, motion and distance; quantities are `QUANTITIES` and whether predicted as dynamic."""
