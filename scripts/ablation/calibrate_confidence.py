@@ -52,12 +52,9 @@ def simulated(seeds: tuple[int, int]) -> Iterator[Item]:
 
 
 def statistics(items: Iterable[Item], histories: Sequence[int], max_points: float = math.inf) -> np.ndarray:
-    """(C, 7) float64: sums over the points of each of the C bins of the table.
+    """(C, 7) float64: sums over the points of each of the C bins of the table, for windows with each of some h.
 
-    Args:
-        items: with h = 4.
-        histories: each window is evaluated with each of these h.
-        max_points: weight of a window in a bin; if it has more points, all of them get less weight.
+    `max_points` is the weight of a window in a bin; if it has more points, all of them get less weight.
     """
     num_bins = len(confidence.TABLE["probabilities"])
     kept, sums = confidence.TABLE["probabilities"], np.zeros((num_bins, 7))

@@ -25,15 +25,10 @@ SQUARE = np.ones((3, 3), bool)
 
 
 def chain_flow(pairs: Sequence[Labelled], pose_flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Chain the labels of consecutive pairs to the flow over several sweeps.
+    """Chain the labels of consecutive pairs, of sweeps t, t + 1, ... t + k - 1, to the flow t -> t + k.
 
-    Args:
-        pairs: of sweeps t, t + 1, ... t + k - 1; their flow leads to the next sweep.
-        pose_flow: (N, 3) metres, flow t -> t + k of static points, axes of t + k.
-
-    Returns:
-        (N, 3) float32 total flow t -> t + k of the points of t. Objects move by the product of their rigid motions, the
-        background by `pose_flow`. (N,) bool, False for objects with too few points in one of the sweeps.
+    Objects move by the product of their rigid motions, the background by `pose_flow`, (N, 3) metres in the axes of t +
+    k. Also returns (N,) bool, False for objects with too few points in one of the sweeps.
     """
     points, instance = pairs[0][0].astype(np.float64), pairs[0][1]
     flow, is_known = pose_flow.astype(np.float64), np.ones(len(points), bool)
@@ -63,20 +58,11 @@ class Component(NamedTuple):
 def paste_static(
     pair: Window, labels: FlowLabels, instance: np.ndarray, scored: np.ndarray, number: int
 ) -> tuple[Window, FlowLabels]:
-    """Paste a static component of the pair next to every moving object.
+    """Paste a static component of the pair next to every moving object; return pair and labels with its points.
 
-    Args:
-        pair: sweeps with poses and ground masks.
-        labels: truth.
-        instance: (N,) object of each point of t, 0 = background.
-        scored: (N,) bool, points with valid truth.
-        number: index of the pair; it varies which component is pasted next to which object.
-
-    Returns:
-        The pair with the points of the components appended to both sweeps, and the labels of all points of t.
-
-    Convention: the component is `GAP` away from the area that the object covers from t to t+1, on the far side from
-        the sensor, where it does not occlude the object. It has the same position in the world in both sweeps.
+    The component is `GAP` away from the area that the object covers from t to t+1, on the far side from the sensor,
+    where it does not occlude the object. It has the same position in the world in both sweeps. `scored` are the points
+    with valid truth, and `number` varies which component is pasted next to which object.
     """
     pc0, pc1 = pair.pc0, pair.pc1
     T_ego1_ego0 = np.linalg.inv(pc1.pose) @ pc0.pose
@@ -106,11 +92,7 @@ def paste_static(
 def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, instance: np.ndarray) -> list[Component]:
     """Find dilated components of both sweeps of suitable size and without objects, in raster order.
 
-    Args:
-        points0: (N, 3) float64, points of t in the frame of t+1.
-        pair: sweeps.
-        static: (N,) bool, points that are static according to the labels.
-        instance: (N,) object of each point of t, 0 = background.
+    `points0` are the points of t in the frame of t+1, and `static` those that are static according to the labels.
     """
     points1 = pair.pc1.points.astype(np.float64)
     pixels = []

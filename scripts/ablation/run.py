@@ -83,11 +83,7 @@ def seed_range(text: str) -> tuple[int, int]:
 def print_table(
     sets: Sequence[ScoredSet], settings: Mapping[str, Callable[[ScoredSet], Figures]]
 ) -> dict[str, dict[str, Figures]]:
-    """Score every setting on every set, print a row for each, and rows for the means over sensors.
-
-    Returns:
-        The figures by set, then by setting.
-    """
+    """Print a row for every setting on every set and means over sensors; return the figures by set, then by setting."""
     torch.set_num_threads(1)
     scores: dict[str, dict[str, Figures]] = {}
     sensors: dict[str, list[str]] = {}

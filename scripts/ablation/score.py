@@ -42,15 +42,10 @@ def score(scored: ScoredSet, config: Config) -> Figures:
 def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NEAR) -> Figures:
     """Errors over all points of a set in a square box around the sensor; NaN without such points.
 
-    Args:
-        frames: windows with estimates.
-        step: sweeps from t to t+1; a point is dynamic from 0.05 m per sweep on.
-        reach: metres, half side of the box.
-
-    Returns:
-        "dynamic", "static": end-point error in metres of dynamic objects and of the static background; "ratio",
-        "pedestrian": mean of error divided by speed of dynamic objects and of those that are pedestrians; "missed":
-        share of the points of dynamic objects whose flow is less than half of the true one; "moving": their number.
+    "dynamic", "static": end-point error in metres of dynamic objects and of the static background; "ratio",
+    "pedestrian": mean of error divided by speed of dynamic objects and of those that are pedestrians; "missed": share
+    of the points of dynamic objects whose flow is less than half of the true one; "moving": their number. With `step`
+    sweeps from t to t+1, a point is dynamic from 0.05 m per sweep on.
     """
     scored = {"region": "box", "max_range": reach, "dynamic_threshold": MOVES * step, "three_way_flow": "residual"}
     definition = Definition("pooled", ("three_way",), **scored)

@@ -77,15 +77,10 @@ class ScoredSet:
 
 
 def make_sets(names: Sequence[str], seeds: Sequence[tuple[int, int]], cache: Path) -> list[ScoredSet]:
-    """Return the sets of some names. Sets of "sim" are returned once per range of seeds.
+    """Return the sets of some names, of groups or of single sets; "walkers" selects "walkers-0.1" and so on.
 
-    Args:
-        names: of groups or of single sets; "walkers" selects "walkers-0.1" and so on.
-        seeds: first and last seed of each range; four seeds, or a multiple, have an even mix of scenes.
-        cache: folder for simulated drives, which are made if they do not exist.
-
-    Raises:
-        CFlowError: there is no set of that name.
+    Sets of "sim" are returned once per range of seeds, first and last; four seeds, or a multiple, have an even mix of
+    scenes. Simulated drives that are not in the cache are made.
     """
     sets = [ScoredSet(name, group, history, NEAR, load, step) for name, group, history, load, step in _REAL]
     for name, stage in _SCENES.items():

@@ -45,16 +45,10 @@ SEEDS = (300, 301)  # settings were chosen on 100 to 103
 
 
 def dufomap_labels(log: Log, T_points_lidar: np.ndarray, settings: tuple[float, float, int]) -> list[np.ndarray]:
-    """Find the dynamic points of every sweep by DUFOMap with clusters and propagation.
+    """Find the dynamic points of every sweep, (N,) bool, by DUFOMap with clusters and propagation.
 
-    Args:
-        log: sweeps with poses.
-        T_points_lidar: (4, 4), coordinates of the LiDAR to those of the points. Points of 2 ... 50 m from the LiDAR are
-            put into the map.
-        settings: side of a voxel in metres, d_s in metres, d_p in voxels.
-
-    Returns:
-        (N,) bool of each sweep.
+    The map takes points of 2 ... 50 m from the LiDAR. The settings are side of a voxel in metres, d_s in metres, d_p in
+    voxels.
     """
     from dufomap import dufomap
 

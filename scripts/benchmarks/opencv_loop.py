@@ -44,17 +44,9 @@ def opencv() -> Any:
 
 
 def opencv_flow(window: Window, config: Config) -> FlowResult:
-    """Estimate the flow of every point of `window.pc0`.
+    """Estimate the flow of every point of `window.pc0`, whose sweeps t-h ... t+1 have equal intervals.
 
-    Args:
-        window: valid sweeps t-h ... t+1 at equal intervals.
-        config: settings; those that choose engines are ignored.
-
-    Returns:
-        `FlowResult` of CPU tensors, rows in the order of pc0.
-
-    Raises:
-        CFlowError: OpenCV is not installed, or the loop does not have the method, clustering or view.
+    Settings that choose engines are ignored; others that the loop does not have are a `CFlowError`.
 
     Cost: one `cv2.matchTemplate` per cluster, sweep and scale.
     """
@@ -102,9 +94,8 @@ def motion_at_scale(
         config: settings.
 
     Returns:
-        flow: for each of `clouds` (2, N) float64, metres per sweep interval.
-        cluster_id: (N,) int32 of the points of sweep t, -1 = none.
-        score: (N,) float32 of the points of sweep t.
+        Flow of each of `clouds`, (2, N) float64 metres per sweep interval; cluster, (N,) int32, -1 = none, and score,
+        (N,) float32, of the points of sweep t.
     """
     images, pixels = zip(*(project(cloud.xy, pixel_size, config) for cloud in (cloud1, *clouds)))
     clusters = find_clusters(images, pixel_size, config)

@@ -65,14 +65,11 @@ _PAIRS_AT_ONCE = 1 << 22
 
 
 def histogram(first: Tensor, second: Tensor, *bounds_and_sizes: Any) -> Tensor:
-    """Count the differences of all pairs of points in bins.
+    """Count the differences first - second of all pairs of points in bins, (B, X, Y, Z) float32.
 
     Args:
         first, second: (B, N, 4), (B, M, 4) float32: x, y, z, and whether the row is a point (> 0).
         bounds_and_sizes: least x, y, z; greatest x, y, z (excluded); number of bins in x, y, z; size of a mini-batch.
-
-    Returns:
-        (B, X, Y, Z) float32 counts of first - second.
     """
     numbers = np.array([float(value) for value in bounds_and_sizes], np.float32)
     low, high, sizes = numbers[:3], numbers[3:6], numbers[6:9].astype(np.int64)
@@ -108,13 +105,7 @@ class Neighbours(NamedTuple):
 def knn_points(p1: Tensor, p2: Tensor, lengths1: Any = None, lengths2: Any = None, **settings: Any) -> Neighbours:
     """Find the nearest point of `p2` to each point of `p1`; padded rows of `p1` have the distance 0 and the index 0.
 
-    Args:
-        p1, p2: (B, N, 3), (B, M, 3) float32, padded with coordinates of 1e8.
-        lengths1, lengths2: ignored, because the padding tells them.
-        settings: `K` must be 1.
-
-    Returns:
-        (B, N, 1) squared distances, (B, N, 1) int64, (B, N, 1, 3).
+    Both are (B, N, 3) float32, padded with coordinates of 1e8, which tell the lengths. `K` must be 1.
     """
     if settings.get("K", 1) != 1:
         raise NotImplementedError("this replacement finds one neighbour")
@@ -151,17 +142,9 @@ def euler_angles(matrix: Tensor, convention: str) -> Tensor:
 def distance_transform(
     image: Tensor, mask: Tensor, spacing: Any, largest: float, weight: float, iterations: int
 ) -> Tensor:
-    """Compute the Euclidean distance to the nearest cell where the mask is 0; FastGeodis approximates it by passes.
+    """Compute the metres to the nearest cell where the (1, 1, X, Y, Z) mask is 0; FastGeodis approximates them.
 
-    Args:
-        image: ignored, because its weight must be 0.
-        mask: (1, 1, X, Y, Z) float32.
-        spacing: metres, size of a cell in x, y, z.
-        largest, iterations: ignored.
-        weight: of the differences of the image.
-
-    Returns:
-        (1, 1, X, Y, Z) float32 metres.
+    The image is ignored, because its weight must be 0.
     """
     from scipy.ndimage import distance_transform_edt
 

@@ -214,12 +214,7 @@ def wires(seed: int) -> Staged:
 
 
 def walkers(seed: int, gap: float = 0.3) -> Staged:
-    """Two people who walk along house fronts in opposite directions.
-
-    Args:
-        seed: of the people, the street and the noise.
-        gap: metres from their shoulders to the wall.
-    """
+    """Two people who walk along house fronts in opposite directions; `gap` is metres from shoulders to wall."""
     rng = np.random.default_rng(seed)
     y = 6.0 - gap - 0.25
     routes = [_at(x + rng.uniform(-0.5, 0.5), y, to, speed) for x, to, speed in ((4, EAST, 1.2), (10, WEST, 1.4))]
@@ -231,13 +226,7 @@ def walkers(seed: int, gap: float = 0.3) -> Staged:
 
 
 def facade(seed: int, step: float = 0.55, profile: str = "av2") -> Staged:
-    """Houses behind parked cars, whose shadows move over the fronts as the vehicle passes.
-
-    Args:
-        seed: of the street and of the noise.
-        step: metres of the vehicle per sweep of 0.1 s.
-        profile: of the sensors.
-    """
+    """Houses behind parked cars, whose shadows move over the fronts by `step` metres of the vehicle per 0.1 s."""
     rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, _at(22, 3.2, WEST, 8)), objects.car(rng, _at(13, 0, EAST, 8))]
     for kerb, front in ((-4.3, -7.0), (7.5, 10.2)):

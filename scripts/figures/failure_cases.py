@@ -77,13 +77,9 @@ Setting = Callable[[Drive], Attempt]
 
 
 def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: drive, **overrides: Any) -> Setting:
-    """A setting: estimates the flow of the scored pair of a drive.
+    """A setting: estimates the flow of the scored pair of a drive, whose poses or points `of` may change.
 
-    Args:
-        preset: "default", "paper" and so on.
-        name: its name in the table; "" = the preset and the overrides.
-        of: function that changes the poses or points of a drive; returns a log.
-        **overrides: of the preset's settings.
+    Its name in the table is the preset and the overrides, unless one is given.
     """
 
     def attempt(drive: Drive) -> Attempt:

@@ -137,12 +137,7 @@ def comma_separated(cells: Cells) -> str:
 
 
 def write_pages(results: Path, output: Path) -> None:
-    """Write the page OUTPUT.md, and its tables and figures to the folder OUTPUT.
-
-    Args:
-        results: folder with results.json files of `cflow eval -m experiment=...`, at any depth.
-        output: folder.
-    """
+    """Write OUTPUT.md, and its tables and figures to the folder OUTPUT, from results.json files at any depth."""
     paper = load_paper()
     runs, remarks = load_runs(results)
     try:

@@ -33,13 +33,7 @@ Panels = List[Tuple[str, Mapping[str, Sequence[float]]]]  # title, and values by
 
 
 def draw(name: str, paper: dict[str, Any], ours: Ours) -> Figure:
-    """Draw the figure of an experiment.
-
-    Args:
-        name: history, scales, datasets or range_split.
-        paper: the paper's numbers, an entry of figures.yaml.
-        ours: data set -> row -> run; may be empty or have gaps.
-    """
+    """Draw the figure of an experiment: the paper's numbers, of figures.yaml, next to ours, which may have gaps."""
     at, panels = paper["at"], _panels(name, paper, ours)
     if name == "datasets":
         return _bars(panels, at, ["Overall", *ours])
