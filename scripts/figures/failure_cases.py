@@ -16,7 +16,7 @@ import argparse
 import io
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Iterator, NamedTuple, Sequence
@@ -42,38 +42,19 @@ class Attempt(NamedTuple):
 
     name: str  # preset and overrides
     residual: np.ndarray  # (N, 3) estimated total flow minus the flow of the TRUE ego motion, metres per sweep
-    confidence: np.ndarray | None  # (N,) 0 ... 1, None if the method has none
+    error: float  # mean end-point error of the scored objects, metres per sweep
+    confidence: float  # their mean confidence, NaN if the method has none
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A failure: a drive with its scored objects, and the results by several settings. The first one fails."""
 
     staged: Staged
+    truth: np.ndarray  # (N, 3) true residual flow, metres per sweep
     attempts: list[Attempt]
 
-    @property
-    def truth(self) -> np.ndarray:
-        """(N, 3) true residual flow, metres per sweep."""
-        return self.staged.drive.labels(PAIR).flow - _pose_flow(self.staged.drive)
 
-    @property
-    def is_scored(self) -> np.ndarray:
-        """(N,) bool, points of the scored objects."""
-        return np.isin(body_of(self.staged.drive), list(self.staged.bodies))
-
-    def errors(self) -> list[float]:
-        """Mean end-point error of the scored objects, metres per sweep, of each attempt."""
-        lengths = (np.linalg.norm(attempt.residual - self.truth, axis=1) for attempt in self.attempts)
-        return [float(length[self.is_scored].mean()) for length in lengths]
-
-    def confidences(self) -> list[float]:
-        """Mean confidence of the scored objects, of each attempt; NaN if it has none."""
-        given = (attempt.confidence for attempt in self.attempts)
-        return [math.nan if one is None else float(one[self.is_scored].mean()) for one in given]
-
-
-Setting = Callable[[Drive], Attempt]
+Setting = Callable[[Staged], Attempt]
 
 
 def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: drive, **overrides: Any) -> Setting:
@@ -81,13 +62,15 @@ def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: d
 
     Its name in the table is the preset and the overrides, unless one is given.
     """
+    described = name or ", ".join([f"`{preset}`", *(f"{k}={v}" for k, v in overrides.items())])
 
-    def attempt(drive: Drive) -> Attempt:
-        config = make_config(preset, **overrides)
+    def attempt(staged: Staged) -> Attempt:
+        config, drive = make_config(preset, **overrides), staged.drive
         (result,) = make_model(config)([window(of(drive), PAIR, config.num_history, config.num_future)])
-        described = ", ".join([f"`{preset}`", *(f"{k}={v}" for k, v in overrides.items())])
-        confidence = None if result.confidence is None else result.confidence.numpy()
-        return Attempt(name or described, result.flow.numpy() - _pose_flow(drive), confidence)
+        residual, is_scored = result.flow.numpy() - _pose_flow(drive), np.isin(body_of(drive), list(staged.bodies))
+        error = np.linalg.norm(residual - _truth(drive), axis=1)[is_scored].mean()
+        confidence = math.nan if result.confidence is None else result.confidence.numpy()[is_scored].mean()
+        return Attempt(described, residual, float(error), float(confidence))
 
     return attempt
 
@@ -149,7 +132,11 @@ def make_case(name: str, seed: int) -> Case:
     """Simulate a drive, and estimate the flow of its pair with each setting."""
     stage, settings, _ = CASES[name]
     staged = stage(seed)
-    return Case(staged, [setting(staged.drive) for setting in settings])
+    return Case(staged, _truth(staged.drive), [setting(staged) for setting in settings])
+
+
+def _truth(drive: Drive) -> np.ndarray:
+    return drive.labels(PAIR).flow - _pose_flow(drive)
 
 
 def _pose_flow(drive: Drive) -> np.ndarray:
@@ -167,15 +154,14 @@ def draw(case: Case) -> Image.Image:
     shown = np.all((sweep.points[:, :2] >= low) & (sweep.points[:, :2] <= high), axis=1) & kept
     longest = np.linalg.norm(truth[shown], axis=1).max()
     rows = []
-    tried = list(zip(case.attempts, case.errors()))
-    for attempt, error in tried[:1] + tried[1:][-1:]:
+    for attempt in case.attempts[:1] + case.attempts[1:][-1:]:
         figure = plot_flow(
             sweep.points[kept],
             attempt.residual[kept],
             point_cloud_range=(*low, -math.inf, *high, math.inf),
             max_flow=max(math.ceil(10 * longest) / 10, 0.5),
             truth=truth[kept],
-            title=f"{attempt.name.replace('`', '')}: error {error:.2f} m ({case.staged.whose})",
+            title=f"{attempt.name.replace('`', '')}: error {attempt.error:.2f} m ({case.staged.whose})",
         )
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=figure.dpi)
@@ -190,12 +176,13 @@ def table(names: Sequence[str], seeds: Sequence[int]) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     for name in names:
         cases = [make_case(name, seed) for seed in seeds]
-        errors, confidences = np.array([c.errors() for c in cases]), np.array([c.confidences() for c in cases])
-        for i, attempt in enumerate(cases[0].attempts):
-            heading = (cases[0].staged.title, cases[0].staged.whose) if i == 0 else ("", "")
-            error = f"{errors[:, i].mean():.3f} ({errors[:, i].min():.3f}–{errors[:, i].max():.3f})"
-            trust = "-" if np.isnan(confidences[:, i]).any() else f"{confidences[:, i].mean():.2f}"
-            yield f"| {' | '.join((*heading, attempt.name, error, trust))} |"
+        heading = (cases[0].staged.title, cases[0].staged.whose)
+        for attempts in zip(*(case.attempts for case in cases)):
+            errors, trust = np.array([(attempt.error, attempt.confidence) for attempt in attempts]).T
+            error = f"{errors.mean():.3f} ({errors.min():.3f}–{errors.max():.3f})"
+            shown = "-" if np.isnan(trust).any() else f"{trust.mean():.2f}"
+            yield f"| {' | '.join((*heading, attempts[0].name, error, shown))} |"
+            heading = ("", "")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
