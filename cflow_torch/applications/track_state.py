@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Callable, NamedTuple
 
 import torch
@@ -19,38 +18,12 @@ _LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres, and at least 
 _JUMP, _SMALL = 1.5, 1.5  # factor of its length, plus metres, from which a box shows another part of its object
 
 
-@dataclass(frozen=True)
-class States:
-    """States of K objects in a constant-velocity Kalman filter.
-
-    The noise is equal along all axes, so one 2x2 covariance of (position, velocity) serves all three.
-    """
-
-    position: Tensor  # (K, 3) float64, metres in the world
-    velocity: Tensor  # (K, 3) float64, m/s in the world
-    covariance: Tensor  # (K, 2, 2) float64 of (position, velocity), for each axis
-
-    def predict(self, seconds: float, acceleration: float) -> States:
-        """States after `seconds`, in which each object has a constant random acceleration of the given standard
-        deviation, m/s²."""
-        transition = self.covariance.new_tensor([[1.0, seconds], [0.0, 1.0]])
-        push = self.covariance.new_tensor([seconds**2 / 2, seconds]) * acceleration
-        covariance = transition @ self.covariance @ transition.T + torch.outer(push, push)
-        return States(self.position + seconds * self.velocity, self.velocity, covariance)
-
-    def update(self, position: Tensor, velocity: Tensor, noise: Tensor) -> States:
-        """States after a measurement of position and velocity, (K, 3), with standard deviations (K, 2) per axis."""
-        residual = torch.stack([position - self.position, velocity - self.velocity], 1)  # (K, 2, 3)
-        spread = self.covariance + torch.diag_embed(noise**2)
-        gain = torch.linalg.solve(spread, self.covariance).transpose(1, 2)  # both are symmetric
-        change = gain @ residual
-        covariance = (torch.eye(2, dtype=gain.dtype, device=gain.device) - gain) @ self.covariance
-        covariance = (covariance + covariance.transpose(1, 2)) / 2  # symmetric despite rounding
-        return States(self.position + change[:, 0], self.velocity + change[:, 1], covariance)
-
-
 class Tracks(NamedTuple):
-    """K tracks in the world frame; float64 unless another type is named."""
+    """K tracks in the world frame; float64 unless another type is named.
+
+    Position and velocity are states of a constant-velocity Kalman filter. The noise is equal along all axes, so one 2x2
+    covariance of (position, velocity) serves all three.
+    """
 
     id: Tensor  # (K,) int64
     position: Tensor  # (K, 3) metres, filtered
@@ -100,9 +73,23 @@ class Tracks(NamedTuple):
         for name, values in columns.items():
             getattr(self, name)[index] = values
 
-    def states(self) -> States:
-        """The filtered states."""
-        return States(self.position, self.velocity, self.covariance)
+    def predict(self, seconds: float, acceleration: float) -> Tracks:
+        """The tracks after `seconds`, if each has a constant random acceleration of this standard deviation, m/s²."""
+        transition = self.covariance.new_tensor([[1.0, seconds], [0.0, 1.0]])
+        push = self.covariance.new_tensor([seconds**2 / 2, seconds]) * acceleration
+        covariance = transition @ self.covariance @ transition.T + torch.outer(push, push)
+        return self._replace(position=self.position + seconds * self.velocity, covariance=covariance)
+
+    def measure(self, index: Tensor, position: Tensor, velocity: Tensor, noise: Tensor) -> None:
+        """Update the indexed tracks by measurements (K, 3), with standard deviations (2,) of position and velocity."""
+        before = self.covariance[index]
+        residual = torch.stack([position - self.position[index], velocity - self.velocity[index]], 1)  # (K, 2, 3)
+        gain = torch.linalg.solve(before + torch.diag(noise**2), before).transpose(1, 2)  # both are symmetric
+        change = gain @ residual
+        covariance = (torch.eye(2, dtype=gain.dtype, device=gain.device) - gain) @ before
+        self.covariance[index] = (covariance + covariance.transpose(1, 2)) / 2  # symmetric despite rounding
+        self.position[index] += change[:, 0]
+        self.velocity[index] += change[:, 1]
 
     def start_again(self, index: Tensor, length: Tensor) -> None:
         """Start the evidence again for the indexed tracks whose `length` (K,) was very different in the sweep before.

@@ -137,8 +137,8 @@ class Tracker:
         tracks = self._tracks.map(lambda values: values.to(device))
         points, track_index = self._points.to(device), self._track_index.to(device)
         points = points + times.late * tracks.velocity[track_index]
-        states = tracks.states().predict(times.elapsed, _ACCELERATION)
-        return tracks._replace(box=tracks.box + times.late * tracks.velocity, **vars(states)), points, track_index
+        tracks = tracks._replace(box=tracks.box + times.late * tracks.velocity)
+        return tracks.predict(times.elapsed, _ACCELERATION), points, track_index
 
     def _update(
         self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: _Times
@@ -190,9 +190,7 @@ class Tracker:
 
         measured, step = torch.cat([matches.track, stopped]), torch.zeros_like(tracks.box)
         step[track_of_group] = flow
-        states = tracks.take(measured).states()
-        states = states.update(tracks.box[measured], step[measured] / interval, noise.expand(len(measured), 2))
-        tracks.write(measured, **vars(states))
+        tracks.measure(measured, tracks.box[measured], step[measured] / interval, noise)
         return tracks, track_of_group
 
     def _table(self, tracks: Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:

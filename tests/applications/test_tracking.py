@@ -13,7 +13,7 @@ from staged_cars import Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, track
 from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
-from cflow_torch.applications.track_state import States
+from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 
 
@@ -236,9 +236,11 @@ def test_boxes_are_tight_around_their_points() -> None:
 
 def test_the_filter_equals_the_textbook_equations() -> None:
     one = torch.ones(1, 3, dtype=torch.float64)
-    before = States(0 * one, 5 * one, torch.tensor([[[0.2, 0.05], [0.05, 0.1]]], dtype=torch.float64))
-    after = before.predict(0.1, 2.0).update(0.55 * one, 5.1 * one, torch.tensor([[0.3, 0.2]], dtype=torch.float64))
-    F, P = np.array([[1, 0.1], [0, 1]]), before.covariance[0].numpy()
+    covariance = torch.tensor([[[0.2, 0.05], [0.05, 0.1]]], dtype=torch.float64)
+    before = Tracks.none(torch.device("cpu"))._replace(position=0 * one, velocity=5 * one, covariance=covariance)
+    after = before.predict(0.1, 2.0)
+    after.measure(torch.tensor([0]), 0.55 * one, 5.1 * one, torch.tensor([0.3, 0.2], dtype=torch.float64))
+    F, P = np.array([[1, 0.1], [0, 1]]), covariance[0].numpy()
     push = 2.0 * np.array([0.005, 0.1])
     P = F @ P @ F.T + np.outer(push, push)
     gain = P @ np.linalg.inv(P + np.diag([0.09, 0.04]))
