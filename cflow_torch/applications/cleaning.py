@@ -15,6 +15,7 @@ from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, window
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_array
@@ -209,5 +210,4 @@ def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: tor
 
 def _world(sweep: Sweep) -> np.ndarray:
     """(N, 3) float64, points in the world."""
-    pose = pose_of(sweep)
-    return as_numpy(sweep.points, np.float64)[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    return transform_points(as_numpy(sweep.points)[:, :3], pose_of(sweep))

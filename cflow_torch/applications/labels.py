@@ -18,6 +18,7 @@ from cflow_torch.applications.moving_groups import MOVING, pose_of
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.results import write_hdf5_labels
 from cflow_torch.data.log import CachedLog, Log, windows
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.errors import import_optional
 from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
@@ -161,18 +162,13 @@ def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult) -> DynamicPo
     interval = _seconds(other) - _seconds(sweep)  # negative where the flow leads to the sweep before
     velocity = residual[rows] @ pose_of(other)[:3, :3].T / interval
     confidence = as_numpy(result.confidence, np.float64)[rows]  # type: ignore[arg-type]  # checked before
-    positions = _transform(sweep, rows, pose_of(sweep))
+    positions = transform_points(as_numpy(sweep.points)[rows, :3], pose_of(sweep))
     return DynamicPoints(rows, positions, velocity, group[rows], confidence, _seconds(sweep))
 
 
 def _seconds(sweep: Sweep) -> float:
     """Time of a sweep, to 0.1 microseconds."""
     return float(sweep.timestamp_ns or 0) / 1e9
-
-
-def _transform(sweep: Sweep, rows: Any, transform: Any) -> np.ndarray:
-    """(M, 3) float64: the points of some rows after a rigid transform."""
-    return as_numpy(sweep.points)[rows, :3].astype(np.float64) @ transform[:3, :3].T + transform[:3, 3]
 
 
 def _is_confirmed(dynamic: Sequence[DynamicPoints], trees: Sequence[Any], index: int) -> np.ndarray:
@@ -209,7 +205,7 @@ def _number_groups(group: np.ndarray, moves: np.ndarray, is_ground: np.ndarray) 
 
 def _has_moved_by_nearest(tree: Callable[..., Any], sweep: Sweep, other: Sweep, workers: int) -> np.ndarray:
     """(N,) uint8 `nnd`; 0 for points that are not finite."""
-    points = _transform(sweep, slice(None), np.linalg.inv(pose_of(other)) @ pose_of(sweep))
+    points = transform_points(as_numpy(sweep.points)[:, :3], np.linalg.inv(pose_of(other)) @ pose_of(sweep))
     others = as_numpy(other.points)[:, :3].astype(np.float64)
     is_finite, nnd = np.isfinite(points).all(axis=1), np.zeros(len(points), np.uint8)
     nearest = tree(others[np.isfinite(others).all(axis=1)])

@@ -23,19 +23,13 @@ _log = logging.getLogger(__name__)
 
 
 class DataSet(NamedTuple):
-    """One format.
+    """One format."""
 
-    Args:
-        log: class of its reader, source -> `Log`.
-        what: what one log is.
-        marks: ends of paths by which we recognise the format.
-        find: function of its module, root -> sources; "" = the folders that hold the first mark, at most `depth`
-            levels below the root, or the root itself if there is no mark.
-    """
-
-    log: str
-    what: str
-    marks: tuple[str, ...] = ()
+    log: str  # class of its reader, source -> `Log`
+    what: str  # what one log is
+    marks: tuple[str, ...] = ()  # ends of paths by which we recognise the format
+    # Function of its module, root -> sources; "" = the folders that hold the first mark, at most `depth` levels below
+    # the root, or the root itself if there is no mark.
     find: str = ""
     depth: int = 0
 
