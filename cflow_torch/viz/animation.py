@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from subprocess import CalledProcessError
-from typing import TYPE_CHECKING, Any, Iterable, Iterator, Sequence
+from typing import Any, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -14,10 +14,8 @@ from cflow_torch.data.atomic import atomic_name
 from cflow_torch.errors import import_optional
 from cflow_torch.types import Array, CFlowError, FlowResult
 from cflow_torch.viz.bev import longest_flow, plot_flow, point_rows, split_sweep
+from cflow_torch.viz.style import Figure, checked_path
 from cflow_torch.viz.wheel import wheel_image
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _SHORTEST = 2  # hundredths of a second; viewers slow down a .gif with shorter frames
 
@@ -101,11 +99,9 @@ def save_animation(figures: Iterable[Figure], path: str | Path, *, frames_per_se
 
     Cost: a .gif keeps one byte per pixel and picture until the end, a .mp4 nothing.
     """
-    path = Path(path)
+    path = checked_path(path, ".gif", ".mp4")
     if not 0 < frames_per_second < np.inf:
         raise CFlowError(f"frames_per_second={frames_per_second}: give a positive number")
-    if path.suffix.lower() not in (".gif", ".mp4"):
-        raise CFlowError(f"{path} does not end in .gif or .mp4: give a file that does")
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with atomic_name(path) as temporary:
         write(temporary, _of_one_size(figures), frames_per_second)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Sequence
+from typing import Sequence
 
 import numpy as np
 
@@ -12,9 +12,7 @@ from cflow_torch.data.atomic import atomic_name
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
 from cflow_torch.viz import style
 from cflow_torch.viz.panel import MOVING, dot_area, draw_error, draw_flow, draw_ground, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from cflow_torch.viz.style import Figure
 
 _SIDE, _GAP, _HEAD, _FOOT = 9.6, 0.2, 0.5, 0.42  # inches: longest side of the panel, and the space around it
 _OUTLIERS = 0.2  # per cent of the points on each side that the view may leave out
@@ -142,9 +140,7 @@ def save_picture(figure: Figure, path: str | Path) -> Path:
         CFlowError: the path does not end in .png.
         OSError: the file cannot be written.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise CFlowError(f"{path} does not end in .png: give a file that does")
+    path = style.checked_path(path, ".png")
     with atomic_name(path) as temporary:
         figure.savefig(temporary, format="png", dpi=figure.dpi)
     return path

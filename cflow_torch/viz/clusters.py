@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -10,10 +10,7 @@ from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import split_sweep
 from cflow_torch.viz.panel import dot_area, draw_ego, draw_ground, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from cflow_torch.viz.style import Axes, Figure
 
 PALETTE = np.array(
     [(230, 25, 75), (60, 180, 75), (67, 99, 216), (245, 130, 49), (145, 30, 180),

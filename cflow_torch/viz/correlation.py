@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +11,7 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.types import Window
 from cflow_torch.viz import style
 from cflow_torch.viz.stages import ClusterCorrelation, cluster_correlation
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from cflow_torch.viz.style import Axes, Figure
 
 _COLORMAP = "viridis"
 _PEAK = "#e6194b"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,11 +12,8 @@ from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow
 from cflow_torch.viz.panel import MOVING
 from cflow_torch.viz.stages import KeyPointMatches, keypoint_matches, sweep_marks
+from cflow_torch.viz.style import Axes, Figure
 from cflow_torch.viz.wheel import flow_to_rgb
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _HALF_VIEW = np.array((5.0, 3.6))  # metres, half width and height of the view
 _CELL = 4.0  # metres, side of the cells in which matches are added up to choose the view

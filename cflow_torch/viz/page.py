@@ -17,6 +17,7 @@ from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.packing import PackedDrive, packed
 from cflow_torch.viz.scene import MAX_FLOW, Scene
+from cflow_torch.viz.style import checked_path
 
 VOXEL = 0.1  # metres
 _TEMPLATE = Path(__file__).parent / "page.html"
@@ -42,8 +43,9 @@ class Page:
             CFlowError: the path does not end in .html.
             OSError: the file cannot be written.
         """
-        write_text(_checked(path), self.html)
-        return Path(path)
+        path = checked_path(path, ".html")
+        write_text(path, self.html)
+        return path
 
     def _repr_html_(self) -> str:
         frame = "width:100%;height:600px;border:0;border-radius:8px"
@@ -112,7 +114,7 @@ def save_page(
 
     Cost: on disk about 0.3 MB per sweep of 100,000 points, and 1.2 MB for k3d; 1 MB of memory per sweep.
     """
-    _checked(path)
+    checked_path(path, ".html")
     scenes = (Scene.of(i, log.sweep(i), log.sweep(i + 1), result, log.labels(i)) for i, result in results)
     page = _page(scenes, tracks, log.log_id, preset, max_flow, voxel)
     page.save(path)
@@ -131,12 +133,6 @@ def load_k3d() -> str:
 @lru_cache(maxsize=1)
 def _packed_file(path: Path) -> str:
     return packed(path.read_bytes())
-
-
-def _checked(path: str | Path) -> Path:
-    if Path(path).suffix.lower() != ".html":
-        raise CFlowError(f"{path} does not end in .html: give a file that does")
-    return Path(path)
 
 
 def _page(

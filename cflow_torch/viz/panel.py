@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import torch
 
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.viz import style
+from cflow_torch.viz.style import Axes, Figure
 from cflow_torch.viz.wheel import flow_to_rgb
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 MOVING = 0.08  # metres per sweep; the field's viewers draw slower points in white
 MIN_ERROR, MAX_ERROR = 0.05, 0.35  # metres, ends of the viewers' error colours; a smaller error is drawn as none

@@ -15,6 +15,7 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 from cflow_torch.viz.clusters import cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MOVING
 from cflow_torch.viz.scene import MAX_FLOW, Scene, ViewerFrame
+from cflow_torch.viz.style import checked_path
 from cflow_torch.viz.wheel import flow_to_rgb
 
 if TYPE_CHECKING:
@@ -70,11 +71,9 @@ def record_log(
 
     Cost: on disk about 20 bytes per point and pair for each entity that shows the point.
     """
-    path = Path(path)
+    path = checked_path(path, ".rrd")
     if not 0 < max_flow < np.inf:
         raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
-    if path.suffix.lower() != ".rrd":
-        raise CFlowError(f"{path} does not end in .rrd: give a file that does")
     rr = load_rerun()
     with atomic_name(path) as temporary:
         stream = rr.RecordingStream("cflow_torch", recording_id=f"{log.log_id}-{uuid.uuid4().hex}")

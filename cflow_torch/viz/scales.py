@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,10 +12,7 @@ from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow, point_rows, view_of
 from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
 from cflow_torch.viz.stages import Scale, choose_cluster, scales, sweep_marks
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from cflow_torch.viz.style import Axes, Figure
 
 _MARGIN = 2.0  # metres around the object in the close-up
 _SMALLEST = 4.0  # metres, half a side of the close-up

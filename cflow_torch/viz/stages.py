@@ -9,7 +9,7 @@ default and offline weigh the motions of all scales together, so they have none 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,9 +29,7 @@ from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.panel import group_medians
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from cflow_torch.viz.style import Axes
 
 COLORS = {"sweep t": (79, 134, 217), "sweep t+1": (232, 96, 76), "both": (43, 33, 64)}
 

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cflow_torch.errors import import_optional
+from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.viz.wheel import wheel_image
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    Axes = Figure = Any  # matplotlib is an extra
 
 INK, FAINT, STATIC, GROUND, FRAME = "#20262e", "#5b6570", "#b4bbc3", "#eff1f3", "#c9ced4"
 SWEEP_RATE = 10  # Hz
 CORNERS = ("upper right", "lower right", "upper left")  # corners for a legend; the fourth has the scale bar
 WHEEL_INCHES = (1.6, 1.82)  # width and height of the legend
 _TITLE = 7.2  # characters of a heading per inch
+
+
+def checked_path(path: str | Path, *endings: str) -> Path:
+    """Return the path of a picture or page, which must have one of some endings."""
+    if Path(path).suffix.lower() not in endings:
+        raise CFlowError(f"{path} does not end in {' or '.join(endings)}: give a file that does")
+    return Path(path)
 
 
 def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
