@@ -144,8 +144,7 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
     if ground is None:
         masks: list[Any] = [np.zeros(len(cloud), dtype=bool) for cloud in clouds]
     else:
-        method = "grid" if ground == "auto" else ground
-        masks = find_ground_batch(clouds, method, device=choose_device([window], device))
+        masks = find_ground_batch(clouds, ground, device=choose_device([window], device))
     if ground == "auto" and any(bool(mask.any()) for mask in masks):
         warn(
             "there is no ground mask for some sweeps, so we found their ground. To turn this line off give masks (gm0, "

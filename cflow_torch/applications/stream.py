@@ -14,7 +14,7 @@ from cflow_torch.data.odometry import Odometry
 from cflow_torch.estimate import make_model
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.collation import make_batch
-from cflow_torch.windows.ground import CHOICES, find_ground_batch
+from cflow_torch.windows.ground import CHOICES, find_ground
 from cflow_torch.windows.validation import check_windows, choose_device, read_ground, read_positions
 
 _log = logging.getLogger(__name__)
@@ -164,7 +164,7 @@ class FlowStream:
         if is_ground is not None:
             is_ground = read_ground([sweep], device)
         elif self._ground is not None:
-            is_ground = find_ground_batch([points], "grid" if self._ground == "auto" else self._ground)[0]
+            is_ground = find_ground(points, self._ground)
         if times is not None:
             times = torch.as_tensor(times).to(device, copy=True)
         if pose is None:

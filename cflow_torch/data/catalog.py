@@ -219,9 +219,8 @@ class GroundSegmentedLog(LogWrapper):
         sweep = self.log.sweep(index)
         if sweep.is_ground is not None:
             return sweep
-        is_auto = self.method == "auto"
-        is_ground: Any = ground_of(sweep.points, "grid" if is_auto else self.method)
-        self.has_found_ground |= is_auto and bool(is_ground.any())
+        is_ground: Any = ground_of(sweep.points, self.method)
+        self.has_found_ground |= self.method == "auto" and bool(is_ground.any())
         return replace(sweep, is_ground=is_ground)
 
 

@@ -20,7 +20,7 @@ from cflow_torch.data.log import window
 from cflow_torch.estimate import make_model
 from cflow_torch.types import Array, CFlowError, Sweep, Window
 from cflow_torch.windows.ego_motion import compensate
-from cflow_torch.windows.ground import CHOICES, find_ground_batch, has_ground
+from cflow_torch.windows.ground import CHOICES, find_ground, has_ground
 from cflow_torch.windows.validation import read_positions
 
 
@@ -107,12 +107,10 @@ class SequenceFlow(nn.Module):
         points = [frame.ego_points() for frame in frames]
         ignored = [~frame.is_active for frame in frames]
         if self.ground is not None:
-            method = "grid" if self.ground == "auto" else self.ground
-            found = [find_ground_batch([cloud], method)[0] for cloud in points]  # separately, as sequences may be long
-            ignored = [a | b for a, b in zip(ignored, found)]
+            ignored = [mask | find_ground(cloud, self.ground) for mask, cloud in zip(ignored, points)]
         elif not self._has_checked_ground:
             self._has_checked_ground = True
-            if any(has_ground([points[-2][frames[-2].is_active]])):
+            if has_ground(points[-2][frames[-2].is_active]):
                 warnings.warn(
                     "the active points contain ground, which connects the objects on it, so that moving ones are "
                     "missed. Load the data set with with_ground=False, or pass ground='auto'",

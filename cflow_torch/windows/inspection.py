@@ -56,7 +56,7 @@ class Inspection:
             self._has_seen_points = True
             if is_upside_down(first.pc0.points):
                 warn(UPSIDE_DOWN)
-            elif first.pc0.is_ground is None and has_ground([first.pc0.points])[0]:
+            elif first.pc0.is_ground is None and has_ground(first.pc0.points):
                 warn(_GROUND)
         if not self._has_seen_motion and has_moved(first.pc0, first.pc1):
             self._has_seen_motion = True
