@@ -9,10 +9,10 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from cflow_torch.data.atomic import atomic_file, write_text
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.types import CFlowError, as_numpy
+from cflow_torch.types import as_numpy
 
 Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # next to the flow files of a log
@@ -49,11 +49,10 @@ def write_tracks(path: PathLike, table: Table) -> None:
 def read_tracks(path: PathLike) -> Table:
     """Read a table that `write_tracks` wrote; a missing or another file is a `CFlowError`."""
     path = as_path(path)
-    with file_errors(path, "give a table that `cflow flow tracks=true` wrote"):
+    hint = "give a table that `cflow flow tracks=true` wrote"
+    with file_errors(path, hint):
         table = parquet.read_table(pa.BufferReader(read_bytes(path)), use_threads=False)
-    missing = sorted(COLUMNS.keys() - set(table.column_names))
-    if missing:
-        raise CFlowError(f"{path} lacks {', '.join(missing)}: give a table that `cflow flow tracks=true` wrote")
+    check_columns(path, table.column_names, list(COLUMNS), hint)
     return {name: table.column(name).to_numpy().astype(dtype) for name, dtype in COLUMNS.items()}
 
 

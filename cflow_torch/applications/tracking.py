@@ -13,7 +13,7 @@ from cflow_torch.applications.moving_groups import MOVING, MovingGroups
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.config import make_config
-from cflow_torch.data.log import CachedLog, Log, window
+from cflow_torch.data.log import CachedLog, Log, window, windows
 from cflow_torch.estimate import make_model
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
@@ -255,12 +255,9 @@ def track(
     """
     if results is None:
         model = make_model(make_config("default"))
-        recent = CachedLog(log, model.config.num_sweeps)
-        every = (window(recent, index, model.config.num_history) for index in range(len(log.timestamps) - 1))
-        results = ((index, model([sweeps])[0]) for index, sweeps in enumerate(every))
-    else:
-        recent = CachedLog(log, 2)
-    tracker, tables = Tracker(sweep_interval), []
+        log = CachedLog(log, model.config.num_sweeps)
+        results = enumerate(model([sweeps])[0] for sweeps in windows(log, model.config.num_history))
+    recent, tracker, tables = CachedLog(log, 2), Tracker(sweep_interval), []
     for index, result in results:
         table = tracker.push(window(recent, index), result).table
         where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}
