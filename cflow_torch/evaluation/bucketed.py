@@ -11,9 +11,8 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.categories import META_NAMES, meta_class
-from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.definitions import Definition, interval_of, range_names
-from cflow_torch.evaluation.scored_points import ScoredPoints
+from cflow_torch.evaluation.scored_points import Accumulator, ScoredPoints
 
 _MEANS = ("static_epe", "dynamic_error")
 

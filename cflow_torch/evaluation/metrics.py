@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any, Callable, Mapping, Sequence
 
-from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE, RangeWiseEPE
 from cflow_torch.evaluation.definitions import Definition, get_definition
 from cflow_torch.evaluation.frame import EvalFrame
-from cflow_torch.evaluation.scored_points import score_points
+from cflow_torch.evaluation.scored_points import Accumulator, score_points
 from cflow_torch.evaluation.three_way import ThreeWayEPE
 from cflow_torch.types import CFlowError
 

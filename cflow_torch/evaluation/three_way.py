@@ -7,9 +7,8 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX, META_CLASSES, meta_class
-from cflow_torch.evaluation.accumulator import Accumulator
 from cflow_torch.evaluation.definitions import Definition
-from cflow_torch.evaluation.scored_points import ScoredPoints
+from cflow_torch.evaluation.scored_points import Accumulator, ScoredPoints
 
 MOTIONS = ("static", "dynamic")
 DISTANCES = ("close", "far")

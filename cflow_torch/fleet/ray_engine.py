@@ -13,14 +13,13 @@ from types import ModuleType
 from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.errors import import_optional
+from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.fleet.dispatch import dispatch
 from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
 from cflow_torch.fleet.manifest import MANIFEST, make_identity
 from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.work import describe, make_worker
-from cflow_torch.types import CFlowError
 
 _OBJECT_STORE_BYTES = 200 * 2**20  # it holds names and events only; Ray's default is 30 % of the memory
 

@@ -23,7 +23,7 @@ from cflow_torch import CFlowError, Sweep, Window, make_config, make_model
 from cflow_torch.data.hdf5.frames import harness_motion, harness_pose_flow, recognized_extrinsics
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.integrations.opensceneflow import CFlow
-from cflow_torch.integrations.opensceneflow.checkpoint import main as write_checkpoint
+from cflow_torch.integrations.opensceneflow.__main__ import main as write_checkpoint
 
 Batch = Dict[str, Any]
 SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE)}

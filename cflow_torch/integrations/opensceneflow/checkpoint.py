@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -42,17 +40,3 @@ def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
     with atomic_file(file) as new:
         torch.save(contents, new)
     return file
-
-
-def main() -> None:
-    """Run `python -m cflow_torch.integrations.opensceneflow`; an error exits with status 1 and one line on stderr."""
-    parser = argparse.ArgumentParser(
-        prog="python -m cflow_torch.integrations.opensceneflow", description="Write the checkpoint without weights."
-    )
-    parser.add_argument("file", metavar="FILE", help="for example cflow.ckpt; its stem is the default name of results")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    arguments = parser.parse_args()
-    try:
-        print(f"wrote {write_null_checkpoint(arguments.file, overwrite=arguments.overwrite)}")
-    except (CFlowError, OSError) as error:
-        sys.exit(f"error: {error}")
