@@ -17,17 +17,10 @@ from cflow_torch.ops.segments import bounding_boxes, segment_amin
 def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[Clusters, Tensor, Tensor]:
     """Cluster the points of all sweeps of each window (t+1, t, t-1, ...) by HDBSCAN on x, y, z.
 
-    Args:
-        sweeps: points with three axes.
-        config: `min_cluster_size`.
-
     Returns:
         clusters: M clusters, each with pixels at t+1 and before. Unlike components, clusters may share pixels.
         cluster_of_cell: (P,) int64, cluster of each point, M = none (HDBSCAN's noise included).
         cell_of_point: (P,) int64, 0 ... P - 1: every point is a cell of its own.
-
-    Raises:
-        CFlowError: the extra is not installed.
 
     Convention:
         Clusters are in order of window, then of first pixel in raster order, then of HDBSCAN's label.

@@ -18,22 +18,13 @@ from cflow_torch.ops.segments import bounding_boxes
 def add_sectional_view(
     estimates: Estimates, cluster: Tensor, sweeps: ProjectedSweeps, config: DenseConfig
 ) -> Estimates:
-    """Add f_z to the estimates, and correct f_x and f_y along the heading.
+    """Add f_z to the estimates of M clusters, and correct f_x and f_y along the heading (Alg. scene_flow_1obj).
 
-    Args:
-        estimates: from the bird's-eye view, of M clusters.
-        cluster: (P,) int32 or int64, cluster of each point, M = none.
-        sweeps: points with three axes.
-        config: `correlation`, `max_memory`.
-
-    Returns:
-        The estimates with new displacements.
+    `cluster` is the (P,) cluster of each point, M = none; the points of the sweeps have three axes.
 
     Convention:
         The heading is the direction of (f_x, f_y), the x axis if that is zero. The X-Z images lie on one grid through
         the origin, cut to the bounding box of the pair. Ties: smallest shift, then smallest dz, then smallest dx'.
-
-    Source: Alg. scene_flow_1obj.
     """
     available, positions, pixel_size = estimates.available, sweeps.positions(), sweeps.grid.pixel_size
     step = sweeps.batch.image % sweeps.batch.num_steps

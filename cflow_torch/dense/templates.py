@@ -38,11 +38,7 @@ class TemplatePairs:
 def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max_speed: float | None) -> TemplatePairs:
     """Make a pair for every cluster and every earlier sweep in which it has pixels.
 
-    Args:
-        clusters: M clusters.
-        batch: gives the elapsed time of each sweep.
-        pixel_size: metres, of the images of the clusters: one, or (M,) float64.
-        max_speed: m/s; None = no bound.
+    The pixel size of the images is one for all, or (M,) float64. `max_speed` is in m/s; None = no bound.
     """
     num_sources, pixels = batch.num_steps - 1, clusters.pixels
     num_slots = clusters.window.numel() * num_sources

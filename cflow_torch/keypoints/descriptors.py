@@ -33,16 +33,9 @@ def detect(occupancy: Tensor) -> Tensor:
 
 
 def describe(images: Tensor, patch_size: int) -> KeyPoints:
-    """Find the key points of one sweep and describe each by the pixels around it (Sec. Descriptor).
+    """Find the key points of one sweep and describe each by the L x L pixels around it (Sec. Descriptor).
 
-    Args:
-        images: (B, H, W) bool, occupancy of the sweep of every window.
-        patch_size: L, odd.
-
-    Returns:
-        The key points with their L x L patches, zero outside the image.
-
-    Cost: memory K L^2 bytes; the images are not unfolded.
+    The images are (B, H, W) bool; patches are zero outside. Cost: memory K L^2 bytes; the images are not unfolded.
     """
     pixel = flat_nonzero(detect(images))
     line, col = split_index(pixel, images.shape[2])

@@ -46,13 +46,7 @@ class Matches:
 def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> Matches:
     """Find the best match of every key point of t and apply the ratio test (Eq. descriptor_ncc, best_match).
 
-    Args:
-        pc0, pc1: key points of t and t+1.
-        reach: (B,) float64, pixels, longest distance of a match in each window.
-        config: `ratio_threshold`, `max_memory`.
-
-    Returns:
-        The accepted matches.
+    `reach` is (B,) float64, pixels, the longest distance of a match in each window.
 
     Convention:
         Scores are compared exactly, as count^2 / energy of the candidate. A match is accepted if R > rho R' holds in
@@ -99,16 +93,12 @@ def _shift(pc0: KeyPoints, pc1: KeyPoints, source: Tensor, target: Tensor) -> tu
 def _contenders(
     source: KeyPoints, target: KeyPoints, reach: Tensor, share: float, num_pairs: int
 ) -> Iterator[tuple[Tensor, ...]]:
-    """Find the pairs that come near the best of their key point.
+    """Find the pairs that come near the best of their key point; all pairs of a key point of `source` at once.
 
-    Args:
-        source, target: key points of the same windows.
-        reach: (B,) float64, pixels.
-        share: a pair is found if its count^2 / energy is at least this share of the best one of its `source`.
-        num_pairs: number of pairs that are compared together.
+    A pair is found if its count^2 / energy is at least `share` of the best one of its `source`.
 
     Yields:
-        Key points of `source`, of `target` and counts, (N,) int64 each; all of a key point of `source` at once.
+        Key points of `source`, of `target` and counts, (N,) int64 each.
     """
     if source.row.numel() == 0 or target.row.numel() == 0:
         return
