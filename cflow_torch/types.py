@@ -33,7 +33,7 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
 
 
 def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str, wanted: str) -> None:
-    """Check the type, shape and dtype of an array.
+    """Check the type, shape and dtype of a dense array or tensor.
 
     Args:
         array: anything.
@@ -41,9 +41,6 @@ def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str
         shape: None = any length.
         kinds: allowed kinds of dtypes, of "b" bool, "iu" integers, "f" floats.
         wanted: what to give, for the message.
-
-    Raises:
-        CFlowError: not a dense array or tensor of that shape and dtype.
     """
     if not isinstance(array, (np.ndarray, Tensor)):
         raise CFlowError(f"{name} is {type(array).__name__}: give {wanted}, a NumPy array or a torch tensor")

@@ -45,13 +45,9 @@ def task(cfg: DictConfig) -> None:
 
 
 def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: Sequence[int] = ()) -> dict[str, Any]:
-    """Measure the seconds and the memory of a method.
+    """Measure the seconds and the memory of a method, `repeats` times for each window and batch size.
 
-    Args:
-        model: the method.
-        windows: at least one; a larger batch repeats them.
-        repeats: timed runs of each window and of each batch size, after one that warms up.
-        batches: batch sizes.
+    One run before them warms up. A batch that is larger than the number of windows repeats them.
 
     Returns:
         "points" (mean number per sweep), "windows", "repeats", "device"; "seconds": of one window, see

@@ -45,11 +45,7 @@ def task(cfg: DictConfig) -> None:
 def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> dict[str, Any]:
     """Push the sweeps of a log, at most `count`.
 
-    Args:
-        stream: receives the sweeps.
-        log: the sweeps.
-        pace: factor on the speed of the recording; None = each sweep as soon as the previous one is done.
-        count: number of sweeps; None = all.
+    `pace` is a factor on the speed of the recording; None = each sweep as soon as the previous one is done.
 
     Returns:
         "sweeps", "results"; "latency": "p50" and "p99", seconds from the time a sweep is due to the flow of the sweep

@@ -103,14 +103,9 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
         boxes0, boxes1: boxes of sweep t and t+1, each in the ego frame of its sweep.
         T_ego1_ego0: (4, 4) float64, ego coordinates of t to those of t+1.
 
-    Returns:
-        Labels with TOTAL flow, rounded to float32 once at the end. Points in a box whose track ends have the category
-        of the box, the flow of ego motion and `is_valid` False.
-
-    Convention: computed in float64. A point in several boxes takes the flow and category of the last one, and is valid
-    only if the tracks of all these boxes continue.
-
-    Cost: time O(N K), for most points two comparisons per box.
+    Convention: computed in float64, TOTAL flow is rounded to float32 once at the end. Points in a box whose track ends
+        have the category of the box, the flow of ego motion and `is_valid` False. A point in several boxes takes the
+        flow and category of the last one, and is valid only if the tracks of all these boxes continue.
 
     Source: the recipe of av2-api (torch/structures/flow.py), which rounds the ego motion to float32 first.
     """

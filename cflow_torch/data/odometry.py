@@ -24,21 +24,13 @@ _MAX_RANGE = 100.0  # metres; KISS-ICP's own default, which also sets its voxel 
 
 
 def poses_from_odometry(log: Log) -> np.ndarray:
-    """Estimate `T_world_ego` of every sweep; the world is the ego frame of the first.
+    """Estimate (K, 4, 4) float64 `T_world_ego` of the sweeps of a log; the world is the ego frame of the first.
 
-    Args:
-        log: poses of its sweeps are ignored. Ground points are used, because they constrain height and tilt.
-
-    Returns:
-        (K, 4, 4) float64, in the frame of the points.
+    Poses of the sweeps are ignored. Ground points are used, because they constrain height and tilt.
 
     Convention: KISS-ICP runs with its own settings, without de-skewing, on one thread, so that the poses do not depend
         on the number of threads. It needs a few sweeps to adapt to the speed, so we take the first five steps from a
         second run, backwards from the eleventh sweep.
-
-    Raises:
-        CFlowError: KISS-ICP is not installed, a sweep has fewer than 100 finite points in range, or the result is not a
-            rigid motion.
 
     Cost: one registration per sweep and eleven more, 0.13 s each for 120,000 points; reads as many sweeps.
 

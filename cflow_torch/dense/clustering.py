@@ -41,18 +41,13 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
 
     Args:
         sweeps: images of B windows of S sweeps.
-        config: `connectivity`, `max_extent` (d^max), `labeling`.
+        config: `connectivity`, `max_extent` (d^max), `labeling`, whose engines return identical clusters.
 
     Returns:
-        clusters: M clusters.
+        clusters: M clusters, which never join across windows (Alg. clustering).
         cluster_of_cell: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none. The last
             entry, M, is for points outside the images. Undefined for empty pixels.
         cell_of_point: (P,) int64, index of each point into `cluster_of_cell`.
-
-    Convention:
-        Clusters never join across windows. Both engines return identical clusters.
-
-    Source: Alg. clustering.
     """
     images, pixel_size = sweeps.occupancy, sweeps.grid.pixel_size
     _, num_steps, height, width = images.shape

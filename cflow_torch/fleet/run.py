@@ -74,16 +74,15 @@ def run_fleet(
     about: dict[str, Any] | None = None,
     **engine_settings: Any,
 ) -> dict[str, Any]:
-    """Compute the frames that are not complete, and write a report.
+    """Compute the frames of a shard that are not complete, and write a report.
 
     Args:
         job: the run; its folder is claimed already (`manifest.claim_folder`).
         sources: all logs, of all shards.
         layout: workers of this machine.
         shard: which share of the logs to do.
-        engine: "local" or "ray".
+        engine: "local" or "ray"; `engine_settings` are its own.
         about: more entries of the report.
-        **engine_settings: of the engine.
 
     Returns:
         The report of `Counters.report`, which is also in OUTPUT/reports/<shard>.json. "exit_status" is 0 if every frame

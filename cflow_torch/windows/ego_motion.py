@@ -67,7 +67,7 @@ def relative_transform(pose1: Any, pose: Any) -> np.ndarray:
 
 
 def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -> Tensor:
-    """Transform positions to the frame of t+1.
+    """Transform positions to the frame of t+1 (Eq. def_scene_flow).
 
     Args:
         positions: (3, N) float64, metres, in the ego frame of their sweep; rows x, y, z.
@@ -80,8 +80,6 @@ def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -
     Convention:
         ((R0 x + R1 y) + R2 z) + t with one rounding per operation instead of a matrix product: the same bits on every
         device.
-
-    Source: Eq. def_scene_flow.
     """
     if T_ego1_ego is None:
         return positions[:num_axes]

@@ -33,13 +33,11 @@ _LEAST_MOTION, _REACH = 0.3, 30.0  # metres at this distance, ego motion over on
 
 
 class Inspection:
-    """Inspects the windows of a model. It checks the points of the first window only, and the direction of the ego
-    motion only in the first window in which the sensor moves.
+    """Warns of likely mistakes in the windows of a model.
 
-    Warns:
-        CFlowWarning: z points down; ground without a mask; pc1 repeats pc0; inverted poses or interchanged sweeps.
-
-    Cost: about 20 ms, once; 5 us for each window.
+    These are: z points down; ground without a mask; pc1 repeats pc0; inverted poses or interchanged sweeps. It checks
+    the points of the first window only, and the direction of the ego motion only in the first window in which the
+    sensor moves. Cost: about 20 ms, once; 5 us for each window.
     """
 
     def __init__(self) -> None:

@@ -30,17 +30,12 @@ class Trajectory:
 
 
 def read_poses(path: PathLike) -> Trajectory:
-    """Read the poses of a file; its number of columns tells the format.
+    """Read the poses of a file, orthogonal up to rounding; its number of columns tells the format.
 
     Args:
         path: text with 12 numbers per line (KITTI: upper three rows of the matrix), 8 (TUM: time in seconds, tx ty tz,
-            qx qy qz qw, the scalar LAST), or 16 (the matrix by rows); or `.npy` with (K, 4, 4) or (K, 3, 4).
-
-    Returns:
-        The poses, orthogonal up to rounding. Lines that are empty or begin with `#` are skipped.
-
-    Raises:
-        CFlowError: no such file, another number of columns, not numbers, not rigid motions, times that do not ascend.
+            qx qy qz qw, the scalar LAST), or 16 (the matrix by rows); or `.npy` with (K, 4, 4) or (K, 3, 4). Lines that
+            are empty or begin with `#` are skipped.
     """
     path, times_ns, layout = as_path(path), None, "matrix"
     if path.suffix == ".npy":

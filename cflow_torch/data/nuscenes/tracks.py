@@ -9,14 +9,9 @@ from cflow_torch.data.rigid_motion import interpolate_poses
 
 
 class Tracks:
-    """The annotated boxes of a scene at any time.
+    """The annotated boxes of a scene at any time, from its (S,) ascending sample times in microseconds.
 
-    Args:
-        sample_times: (S,) int64, ascending, microseconds.
-        annotations: of these samples.
-
-    Attributes:
-        start, end: times of the first and of the last sample, microseconds.
+    `start` and `end` are the times of the first and of the last sample.
     """
 
     def __init__(self, sample_times: np.ndarray, annotations: Annotations) -> None:
@@ -27,11 +22,9 @@ class Tracks:
             self._rows[int(sample)][annotations.track[row]] = row
 
     def at(self, time: int) -> tuple[Annotations, np.ndarray] | None:
-        """Return the boxes at a time; None before the first sample, after the last, and without annotations.
+        """Return the K boxes at a time, and (K,) bool whether each is known; None outside the annotated time.
 
-        Returns:
-            The K boxes, and (K,) bool whether each is known. A box between two samples of which only one has the object
-            is a guess. Guesses come first.
+        A box between two samples of which only one has the object is a guess. Guesses come first.
 
         Convention: at a sample, we return its own boxes. Between two samples the centre and the size change linearly,
             and the rotation at a constant rate. If only one of the two samples has an object, we continue its motion

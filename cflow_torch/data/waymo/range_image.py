@@ -84,9 +84,6 @@ def range_image_points(
         pixels: (N,) int64, row * W + column, ascending.
 
     Convention: float64 throughout, because world coordinates are about 10 km, where float32 has steps of 1 mm.
-
-    Raises:
-        CFlowError: shapes that do not fit, or a frame pose that is missing or not rigid.
     """
     num_rows, num_columns = image.shape[:2]
     pixels = np.flatnonzero(image[..., RANGE] > 0)

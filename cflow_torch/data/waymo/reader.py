@@ -39,11 +39,8 @@ _KEPT_FRAMES = 2  # the labels of a pair are read after both of its sweeps
 def find_waymo_segments(root: PathLike) -> list[Path]:
     """Find the LiDAR files `<split>/lidar/<segment>.parquet` of all segments, sorted.
 
-    Args:
-        root: such a file, a folder `lidar`, a split (holds `lidar`), or a folder at most three levels above `lidar`.
-
-    Raises:
-        CFlowError: `root` does not exist, or holds files of version 1.
+    The root is such a file, a folder `lidar`, a split (holds `lidar`), or a folder at most three levels above `lidar`.
+    Files of version 1 are a `CFlowError`.
     """
     root = as_path(root)
     if root.is_file() and root.suffix != ".tfrecord":

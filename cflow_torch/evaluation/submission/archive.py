@@ -65,7 +65,7 @@ def get_version(number: Any) -> SubmissionVersion:
 def encode(
     version: SubmissionVersion, result: FlowResult, is_ground: Array | None = None, mask: np.ndarray | None = None
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Convert the flow of one frame to the columns of its file.
+    """Convert the flow of one frame to the columns of its file; also return (M,) float64, metres, the rounding errors.
 
     Args:
         version: the format.
@@ -73,13 +73,9 @@ def encode(
         is_ground: (N,) bool, True = ground; None = no point is ground.
         mask: (N,) bool, points to write; None = all, for versions without a mask.
 
-    Returns:
-        Columns by name (flow in metres until the next sweep, float16; `is_dynamic` bool), and (M,) float64, metres, the
-        error of each row from rounding to float16.
-
     Convention:
-        A residual flow is in the axes of t+1, as OpenSceneFlow writes it, and 0 for ground points. `is_dynamic` is
-        True where the unrounded residual is 0.05 m or longer.
+        The flow is float16 metres until the next sweep. A residual flow is in the axes of t+1, as OpenSceneFlow writes
+        it, and 0 for ground points. `is_dynamic` is True where the unrounded residual is 0.05 m or longer.
     """
     if (mask is not None) != version.is_masked:
         raise CFlowError(f"submission version {version.number} needs {'a' if version.is_masked else 'no'} mask")
