@@ -205,10 +205,10 @@ class FlowResult:
         return pandas.DataFrame({**positions, **self.columns()})
 
     def to_open3d(self, points: Array) -> Any:
-        """An `open3d.t.geometry.PointCloud` of pc0 with an attribute for every field that is not None.
+        """Return pc0 as an `open3d.t.geometry.PointCloud`, with an attribute for every field that is not None.
 
         Args:
-            points: (N, 3+) of pc0.
+            points: (N, 3+) points of pc0, metres.
 
         Raises:
             CFlowError: Open3D is not installed, or the number of points differs.

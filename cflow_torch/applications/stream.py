@@ -23,14 +23,14 @@ _log = logging.getLogger(__name__)
 class FlowStream:
     """Push sweeps one after the other; get the flow of a sweep as soon as the next one arrives.
 
-    A stream keeps the last `num_history` + 2 sweeps on the device of the method, and nothing else. Results equal those
-    of `make_model(config)([window])` with these sweeps to the bit.
+    A stream keeps the last `num_history` + 2 sweeps on the device of the method, and nothing else. A result is equal,
+    bit for bit, to that of `make_model(config)([window])` with these sweeps.
 
     Args:
         preset: "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
         config: settings, from `make_config`, in place of a preset.
         device: "auto" = that of the given tensors, else a GPU if available, else the CPU.
-        ground: None = use the given masks only; "auto" or "patchwork" = find the ground of sweeps without a mask, once.
+        ground: None = use only the given masks; "auto" or "patchwork" = find the ground of each sweep without a mask.
         max_gap: seconds; sweeps that are further apart are not compared, and the stream starts again.
         **overrides: any field of the settings.
 

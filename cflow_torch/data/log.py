@@ -73,10 +73,12 @@ class Log(Protocol):
         return None
 
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
-        """Read what the log has of each point of sweep `index` besides its position, such as intensity, ring and time.
+        """Read the columns of sweep `index` besides the positions of its points, such as intensity, ring and time.
 
-        Name -> (N,) bool, integers or floats, as stored; {} where the reader gives none. Models ignore them, and
-        `CleanLog` and `write_array_log` keep them.
+        Models ignore them; `CleanLog` and `write_array_log` keep them.
+
+        Returns:
+            Name -> (N,) bool, integers or floats, as stored; empty if the reader has no such columns.
         """
         self._timestamp(index)
         return {}

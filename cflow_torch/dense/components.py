@@ -49,10 +49,10 @@ def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: C
 def components_by_size(
     padded: Tensor, height: int, width: int, indices: PixelIndices, pixel_size: float, config: ClusteringConfig
 ) -> tuple[Tensor, int]:
-    """Component of each set pixel of padded images of height x width, and a number above the largest component.
+    """Label the set pixels of padded images of height x width; return the labels, and a number above the largest.
 
-    We erode all oversized components together. Components of a dilated image do not share a 3 x 3 neighbourhood that
-    lies in their union, so none affects another.
+    We erode all oversized components in one image. None affects another, because no 3 x 3 neighbourhood of set pixels
+    belongs to two components.
     """
     component, count = _components(padded, indices, 3, config)
     top, bottom = segment_minmax(indices.row, component, count)

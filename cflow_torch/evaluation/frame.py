@@ -118,7 +118,7 @@ class EvalFrame:
         return cls(points=window.pc0.points, labels=labels, **parts)
 
     def transform(self) -> np.ndarray:
-        """Return T_ego1_ego0, (4, 4) float64; a `CFlowError` if the frame has only `pose_flow`."""
+        """Return T_ego1_ego0, (4, 4) float64. A frame that has only `pose_flow` raises a `CFlowError`."""
         if self.T_ego1_ego0 is None:
             raise CFlowError("this definition measures in another frame: pass T_ego1_ego0 to the evaluation frame")
         return as_numpy(self.T_ego1_ego0)

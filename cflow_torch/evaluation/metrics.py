@@ -60,7 +60,7 @@ class SceneFlowMetrics:
         self.num_nan += other.num_nan
 
     def compute(self) -> dict[str, Any]:
-        """Return "definition", `num_frames`, `num_points`, `num_nan`, and a dictionary of plain numbers per metric."""
+        """Return a dictionary: "definition", "num_frames", "num_points", "num_nan", and a dictionary per metric."""
         return {
             "definition": self.definition.name,
             "num_frames": self.num_frames,

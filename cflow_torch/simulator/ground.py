@@ -25,7 +25,7 @@ class Ground:
         kerb: height of the pavement above the road, metres.
         half_widths: half the width between the kerbs of the street along x and of the one along y, metres.
         crossing_x: centre of the street along y, metres.
-        corner_radius: of the kerbs at the crossing, metres.
+        corner_radius: radius of the kerbs at the crossing, metres.
     """
 
     slope: tuple[float, float]

@@ -219,7 +219,7 @@ def _blocks_near(
 
 
 class RollingRays:
-    """The rays of a sweep in unit coordinates of the solids of its blocks: `rays_at` of `raycast.nearest_hits`."""
+    """Map blocks and columns to rays in unit coordinates of the block's solid, as `raycast.nearest_hits` needs."""
 
     def __init__(self, solids: MovingSolids, shots: Shots, blocks: Blocks) -> None:
         middle = blocks.first_column + blocks.num_columns // 2

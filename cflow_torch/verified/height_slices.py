@@ -231,7 +231,7 @@ class HeightSlicedSweeps:
         """Return the flat index into `image` of pixels that may lie outside it.
 
         Args:
-            index: (...) int64, flat index, right for pixels inside.
+            index: (...) int64, flat index, correct for pixels inside.
             at: (2, ...) int64, rows and columns, any value.
 
         Returns:
@@ -279,8 +279,12 @@ def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Te
 
 
 def count_slices(slices: Tensor) -> Tensor:
-    """Count the set bits of uint8 values: of the lower four and, times 2^32, of the upper four; int64, same shape. Two
-    counts share one number because sums cost more than lookups."""
+    """Count the set bits in both halves of uint8 values.
+
+    Returns:
+        int64 of the same shape: the count of the lower four bits, plus 2^32 times that of the upper four. The two
+        share a number because sums cost more than lookups.
+    """
     return constant(_COUNTS, torch.int64, slices.device).index_select(0, slices.reshape(-1).int()).view(slices.shape)
 
 

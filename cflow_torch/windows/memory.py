@@ -76,14 +76,17 @@ def control_groups() -> list[Path]:
 def split_windows(
     windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: float | None
 ) -> list[list[Window]]:
-    """Split windows into groups that fit into memory, in order. Results do not depend on the grouping.
+    """Split windows into groups that fit into memory, in their order. Results do not depend on the grouping.
 
     Args:
-        windows: B windows, checked. One that does not fit by itself is a `CFlowError`.
-        grid: the finest scale, whose images are the largest.
-        device: on a CPU large groups are slower.
-        bytes_per_point: working memory of a method per point.
-        max_memory: bytes; None = no limit on a GPU, 512 MiB per group on a CPU.
+        windows: B windows, checked.
+        grid: that of the finest scale, whose images are the largest.
+        device: where the windows are processed.
+        bytes_per_point: working memory of the method per point.
+        max_memory: bytes per group; None = no limit on a GPU, 512 MiB on a CPU, where large groups are slower.
+
+    Raises:
+        CFlowError: a window does not fit into memory by itself.
     """
     groups: list[list[Window]] = []
     if max_memory is None and device.type == "cpu":

@@ -45,10 +45,10 @@ def move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
 
 
 def is_better_inverted(given: float, none: float, inverted: float) -> bool:
-    """Test by agreements whether the motion between two sweeps is inverted.
+    """Test whether the given motion between two sweeps is inverted.
 
-    The agreement must grow from the given motion over none to the inverted one. Where most structure belongs to
-    vehicles that keep pace, as on a highway, it is largest without motion.
+    The arguments are the agreements of the sweeps under three motions, which must increase in this order. Where most
+    structure belongs to vehicles that keep pace, as on a highway, the agreement is largest without motion.
     """
     return given < none < inverted and inverted > _BETTER * given
 

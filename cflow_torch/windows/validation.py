@@ -42,7 +42,7 @@ def keep_nearest(window: Window, num_history: int) -> Window:
 
 
 def resolution(dtype: Any, distance: float) -> float:
-    """Difference between neighbouring numbers of a type at a distance from 0, in its unit; 0 for integer types."""
+    """Return the step between neighbouring numbers of a dtype at this distance from 0; 0 for integer dtypes."""
     if isinstance(dtype, torch.dtype):
         epsilon = torch.finfo(dtype).eps if dtype.is_floating_point else 0.0
     else:

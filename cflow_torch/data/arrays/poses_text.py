@@ -22,7 +22,7 @@ _LONGEST_GAP_NS = 500_000_000  # longest gap between two poses that we interpola
 
 @dataclass(frozen=True)
 class Trajectory:
-    """K poses."""
+    """K poses of a file."""
 
     poses: np.ndarray  # (K, 4, 4) float64 `T_world_frame`; the file does not say which frame
     times_ns: np.ndarray | None  # (K,) int64 nanoseconds, ascending; None if the format has no times

@@ -101,7 +101,7 @@ def write_hdf5_labels(
 
 
 def labelled_by(file: str | Path) -> str | None:
-    """Return `made_by` of a scene's labels, "" if it is unknown, None if the scene has no labels."""
+    """Return what made the labels of a scene, "" if that is unknown, None if the scene has no labels."""
     with open_scene(Path(file)) as scene, file_errors(file):
         has_labels = any(set(scene[stamp]) & set(LABELS) for stamp in scene if is_timestamp(stamp))
         made_by = scene.attrs.get(LABELLED, "" if has_labels else None)

@@ -72,13 +72,13 @@ class Annotations:
 
 
 def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list[SceneSource]:
-    """Find the scenes of all versions under a folder, by folder and name. Those of one version share their tables.
+    """Find the scenes of all versions under a folder, sorted by folder and name. Scenes of a version share its tables.
 
     Args:
         root: data root (it holds `v1.0-mini` or the like), the folder of one version, or a folder up to two levels
             above data roots.
-        foreign: tables of the related data set; a version that has one of them is not this data set.
-        data_set: its name.
+        foreign: tables that only the related data set has, by which we recognise its versions.
+        data_set: name of the data set, for error messages.
     """
     what = "the data root, which holds v1.0-mini or the like"
     versions = find_folders(
