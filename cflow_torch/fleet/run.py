@@ -81,8 +81,9 @@ def run_fleet(
         sources: all logs, of all shards.
         layout: workers of this machine.
         shard: which share of the logs to do.
-        engine: "local" or "ray"; `engine_settings` are its own.
+        engine: "local" or "ray".
         about: more entries of the report.
+        **engine_settings: settings of the engine.
 
     Returns:
         The report of `Counters.report`, which is also in OUTPUT/reports/<shard>.json. "exit_status" is 0 if every frame

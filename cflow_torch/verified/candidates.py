@@ -36,7 +36,7 @@ class Candidates(NamedTuple):
     """Motion candidates of N nodes.
 
     Args:
-        motion: (N, C, 2) float64, (y, x), finest pixels per sweep interval; 0 = unknown. Ties: the first candidate.
+        motion: (N, C, 2) float64, (y, x), finest pixels per sweep interval; 0 = unknown. Earlier candidates win ties.
         score: (N,) float32, NCC with the nearest sweep in which the node has pixels.
     """
 

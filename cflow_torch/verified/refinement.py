@@ -46,17 +46,17 @@ def register_deskewed(
     """Return the motion of objects per sweep interval, by registration and the times of points.
 
     Args:
-        points: of the objects that move, as `VoxelPairs` takes them.
+        points: points of the objects that move, as `VoxelPairs` takes them.
         sweeps: finest images.
-        start: (G, 2) float64, x and y, metres per sweep interval, to start from.
+        start: (G, 2) float64, x and y, metres per sweep interval, from which registration starts.
 
     Returns:
         The motion, and the apparent motion, which registration finds. Without times, both are equal. With times, the
-        apparent motion is divided by `VoxelPairs.stretch`. In windows with history, the points are then de-skewed and
-        registered again, from the start divided by the same factor. In pairs they are not, because de-skewed smooth
-        surfaces would slide along the pattern of the beams, and only a third sweep can prevent that.
+        motion is the apparent motion divided by `VoxelPairs.stretch`. In windows with history, we then de-skew the
+        points and register them again, from the start divided by the same factor. In pairs we do not, because de-skewed
+        smooth surfaces would slide along the pattern of the beams, and only a third sweep can prevent that.
 
-    Convention: times of 0 give the result without times to the bit.
+    Convention: times of 0 give the same bits as no times.
 
     Cost: that of two registrations, and a sort of the points.
     """

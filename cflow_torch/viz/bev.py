@@ -184,6 +184,6 @@ def view_of(position: np.ndarray, point_cloud_range: Sequence[float] | None) -> 
 
 
 def longest_flow(flow: np.ndarray) -> float:
-    """Length of the longest flow in the plane, rounded up to 0.1 m, at least 0.1 m."""
+    """Return the length in x and y of the longest flow, rounded up to 0.1 m, at least 0.1 m."""
     length = np.hypot(flow[:, 0], flow[:, 1])
     return max(float(np.ceil(length[np.isfinite(length)].max(initial=0) * 10 - 1e-3)) / 10, 0.1)

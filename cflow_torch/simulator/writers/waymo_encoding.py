@@ -74,7 +74,7 @@ def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray) -> ShotPos
 
 
 def true_poses_of_shots(log: Any, index: int, offset_ns: np.ndarray) -> ShotPoses:
-    """Poses at the times of shots, from a recording with poses between its sweeps (`Drive.poses_at`)."""
+    """Return the poses at the times of shots, from a recording that has poses between its sweeps (`Drive.poses_at`)."""
     of_shot = pose_angles(log.poses_at(index, offset_ns))
     of_shot[:, :3] = of_shot[:, :3].astype(np.float32)
     return ShotPoses(of_shot, pose_angles(log.poses[index]), log.poses[index])
