@@ -25,16 +25,18 @@ def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class EvalFrame:
-    """One pair of sweeps with prediction and truth. Arrays or tensors; rows in the order of sweep t, ground included.
+    """One pair of sweeps with its prediction and truth, as arrays or tensors.
+
+    Rows are the points of sweep t in their order, ground included.
 
     Args:
         points: (N, 3+) float, metres, ego frame of t.
         labels: truth of the pair (total flow, categories, valid rows).
-        residual_flow: (N, 3) float, predicted residual, metres per frame. Give this or `flow`, not both.
+        residual_flow: (N, 3) float, predicted residual, metres per sweep. Give this or `flow`, not both.
         flow: (N, 3) float, predicted total flow, axes of ego1.
         pose_flow: (N, 3) float, T_ego1_ego0 p - p; None = computed from `T_ego1_ego0`. Give at least one of the two.
-        T_ego1_ego0: (4, 4) float, ego coordinates of t to those of t+1. Definitions that measure ranges or residuals
-            in another frame need it.
+        T_ego1_ego0: (4, 4) float, maps ego coordinates of t to those of t+1. Definitions that measure ranges or
+            residuals in another frame need it.
         is_ground: (N,) bool, True = ground; None = no point is ground.
         eval_mask: (N,) bool, True = scored; None = all.
         residual_axes: axes of `residual_flow`, "t+1" or "t". This package predicts in "t+1".

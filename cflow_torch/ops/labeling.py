@@ -188,8 +188,8 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
         (V,) int64: the smallest node of the same component.
 
     Cost: a few rounds (about log V), each linear in V + E, with one host synchronisation after three rounds and after
-    each further one. A node only moves to smaller nodes of its component. Once both ends of every edge have the same
-    parent, this is the root.
+    each further one. The parent of a node only changes to a smaller node of its component. Once both ends of every
+    edge have the same parent, that parent is the root.
     """
     parent = torch.arange(num_nodes, device=sources.device)
     ends, low, high, num_rounds = torch.cat((sources, targets)), sources, targets, _ROUNDS

@@ -25,7 +25,7 @@ _PER_METRE, _HIGHEST = 256, 8192  # steps of height per metre; their largest num
 
 
 class ChangedPixels(NamedTuple):
-    """The change of P pixels; all False in windows without history, because a single other sweep would decide there.
+    """The change of P pixels. Windows without history have none, because only one other sweep would decide there.
 
     Args:
         is_missing: (P,) bool, a slice is missing in another sweep and not occluded there.

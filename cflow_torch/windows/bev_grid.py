@@ -67,10 +67,16 @@ class Grid:
         return inside.bool()
 
     def pixel(self, positions: Tensor) -> Tensor:
-        """(N,) int32 raster index row * W + col of (2, N) or (3, N) float64 metres (Eq. 3d_to_bev); undefined outside.
+        """Return the raster index, row * W + col, of each position (Eq. 3d_to_bev).
 
-        It is floor((p - p_lower) / s) with a true division in float64. The divisor is a tensor, because a GPU
-        multiplies by the reciprocal of a plain number, which rounds differently.
+        Rows and columns are floor((p - p_lower) / s) with a true division in float64. The divisor is a tensor, because
+        a GPU multiplies by the reciprocal of a plain number, which rounds differently.
+
+        Args:
+            positions: (2, N) or (3, N) float64, metres.
+
+        Returns:
+            (N,) int32; undefined outside the region.
         """
         size = constant((self.pixel_size,), positions.dtype, positions.device)
         # Inside the region nothing is below the lower end, so int() rounds down.

@@ -116,7 +116,7 @@ class Frames:
         return result
 
     def between(self, target: str, source: str, times_ns: np.ndarray) -> np.ndarray:
-        """Return (K, 4, 4) float64 `T_target_source`; a `CFlowError` if no transforms connect the two frames."""
+        """Return (K, 4, 4) float64 `T_target_source`. Frames that no transforms connect raise a `CFlowError`."""
         if not self.are_joined(target, source):
             known = shortened(", ".join(sorted({*self._parents, *self._parents.values()})))
             raise CFlowError(f"no transforms connect {source} to {target}; the frames are {known or 'none'}")

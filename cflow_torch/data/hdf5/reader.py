@@ -227,7 +227,7 @@ def import_h5py() -> Any:
 
 
 def open_scene(file: Path) -> Any:
-    """Open a scene for reading; a missing package or file, or a file that is not HDF5, is a `CFlowError`."""
+    """Open a scene for reading. A missing package or file, or a file that is not HDF5, raises a `CFlowError`."""
     h5py = import_h5py()
     with scene_errors(file):
         return h5py.File(source_for_random_access(file), "r")

@@ -85,7 +85,7 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """Name of its file inside the archive."""
+        """Path of the frame's file inside the archive."""
         return f"{self.log.log_id}/{self.log.timestamps[self.index]}.feather"
 
     def count_rows(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> int:
