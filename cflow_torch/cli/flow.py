@@ -86,7 +86,7 @@ def task(cfg: DictConfig) -> None:
 def compute(
     cfg: DictConfig, shard: Shard, contents: tuple[str, ...], check: Callable[[Job, Sources], None] | None = None
 ) -> FlowRun | None:
-    """Estimate the flow of all logs of a shard into files; with dry_run=true count the frames, and return None.
+    """Write the flow of all logs of a shard to files. With dry_run=true, count the frames and return None.
 
     `contents` are the columns of a flow file. `check` is called before anything is computed, and raises an error if the
     logs are not usable.

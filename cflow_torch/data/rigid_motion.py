@@ -32,7 +32,11 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
 
 
 def poses_from_json(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
-    """Make (K, 4, 4) float64 poses of K JSON objects with {x, y, z} and {w, x, y, z}, see `poses_from_quaternions`."""
+    """Return the (K, 4, 4) float64 poses of K JSON objects.
+
+    `translation` and `rotation` are the keys of {x, y, z} in metres and of the unit quaternion {w, x, y, z}. `what`
+    names the objects in the `CFlowError` for a pose that is not rigid.
+    """
     shifts = [[node[translation][axis] for axis in "xyz"] for node in nodes]
     quaternions = [[node[rotation][axis] for axis in "wxyz"] for node in nodes]
     return poses_from_quaternions(shifts, quaternions, lambda row: f"{what} {row}")
