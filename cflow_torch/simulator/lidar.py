@@ -73,7 +73,8 @@ def scan(
 
     Args:
         profile: the units and their quality.
-        solids, ground: everything except the ground, and the ground, in the world.
+        solids: everything in the world except the ground.
+        ground: height of the ground in the world.
         T_world_ego: (4, 4) float64.
         generator: source of noise, drop-out and the azimuth at which the sweep begins.
     """

@@ -46,7 +46,7 @@ class Grid:
         return math.floor((self.upper[0] - self.lower[0]) / self.pixel_size) + 1
 
     def centre(self, pixel: Tensor) -> Tensor:
-        """(2, K) float64, metres, y and x of the centres of pixels, (2, K) int64, row and column."""
+        """Return y and x of the centres of pixels, (2, K) float64 metres, given their row and column, (2, K) int64."""
         lower = constant(self.lower[1::-1], torch.float64, pixel.device)
         return pixel.double().add_(0.5).mul_(self.pixel_size).add_(lower[:, None])
 

@@ -63,7 +63,7 @@ class Inspection:
 
 
 def repeats(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether two sweeps have the same points. Tensors on a GPU are not compared: that would wait for it."""
+    """Test whether two sweeps have the same points. False for tensors on a GPU, because we would wait for the GPU."""
     a, b = pc0.points, pc1.points
     if a.shape != b.shape or len(a) < _FEWEST_REPEATED:
         return False

@@ -55,21 +55,21 @@ def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int,
 
     Args:
         file: `<scene>.h5`; every other key keeps its contents.
-        name: of the result; a result of that name is replaced.
-        results: (time stamp of sweep t, (N, 3) TOTAL flow) pairs, metres until the next sweep, axes of ego1, one row
-            per point of the sweep, ground included; consumed one by one.
+        name: name of the result; we replace a result of the same name.
+        results: pairs of the time stamp of sweep t and the (N, 3) TOTAL flow, metres per sweep interval, axes of ego1,
+            one row per point of the sweep, ground included; consumed one by one.
 
     Returns:
         Number of sweeps written.
 
     Convention:
-        float32, compressed as the points of the sweep are. NaN rows are kept (viewers show them white).
+        The flow is float32, compressed as the points of the sweep are. NaN rows are kept (viewers show them white).
         All results go into a copy next to the file, which replaces it at the end, so the scene is always the old or the
         new one. Readers that have it open continue with the old one. Only one process may write into a scene at a time.
 
     Raises:
-        CFlowError: h5py is missing; the name is taken; the file is read-only or not a scene; a sweep is not in it; or
-            the numbers of rows differ. The scene is then unchanged.
+        CFlowError: h5py is missing; the name is a key of scenes; the file is read-only or not a scene; a sweep is not
+            in it; or the numbers of rows differ. The scene is then unchanged.
 
     Cost: one copy of the scene, in time and, until the end, in space.
     """
