@@ -98,7 +98,7 @@ class SceneFlowModel(nn.Module):
 
         Args:
             preset: a preset of the method; None = its first.
-            device: see above.
+            device: as for the class.
             **overrides: any field of its settings.
 
         Raises:

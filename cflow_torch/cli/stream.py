@@ -43,7 +43,7 @@ def task(cfg: DictConfig) -> None:
 
 
 def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> dict[str, Any]:
-    """Push the sweeps of a log, at most `count`.
+    """Push at most `count` sweeps of a log into a stream.
 
     `pace` is a factor on the speed of the recording; None = each sweep as soon as the previous one is done.
 

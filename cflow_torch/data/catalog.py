@@ -97,12 +97,15 @@ def _has_logs(name: str, root: Any) -> bool:
 
 
 def find_user_sources(target: str, settings: Mapping[str, Any]) -> list[UserSource]:
-    """Return one source per log that your own reader returns, for `open_log`; a reader that fails is a `CFlowError`.
+    """Return one source, for `open_log`, per log that your own reader returns.
 
     Args:
         target: name of a class or function, as "package.module.name". It returns a log (`cflow_torch.data.log.Log`), or
             a sequence of logs, which may open them lazily.
-        settings: its keyword arguments, and those of `open_log`.
+        settings: keyword arguments of the target and of `open_log`.
+
+    Raises:
+        CFlowError: there is no such target, or it fails.
     """
     logs = _user_logs(target, {key: value for key, value in settings.items() if key not in _OF_ALL})
     if len(logs) == 0:

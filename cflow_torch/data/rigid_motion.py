@@ -16,7 +16,7 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
     """Build (K, 4, 4) float64 poses from translations and quaternions, as files store them.
 
     Args:
-        translation: (K, 3) numbers, metres; an empty list is K = 0.
+        translation: (K, 3) numbers, metres; K may be 0.
         quaternion: (K, 4) numbers, scalar first (w, x, y, z), of length 1 within `QUATERNION_TOLERANCE`.
         what: row -> where it comes from, for the message of the `CFlowError` about a row that is not a pose.
     """

@@ -46,7 +46,7 @@ def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Te
 
 @dataclass(frozen=True)
 class Pairing:
-    """Groups of key points and their match candidates, in order of falling number of candidates."""
+    """Groups of key points and their match candidates. The groups with the most candidates come first."""
 
     member: Tensor  # (G, S) int64, key points of each group, padded with the number of key points
     candidate: Tensor  # (C,) int64, candidates of all groups, one group after the other

@@ -122,7 +122,7 @@ class Objects:
 
     @property
     def count(self) -> int:
-        """G."""
+        """Number of objects, G."""
         return self.component.numel()
 
 

@@ -112,10 +112,11 @@ class Wins(NamedTuple):
     """Paired counts of M components with C candidate motions each.
 
     Args:
-        won, lost: (2, M, C) int64, slices; then the near counts: a slice also counts as found in the 3 x 3 pixels
-            around a position, if the motion is at least two pixels.
-        of_static: (2, M, 2) int64, slices of other sweeps, then of t+1: first all of them, then those in place in the
-            sweep compared and, times 2^32, those that it has in the 3 x 3 pixels around.
+        won, lost: (2, M, C) int64, the counts of slices, then the near counts. For these, a slice also counts as found
+            in the 3 x 3 pixels around a position, if the motion is at least two pixels.
+        of_static: (2, M, 2) int64. The first row counts all slices that are compared. The second row counts those that
+            the other sweep has in place, plus 2^32 times those that it has in the 3 x 3 pixels around. Column 0 is for
+            slices of other sweeps, compared with t+1; column 1 is for slices of t+1.
     """
 
     won: Tensor

@@ -70,7 +70,7 @@ def show(
         results: its flow, or a list of the same length.
         labels: its labels, or a list of the same length; None = no labels.
         tracks: table of `cflow_torch.track`, whose column `sweep` counts the windows from 0.
-        title, preset: in the heading.
+        title, preset: texts of the heading.
         max_flow: residual flow with the full colour, metres per sweep. Faster flow is darker.
         voxel: side of the cubes of which each keeps one static point, metres; twice as large for ground.
 

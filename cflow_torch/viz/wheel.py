@@ -56,7 +56,8 @@ def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
 def wheel_image(size: int) -> np.ndarray:
     """Draw the wheel for a legend: +x to the right, +y up, zero flow in the middle, `max_flow` at the rim.
 
-    (size, size, 4) uint8 RGBA, transparent outside the wheel; row 0 is the top.
+    Returns:
+        (size, size, 4) uint8 RGBA, transparent outside the wheel; row 0 is the top.
     """
     axis = (np.arange(size) + 0.5) * (2 / size) - 1
     flow = np.stack(np.meshgrid(axis, -axis), axis=-1)
