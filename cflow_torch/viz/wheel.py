@@ -19,7 +19,7 @@ def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
 
     Args:
         flow: (..., 2+) float, metres; columns after x and y are ignored.
-        max_flow: length in metres that gets the full hue; None = the longest flow.
+        max_flow: length in metres with full saturation; None = the longest flow.
 
     Returns:
         (..., 3) uint8 RGB.
