@@ -83,8 +83,8 @@ def cast_solids(
     """Find the nearest solid along every ray of a range image.
 
     Args:
-        kind: (P,) int64.
-        T_solid_sensor: (P, 4, 4) float64, rigid, sensor coordinates to the solid's.
+        kind: (P,) int64, BOX, CYLINDER or ELLIPSOID.
+        T_solid_sensor: (P, 4, 4) float64, rigid, maps coordinates of the sensor to those of the solid.
         half_size: (P, 3) float64, metres.
         azimuth: (C,) float64 radians, evenly spaced over one full revolution, ascending.
         elevation: (B,) float64 radians, ascending.

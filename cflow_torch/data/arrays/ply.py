@@ -28,9 +28,10 @@ _LONGEST_HEADER = 65536  # bytes
 
 
 def ply_fields(content: bytes) -> dict[str, np.ndarray]:
-    """Read the vertices of a `.ply` file: property -> (N,) array of the stated type; another file raises any exception.
+    """Read the vertices of a `.ply` file: property -> (N,) array of the stated type.
 
-    The first element must be `vertex`. Faces are not read. Source: G. Turk, "The PLY Polygon File Format".
+    The first element must be `vertex`. Faces are not read. A file that is damaged or not a `.ply` file may raise any
+    exception, which the caller reports. Source: G. Turk, "The PLY Polygon File Format".
     """
     header = re.match(rb"ply\s(.*?)\nend_header\s*?\n", content[:_LONGEST_HEADER], re.DOTALL)
     if header is None:
