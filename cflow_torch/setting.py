@@ -56,7 +56,7 @@ def describe(f: Any) -> str:
 
 
 def checked(f: Any, value: Any) -> Any:
-    """Return the value of a field in its plain type; one that is not allowed is a `CFlowError`."""
+    """Return the value of a field in its plain type. A value that is not allowed raises a `CFlowError`."""
     limits = f.metadata
     kind = limits["kind"]
     if value is None and limits["optional"]:

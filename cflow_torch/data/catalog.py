@@ -211,7 +211,7 @@ class GroundSegmentedLog(LogWrapper):
         method: as `find_ground` of `open_log`.
 
     Attributes:
-        has_found_ground: True once ground was found although nobody asked for it, by "auto".
+        has_found_ground: True once ground was found by "auto", that is, without a request.
     """
 
     def __init__(self, log: Log, method: str = "grid") -> None:

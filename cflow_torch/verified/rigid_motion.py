@@ -46,7 +46,7 @@ class RigidMotion:
 
 
 def rotate(rotation: Tensor, arm: Tensor) -> Tensor:
-    """Rotate x + iy, (K,) complex128, about the origin by the angle whose half has the tangent `rotation`, (K,)."""
+    """Rotate x + iy, (K,) complex128, about the origin; `rotation`, (K,), is the tangent of half the angle."""
     half = torch.complex(constant((1.0,), rotation.dtype, rotation.device), rotation)
     return half / half.conj() * arm
 

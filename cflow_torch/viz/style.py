@@ -43,7 +43,7 @@ def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
 
 
 def add_panel(figure: Figure, left: float, bottom: float, width: float, height: float, **settings: Any) -> Any:
-    """Add axes, measured in inches. Args: settings: of `Figure.add_axes`."""
+    """Add axes at a position in inches, with the settings of `Figure.add_axes`."""
     across, up = figure.get_size_inches()
     return figure.add_axes((left / across, bottom / up, width / across, height / up), **settings)
 
