@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from preset_windows import PRESETS, num_moving, small, windows_for
-from scenes import assert_same_bits, reordered, rows_of
+from scenes import assert_same, assert_same_bits, needs_gpu, reordered, rows_of
 
 from cflow_torch import Config, FlowResult, Sweep, Window, make_model
 
@@ -109,3 +109,19 @@ def test_results_have_the_same_bits_however_they_are_computed(preset: str, call:
     assert len(found) == len(results)
     for one, other in zip(found, results):
         assert_same_bits(one, other)
+
+
+VARIANTS = [(preset, {}) for preset in PRESETS]
+VARIANTS += [("paper", {"correlation": "conv", "sectional_view": True}), ("paper", {"labeling": "kornia"})]
+VARIANTS += [("keypoints", {"densify": densify}) for densify in ("clusters", "nearest")]
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize("preset, overrides", VARIANTS)
+def test_a_gpu_gives_the_flow_of_the_cpu(preset: str, overrides: dict) -> None:
+    config = small(preset, **overrides)
+    windows = windows_for(config, 4)
+    for on_gpu, on_cpu in zip(*(make_model(config, device)(windows) for device in ("cuda", "cpu"))):
+        assert on_gpu.flow.is_cuda
+        assert_same(on_gpu, on_cpu, atol=1e-4)

@@ -9,17 +9,7 @@ import numpy as np
 import pytest
 import torch
 from oracle import reference_flow
-from scenes import (
-    assert_same,
-    assert_same_bits,
-    box,
-    config,
-    flow_as_oracle,
-    needs_gpu,
-    needs_kornia_labelling,
-    pose,
-    scene,
-)
+from scenes import assert_same, assert_same_bits, box, config, flow_as_oracle, needs_kornia_labelling, pose, scene
 
 from cflow_torch import CFlowError, CorrelationFlow, FlowResult, Sweep, Window, estimate_flow, make_config
 from cflow_torch.data.av2 import AV2Log
@@ -77,19 +67,6 @@ def test_drives_equal_the_oracle(kitti_file, data_root, settings):
         for window in [window_of(log, index, min(history, index)) for log, index in logs]:
             result = flow_as_oracle(window, make_config("paper", **settings))
             assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 500
-
-
-@pytest.mark.cuda
-@needs_gpu
-@pytest.mark.parametrize("num_history, pixel_sizes", [(0, (0.25,)), (2, (0.5, 0.25))])
-def test_cuda_equals_cpu(num_history, pixel_sizes):
-    windows = [scene(seed, num_history=num_history) for seed in range(12)]
-    for engines in ({}, {"correlation": "conv"}, {"labeling": "kornia"}):
-        settings = config(num_history=num_history, pixel_sizes=pixel_sizes, sectional_view=True, **engines)
-        on_cpu = CorrelationFlow(settings, device="cpu")(windows)
-        for gpu, cpu in zip(CorrelationFlow(settings, device="cuda")(windows), on_cpu):
-            assert gpu.flow.is_cuda
-            assert_same(gpu, cpu, atol=1e-4)
 
 
 # ------------------------------------------------------------------------------------------------- known motions

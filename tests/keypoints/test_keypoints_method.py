@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from oracle.keypoints import match_radius
-from scenes import assert_same, config, flow_as_oracle, needs_gpu, needs_kornia_labelling, scene
+from scenes import config, flow_as_oracle, needs_kornia_labelling, scene
 
-from cflow_torch import CorrelationFlowKeypoints, Sweep, Window, make_config
+from cflow_torch import Sweep, Window, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
@@ -57,18 +57,6 @@ def test_real_drives_equal_the_oracle(av2_folder, kitti_file):
 def test_the_whole_real_pair_equals_the_oracle(av2_folder, preset):
     flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config(preset, method="keypoints"))
 
-
-@pytest.mark.cuda
-@needs_gpu
-@pytest.mark.parametrize("densify", DENSIFIERS)
-def test_cuda_equals_cpu(densify):
-    settings, windows = config("keypoints", densify=densify), [scene(seed) for seed in range(6)]
-    on_gpu, on_cpu = (CorrelationFlowKeypoints(settings, device)(windows) for device in ("cuda", "cpu"))
-    for one, other in zip(on_gpu, on_cpu):
-        assert_same(one, other, atol=1e-4)
-
-
-# ------------------------------------------------------------------------------------------------- known motions
 
 METRE = config(
     "keypoints", pixel_size=1.0, point_cloud_range=(0.0, 0.0, -math.inf, 40.0, 40.0, math.inf), max_extent=1000.0
@@ -123,9 +111,6 @@ def test_the_radius_of_matches_follows_time_and_speed():
         assert flow_as_oracle(window, METRE.replace(gate_radius=3.0)).residual_flow[0, 0] == expected
 
 
-# --------------------------------------------------------------------------------------------------------- matching
-
-
 def hand_made(pixels: list[list[int]], ones: list[int]) -> KeyPoints:
     """Key points whose 11 x 11 descriptors have their first pixels set."""
     row, col = torch.tensor(pixels, dtype=torch.int64).reshape(-1, 2).unbind(1)
@@ -166,9 +151,6 @@ def test_a_match_at_the_radius_is_allowed():
 def test_without_key_points_there_are_no_matches():
     none, one = hand_made([], []), hand_made([[5, 5]], [9])
     assert all(shifts(*pair) == {} for pair in ((none, one), (one, none), (none, none)))
-
-
-# ---------------------------------------------------------------------------------------------- parts of the search
 
 
 def test_all_within_the_radius_are_candidates():

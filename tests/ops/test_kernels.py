@@ -1,13 +1,16 @@
-"""Medians, adjugates, nearest pixels, lower surfaces and morphology, against NumPy, SciPy and loops."""
+"""Medians, counts, adjugates, nearest pixels, surfaces, correlation and morphology, against NumPy, SciPy and loops."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from scipy import ndimage
 
 from cflow_torch.ops import morphology
+from cflow_torch.ops.cross_correlation import cross_correlate
+from cflow_torch.ops.indices import floor_divide, lazy_empty, lazy_zeros, scatter_count, split_index
 from cflow_torch.ops.kornia_engine import close_3x3_kornia
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.linear import adjugate
@@ -108,3 +111,51 @@ def test_erosion_with_a_cross_is_scipys_with_background_outside(shape):
         image = np.random.default_rng(seed).random((2, *shape)) < 0.8
         expected = np.stack([ndimage.binary_erosion(part, border_value=0) for part in image])
         assert np.array_equal(morphology.erode_cross(torch.from_numpy(image)).numpy(), expected)
+
+
+CPU = torch.device("cpu")
+
+
+def test_indices_are_divided_like_integers():
+    index = torch.tensor([0, 1, 6, 7, 8, 2**40, 2**62 + 5])
+    for width in (1, 2, 7, 701, 2**31 + 1):
+        row, col = split_index(index, width)
+        assert [tuple(pair) for pair in zip(row.tolist(), col.tolist())] == [divmod(i, width) for i in index.tolist()]
+    assert floor_divide(torch.tensor(7), 2) == 3 and floor_divide(torch.tensor(7), 2).shape == ()
+
+
+def test_counts_are_those_of_bincount():
+    rng = np.random.default_rng(0)
+    for number, size in [(0, 0), (0, 4), (1, 1), (50, 7), (1000, 300)]:
+        index = rng.integers(0, max(size, 1), number)
+        weights = rng.integers(-(2**40), 2**40, (3, number))
+        given = torch.from_numpy(index)
+        assert scatter_count(given, size).tolist() == np.bincount(index, minlength=size).tolist()
+        expected = [[int(row[index == i].sum()) for i in range(size)] for row in weights]
+        assert scatter_count(given, size, torch.from_numpy(weights)).tolist() == expected
+        assert scatter_count(given, size, torch.from_numpy(weights[1])).tolist() == expected[1]
+        halves = scatter_count(given, size, torch.from_numpy(weights / 2))
+        assert halves.shape == (3, size) and halves.dtype == torch.float64
+        assert halves.tolist() == [[total / 2 for total in row] for row in expected]
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.int64, torch.float32])
+def test_lazy_tensors_have_their_size_and_type_and_can_be_written(dtype):
+    for size in (0, 5, 10**6):
+        zeros, empty = lazy_zeros(size, dtype, CPU), lazy_empty(size, dtype, CPU)
+        assert {values.dtype for values in (zeros, empty)} == {dtype}
+        assert zeros.shape == empty.shape == (size,) and not zeros.any()
+        for values in (zeros, empty):
+            assert values.fill_(1).bool().all()
+
+
+@pytest.mark.parametrize("shape", [(100, 100), (317, 401), (4, 3000)])
+def test_fft_counts_stay_exact_on_full_images(shape):
+    # The largest counts there are: the overlap of two full images is (H - |dy|) (W - |dx|).
+    height, width = shape
+    template = F.pad(torch.ones((1, *shape)), (0, width // 2, 0, height // 2))
+    target = F.pad(torch.ones((1, *shape)), (width // 2, 0, height // 2, 0))  # moved by half the size
+    found = cross_correlate(torch.cat((template, target)), 1, torch.zeros(1, dtype=torch.int64), "fft")
+    rows, cols = (side - abs(np.arange(-(side // 2), side // 2 + 1)) for side in shape)
+    found = found[0, : len(rows), : len(cols)]
+    assert (found - found.round()).abs().max() < 0.5 and np.array_equal(found.round(), rows[:, None] * cols)

@@ -86,31 +86,6 @@ def test_sets_of_images_that_are_labelled_together_equal_each_set_alone(connecti
             assert before == found[0].num_components, "the components of all sets are numbered one after the other"
 
 
-# ------------------------------------------------------------------------------------------------------ hard shapes
-# In every round each root with a smaller neighbour hooks onto the smallest one. A root that stays has no smaller
-# neighbour: after the next round it has hooked as well or swallowed all of its neighbours. So two rounds at least halve
-# the roots of every open component: at most 2 log2(V) + 1 rounds for V nodes.
-
-
-def spiral(size: int) -> np.ndarray:
-    """One arm, one pixel wide, that winds inwards, with one free pixel between its windings."""
-    image, low, high = np.zeros((size, size), dtype=bool), 0, size - 1
-    image[0, 0] = True
-    while low <= high:
-        image[low, max(low - 1, 0) : high + 1] = image[low : high + 1, high] = image[high, low : high + 1] = True
-        image[low + 2 : high + 1, low] = True
-        low, high = low + 2, high - 2
-    return image
-
-
-def test_spirals_equal_scipy():
-    """Rotated and mirrored, in one batch."""
-    image = spiral(63)
-    images = np.stack([image, image[::-1], image[:, ::-1].T, np.zeros_like(image)])
-    for connectivity, reach in ((4, 1), (8, 1), (8, 3)):
-        assert label(images, connectivity, reach).tolist() == by_scipy(images, connectivity, reach).tolist()
-
-
 def test_union_find_equals_scipy():
     rng = np.random.default_rng(0)
     for num_nodes, num_edges in [(1, 0), (5, 0), (1, 3), (10, 6), (200, 150), (3000, 9000)]:
@@ -124,6 +99,9 @@ def test_union_find_equals_scipy():
 
 @pytest.mark.parametrize("num_nodes", [17, 65_536])
 def test_paths_stars_and_trees_take_few_rounds_whatever_their_numbering(num_nodes, monkeypatch):
+    # In every round each root with a smaller neighbour hooks onto the smallest one. A root that stays has no smaller
+    # neighbour: after the next round it has hooked as well or swallowed all of its neighbours. So two rounds at least
+    # halve the roots of every open component: at most 2 log2(V) + 1 rounds for V nodes.
     rng, line, hook, rounds = np.random.default_rng(0), np.arange(num_nodes), torch.Tensor.scatter_reduce_, []
     monkeypatch.setattr(torch.Tensor, "scatter_reduce_", lambda *given: rounds.append(1) or hook(*given))
     bit_reversed = np.array([int(f"{i:032b}"[::-1], 2) for i in line]).argsort().argsort()

@@ -6,7 +6,7 @@ docstring says what is done.
 
 Order of reading: reference_flow, here -> `dense` (Alg. general_correlation_flow), `keypoints` (Sec.
 CorrelationFlow-Keypoints) or `verified` (ours). What they use: `sweeps` (ego motion), `pixels` (Eq. 3d_to_bev),
-`clustering` (Alg. clustering), `history` (Sec. leverage_past_pcs), `matching` (key points).
+`clustering` (Alg. clustering).
 
 Parts of the verified method, in its order: `height_slices`, `changed_pixels`, `component_tree`, `candidates`,
 `paired_test`, `aperture`, `registration`, `confidence`.
@@ -22,8 +22,7 @@ import torch
 from cflow_torch.config import Config
 from cflow_torch.types import FlowResult, Window
 from oracle.dense import general_correlation_flow, ncc_map
-from oracle.keypoints import correlation_flow_keypoints
-from oracle.matching import match_keypoints
+from oracle.keypoints import correlation_flow_keypoints, match_keypoints
 from oracle.pixels import in_range, occupancy, project_bev
 from oracle.sweeps import Cloud, PointMotion, compensate, ground_points, xyz
 from oracle.verified import verified_flow
@@ -32,17 +31,9 @@ __all__ = ["compensate", "in_range", "match_keypoints", "ncc_map", "occupancy", 
 
 
 def reference_flow(window: Window, config: Config) -> FlowResult:
-    """Flow of every point of `window.pc0`, by the method of the settings.
+    """Flow of every point of `window.pc0`, by the method of the settings, as CPU tensors.
 
-    Args:
-        window: sweeps t-h ... t+1, taken as valid.
-        config: settings; the fields `labeling`, `correlation`, `max_memory` choose engines and mean nothing here.
-
-    Returns:
-        `FlowResult` of CPU tensors, rows in the order of pc0.
-
-    Cost: dense: about one addition per (pixel of a cluster) x (pixel of its bounding box). Key points: about L^2
-        per pair of key points within the radius.
+    The settings `labeling`, `correlation` and `max_memory` choose engines and are ignored here.
     """
     clouds, cloud1 = compensate(window, config)
     if config.method == "verified":
@@ -71,11 +62,6 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
 
 def coarse_to_fine(clouds: Sequence[Cloud], cloud1: Cloud, config: Config) -> PointMotion:
     """Multi-scale strategy: estimate, translate the clouds by the flow so far, repeat with finer pixels.
-
-    Args:
-        clouds: sweeps m = t, t-1, ... nearest first.
-        cloud1: sweep t+1.
-        config: settings of the dense or of the key-point method.
 
     Returns:
         Flow, the sum over the scales; cluster and score of the finest scale.

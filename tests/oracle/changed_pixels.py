@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Sequence
+from typing import Sequence
 
 import numpy as np
 
@@ -12,16 +12,11 @@ AZIMUTHS, ELEVATIONS, RISE = 720, 120, 1 / 57.3
 ABOVE_LOWEST, NEAR = 1.6, 12.0  # metres
 
 
-class Change(NamedTuple):
-    """Pixels, (P,) bool, of which a slice is missing in another sweep and not hidden there, and those of which one is
-    missing in another sweep that saw its place."""
-
-    is_missing: np.ndarray
-    has_changed: np.ndarray
-
-
-def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: Sequence[Sequence[float]]) -> Change:
-    """Compare every pixel in place with every other sweep; nothing has changed in windows of two sweeps.
+def find_changed(
+    sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: Sequence[Sequence[float]]
+) -> np.ndarray:
+    """(2, P) bool: pixels of which a slice is missing in another sweep and not hidden there, and those of which one is
+    missing in another sweep that saw its place; none in windows of two sweeps.
 
     Args:
         in_sight: (N, 3) of each sweep: its points, those that are not drawn included.
@@ -29,7 +24,7 @@ def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: 
 
     Convention: the middle of a slice is that of the first one at or above the lowest point of its pixel.
     """
-    change = Change(*np.zeros((2, len(sweeps.pixels)), dtype=bool))
+    is_missing, has_changed = change = np.zeros((2, len(sweeps.pixels)), dtype=bool)
     lowest = np.full(len(sweeps.pixels), np.inf)
     np.minimum.at(lowest, sweeps.pixel_of_point, sweeps.points[:, 2])
     _, row, col = sweeps.pixels.T
@@ -43,8 +38,8 @@ def find_changed(sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: 
         height = (first + (number - first) % NUM_SLICES + 0.5) * SLICE_HEIGHT
         direction, distance = directions(np.column_stack((sweeps.middle(sweeps.pixels[pixel]), height)), sensor)
         is_seen, is_unknown = farthest[direction] >= distance, farthest[direction] == -np.inf
-        change.is_missing[pixel[is_seen | is_unknown]] = True
-        change.has_changed[pixel[is_seen]] = True
+        is_missing[pixel[is_seen | is_unknown]] = True
+        has_changed[pixel[is_seen]] = True
     return change
 
 

@@ -18,9 +18,7 @@ def cluster(images: Sequence[np.ndarray], pixel_size: float, max_extent: float, 
 
     Args:
         images: occupancy (H, W) bool of sweep t+1, then of sweeps t, t-1, ...
-        pixel_size: s in metres.
         max_extent: d^max in metres.
-        connectivity: 4 or 8.
 
     Returns:
         (H, W) int64: cluster of every pixel that some sweep occupies, -1 elsewhere and in clusters without a pixel
@@ -63,7 +61,6 @@ def cluster_hdbscan(
     Args:
         points: (N, 3) float64 of sweep t+1, then of sweeps t, t-1, ...
         pixels: (N, 2) their BEV pixels (row, column).
-        config: `min_cluster_size`.
 
     Returns:
         Per sweep (N,) int64, cluster of every point, -1 for noise and for clusters without a point at t+1 or without

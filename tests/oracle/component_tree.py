@@ -9,7 +9,6 @@ from scipy import ndimage
 
 from cflow_torch.config import VerifiedConfig
 from oracle.aperture import both_ends_move
-from oracle.changed_pixels import Change
 from oracle.clustering import SQUARE
 from oracle.height_slices import SlicedSweeps
 
@@ -18,19 +17,12 @@ LOCAL = 3.0  # metres, longest component of changed pixels
 
 
 class Node(NamedTuple):
-    """A component that may move.
+    """A component that may move."""
 
-    Attributes:
-        members: its pixels, ascending.
-        level: 0 ... L - 1 in the tree, coarse to fine; L = changed pixels.
-        parent: number of the next coarser node around it, -1 = there is none.
-        travels: it is longer than other objects, and both of its ends move.
-    """
-
-    members: np.ndarray
-    level: int
-    parent: int
-    travels: bool
+    members: np.ndarray  # its pixels, ascending
+    level: int  # 0 ... L - 1 in the tree, coarse to fine; L = changed pixels
+    parent: int  # number of the next coarser node around it, -1 = there is none
+    travels: bool  # it is longer than other objects, and both of its ends move
 
 
 class Tree(NamedTuple):
@@ -57,7 +49,7 @@ def is_linked(sweeps: SlicedSweeps, members: np.ndarray) -> bool:
     return bool(step[0] == 0 < step[-1])
 
 
-def grow(sweeps: SlicedSweeps, change: Change, config: VerifiedConfig) -> Tree:
+def grow(sweeps: SlicedSweeps, change: np.ndarray, config: VerifiedConfig) -> Tree:
     """Components of all scales, and which of them may move.
 
     Convention: in windows with history more than 5 % of the pixels of what may move are missing. A plain component that
@@ -65,14 +57,15 @@ def grow(sweeps: SlicedSweeps, change: Change, config: VerifiedConfig) -> Tree:
         box at t+1. Components of changed pixels are at most 3 m long.
     """
     longest, every = config.max_object_length, np.ones(len(sweeps.pixels), dtype=bool)
+    is_missing, has_changed = change
     scales = [(round(size / sweeps.size), True) for size in config.pixel_sizes]
     tree = Tree([components(sweeps, every, *scale) for scale in (*scales, (1, False))], [])
     node_of, plain = np.full(len(every), -1), len(scales)
-    for level, found in enumerate([*tree.levels, components(sweeps, change.has_changed, 1, False)]):
+    for level, found in enumerate([*tree.levels, components(sweeps, has_changed, 1, False)]):
         number = node_of.copy()
         for name in np.unique(found[found > 0]):
             members = np.flatnonzero(found == name)
-            num_missing = change.is_missing[members].sum()
+            num_missing = is_missing[members].sum()
             if not is_linked(sweeps, members) or (sweeps.has_history and 20 * num_missing <= len(members)):
                 continue
             newest = sweeps.pixels[members[sweeps.pixels[members, 0] == 0], 1:]

@@ -1,19 +1,19 @@
 """Oracle of CorrelationFlow at one scale: the motion of every cluster (Alg. general_correlation_flow).
 
 Order of reading: general_correlation_flow -> scene_flow_1obj (Alg. scene_flow_1obj) -> scene_flow_in_1view
-(Alg. scene_flow_1view) -> overlap_and_energy (Eq. norm_correlation).
+(Alg. scene_flow_1view) -> overlap_and_energy (Eq. norm_correlation); pool (Sec. leverage_past_pcs).
 """
 
 from __future__ import annotations
 
 import math
+from statistics import median
 from typing import Sequence
 
 import numpy as np
 
 from cflow_torch.config import DenseConfig
 from oracle.clustering import cluster, cluster_hdbscan
-from oracle.history import pool
 from oracle.pixels import Box, bev_dims, bounding_box, in_range, occupancy, project_bev, search_radius
 from oracle.sweeps import Cloud, PointMotion
 
@@ -23,10 +23,7 @@ def general_correlation_flow(
 ) -> PointMotion:
     """Cluster, find the motion of each cluster, assign it to the cluster's points (Alg. general_correlation_flow).
 
-    Args:
-        clouds: sweeps m = t, t-1, ... nearest first.
-        cloud1: sweep t+1.
-        pixel_size: s in metres.
+    `clouds` are the sweeps m = t, t-1, ... nearest first.
     """
     # Partition the aggregation of all sweeps into clusters.
     sweeps = [cloud1, *clouds]
@@ -80,8 +77,6 @@ def scene_flow_1obj(
         points_1: (K, 3) float64, the object at t+1.
         box: BEV pixels of the object in all sweeps.
         reach: longest displacement searched in the BEV, pixels; None = no limit.
-        pixel_size: s in metres.
-        config: settings (`sectional_view`, `point_cloud_range`).
 
     Returns:
         f_{m -> t+1} (3,) float64 in metres (z = 0 without the sectional view), and the NCC score of the BEV.
@@ -117,7 +112,6 @@ def scene_flow_in_1view(
     Args:
         template: (H, W) bool, image of sweep m, at least one pixel.
         target: (H, W) bool, image of sweep t+1 of the same box.
-        pixel_size: s in metres.
         reach: longest displacement searched, pixels; None = no limit.
 
     Returns:
@@ -175,3 +169,55 @@ def overlap_and_energy(template: np.ndarray, target: np.ndarray) -> tuple[np.nda
         bottom, right = i + half_h, j + half_w
         energy[max(bottom - height + 1, 0) : bottom + 1, max(right - width + 1, 0) : right + 1] += 1
     return overlap.astype(np.int64), energy.astype(np.int64)
+
+
+def pool(estimates: Sequence[np.ndarray]) -> np.ndarray:
+    """Median of the magnitudes and of the orientations, separately (Sec. leverage_past_pcs).
+
+    Args:
+        estimates: at least one estimate of f_{t -> t+1}, (3,) float64 each, nearest sweep first.
+
+    Returns:
+        (3,) float64; z is the median of the z components.
+
+    Convention:
+        One estimate is returned unchanged. Even number: the mean of the middle two. Estimates of length 0 count among
+        the magnitudes, but have no orientation; if all have length 0 the result is (0, 0). The median orientation is
+        taken about the circular mean. If opposite estimates cancel it, it is taken about the nearest one.
+    """
+    if len(estimates) == 1:
+        return np.array(estimates[0], dtype=np.float64)
+    magnitudes, directions = [], []
+    for f_x, f_y, _ in (estimate.tolist() for estimate in estimates):
+        magnitude = math.sqrt(f_x * f_x + f_y * f_y)
+        magnitudes.append(magnitude)
+        if magnitude > 0:
+            directions.append((f_x / magnitude, f_y / magnitude))
+    magnitude = median(magnitudes)
+    u_x, u_y = median_direction(directions) if directions else (0.0, 0.0)
+    return np.array([magnitude * u_x, magnitude * u_y, median([float(estimate[2]) for estimate in estimates])])
+
+
+def median_direction(directions: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Angular median of unit vectors about their circular mean. Even number: the bisector of the middle two.
+
+    Convention: equal angles keep the given order. If the middle two are exactly opposite, the first of them is taken.
+    """
+    mean_x, mean_y = 0.0, 0.0
+    for u_x, u_y in directions:
+        mean_x, mean_y = mean_x + u_x, mean_y + u_y
+    if mean_x == 0 and mean_y == 0:
+        mean_x, mean_y = directions[0]
+
+    def angle(u: tuple[float, float]) -> float:
+        """Angle from the mean to u, counter-clockwise."""
+        return math.atan2(mean_x * u[1] - mean_y * u[0] + 0.0, mean_x * u[0] + mean_y * u[1])
+
+    ordered = sorted(directions, key=angle)
+    middle = len(ordered) // 2
+    if len(ordered) % 2 == 1:
+        return ordered[middle]
+    first, second = ordered[middle - 1], ordered[middle]
+    w_x, w_y = first[0] + second[0], first[1] + second[1]
+    norm = math.sqrt(w_x * w_x + w_y * w_y)
+    return (w_x / norm, w_y / norm) if norm > 0 else first

@@ -22,7 +22,6 @@ class SlicedSweeps:
     Args:
         clouds: (N, 3) of each sweep, the points that are drawn.
         elapsed, seconds: from each sweep to t+1, in sweep intervals and in seconds.
-        config: `pixel_sizes`, `point_cloud_range`.
 
     Attributes:
         image, around: (S, H, W), bit c = a point of slice c lies in the pixel, or in the 3 x 3 pixels around it.
@@ -34,11 +33,7 @@ class SlicedSweeps:
     """
 
     def __init__(
-        self,
-        clouds: Sequence[np.ndarray],
-        elapsed: Sequence[float],
-        seconds: Sequence[float],
-        config: VerifiedConfig,
+        self, clouds: Sequence[np.ndarray], elapsed: Sequence[float], seconds: Sequence[float], config: VerifiedConfig
     ) -> None:
         self.elapsed, self.seconds, self.config = np.array(elapsed), seconds, config
         self.has_history = len(elapsed) > 2
@@ -77,9 +72,6 @@ def over_squares(image: np.ndarray, reach: int, combine: np.ufunc) -> np.ndarray
 def slice_of(z: np.ndarray, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES) -> np.ndarray:
     """Slice of a height, metres: they repeat, as the ground has no fixed height in the frame of the vehicle."""
     return (np.floor(z / height) % num_slices).astype(int)
-
-
-# ------------------------------------------------------------------------------------------------ ground
 
 
 def blocks_of(points: np.ndarray, config: VerifiedConfig) -> tuple[np.ndarray, ...]:

@@ -1,21 +1,21 @@
 """Oracle of CorrelationFlow-Keypoints at one scale: match boundary pixels of I_t and I_{t+1}, then spread their flow.
 
-Order of reading: correlation_flow_keypoints -> `matching` (Sec. Keypoints, Descriptor, Matching keypoints) ->
-median_of_components or nearest_match (Sec. From sparse to dense). Displacements are pixels until the last step of
-correlation_flow_keypoints multiplies them by s.
+Order of reading: correlation_flow_keypoints -> match_keypoints (Sec. Keypoints, Descriptor, Matching keypoints) ->
+median_of_components or nearest_match (Sec. From sparse to dense). Pixels are (row, column), displacements are pixels,
+t -> t+1, until the last step of correlation_flow_keypoints multiplies them by s.
 """
 
 from __future__ import annotations
 
+import math
 from statistics import median
-from typing import NamedTuple, Sequence
+from typing import NamedTuple, Sequence, Tuple
 
 import numpy as np
 from scipy import ndimage
 
 from cflow_torch.config import KeypointsConfig
 from oracle.clustering import cluster
-from oracle.matching import Match, match_keypoints
 from oracle.pixels import bev_dims, in_range, occupancy, project_bev, search_radius
 from oracle.sweeps import Cloud, PointMotion
 
@@ -77,14 +77,10 @@ def match_radius(config: KeypointsConfig, seconds: float, pixel_size: float) -> 
 
 
 def median_of_components(ids: np.ndarray, matches: Sequence[Match]) -> list[Shift]:
-    """Median flow of the matched key points of each connected component of I_t (Sec. From sparse to dense).
+    """Median shift of the matched key points of each connected component of I_t (Sec. From sparse to dense).
 
     Args:
         ids: (H, W) int64, component of every occupied pixel, 0 ... in raster order of its first pixel, -1 elsewhere.
-        matches: the accepted ones.
-
-    Returns:
-        The shift of each component.
 
     Convention:
         Medians of dx, of dy and of the scores, separately; of an even number the mean of the middle two. A
@@ -104,18 +100,11 @@ def median_of_components(ids: np.ndarray, matches: Sequence[Match]) -> list[Shif
 
 
 def nearest_match(image: np.ndarray, matches: Sequence[Match]) -> tuple[np.ndarray, list[Shift]]:
-    """Give every occupied pixel the flow of the nearest matched key point (Table keypoint_sparse2dense).
-
-    Args:
-        image: (H, W) bool, I_t.
-        matches: the accepted ones, in raster order.
+    """Give every occupied pixel of I_t the flow of the nearest matched key point (Table keypoint_sparse2dense).
 
     Returns:
         (H, W) int64 number of the match of every occupied pixel, -1 elsewhere and where there is no match at all;
-        and the shift of each match.
-
-    Convention:
-        Ties: the first in raster order, that is smallest row, then smallest column.
+        and the shift of each match. Ties: the first in raster order.
     """
     ids = np.full(image.shape, -1, dtype=np.int64)
     if matches:
@@ -124,3 +113,107 @@ def nearest_match(image: np.ndarray, matches: Sequence[Match]) -> tuple[np.ndarr
             # argmin returns the first of several minima
             ids[r, c] = np.argmin((rows - r) * (rows - r) + (columns - c) * (columns - c))
     return ids, [Shift(match.dx, match.dy, match.score) for match in matches]
+
+
+class Keypoints(NamedTuple):
+    """Key points of one image with their descriptors, in raster order."""
+
+    pixels: np.ndarray  # (K, 2) int64, row and column
+    descriptors: np.ndarray  # (K, L * L) bool
+    energies: np.ndarray  # (K,) int64, E = number of ones of each descriptor, its squared norm; at least 1, the centre
+
+
+def described_keypoints(image: np.ndarray, patch_size: int) -> Keypoints:
+    """Key points of an image (H, W) bool and their descriptors of side L = `patch_size`."""
+    pixels = detect_keypoints(image)
+    descriptors = describe(image, pixels, patch_size)
+    return Keypoints(pixels, descriptors, descriptors.sum(axis=1))
+
+
+def detect_keypoints(image: np.ndarray) -> np.ndarray:
+    """Foreground pixels of an image (H, W) bool whose distance to the background is 1 (Sec. Keypoints): (K, 2) int64,
+    row and column, in raster order. One of their 4 orthogonal neighbours is background, as is all outside the image.
+    """
+    padded = np.pad(image, 1)
+    is_inside = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    return np.argwhere(image & ~is_inside)
+
+
+def describe(image: np.ndarray, keypoints: np.ndarray, patch_size: int) -> np.ndarray:
+    """(K, L * L) bool: the L x L patch of an image (H, W) bool around each key point (K, 2), 0 outside the image (Sec.
+    Descriptor).
+    """
+    patches = np.lib.stride_tricks.sliding_window_view(np.pad(image, patch_size // 2), (patch_size, patch_size))
+    return patches[tuple(keypoints.T)].reshape(len(keypoints), patch_size**2)
+
+
+# A key point of t+1 as a match of one of t; the smaller tuple is the better match: -c^2 / E of its descriptor, squared
+# length and dy, dx of the displacement in pixels, its number, c (positions at which both descriptors are one).
+Candidate = Tuple[float, int, int, int, int, int]
+
+
+class Match(NamedTuple):
+    """An accepted match: pixel of the key point of t, displacement to t+1 in pixels, Eq. descriptor_ncc."""
+
+    row: int
+    column: int
+    dx: int
+    dy: int
+    score: float
+
+
+def match_keypoints(image: np.ndarray, image1: np.ndarray, reach: float, config: KeypointsConfig) -> list[Match]:
+    """Find Eq. best_match of every key point of t, then apply the ratio test (Sec. Matching keypoints).
+
+    Args:
+        image, image1: (H, W) bool, I_t and I_{t+1}.
+        reach: longest displacement in pixels, itself allowed.
+
+    Returns:
+        The accepted matches, in raster order of their key points of t. One without a second candidate is accepted.
+        Ties: smallest displacement, then smallest dy, then smallest dx.
+    """
+    at_t, at_t1 = (described_keypoints(i, config.patch_size) for i in (image, image1))
+    matches = []
+    for i, (row, column) in enumerate(at_t.pixels.tolist()):
+        candidates = rank_candidates(at_t, i, at_t1, reach)
+        if not candidates:
+            continue
+        _, _, dy, dx, best, overlap = candidates[0]
+        if len(candidates) > 1:
+            second, overlap2 = candidates[1][4:]
+            counts = overlap, int(at_t1.energies[best]), overlap2, int(at_t1.energies[second])
+            if not passes_ratio_test(*counts, config.ratio_threshold):
+                continue
+        score = overlap / math.sqrt(int(at_t.energies[i]) * int(at_t1.energies[best]))
+        matches.append(Match(row, column, dx, dy, score))
+    return matches
+
+
+def rank_candidates(at_t: Keypoints, number: int, at_t1: Keypoints, reach: float) -> list[Candidate]:
+    """Sort the key points of t+1 within reach of one key point of t, the best match first (Eq. best_match).
+
+    Convention:
+        Eq. descriptor_ncc is c / sqrt(E E_other). E is equal for all candidates of a key point, so c^2 / E_other ranks
+        them. The float64 quotient ranks as the exact rational does. Counts are at most 51^2 = 2601, so equal rationals
+        are rounded alike, and different ones differ by at least 1 / 2601^2 > 1e-7, at values of at most 2601, where
+        rounding changes less than 1e-12.
+    """
+    dy, dx = (at_t1.pixels - at_t.pixels[number]).T
+    numbers = np.flatnonzero(dx * dx + dy * dy <= reach * reach)
+    dy, dx = dy[numbers], dx[numbers]
+    overlap = np.count_nonzero(at_t1.descriptors[numbers] & at_t.descriptors[number], axis=1)
+    rank = overlap * overlap / at_t1.energies[numbers]
+    columns = (-rank, dx * dx + dy * dy, dy, dx, numbers, overlap)
+    return sorted(zip(*(column.tolist() for column in columns)))
+
+
+def passes_ratio_test(overlap: int, energy: int, second_overlap: int, second_energy: int, ratio: float) -> bool:
+    """Test R_best > rho R_second in whole numbers (Sec. Matching keypoints).
+
+    Convention:
+        We square c1 / sqrt(E1) > rho c2 / sqrt(E2) and clear the fractions; rho = P / 10^4. A match that is exactly
+        rho times as good is rejected, and so is a tie, for every rho >= 1.
+    """
+    p = round(ratio * 10_000)
+    return overlap * overlap * second_energy * 10_000**2 > p * p * second_overlap * second_overlap * energy

@@ -28,13 +28,7 @@ CHANGED_Z = 4.0  # standard deviations for nodes of changed pixels
 
 
 def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, config: VerifiedConfig) -> PointMotion:
-    """The motion of every point of sweep t.
-
-    Args:
-        clouds: sweeps m = t, t-1, ... nearest first.
-        cloud1: sweep t+1.
-        ground: (N, 3) float64, metres, frame of t+1, ground points of t where they are known.
-    """
+    """The motion of every point of sweep t. The clouds are t, t-1, ...; the ground are the known ground points of t."""
     points, is_inside = clouds[0].points, in_range(clouds[0].points, config)
     wide = math.ceil(4.0 / config.pixel_sizes[0]) * config.pixel_sizes[0]
     x0, y0, z0, x1, y1, z1 = config.point_cloud_range

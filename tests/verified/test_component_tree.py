@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from moving_scenes import for_oracle, from_images
 from oracle import component_tree as oracle
-from oracle.changed_pixels import Change
 from oracle.height_slices import SlicedSweeps
 
 from cflow_torch.config import VerifiedConfig
@@ -62,7 +61,7 @@ def grown(seed: int, longest: float | None = 3.0, blocks=(4, 2, 1), shape=(3, 3,
     windows, trees = [for_oracle(sweeps, window) for window in range(shape[0])], []
     for window, drawn in enumerate(windows):
         mine = sweeps.pixels.window == window
-        trees.append(oracle.grow(drawn, Change(*(values[mine].numpy() for values in change)), config))
+        trees.append(oracle.grow(drawn, np.stack([values[mine].numpy() for values in change]), config))
     components = find_components(sweeps, change, blocks)
     return Grown(sweeps, components, movable_nodes(sweeps, components, longest), windows, trees)
 

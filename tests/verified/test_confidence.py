@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from oracle import confidence as oracle
-from scenes import config, flow_as_oracle, scene
-from test_changed_movers import beside_a_wall
+from scenes import flow_as_oracle
+from test_changed_pixels import beside_a_wall
 from turning_car import MODEL, turning_car
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config, make_model
@@ -15,14 +15,6 @@ from cflow_torch.data.log import window as window_of
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
 from cflow_torch.verified import confidence
-
-
-@pytest.fixture
-def numbered(monkeypatch):
-    """The table with the number of each bin instead of its probability: no two bins are alike."""
-    places = [i / 64 for i in range(len(confidence.TABLE["probabilities"]))]
-    for module in (confidence, oracle):
-        monkeypatch.setitem(module.TABLE, "probabilities", places)
 
 
 def test_the_table_is_monotone_and_the_oracle_reads_it():
@@ -35,18 +27,6 @@ def test_the_table_is_monotone_and_the_oracle_reads_it():
     unlinked, static, (beside,), *moving = rows
     assert unlinked == sorted(unlinked, reverse=True) and unlinked[0] > unlinked[-1]
     assert all(row == sorted(row) and row[0] < row[-1] for row in (static, *moving)) and beside < static[0]
-
-
-def test_every_bin_equals_the_oracle(numbered):
-    seen = set()
-    for seed in range(16):
-        settings = config("verified", num_history=seed % 3, min_height=0.3, pixel_size=0.2)
-        settings = settings.replace(max_object_length=4.0)
-        window = scene(500 + seed, num_history=seed % 3, poses=seed % 5 > 0, stamps=seed % 2 > 0)
-        result = flow_as_oracle(window, settings)
-        seen |= {round(64 * value) for value in result.confidence[result.is_valid].tolist()}
-    kinds = [sum(low <= place < high for place in seen) for low, high in ((1, 6), (6, 11), (12, 24), (24, 36))]
-    assert min(kinds) >= 2, (kinds, seen)  # unlinked, static, moving in pairs, moving with history
 
 
 def test_a_wall_next_to_a_pedestrian_has_less_confidence(numbered):

@@ -43,9 +43,6 @@ def at_once(window: Window) -> Window:
     return changed(window, lambda sweep: replace(sweep, point_times=np.zeros(len(sweep.points))))
 
 
-# --------------------------------------------------------------------------------------------------- hand-made truth
-
-
 def seen_box(
     velocity: Sequence[float], times: Sequence[Sequence[float]], elapsed: Sequence[int] = (0, 1, 2), angle: float = 0.0
 ) -> tuple[list[np.ndarray], np.ndarray]:
@@ -123,9 +120,6 @@ def test_times_that_differ_by_a_rotation_of_the_sensor_are_ignored():
     assert torch.equal(found.flow, seen.flow)
 
 
-# ------------------------------------------------------------------------------------------------ what must not matter
-
-
 @pytest.mark.parametrize("num_history", [0, 3])
 def test_times_of_zero_and_times_of_some_sweeps_change_no_bit(num_history):
     window, model = turning_car(4, num_history), VerifiedFlow(HISTORY)
@@ -134,9 +128,6 @@ def test_times_of_zero_and_times_of_some_sweeps_change_no_bit(num_history):
     assert_same_bits(model([at_once(window)])[0], expected)
     some = late(window, 1)
     assert_same_bits(model([replace(some, pc1=replace(some.pc1, point_times=None))])[0], expected)
-
-
-# ------------------------------------------------------------------------------------------------------- what is given
 
 
 def flow_with(times: object) -> FlowResult:

@@ -8,7 +8,7 @@ from typing import Sequence, Tuple
 import numpy as np
 import pytest
 import torch
-from scenes import assert_same, assert_same_bits, needs_gpu, reordered, rows_of, sweeps_of
+from scenes import assert_same_bits, reordered, rows_of, sweeps_of
 from turning_car import MODEL, upright_box
 
 from cflow_torch import Sweep, VerifiedFlow, Window
@@ -57,9 +57,6 @@ def overhung(boxes: Sequence[Box]) -> tuple[int, torch.Tensor]:
     return nodes.count - tree_nodes.count, sweeps.batch.positions[2, drawn.copied]
 
 
-# --------------------------------------------------------------------------------------------------- hand-made truth
-
-
 @pytest.mark.parametrize(
     "thing, others, is_under",
     [
@@ -95,8 +92,6 @@ def test_cells_that_touch_at_a_corner_are_one_object(dx, dy):
     pieces = [(corner, tuple(np.add(corner, 0.3))) for corner in (low, top)]
     assert overhung([*pieces, POST, CROWN])[0] == 1
 
-
-# ------------------------------------------------------------------------------------------------ the whole method
 
 AVENUE: VerifiedConfig = MODEL.replace(num_history=3, point_cloud_range=(-7, -6, -3, 7, 6, 9))
 STEP = 0.7  # metres per interval of the cars, along x
@@ -153,11 +148,3 @@ def test_alone_or_in_a_batch_in_any_order_of_points():
         assert_same_bits(model([window])[0], result)
         mixed, order = reordered(window)
         assert_same_bits(model([mixed])[0], rows_of(result, order))
-
-
-@pytest.mark.cuda
-@needs_gpu
-def test_cuda_equals_cpu():
-    windows = [avenue(2, 1), avenue(0, 2), avenue(1, 3, -6.0)]
-    for on_cpu, on_gpu in zip(*(VerifiedFlow(AVENUE, device)(windows) for device in ("cpu", "cuda"))):
-        assert_same(on_gpu, on_cpu, atol=1e-4)
