@@ -100,15 +100,6 @@ def test_the_real_log_is_read(av2_folder: Path, data_root: Path, tmp_path: Path)
     assert (stored.category[ends] > 0).all()
 
 
-def test_sweeps_have_points_and_poses(folder: Path) -> None:
-    log = AV2Log(folder)
-    assert (log.log_id, list(log.timestamps)) == ("some-log", [100, 200, 300])
-    sweep = log.sweep(1)
-    np.testing.assert_array_equal(sweep.points, POINTS.astype(np.float32))
-    assert (sweep.timestamp_ns, sweep.is_ground, log.labels(0)) == (200, None, None)
-    np.testing.assert_allclose(sweep.pose @ [1, 0, 0, 1], [1001, 1, 0, 1], atol=1e-12)  # forward is city y
-
-
 def test_stored_labels_take_precedence_over_boxes(folder: Path) -> None:
     annotate(folder, box_columns(100, 10.0), box_columns(200, 10.0), box_columns(300, 13.0))
     write(folder / "flow_labels.feather", label_columns(flow_tx_m=np.zeros(3, dtype=np.float32)))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import signal
 from pathlib import Path
-from typing import Any, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,25 +37,6 @@ def contents(file: Path) -> dict[str, Any]:
 def assert_unchanged(file: Path, before: bytes) -> None:
     assert file.read_bytes() == before
     assert os.listdir(file.parent) == [file.name], "no temporary file is left"
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # it is multi-threaded; the child only writes
-def test_a_killed_process_changes_nothing(scene: Path) -> None:
-    def results() -> Iterator[tuple[int, np.ndarray]]:
-        yield STAMPS[0], np.ones((50, 3))
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    before, child = scene.read_bytes(), os.fork()
-    if child == 0:
-        try:
-            write_hdf5_results(scene, "cflow", results())
-        finally:
-            os._exit(1)
-    assert os.waitpid(child, 0)[1] == signal.SIGKILL
-    assert scene.read_bytes() == before
-    assert find_hdf5_scenes(scene.parent) == [scene], "what it left is not taken for a scene"
-    assert write_hdf5_results(scene, "cflow", [(STAMPS[0], flow_of(0))]) == 1
 
 
 def test_a_result_is_written_and_the_rest_stays(scene: Path) -> None:

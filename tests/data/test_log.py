@@ -86,8 +86,18 @@ def test_windows_read_each_sweep_once(drive: Drive) -> None:
     assert sorted(Counted.read) == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("index, past, future", [(0, [], [2, 3]), (1, [0], [3, 4]), (2, [1, 0], [4]), (3, [2, 1], [])])
+def test_windows_are_shorter_at_both_ends_of_a_log(
+    index: int, past: Sequence[int], future: Sequence[int], drive: Drive
+) -> None:
+    found, stamps = window(drive, index, 2, 2), list(drive.timestamps)
+    sides = ((found.pc0, found.pc1), found.pch, found.pcf)
+    places = [[stamps.index(sweep.timestamp_ns) for sweep in sweeps] for sweeps in sides]
+    assert places == [[index, index + 1], past, future]
+
+
 def test_a_data_loader_with_workers_equals_the_loop(drive: Drive) -> None:
-    model = make_model(make_config(num_history=2))
+    model = make_model(make_config(num_history=2, point_cloud_range=(-20, -20, -9, 20, 20, 9)))
     data = WindowDataset([drive, make_drive(seed=2, num_sweeps=3, profile="demo")], num_history=2)
     assert len(WindowDataset(drive)) == 4
     loader: Any = DataLoader(data, batch_size=2, num_workers=2, collate_fn=data.collate)
@@ -96,9 +106,6 @@ def test_a_data_loader_with_workers_equals_the_loop(drive: Drive) -> None:
     assert len(loaded) == len(looped) == 6 and any(result.residual_flow.any() for result in looped)
     for one, other in zip(loaded, looped):
         assert all(np.array_equal(values, other.numpy()[name]) for name, values in one.numpy().items())
-
-
-# ---------------------------------------------------------------- results
 
 
 def test_a_result_is_saved_and_loaded(result: FlowResult, tmp_path: Path) -> None:
