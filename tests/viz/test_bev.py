@@ -132,21 +132,6 @@ def test_everything_is_inside_the_picture(scene: Scene, box: tuple) -> None:
         assert ("ego" in texts) == (low <= 0 <= high)
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"points": np.zeros((5, 2))}, "points has shape"),
-        ({"result_or_residual": np.zeros((4, 3))}, "residual flow has shape"),
-        ({"max_flow": -1.0}, "max_flow"),
-        ({"legend": "middle"}, "upper right"),
-        ({"point_cloud_range": (0, 0, 1, 1)}, "point_cloud_range"),
-    ],
-)
-def test_plot_flow_refuses(changed: dict, message: str) -> None:
-    with pytest.raises(CFlowError, match=message):
-        plot_flow(**{"points": np.zeros((5, 3)), "result_or_residual": np.zeros((5, 3)), **changed})
-
-
 def test_colours_of_clusters_lie_where_their_points_are() -> None:
     points = np.concatenate([block(12, 12), block(12, -8), block(-13, 2)])
     cluster = np.repeat([5, 2, -1], len(points) // 3)
@@ -192,11 +177,6 @@ def test_a_saved_picture_is_the_picture(scene: Scene, tmp_path: Path) -> None:
     path = save_picture(figure, tmp_path / "new" / "flow.png")
     assert (np.rint(imread(str(path))[..., :3] * 255) == pixels(figure)).all()
     assert [file.name for file in path.parent.iterdir()] == ["flow.png"]
-    with pytest.raises(CFlowError, match=r"does not end in \.png"):
-        save_picture(figure, tmp_path / "flow.pdf")
-
-
-# ---------------------------------------------------------------------------------------------- colours of the wheel
 
 
 def test_axes_of_the_ego_frame() -> None:

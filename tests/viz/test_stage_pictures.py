@@ -27,9 +27,6 @@ def one_object() -> Window:
     return Window(Sweep(points), Sweep(points + (1.0, -0.5, 0.0)))
 
 
-# --- intermediate results
-
-
 @pytest.mark.parametrize(
     "settings", [paper(), paper(**TWO_SIZES, num_history=2), keypoints(**TWO_SIZES)], ids=["one", "history", "keys"]
 )
@@ -80,9 +77,6 @@ def test_matches_of_one_object_are_its_motion() -> None:
     assert np.allclose(found.end - found.start, (1.0, -0.5)) and len(found.start) > 10
     col, row = np.floor((found.key_points - found.images.lower) / SIZE).astype(int).T
     assert found.images.t[row, col].all() and len(row) > len(found.start)
-
-
-# --- the pictures
 
 
 def test_scales_and_correlation_draw_the_stages() -> None:
