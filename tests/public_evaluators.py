@@ -41,9 +41,6 @@ def check(label: str, numbers: Comparison) -> None:
     assert {name: pair for pair, far, name in zip(numbers.values(), difference > TOLERANCE, numbers) if far} == {}
 
 
-# ---------------------------------------------------------------------------------------------- the real pair
-
-
 @dataclass(frozen=True)
 class Pair:
     """The real pair of Argoverse 2 with its stored labels and two versions of its ego motion."""
@@ -74,9 +71,6 @@ def read_pair(folder: Path) -> Pair:
 def official_mask(pair: Pair) -> np.ndarray:
     """Points that the challenge of 2023 scores."""
     return ~pair.is_ground & (np.abs(pair.points[:, :2]) <= 50).all(axis=1)
-
-
-# ---------------------------------------------------------------------------------------------- made-up frames
 
 
 @dataclass(frozen=True)
@@ -140,9 +134,6 @@ def write_log(root: Path, made: Sequence[MadeUp]) -> Path:
     alignment = {"R": [1.0, 0.0, 0.0, 1.0], "t": [100.0, 100.0], "s": 2.0}
     (folder / "map" / f"{LOG}___img_Sim2_city.json").write_text(json.dumps(alignment))
     return root
-
-
-# ---------------------------------------------------------------------------------------------- BucketedSceneFlowEval
 
 
 def bsfe_data_set(bsfe: ModuleType, raw: Path, truth: Path, kind: str, output: Path, with_ground: bool = False) -> Any:

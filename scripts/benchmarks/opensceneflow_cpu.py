@@ -1,7 +1,7 @@
 """Replacements of compiled packages that OpenSceneFlow imports, so that its unmodified files run on a CPU.
 
 A module gets a replacement only if it cannot be imported. We wrote the replacements from the documented behaviour of
-the originals; tests/scripts/test_opensceneflow_cpu.py compares them with dense loops. Nearest neighbours come from a
+the originals; tests/scripts/test_benchmarks.py compares them with dense loops. Nearest neighbours come from a
 k-d tree. In ties of distances another neighbour than on a GPU may win.
 """
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scenes import pose
 from staged_cars import Staged, straight
-from test_tracks_of_runs import calls_on_a_drive
+from test_tracking import calls_on_a_drive
 
 from cflow_torch import CFlowError, CleanLog, FlowResult, Sweep, static_map
 from cflow_torch.data.arrays import ArraysLog, write_array_log

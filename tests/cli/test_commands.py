@@ -42,7 +42,8 @@ def results_of(folder: Path) -> dict[str, Any]:
 @pytest.fixture
 def evaluate(cflow: Cflow, log_folder: Path, tmp_path: Path) -> Cflow:
     """`cflow eval` of the small log into `tmp_path`, by the paper's method."""
-    call = ("eval", "data=av2", f"data.root={log_folder}", "data.check=false", f"output={tmp_path}", "model=paper")
+    data = ("data=av2", f"data.root={log_folder}", "data.check=false", f"output={tmp_path}")
+    call = ("eval", *data, "model=paper", SMALL)
     return lambda *arguments: cflow(*call, *arguments)
 
 

@@ -54,8 +54,6 @@ def test_a_path_by_itself_is_the_data_root() -> None:
     assert split(call) == (['data.root="/a b/c"', "model=paper,default"], ["-m", "--config-dir", "conf", "-p", "model"])
 
 
-# ---------------------------------------------------------------- your own reader
-
 READER = """
 import numpy as np
 from cflow_torch.data.log import FlowLabels, Log

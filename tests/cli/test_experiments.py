@@ -60,13 +60,10 @@ def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment: str, co
         assert cfg.data.label == "benchmark" and cfg.experiment_name == experiment
 
 
-# ---------------------------------------------------------------- one folder per job, resumable
-
-
 def test_a_sweep_keeps_every_result_and_resumes(
     log_folder: Path, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
 ) -> None:
-    data = ("data=av2", log_folder, "data.check=false", "data.step=2")
+    data = ("data=av2", log_folder, "data.check=false", "data.step=2", "model.point_cloud_range=[-20,-20,-9,20,20,9]")
     call = ("eval", "-m", "experiment=history", *data, f"output={tmp_path}", "model.num_history=0,2")
     assert cflow(*call) == 0
     files = sorted(tmp_path.rglob("results.json"))
@@ -112,8 +109,6 @@ def test_the_comparison_sorts_jobs_by_their_settings_and_names_other_data(tmp_pa
     assert header[0] == "job" and rows[-1][:5] == ["a_copy", "", "", "", "y"] and "scored data" in header
     assert "old/results.json is not compared" in capsys.readouterr().out
 
-
-# ---------------------------------------------------------------- launchers and sweepers
 
 PLUGINS = {
     "joblib": (

@@ -39,9 +39,6 @@ def test_help_explains_a_command_with_examples_and_settings(
     assert capsys.readouterr().out == text
 
 
-# ---------------------------------------------------------------- wrong calls
-
-
 # Mistakes that are found without torch, then the others.
 CHEAP = (
     ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, flow,"),
@@ -74,7 +71,6 @@ OTHERS = (
     ("eval definition=mine data.num_sweeps=2", "mine"),
     ("demo pair=99 data.num_sweeps=2", "has pairs 0 to 0"),
     ("plot log=1e5 data.num_sweeps=2", "log=1e5: there is no such log"),
-    ("plot pair=1.5", "pair=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
     ("plot picture=animation width=abc", "width=abc: Value 'abc'"),
     ("flow contents=[confidence] model=paper", "only model=default and offline have a confidence"),
 )
@@ -163,9 +159,6 @@ def test_a_reader_that_leaves_ends_a_command_quietly(arguments: str) -> None:
     assert (done.stdout, done.stderr) == ("141 0\n", "")
 
 
-# ---------------------------------------------------------------- completion
-
-
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
@@ -205,9 +198,6 @@ def test_a_shell_runs_its_script(shell: str, tmp_path: Path, cflow: Cflow, capsy
     text = "\n".join([call, capsys.readouterr().out, ask])
     done = subprocess.run([shell, "-c", text], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() in ("paper", "model=paper") and not done.stderr  # bash has split the word at its =
-
-
-# ---------------------------------------------------------------- information
 
 
 def test_info_lists_every_required_package(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:

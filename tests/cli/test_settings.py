@@ -60,9 +60,6 @@ def test_examples_use_existing_settings_and_choices(compose: Compose) -> None:
             assert not unknown_options(options)
 
 
-# ---------------------------------------------------------------- your own preset, and removed settings
-
-
 @pytest.fixture
 def mine(tmp_path: Path) -> Callable[[str], Path]:
     """A folder with a preset model/mine.yaml of this text."""
@@ -103,9 +100,6 @@ def test_a_wrong_preset_is_one_line(
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
 
 
-# ---------------------------------------------------------------- names
-
-
 @pytest.mark.parametrize(
     "name",
     ["10203656353524179475_7625_000_7645_000", "1e5", "2024_11_22", "-1.5", "true", "a_1", "Ausgänge/東京", 'it\'s "ü"']
@@ -121,9 +115,6 @@ def test_hydra_syntax_in_names_keeps_its_meaning(compose: Compose) -> None:
     assert cfg.log is None and cfg.output == "auto"
     assert split(["-m", "log=1_0,b,2_0", "pair=1,2"]) == (['log="1_0",b,"2_0"', "pair=1,2"], ["-m"])
     assert split(["log=choice(a,b)", "log='1_0'"])[0] == ["log=choice(a,b)", "log='1_0'"]
-
-
-# ---------------------------------------------------------------- cflow settings
 
 
 def test_the_page_lists_every_setting(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:

@@ -37,7 +37,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> AV2Log:
 @pytest.fixture(scope="module")
 def estimated(log: AV2Log) -> dict[int, Any]:
     """Windows and results of the submitted pairs."""
-    model = CorrelationFlow.from_preset("paper")
+    model = CorrelationFlow.from_preset("paper", pixel_size=0.4)
     windows = {index: window(log, index) for index in (0, 5)}
     return {index: (sweeps, model([sweeps])[0]) for index, sweeps in windows.items()}
 
@@ -259,7 +259,7 @@ def test_official_masks_take_precedence(log: AV2Log, tmp_path: Path) -> None:
 
 def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     data = ("data=av2", f"data.root={log.folder}", "data.check=false")
-    call = ["submit", *data, f"output={tmp_path}", "version=3", "model=paper"]
+    call = ["submit", *data, f"output={tmp_path}", "version=3", "model=paper", "model.pixel_sizes=[0.4]"]
     assert cflow(*call) == 0
     printed = capsys.readouterr().out
     assert "frames written: 2" in printed and "float16 rounding" in printed and "v3.zip: passes" in printed

@@ -1,21 +1,25 @@
-"""Real worker processes that die or hang: no other frame is lost, and the run ends and lists what it could not do."""
+"""Worker processes that die or hang, and runs that are killed: no other frame is lost, and runs can be resumed."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any, Callable
 
 import numpy as np
 import pytest
-from small_fleet import PAIRS, TWO, run, tree
+from small_fleet import COMMAND, PAIRS, TWO, command, frames, run, tree
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet import run as running
 from cflow_torch.fleet import work
 
+pytestmark = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
 DEADLY = "CFLOW_TEST_DEADLY"  # folder of files <log>.<time stamp> with the name of a cause and how often it occurs
 REAL_MAKE = running.make_worker
 LIMIT = 12e9  # bytes, of a worker's address space
@@ -68,3 +72,72 @@ def test_dying_workers_lose_only_the_frame_that_always_kills(
     assert ("MemoryError" if always == "memory" else "2 workers died on it") in message
     assert (report["frames"]["computed"], report["exit_status"]) == (PAIRS - 1, 1)
     assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}
+
+
+COPIES = 20  # of a log of five pairs: a run of some seconds
+
+
+@pytest.fixture(scope="module")
+def many(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One log under many names."""
+    root = tmp_path_factory.mktemp("many")
+    for number in range(COPIES):
+        shutil.copytree(sorted(fleet.iterdir())[1], root / f"log-{number:02}", copy_function=os.link)
+    return root
+
+
+@pytest.fixture(scope="module")
+def expected(fleet: Path, single: dict[str, bytes]) -> dict[str, bytes]:
+    """Flow files of a run on `many` that nothing disturbed."""
+    log = sorted(fleet.iterdir())[1].name
+    names = [name for name in single if name.startswith(log) and name.endswith(".feather")]
+    return {f"log-{n:02}/{Path(name).name}": single[name] for n in range(COPIES) for name in names}
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Wait until the condition holds, at most two minutes."""
+    deadline = time.monotonic() + 120
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def workers(process: subprocess.Popen) -> list[int]:
+    """Worker processes of a run."""
+    threads = Path(f"/proc/{process.pid}/task").iterdir()
+    children = [child for thread in threads for child in (thread / "children").read_text().split()]
+    return [int(child) for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
+
+
+def flow_of(output: Path) -> dict[str, bytes]:
+    """All files but manifests and hidden ones."""
+    return {n: content for n, content in tree(output).items() if not n.endswith("manifest.json") and "/." not in n}
+
+
+@pytest.mark.parametrize(
+    ("send", "name", "status"),
+    [(os.kill, "SIGKILL", -9), pytest.param(os.killpg, "SIGTERM", 143, marks=pytest.mark.slow)],
+)
+def test_a_killed_run_is_resumed_and_its_workers_end(
+    many: Path, expected: dict[str, bytes], tmp_path: Path, send: Callable[[int, int], None], name: str, status: int
+) -> None:
+    settings = [f"data.root={many}", f"output={tmp_path}", "engine.batch=2", "engine.workers=2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cflow_torch.cli.main", *COMMAND, *settings],
+        start_new_session=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    wait_for(lambda: len(frames(tmp_path)) > 3)
+    children = workers(process)
+    send(process.pid, signal.Signals[name])
+    assert process.wait(timeout=60) == status and len(children) == 2
+    wait_for(lambda: not any(Path(f"/proc/{child}").exists() for child in children))
+    assert not any(Path(f"/proc/{child}").exists() for child in children)
+    assert 3 < len(frames(tmp_path)) < len(expected) and flow_of(tmp_path).items() <= expected.items()
+    assert command(f"data.root={many}", f"output={tmp_path}") == 0
+    assert flow_of(tmp_path) == expected, "nothing is lost"
+    left = list(tmp_path.rglob(".*"))
+    assert all(file.name.endswith(".tmp") for file in left)
+    for file in left:
+        os.utime(file, (0, 0))
+    assert command(f"data.root={many}", f"output={tmp_path}") == 0
+    assert not list(tmp_path.rglob(".*")), "old temporary files are removed"

@@ -21,8 +21,6 @@ from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.run import StopSignal
 
-# Shares of the work
-
 
 @settings(deadline=None)  # the first call imports
 @given(
@@ -89,9 +87,6 @@ def test_a_contradictory_shard_is_an_error(given_: Any, environ: dict[str, str],
         find_shard(*given_, environ)
 
 
-# The machine
-
-
 def test_layout_is_chosen_from_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "usable_cores", lambda environ: 16)
     monkeypatch.setattr(machine, "available_memory", lambda environ: 10 * machine.WORKER_MEMORY + 1)
@@ -125,9 +120,6 @@ def test_the_job_limits_the_cores() -> None:
     assert usable_cores({"SLURM_CPUS_PER_TASK": "1"}) == 1
     assert usable_cores({"LOCAL_WORLD_SIZE": str(cores)}) == 1
     assert usable_cores({"SLURM_CPUS_PER_TASK": "many", "LOCAL_WORLD_SIZE": "0"}) == cores
-
-
-# Signals and terminals
 
 
 def test_the_first_signal_finishes_and_the_second_interrupts() -> None:

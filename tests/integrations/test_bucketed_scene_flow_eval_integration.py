@@ -29,8 +29,6 @@ from cflow_torch.data.log import window
 from cflow_torch.evaluation import EvalFrame
 from cflow_torch.integrations.bucketed_scene_flow_eval import CorrelationFlowEstimator
 
-# --------------------------------------------------------------------------------------------- frames made by hand
-
 
 def make_frame(number: int, sweep: Sweep, ego_to_global: np.ndarray, sensor_to_ego: Any = None) -> SimpleNamespace:
     def SE3(matrix: np.ndarray) -> SimpleNamespace:
@@ -169,9 +167,6 @@ def test_the_error_names_the_bad_field_of_a_frame(bsfe: ModuleType, path: str, v
         estimator()(frames)
     with pytest.raises(CFlowError, match="at least two frames"):
         estimator()(frames[:1])
-
-
-# --------------------------------------------------------------------------------------------------- its data sets
 
 
 @pytest.mark.parametrize("preset", ["paper", "default"])

@@ -108,9 +108,6 @@ def test_waymo_writes_true_poses_where_a_turn_begins(tmp_path, monkeypatch):
         assert len(stored) == len(read) and cKDTree(read).query(stored)[0].max() < 1e-4
 
 
-# ---------------------------------------------------------------------------------------------- cached drives
-
-
 def test_a_drive_is_made_once(tmp_path, monkeypatch):
     first = benchmark_logs(tmp_path, "demo", [1, 2], 3)
     drive, log = make_drive(seed=2, num_sweeps=3, profile="demo"), AV2Log(first[1])

@@ -1,10 +1,12 @@
-"""Collation: active points, repeated sweeps, the ego box, groups of windows, forms of arrays."""
+"""Collation: active points, repeated sweeps, the ego box, memory and groups of windows, forms of arrays."""
 
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Callable
 
 import numpy as np
@@ -13,7 +15,7 @@ import torch
 from preset_windows import PRESETS, changed, num_moving, small, windows_for
 from scenes import RANGE, assert_same_bits, assert_zeros, config, flow_as_oracle, pose, rows_of, scene
 
-from cflow_torch import FlowResult, Sweep, Window, make_model
+from cflow_torch import CFlowError, FlowResult, Sweep, Window, estimate_flow, make_model
 from cflow_torch.config import Config
 from cflow_torch.windows import memory
 from cflow_torch.windows.bev_grid import Grid
@@ -27,9 +29,6 @@ P0, P1 = np.random.default_rng(0).uniform(-5, 5, (2, 50, 3)).astype(np.float32)
 def cflow(window: Window, settings: Config) -> FlowResult:
     (result,) = make_model(settings, "cpu")([window])
     return result
-
-
-# ------------------------------------------------------------------------------------------------- active points
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -86,8 +85,6 @@ def test_repeated_sweeps_are_dropped_and_the_others_keep_their_times():
     assert_same_bits(once, thrice)
 
 
-# --------------------------------------------------------------------------------------------- the vehicle itself
-
 BOX = (-1.5, -1.0, 2.5, 1.0)
 
 
@@ -121,9 +118,6 @@ def test_the_ego_box_is_in_the_frame_of_each_sweep_and_includes_its_ends():
     assert cflow(window, settings).is_valid.tolist() == [False, True, False, False, True]
 
 
-# ----------------------------------------------------------------------------------------------- batch and groups
-
-
 def test_windows_are_grouped_by_memory(monkeypatch):
     grid, windows = Grid(1.0, RANGE[:3], RANGE[3:]), [scene(seed) for seed in range(5)]
 
@@ -134,9 +128,6 @@ def test_windows_are_grouped_by_memory(monkeypatch):
     assert sum(sizes(1_000_000)) == 5 and 1 < len(sizes(1_000_000)) < 5
     monkeypatch.setattr(memory, "_BYTES_ON_CPU", 1)
     assert sizes() == [1] * 5 and split_windows([], grid, CPU, 160, None) == []
-
-
-# ---------------------------------------------------------------------------------------------- forms of arrays
 
 
 def locked(array: np.ndarray) -> np.ndarray:
@@ -195,3 +186,45 @@ def test_results_share_no_memory_with_the_input():
     for sweep in (given.pc0, given.pc1, *given.pch, *given.pcf):
         sweep.points.fill_(7.0)
     assert_same_bits(result, kept)
+
+
+def highest_resident_kb() -> int:
+    """Largest resident memory of this process."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        pytest.skip("no /proc/self/status: resident memory cannot be read")
+    return int(re.search(r"VmHWM:\s+(\d+)", status.read_text()).group(1))  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_too_large_windows_are_refused_before_allocation(preset, monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda environ: 4_000_000_000)
+    before, car = highest_resident_kb(), np.zeros((100, 3))
+    wide = (-1000.0, -1000.0, -3.0, 1000.0, 1000.0, 3.0)
+    with pytest.raises(CFlowError, match=r"20(00|08)1 x 20(00|08)1 pixels of 0.1 m.*4.0 GB.*smaller point_cloud_range"):
+        estimate_flow(car, car, preset=preset, point_cloud_range=wide)
+    points = np.broadcast_to(np.float32([1.0, 2.0, 0.5]), (10**8, 3))  # a view that takes no memory
+    with pytest.raises(CFlowError, match=r"200000000 points in 2 sweeps.*fewer points"):
+        make_model(small(preset), "cpu")([Window(Sweep(points), Sweep(points))])
+    assert highest_resident_kb() - before < 50_000
+
+
+def test_requests_are_compared_with_the_free_memory():
+    free = memory.available_memory({})
+    if free is None:
+        pytest.skip("no /proc/meminfo: free memory is unknown")
+    memory.require_memory(free // 2, CPU, "half of it", "")
+    with pytest.raises(CFlowError, match="all of it needs about .*GB.*cpu has .* left: use less"):
+        memory.require_memory(4 * free + 2**40, CPU, "all of it", "use less")
+
+
+def test_torchrun_and_control_groups_limit_the_memory(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory, "control_groups", list)
+    alone = memory.available_memory({})
+    if alone is None:
+        pytest.skip("no /proc/meminfo: free memory is unknown")
+    assert memory.available_memory({"LOCAL_WORLD_SIZE": "4"}) <= alone // 3
+    (tmp_path / "memory.max").write_text("9000000\n")
+    (tmp_path / "memory.current").write_text("2000000\n")
+    monkeypatch.setattr(memory, "control_groups", lambda: [tmp_path])
+    assert memory.available_memory({}) == 7_000_000

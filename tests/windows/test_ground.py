@@ -44,9 +44,6 @@ def sweeps() -> list[Sweep]:
     return [drive.sweep(i) for i in range(2)]
 
 
-# ------------------------------------------------------------------------------------------------- exact properties
-
-
 def test_order_of_points_and_other_sweeps_do_not_matter(sweeps):
     points = sweeps[0].points
     order = np.random.default_rng(1).permutation(len(points))
@@ -105,9 +102,6 @@ def test_bad_arguments(arguments, complaint):
         find_ground(**arguments)
 
 
-# --------------------------------------------------------------------------------------------------- scenes by hand
-
-
 @pytest.mark.parametrize("slope, height", [(0.0, 0.5), (0.0, 3.0), (-0.22, 1.7), (0.22, 1.7)])
 def test_a_floor_is_ground_and_a_box_on_it_is_not(slope, height):
     low = 0.45 if slope else 0.31
@@ -135,9 +129,6 @@ def test_multipath_points_below_the_ground_do_not_pull_it_down(sweeps):
     keep = np.ones(len(rain), bool)
     keep[rows] = False
     assert overlap(find_ground(rain)[keep], find_ground(sweeps[0].points)[keep]) > 0.98
-
-
-# --------------------------------------------------------------------------------------------------------- accuracy
 
 
 def test_a_simulated_drive_on_flat_ground_and_on_hills():
@@ -173,9 +164,6 @@ def test_patchwork_finds_the_ground_at_any_height():
     for shift in (0.0, 1.7):
         mask = find_ground(sweep.points + np.array([0, 0, shift], np.float32), method="patchwork")
         assert overlap(mask, sweep.is_ground) > 0.8
-
-
-# ---------------------------------------------------------------------------------------------------- estimate_flow
 
 
 def test_finding_ground_keeps_given_masks_and_adds_those_of_the_history():
