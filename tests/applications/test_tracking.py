@@ -301,12 +301,12 @@ def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
 
 def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     call = calls_on_a_drive(tmp_path)
-    run = ("model.num_history=0", "engine.workers=1", "tracks=true")
+    run = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", "engine.workers=1", "tracks=true")
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
     whole = read_tracks(file)
     assert len(whole["id"]) > 4 and set(whole["sweep"]) <= set(range(3)) and not np.isnan(whole["confidence"]).any()
-    model = make_model(make_config(num_history=0, point_cloud_range=RANGE))
+    model = make_model(make_config(num_history=0, pixel_sizes=(0.4, 0.2), point_cloud_range=RANGE))
     (source,) = find_sources("av2", tmp_path / "data")
     log = open_log("av2", source)
     flow = [model([sweeps])[0] for sweeps in windows(log, model.config.num_history)]
@@ -319,12 +319,12 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert other.read_bytes() == file.read_bytes()
 
     before = file.read_bytes()
-    assert call("flow", "whole", *run[:2], "tracks=mot") == 0 and call("flow", "whole", *run[:2], "tracks=csv") == 2
+    assert call("flow", "whole", *run[:3], "tracks=mot") == 0 and call("flow", "whole", *run[:3], "tracks=csv") == 2
     assert (file.parent / "mot.txt").read_text().count("\n") == len(whole["id"])
     file.unlink()
     sorted(file.parent.glob("*.feather"))[2].unlink()
     assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
-    assert call("flow", "whole", *run[:2], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
+    assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
     capsys.readouterr()
     assert call("flow", "small", *run, "contents=[residual,cluster_id,is_valid]") == 2
     assert "contents needs cluster_id, confidence" in capsys.readouterr().err

@@ -157,6 +157,13 @@ def test_time_stamps_replace_steps_where_every_sweep_has_one():
     assert flow_x(ell_at(3, timestamp_ns=50_000_000), ell_at(0, timestamp_ns=0), max_speed=20.0) <= 2.0
 
 
+def test_a_cluster_of_exactly_the_largest_extent_is_not_split():
+    # Two pixels whose dilations touch at a corner: 6 m together.
+    pair = Sweep(np.array([[5.5, 5.5, 0.5], [8.5, 8.5, 0.5]]))
+    for max_extent, ids in ((6.0, [0, 0]), (5.9, [0, 1])):
+        assert flow_as_oracle(Window(pair, pair), METRE.replace(max_extent=max_extent)).cluster_id.tolist() == ids
+
+
 def test_score_is_that_of_the_newest_sweep():
     older = Sweep(ell_at(-1).points[:6])
     result = flow_as_oracle(Window(ell_at(0), ell_at(1), (older,)), METRE.replace(num_history=1))
