@@ -141,6 +141,7 @@ def inputs(checkpoint: Path, folder: Path) -> list[str]:
     return [*THEIRS, f"checkpoint={checkpoint}", f"dataset_path={folder}"]
 
 
+@pytest.mark.slow
 def test_eval_prints_the_scores_of_cflow_eval(harness: Harness, checkpoint: Path, data: Path, tmp_path: Path) -> None:
     scores = read_scores(harness.run("val", "eval.py", *inputs(checkpoint, data)))
     assert scores == evaluated(data / "val", tmp_path, *OURS)
