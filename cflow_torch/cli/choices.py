@@ -19,14 +19,9 @@ SETTERS = ("experiment", "row")  # groups that only change settings of others
 
 def groups(command: str) -> dict[str, list[str]]:
     """Groups of a command and their choices: {"model": ["default", ...], ...}."""
-    names = defaults(command)
-    return {name: list(PRESETS) if name == "model" else [file.stem for file in files(name)] for name in names}
-
-
-def defaults(command: str) -> dict[str, Any]:
-    """Groups of a command and their default choices: {"model": "default", ...}."""
     entries = _load(CONFIGS / f"{command}.yaml")["defaults"]
-    return {name: choice for entry in entries if isinstance(entry, dict) for name, choice in entry.items()}
+    names = [name for entry in entries if isinstance(entry, dict) for name in entry]
+    return {name: list(PRESETS) if name == "model" else [file.stem for file in files(name)] for name in names}
 
 
 def files(group: str) -> list[Path]:
@@ -34,17 +29,15 @@ def files(group: str) -> list[Path]:
     return sorted((CONFIGS / group).glob("*.yaml"))
 
 
-def settings(command: str) -> dict[str, Any]:
-    """All settings of a command in dotted form, each with a value from one of the choices of its group."""
-    found = dict(own_settings(CONFIGS / f"{command}.yaml"))
-    for preset in PRESETS:
-        found.update({f"model.{name}": value for name, value in make_config(preset).as_dict().items()})
+def settings(command: str) -> list[str]:
+    """Names of all settings of a command in dotted form, with every choice of its groups."""
+    found = [*own_settings(CONFIGS / f"{command}.yaml")]
+    found += [f"model.{name}" for preset in PRESETS for name in make_config(preset).as_dict()]
     for group in groups(command):
         if group not in SETTERS:
             prefix = "" if group == "picture" else f"{group}."
-            for file in files(group):
-                found.update({f"{prefix}{name}": value for name, value in own_settings(file).items()})
-    return found
+            found += [f"{prefix}{name}" for file in files(group) for name in own_settings(file)]
+    return list(dict.fromkeys(found))
 
 
 def own_settings(file: Path) -> dict[str, Any]:

@@ -26,10 +26,9 @@ COMMANDS = {
     "bench": "measure run time and memory on your data",
     "settings": "list all settings with defaults and explanations",
     "info": "print the versions and the environment for a bug report",
-    "completion": "print a script that completes commands and settings in your shell",
 }
 
-_WITHOUT_SETTINGS = ("settings", "info", "completion")
+_WITHOUT_SETTINGS = ("settings", "info")
 
 HELP = f"""cflow: training-free LiDAR scene flow
 

@@ -1,11 +1,10 @@
-"""The command line itself: help, wrong calls, bugs, pipes, completion, information."""
+"""The command line itself: help, wrong calls, bugs, pipes, information."""
 
 from __future__ import annotations
 
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +15,6 @@ import hydra
 import pytest
 
 import cflow_torch
-from cflow_torch.cli import completion
 from cflow_torch.cli.choices import CONFIGS
 from cflow_torch.cli.main import COMMANDS
 from cflow_torch.config import REMOVED
@@ -52,7 +50,7 @@ CHEAP = (
     ("flow data=av2", "the data is missing: give data.root=PATH"),
     ("flow paper", "paper: there is no such file or folder; settings are NAME=VALUE"),
     ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
-    ("completion", "one of bash, zsh, fish, got nothing"),
+    ("info --long", "info takes --short (the default) or --full, got --long"),
     ("clean standing=true", "setting standing was removed: use remove_stopped"),
     ("eval -m model=default,papr", "model=papr (did you mean paper?)"),
     ("eval model.num_history=1.5", "num_history=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
@@ -91,7 +89,7 @@ def assert_nothing_was_computed(folder: Path) -> None:
     assert not list(folder.rglob("*results.json")) + list(folder.glob("outputs/flow/**/*.feather"))
 
 
-HELPFUL = ("--version", "--help", "eval --help", "help clean", "settings", "settings data", "info", "completion bash")
+HELPFUL = ("--version", "--help", "eval --help", "help clean", "settings", "settings data", "info")
 
 
 def test_help_comes_without_torch_and_hydra_and_wrong_calls_without_torch(
@@ -167,45 +165,7 @@ def test_a_reader_that_leaves_ends_a_command_quietly(arguments: str) -> None:
     assert (done.stdout, done.stderr) == ("141 0\n", "")
 
 
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    [
-        ("cflow ", {*(f"{command} " for command in COMMANDS), "--help ", "--version "}),
-        ("cflow eval mod", {"model=", "model."}),
-        ("cflow eval model=p", {"model=paper "}),
-        ("cflow eval data=av2 data.ro", {"data.root="}),
-        ("cflow flow over", {"overwrite="}),
-        ("cflow flow overwrite=t", {"overwrite=true "}),
-        ("cflow eval -m experiment=sc", {"experiment=scales "}),
-        ("cflow flow shard.", {"shard.index=", "shard.count="}),
-        ("cflow view data.root=here/[a", {"data.root=here/[alpha] "}),
-        ("cflow view data.root=", {"data.root=here/"}),
-        ("cflow plot picture=", {f"picture={file.stem} " for file in CONFIGS.glob("picture/*.yaml")}),
-        ("cflow completion z", {"zsh "}),
-    ],
-)
-def test_a_word_is_completed(line: str, expected: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "here").mkdir()
-    (tmp_path / "here" / "[alpha]").touch()
-    assert set(completion.completions(line)) == expected
-
-
-@needs_posix
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_a_shell_runs_its_script(shell: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
-    assert cflow("completion", shell) == 0
-    if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
-    ask = 'COMP_LINE="cflow eval model=p"; COMP_POINT=${#COMP_LINE}; _cflow; echo "${COMPREPLY[*]}"'
-    call = f'cflow() {{ {shlex.join(MAIN)} "$@"; }}'
-    if shell == "zsh":
-        call += "; autoload -U compinit; compinit -u -D"
-    elif shell == "fish":
-        ask, call = "complete -C 'cflow eval model=p'", f"function cflow; {shlex.join(MAIN)} $argv; end"
-    text = "\n".join([call, capsys.readouterr().out, ask])
-    done = subprocess.run([shell, "-c", text], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert done.stdout.strip() in ("paper", "model=paper") and not done.stderr  # bash has split the word at its =
+# ---------------------------------------------------------------- information
 
 
 def test_info_lists_every_required_package(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
