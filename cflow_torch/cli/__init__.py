@@ -1,3 +1,1 @@
 """The `cflow` command, one module per sub-command."""
-
-from __future__ import annotations

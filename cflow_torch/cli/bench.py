@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 from cflow_torch.cli import run
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import write_json
+from cflow_torch.data.files import write_json
 from cflow_torch.data.log import Log, window
 from cflow_torch.stages import FlowModel, TimedModel
 from cflow_torch.types import CFlowError, Window

@@ -26,7 +26,7 @@ from cflow_torch.cli import run
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import describe_changes
+from cflow_torch.data.files import describe_changes
 from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.bev import plot_map, save_picture

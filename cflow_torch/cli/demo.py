@@ -23,7 +23,7 @@ from cflow_torch.cli.record import Scores
 from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
-from cflow_torch.data.names import safe_name
+from cflow_torch.data.paths import safe_name
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture

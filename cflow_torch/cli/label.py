@@ -27,9 +27,9 @@ from cflow_torch.applications.labels import find_labels
 from cflow_torch.cli import run
 from cflow_torch.cli.flow import FlowRun, compute, finish
 from cflow_torch.cli.run import Failures, Sources
+from cflow_torch.data.files import write_json
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.results import check_writable, labelled_by, write_hdf5_labels
-from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Job, Shard, find_shard

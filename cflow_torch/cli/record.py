@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch.cli.comparison import RESULTS, headline, summary
 from cflow_torch.cli.run import Failures, machine, versions, write_config
-from cflow_torch.data.json_file import describe_changes, json_ready, write_json
+from cflow_torch.data.files import describe_changes, json_ready, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from cflow_torch.applications.stream import FlowStream
 from cflow_torch.cli import run
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import write_json
+from cflow_torch.data.files import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError
 

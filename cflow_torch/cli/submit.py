@@ -26,7 +26,7 @@ from cflow_torch.cli import run
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import json_ready
+from cflow_torch.data.files import json_ready
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.submission.archive import (
     SubmissionVersion,

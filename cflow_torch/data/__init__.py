@@ -1,3 +1,1 @@
 """Readers and writers of data sets, and everything else that touches files."""
-
-from __future__ import annotations

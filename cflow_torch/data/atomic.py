@@ -12,8 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Iterator
 
-from cflow_torch.data.names import safe_name
-from cflow_torch.data.paths import PathLike, as_path, forget_listings, is_remote, remote_errors
+from cflow_torch.data.paths import PathLike, as_path, forget_listings, is_remote, remote_errors, safe_name
 from cflow_torch.errors import CFlowError
 
 # Object stores, in which a put replaces the older file at once and nobody sees an incomplete one.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Sequence
+from typing import Any, Callable, Sequence
 
 import numpy as np
 
@@ -12,13 +13,18 @@ from cflow_torch.data.arrays.cloud_file import read_columns
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, make_boxes
 from cflow_torch.data.categories import CATEGORIES
-from cflow_torch.data.files import file_errors
-from cflow_torch.data.ground import GROUND_RULES, read_ground_raster
+from cflow_torch.data.files import file_errors, read_json, read_npy
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.names import is_timestamp
-from cflow_torch.data.paths import PathLike, as_path, remote_errors
+from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_errors
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
+
+# Rule -> largest distance of a ground point from the surface, metres; rounding of grid positions to cells (towards
+# zero, or half to even).
+GROUND_RULES: dict[str, tuple[float, Callable[[np.ndarray], Any]]] = {
+    "av2-api": (0.3, np.trunc),
+    "bsfe": (0.4, np.round),
+}
 
 MIN_INTERIOR_POINTS = 1  # av2-api's data loader drops boxes that hold no point, so their track ends
 
@@ -27,12 +33,69 @@ _SIZE = ("length_m", "width_m", "height_m")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
+@dataclass(frozen=True)
+class GroundRaster:
+    """Ground height on a grid of the city.
+
+    Source: layout of the Argoverse 2 map folder, `*_ground_height_surface____*.npy` and `*___img_Sim2_city.json`.
+    """
+
+    heights: np.ndarray  # (H, W) float64, metres, row from y, column from x; NaN = unknown
+    rotation: np.ndarray  # (2, 2) float64
+    translation: np.ndarray  # (2,) float64
+    scale: float  # cells per metre. The grid position of a city point is scale * (rotation @ xy + translation).
+
+    def is_ground(self, points: np.ndarray, rule: str = "av2-api") -> np.ndarray:
+        """Return (N,) bool: which of (N, 3) points, metres in the CITY frame, are on or below the ground by a rule.
+
+        False outside the raster and where its height is NaN.
+        """
+        threshold, to_cell = GROUND_RULES[rule]
+        xyz: np.ndarray = np.asarray(points, dtype=np.float64)
+        inside = np.isfinite(xyz[:, :2]).all(axis=1)
+        position = (np.where(inside[:, None], xyz[:, :2], 0.0) @ self.rotation.T + self.translation) * self.scale
+        cell = to_cell(position).astype(np.int64)
+        inside &= (cell >= 0).all(axis=1) & (cell < self.heights.shape[::-1]).all(axis=1)
+        height = np.full(len(xyz), np.nan)
+        height[inside] = self.heights[cell[inside, 1], cell[inside, 0]]
+        with np.errstate(invalid="ignore"):
+            above = xyz[:, 2] - height
+            return (np.abs(above) <= threshold) | (above < 0)
+
+
+def read_ground_raster(map_folder: Path) -> GroundRaster | None:
+    """Read the raster of a log from its folder `map`; None if there is none, a `CFlowError` if there are several."""
+    rasters = sorted(map_folder.glob("*_ground_height_surface____*.npy"))
+    if not rasters:
+        return None
+    alignments = sorted(map_folder.glob("*___img_Sim2_city.json"))
+    if len(rasters) > 1 or len(alignments) != 1:
+        raise CFlowError(
+            f"{map_folder} must hold one *_ground_height_surface____*.npy and one *___img_Sim2_city.json, "
+            f"found {len(rasters)} and {len(alignments)}"
+        )
+    heights = read_npy(rasters[0], "copy the map folder again")
+    if heights.ndim != 2 or heights.dtype.kind not in "fiu":
+        raise CFlowError(f"{rasters[0]} must hold (H, W) numbers, got shape {heights.shape} and dtype {heights.dtype}")
+    with file_errors(alignments[0], "copy the map folder again"):
+        alignment = read_json(alignments[0])
+        raster = GroundRaster(
+            heights=heights.astype(np.float64),
+            rotation=np.array(alignment["R"], dtype=np.float64).reshape(2, 2),
+            translation=np.array(alignment["t"], dtype=np.float64).reshape(2),
+            scale=float(alignment["s"]),
+        )
+    if not all(np.isfinite(value).all() for value in (raster.rotation, raster.translation, raster.scale)):
+        raise CFlowError(f"{alignments[0]} has numbers that are not finite; copy the map folder again")
+    return raster
+
+
 class AV2Log(BoxLog):
     """One Argoverse 2 sensor log.
 
     Args:
         folder: log folder with `sensors/lidar/<ns>.feather` and `city_SE3_egovehicle.feather`.
-        ground: rule for the map's ground raster, "av2-api" or "bsfe" (`cflow_torch.data.ground`); None = no ground
+        ground: rule for the map's ground raster, "av2-api" or "bsfe" (`GROUND_RULES`); None = no ground
             masks. A log whose map has no raster has no ground masks either.
 
     Convention:

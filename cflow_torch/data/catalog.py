@@ -11,8 +11,7 @@ from typing import Any, Mapping, NamedTuple, Sequence
 from cflow_torch.data.files import find_folders
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
-from cflow_torch.data.names import safe_name
-from cflow_torch.data.paths import as_path, is_path_like, remote_errors
+from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of

@@ -99,7 +99,7 @@ DEFINITIONS: Dict[str, Definition] = {
     # KTH-RPL/OpenSceneFlow: eval.py and its functions evaluate_leaderboard, _v2, evaluate_ssf.
     "opensceneflow": Definition(name="opensceneflow", average="frames", ego_motion="stored"),
     # kylevedder/BucketedSceneFlowEval with_ground=False, evaluators bucketed_epe and threeway_epe. Its ground is the
-    # map raster rule "bsfe" (0.4 m), which the reader applies (cflow_torch.data.ground).
+    # map raster rule "bsfe" (0.4 m), which the reader applies (cflow_torch.data.av2).
     "bucketed_scene_flow_eval": Definition(
         name="bucketed_scene_flow_eval",
         metrics=("bucketed", "three_way"),

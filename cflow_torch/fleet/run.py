@@ -10,7 +10,7 @@ from contextlib import closing, suppress
 from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.data.atomic import remove_stale
-from cflow_torch.data.json_file import write_json
+from cflow_torch.data.files import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.dispatch import dispatch
 from cflow_torch.fleet.job import Event, Failed, Job, Noted, Shard, Unit, split

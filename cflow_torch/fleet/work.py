@@ -19,8 +19,7 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
-from cflow_torch.data.names import safe_name
-from cflow_torch.data.paths import as_path
+from cflow_torch.data.paths import as_path, safe_name
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Unit
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file

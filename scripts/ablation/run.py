@@ -35,7 +35,7 @@ from score import Figures, mean_figures, score
 from sets import ScoredSet, make_sets
 
 from cflow_torch.config import make_config
-from cflow_torch.data.json_file import write_json
+from cflow_torch.data.files import write_json
 from cflow_torch.types import CFlowError
 
 COLUMNS = ("dynamic", "pedestrian", "static", "near", "far", "missed", "moving")

@@ -17,8 +17,7 @@ from typing import Iterator, Tuple
 import numpy as np
 import torch
 
-from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.ground import read_ground_raster
+from cflow_torch.data.av2 import AV2Log, read_ground_raster
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.profiles import PROFILES

@@ -13,10 +13,9 @@ import pyarrow.feather as feather
 import pytest
 from scenes import pose
 
-from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.av2 import AV2Log, GroundRaster, read_ground_raster
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.catalog import find_sources
-from cflow_torch.data.ground import GroundRaster, read_ground_raster
 from cflow_torch.data.log import window
 from cflow_torch.types import CFlowError
 

@@ -12,8 +12,7 @@ from tiny_recording import TinyRecording, rigid, turn_z
 
 from cflow_torch.data.categories import CATEGORY_INDEX, meta_class
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes, pcd_bin_points
-from cflow_torch.data.nuscenes.tables import Annotations, SceneSource
-from cflow_torch.data.nuscenes.tracks import Tracks
+from cflow_torch.data.nuscenes.tables import Annotations, SceneSource, Tracks
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError
-from cflow_torch.data.arrays.cloud_file import read_cloud
-from cflow_torch.data.arrays.pcd import pcd_fields, write_pcd
+from cflow_torch.data.arrays.cloud_file import pcd_fields, read_cloud, write_pcd
 
 DTYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_recording import CAR_VELOCITY, TinyRecording
 
-from cflow_torch.data.arrays.pcd import pcd_fields, write_pcd
+from cflow_torch.data.arrays.cloud_file import pcd_fields, write_pcd
 from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.data.truckscenes import TruckScenesLog, find_truckscenes_scenes

@@ -1,7 +1,5 @@
 """Reader of ROS 1, ROS 2 and MCAP bags, without ROS (experimental)."""
 
-from __future__ import annotations
-
 from cflow_torch.data.bags.reader import BagLog, find_bags
 
 __all__ = ["BagLog", "find_bags"]

@@ -12,8 +12,7 @@ import numpy as np
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log
-from cflow_torch.data.names import is_timestamp
-from cflow_torch.data.paths import PathLike, as_path, source_for_random_access
+from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.types import Sweep
 from cflow_torch.windows.ego_motion import rigid_transform

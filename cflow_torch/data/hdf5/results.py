@@ -14,7 +14,7 @@ import numpy as np
 from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.hdf5.reader import import_h5py, member, open_scene
-from cflow_torch.data.names import is_timestamp
+from cflow_torch.data.paths import is_timestamp
 from cflow_torch.types import Array, CFlowError, as_numpy
 
 LABELS = ("dufo", "cluster", "dufocluster", "nnd")  # keys of labels for self-supervised training

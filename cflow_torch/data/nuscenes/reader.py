@@ -10,10 +10,8 @@ import numpy as np
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, points_in_box
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
-from cflow_torch.data.names import path_inside
-from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, find_scenes
-from cflow_torch.data.nuscenes.tracks import Tracks
-from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
+from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
 from cflow_torch.data.rigid_motion import poses_at, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
@@ -83,7 +81,7 @@ class NuScenesLog(Log):
     Convention:
         - Points are in the ego frame at the sweep's time stamp (x forward, y left, z up, origin on the ground below the
           rear axle); nuScenes itself has compensated ego motion. It has no ground masks.
-        - Truth comes from boxes, which are annotated at 2 Hz and interpolated by `nuscenes.tracks.Tracks.at`. If an
+        - Truth comes from boxes, which are annotated at 2 Hz and interpolated by `tables.Tracks.at`. If an
           object is annotated at only one of the two samples around either sweep, its points are not valid. There is no
           truth outside the annotated time.
     """

@@ -18,8 +18,7 @@ from pyarrow import feather
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.files import file_errors, shortened
-from cflow_torch.data.names import safe_name
-from cflow_torch.data.paths import read_bytes
+from cflow_torch.data.paths import read_bytes, safe_name
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
 
 DYNAMIC_THRESHOLD = 0.05  # metres per sweep, the evaluation's threshold for dynamic points

@@ -15,8 +15,7 @@ import pyarrow as pa
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import Log
-from cflow_torch.data.names import is_timestamp, safe_name
-from cflow_torch.data.paths import read_bytes
+from cflow_torch.data.paths import is_timestamp, read_bytes, safe_name
 from cflow_torch.evaluation.submission.archive import SubmissionVersion
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 

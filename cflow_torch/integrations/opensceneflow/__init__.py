@@ -3,7 +3,6 @@
 `python -m cflow_torch.integrations.opensceneflow FILE` writes the checkpoint without weights that its scripts require.
 """
 
-from cflow_torch.integrations.opensceneflow.checkpoint import write_null_checkpoint
-from cflow_torch.integrations.opensceneflow.module import CFlow
+from cflow_torch.integrations.opensceneflow.module import CFlow, write_null_checkpoint
 
 __all__ = ["CFlow", "write_null_checkpoint"]

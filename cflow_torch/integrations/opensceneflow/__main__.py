@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from cflow_torch.integrations.opensceneflow.checkpoint import write_null_checkpoint
+from cflow_torch.integrations.opensceneflow.module import write_null_checkpoint
 from cflow_torch.types import CFlowError
 
 

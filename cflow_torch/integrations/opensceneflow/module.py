@@ -1,4 +1,4 @@
-"""The class that OpenSceneFlow's configuration names: batches in, residual flow out."""
+"""The model that OpenSceneFlow's configuration names: batches in, residual flow out; its checkpoint has no weights."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Mapping
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import WINDOW, Config, make_config
+from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.hdf5.frames import harness_pose_flow, residual_for_harness
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
@@ -154,3 +156,34 @@ def _extrinsics(ego_T_lidar: Any) -> Any:
     except (TypeError, ValueError):
         raise CFlowError(f"ego_T_lidar={ego_T_lidar!r}: give 'auto', null, or a (4, 4) matrix") from None
     return rigid_transform(rows, "ego_T_lidar")
+
+
+def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
+    """Write the checkpoint without weights and return its path.
+
+    Args:
+        file: for example `cflow.ckpt`. Its stem labels the output folder and the printed tables, and save.py stores
+            its results under this name.
+        overwrite: replace an existing file.
+
+    Convention:
+        It contains plain containers only, so that `torch.load(weights_only=True)` reads it. It has no `model.target`,
+        because the harness prefers the settings of a checkpoint to those of the command line, which must win.
+
+    Raises:
+        CFlowError: the file exists already (it might contain weights).
+    """
+    file = Path(file)
+    if file.exists() and not overwrite:
+        raise CFlowError(f"{file} exists already: give another name, or overwrite it (--overwrite)")
+    cfg = {"model": {"name": file.stem}, "output": file.stem, "num_frames": 2}
+    contents: dict[str, Any] = {
+        "epoch": 0,
+        "global_step": 0,
+        "pytorch-lightning_version": "2.0.1",
+        "state_dict": {},
+        "hyper_parameters": {"cfg": cfg, "eval": True},
+    }
+    with atomic_file(file) as new:
+        torch.save(contents, new)
+    return file

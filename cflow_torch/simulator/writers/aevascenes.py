@@ -12,7 +12,7 @@ import numpy as np
 from cflow_torch.data.aevascenes import CATEGORY_NAME, GROUND
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.boxes import points_in_box
-from cflow_torch.data.names import safe_name
+from cflow_torch.data.paths import safe_name
 from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Boxes, Recording, UnitReturns
 from cflow_torch.types import CFlowError

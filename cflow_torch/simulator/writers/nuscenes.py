@@ -12,8 +12,8 @@ from typing import Any, Dict, List, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.atomic import new_folder
-from cflow_torch.data.names import safe_name
 from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES
+from cflow_torch.data.paths import safe_name
 from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.types import CFlowError

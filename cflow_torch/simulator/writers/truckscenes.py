@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cflow_torch.data.arrays.pcd import write_pcd
+from cflow_torch.data.arrays.cloud_file import write_pcd
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables

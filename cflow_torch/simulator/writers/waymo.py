@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cflow_torch.data.categories import META_CLASSES
-from cflow_torch.data.names import safe_name
+from cflow_torch.data.paths import safe_name
 from cflow_torch.data.waymo.parquet import (
     BOX,
     CALIBRATION,
