@@ -8,18 +8,14 @@ from typing import Any, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.integrations.sequence import Frame, SequenceFlow, import_from, times_in_ns
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, check_array
 from cflow_torch.windows.ego_motion import rigid_transform
 
 
 class CorrelationFlowEstimator:
     """Estimates flow for the frames of a data set of BucketedSceneFlowEval (2.0.25).
 
-    Args:
-        preset, device, ground, **settings: as for `SequenceFlow`, for example `num_history=2`.
-
-    Raises:
-        CFlowError: an unknown setting or an invalid value.
+    The arguments are those of `SequenceFlow`, for example `num_history=2`.
     """
 
     def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
@@ -41,10 +37,8 @@ class CorrelationFlowEstimator:
 
         Convention:
             A point is active if `pc.mask` is True (not ground, in the range of the data set) and, in a pair
-            (frame, data), `is_ground_points` is False. `in_range_mask` of a pair is ignored.
-
-        Raises:
-            CFlowError: a bad field, which the message names ("frames[1].pc.mask"); the package is not installed.
+            (frame, data), `is_ground_points` is False. `in_range_mask` of a pair is ignored. A `CFlowError` names a bad
+            field ("frames[1].pc.mask").
         """
         return self._flows(_read_frames(frames), 0)
 
@@ -53,21 +47,14 @@ class CorrelationFlowEstimator:
         return self._flows(_read_frames(frames), len(frames) - 2)[0]
 
     def evaluate(self, dataset: Any) -> Any:
-        """Estimate and score all frames that a data set scores.
+        """Estimate and score all frames that an `AbstractDataset` scores.
 
-        Args:
-            dataset: an `AbstractDataset`. A causal one scores the frame before the last of each item, a non-causal one
-                every frame but the last.
+        A causal data set scores the frame before the last of each item, a non-causal one every frame but the last.
+        Items that overlap (a causal data set, step 1) share their history. With `subsequence_length=2`, every frame of
+        a log but its last is scored, the first ones with a shorter history.
 
         Returns:
             `dataset.evaluator()` with all flows added. Call its `compute_results()`.
-
-        Convention:
-            Items that overlap (a causal data set, step 1) share their history. With `subsequence_length=2`, every frame
-            of a log but its last is scored, the first ones with a shorter history.
-
-        Raises:
-            CFlowError: as for a call.
         """
         evaluator = dataset.evaluator()
         is_causal = dataset.loader_type().name == "CAUSAL"
@@ -118,8 +105,7 @@ def _read_frames(frames: Any) -> list[_LogFrame]:
 def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
     """Read a frame without its time; `data` is its `TimeSyncedAVLidarData`, or None."""
     points = np.asarray(getattr(frame.pc.full_pc, "points", frame.pc.full_pc))
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise CFlowError(f"{name}.pc.full_pc has shape {points.shape}: give (N, 3) metres")
+    check_array(points, f"{name}.pc.full_pc", (None, 3), "f", "(N, 3) floats, metres")
     if points.dtype == np.float16:  # of the files of Argoverse 2; our own reader converts them as well
         points = points.astype(np.float32)
     is_active = mask = _mask(frame.pc.mask, f"{name}.pc.mask", len(points))
@@ -144,8 +130,7 @@ def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> 
 
 def _mask(values: Any, name: str, length: int) -> np.ndarray:
     mask = np.asarray(values)
-    if mask.shape != (length,) or mask.dtype != np.bool_:
-        raise CFlowError(f"{name} has shape {mask.shape}, {mask.dtype}: give ({length},) bool, one per point")
+    check_array(mask, name, (length,), "b", f"({length},) bool, one per point")
     return mask
 
 

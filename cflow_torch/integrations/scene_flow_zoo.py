@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.integrations.sequence import Frame, SequenceFlow, import_from
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, check_array
 from cflow_torch.windows.ego_motion import rigid_transform
 
 _HOW = (
@@ -24,9 +24,6 @@ class CorrelationFlowModel(nn.Module):
     Args:
         preset, ground, **settings: as for `SequenceFlow`, for example `num_history=3`.
         device: device for the computation; "auto" = that of the sequence. The output is on that of the sequence.
-
-    Raises:
-        CFlowError: an unknown setting or an invalid value.
     """
 
     def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
@@ -50,9 +47,7 @@ class CorrelationFlowModel(nn.Module):
             valid_flow_mask: float32, `full_pc_mask` as 0 and 1, NaN in padding rows. A flow of 0 outside the method's
                 range is scored like any other.
 
-        Raises:
-            CFlowError: a bad field, which the message names ("batched_sequence[0].full_pc_mask"); SceneFlowZoo is
-                missing.
+        A `CFlowError` names a bad field ("batched_sequence[0].full_pc_mask").
         """
         output_class = import_from("dataloaders", "TorchFullFrameOutputSequence", _HOW)
         read = [_read_sequence(sequence, f"batched_sequence[{i}]") for i, sequence in enumerate(batched_sequence)]
@@ -77,22 +72,18 @@ def register(name: str = "CorrelationFlow") -> None:
 
 def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
     """Return sweeps without padding, the first one whose flow is needed, and the (K, PadN) mask (1, 0, NaN)."""
-    for field in ("full_pc", "full_pc_mask", *_POSES):
-        if not isinstance(getattr(sequence, field, None), Tensor):
-            raise CFlowError(f"{name}.{field} is not a tensor: give a TorchFullFrameInputSequence")
     points, mask = sequence.full_pc, sequence.full_pc_mask
-    if points.ndim != 3 or points.shape[2] != 3 or points.shape[0] < 2:
-        raise CFlowError(f"{name}.full_pc has shape {tuple(points.shape)}: give (K, PadN, 3) metres, K of at least 2")
-    if mask.shape != points.shape[:2]:
-        given, shape = tuple(mask.shape), tuple(points.shape[:2])
-        raise CFlowError(f"{name}.full_pc_mask has shape {given}: give {shape}, float with NaN in padding rows")
+    check_array(points, f"{name}.full_pc", (None, None, 3), "f", "(K, PadN, 3) floats, metres")
+    if len(points) < 2:
+        raise CFlowError(f"{name}.full_pc has shape {tuple(points.shape)}: give a K of at least 2")
+    shape = tuple(points.shape[:2])
+    check_array(mask, f"{name}.full_pc_mask", shape, "f", f"{shape} floats with NaN in padding rows")
     is_row = ~torch.isnan(mask)
     poses = []
     for side in _POSES:
-        pose = getattr(sequence, side).detach().cpu()
-        if pose.shape != (len(points), 4, 4):
-            raise CFlowError(f"{name}.{side} has shape {tuple(pose.shape)}: give ({len(points)}, 4, 4), one per sweep")
-        poses.append([rigid_transform(matrix, f"{name}.{side}[{k}]") for k, matrix in enumerate(pose)])
+        pose = getattr(sequence, side)
+        check_array(pose, f"{name}.{side}", (len(points), 4, 4), "f", f"({len(points)}, 4, 4) floats, one per sweep")
+        poses.append([rigid_transform(matrix, f"{name}.{side}[{k}]") for k, matrix in enumerate(pose.detach().cpu())])
     frames = [
         Frame(cloud[rows], flags[rows] > 0, sensor_to_ego, ego_to_global)
         for cloud, flags, rows, sensor_to_ego, ego_to_global in zip(points, mask, is_row, *poses)

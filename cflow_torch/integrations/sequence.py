@@ -53,9 +53,6 @@ class SequenceFlow(nn.Module):
         ground: None = the masks of the frames exclude the ground (`with_ground=False`). "auto" or "patchwork" = also
             find it in every sweep.
         **settings: `method`, or any setting of the method.
-
-    Raises:
-        CFlowError: an unknown setting or an invalid value.
     """
 
     def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
@@ -83,9 +80,6 @@ class SequenceFlow(nn.Module):
             The history of frame i is frames i - 1, i - 2, ..., at most `num_history`. Its future (preset "offline") is
             frames i + 2, i + 3, ... Both may be shorter, so that every pair has a flow. The i-th windows of all
             sequences are computed together.
-
-        Raises:
-            CFlowError: bad input; the message names it.
         """
         windows = [self._windows(frames, first) for frames, first in zip(sequences, firsts)]
         flows: list[list[Tensor]] = [[] for _ in sequences]

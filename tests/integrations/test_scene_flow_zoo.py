@@ -131,7 +131,7 @@ def test_the_error_outside_of_a_checkout_has_the_fix(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"full_pc": None}, r"batched_sequence\[1\]\.full_pc is not a tensor"),
+        ({"full_pc": None}, r"batched_sequence\[1\]\.full_pc is NoneType: give \(K, PadN, 3\)"),
         ({"full_pc": torch.zeros(1, 640, 3)}, r"full_pc has shape \(1, 640, 3\).*at least 2"),
         ({"full_pc_mask": torch.zeros(2, 7)}, r"full_pc_mask has shape \(2, 7\).*give \(2, 640\)"),
         ({"pc_poses_ego_to_global": torch.full((2, 4, 4), NAN)}, r"pc_poses_ego_to_global\[0\] holds NaN"),

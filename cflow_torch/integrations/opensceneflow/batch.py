@@ -42,10 +42,8 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
     Convention:
         A ground mask of the length of its points is applied. If instead the number of its rows that are not ground
         equals the number of points, the harness has already applied it (to pc0, pc1 and some or all of the history).
-        Rows with NaN are ignored: they are padding, or beams without a return. "flow" and other truth is never read.
-
-    Raises:
-        CFlowError: a missing key, a wrong shape, a pose that is not a finite rigid motion; the message names the key.
+        Rows with NaN are ignored: they are padding, or beams without a return. "flow" and other truth is never read. A
+        `CFlowError` names the key of a value that is missing, has a wrong shape, or is not a rigid motion.
     """
     history = [f"h{i}" for i in range(1, num_history + 1)]
     present = [name for name in history if f"pc{name}" in batch]

@@ -41,9 +41,6 @@ class CFlow(nn.Module):
         **settings: any setting of the method except `num_history` and `num_future`; the others are those of the
             preset. A setting that the method does not have is named in a warning and ignored.
 
-    Raises:
-        CFlowError: invalid settings.
-
     Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
 
@@ -92,8 +89,7 @@ class CFlow(nn.Module):
             pose_flow: (N, 3) float32, T p - p of all rows of pc0, as the harness computes it.
             pc1_valid_point_idxes: (M1,) int64; pc0_points_lst: (M, 3), pc1_points_lst: (M1, 3), for losses.
 
-        Raises:
-            CFlowError: a bad batch; the message names the key.
+        A `CFlowError` names a bad key of the batch.
         """
         num_history = self.config.num_history
         samples = read_batch(batch, num_history, self.ego_T_lidar)
@@ -159,20 +155,14 @@ def _extrinsics(ego_T_lidar: Any) -> Any:
 
 
 def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
-    """Write the checkpoint without weights and return its path.
+    """Write the checkpoint without weights, for example `cflow.ckpt`, and return its path.
 
-    Args:
-        file: for example `cflow.ckpt`. Its stem labels the output folder and the printed tables, and save.py stores
-            its results under this name.
-        overwrite: replace an existing file.
-
-    Convention:
-        It contains plain containers only, so that `torch.load(weights_only=True)` reads it. It has no `model.target`,
-        because the harness prefers the settings of a checkpoint to those of the command line, which must win.
-
-    Raises:
-        CFlowError: the file exists already (it might contain weights).
+    OpenSceneFlow's scripts require one. The stem of the file labels the output folder and the printed tables, and
+    save.py stores its results under this name. A file that exists, which might contain weights, is a `CFlowError`
+    unless you set `overwrite`.
     """
+    # Plain containers only, so that `torch.load(weights_only=True)` reads it. There is no `model.target`, because the
+    # harness prefers the settings of a checkpoint to those of the command line, which must win.
     file = Path(file)
     if file.exists() and not overwrite:
         raise CFlowError(f"{file} exists already: give another name, or overwrite it (--overwrite)")
