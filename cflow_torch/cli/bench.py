@@ -27,7 +27,6 @@ from cflow_torch.windows.memory import peak_memory
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow bench`."""
     output = run.output_folder(cfg)
     repeats, num_pairs = run.whole_number(cfg, "repeats", 1), run.whole_number(cfg, "pairs", 1)
     if any(size < 1 for size in cfg.batches):

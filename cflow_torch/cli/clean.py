@@ -33,7 +33,6 @@ from cflow_torch.viz.bev import plot_map, save_picture
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow clean`."""
     output = run.local_folder(cfg)
     if cfg.suffix is not None and cfg.suffix not in SUFFIXES:
         raise CFlowError(f"suffix={cfg.suffix}: give one of {', '.join(SUFFIXES)}")

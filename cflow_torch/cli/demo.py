@@ -32,7 +32,6 @@ from cflow_torch.viz.style import blank_figure
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow demo`."""
     output, picture = run.output_folder(cfg), "none"
     draws = _can("picture", lambda: blank_figure((1, 1), 100))  # matplotlib and k3d are extras
     shows = _can("page", load_k3d)

@@ -65,7 +65,6 @@ class FlowRun(NamedTuple):
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow flow`."""
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
     if cfg.result_name is not None:
         _check_results(cfg, shard)

@@ -22,7 +22,6 @@ from cflow_torch.errors import CFlowError
 
 
 def task(arguments: list[str]) -> None:
-    """Run `cflow info`."""
     if arguments not in ([], ["--short"], ["--full"]):
         raise CFlowError(f"info takes --short (the default) or --full, got {' '.join(arguments)}: cflow info")
     is_full = arguments == ["--full"]

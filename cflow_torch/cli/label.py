@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from pathlib import Path
 
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -31,7 +30,6 @@ from cflow_torch.data.files import write_json
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.results import check_writable, labelled_by, write_hdf5_labels
 from cflow_torch.data.paths import as_path
-from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Job, Shard, find_shard
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file
@@ -41,7 +39,6 @@ _CONTENTS = ("residual", "cluster_id", "confidence")
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow label`."""
     if cfg.data.get("name") != "hdf5":
         raise CFlowError("labels are written into HDF5 scenes of OpenSceneFlow: give their folder, and leave data= out")
     if cfg.model.method != "verified":
@@ -54,7 +51,9 @@ def task(cfg: DictConfig) -> None:
             maker = None
             with suppress(CFlowError):  # a scene that cannot be read is reported later
                 maker = labelled_by(scene)
-            _check_maker(scene, maker, job)
+            if maker not in (None, job.identity) and not job.redo:
+                why = "labels of other settings or of another program"
+                raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
 
     done = compute(cfg, shard, _CONTENTS, check)
     if done is not None:
@@ -66,16 +65,13 @@ def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
-    model = make_model(done.job.config, cfg.device)
-    model.inspect = None  # the logs were checked when their flow was estimated
+    model = run.make_model(cfg)
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
     scenes = [unit.source for unit in shard.units(done.sources.logs)]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = as_path(done.job.output) / scene.stem
         with run.collect_failures(failures, scene.stem):
-            maker = labelled_by(scene)
-            _check_maker(scene, maker, done.job)
-            if maker == done.job.identity and not done.job.redo:
+            if labelled_by(scene) == done.job.identity and not done.job.redo:
                 continue
             log = done.sources.open(scene)
             stamps = log.timestamps[:-1]
@@ -93,11 +89,3 @@ def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
         write_json(file, {**done.report, **kept})
         print(f"report: {file}")
     return failures
-
-
-def _check_maker(scene: Path, maker: str | None, job: Job) -> None:
-    """Reject a scene with labels of another run, unless overwrite=true replaces them."""
-    if maker not in (None, job.identity) and not job.redo:
-        raise CFlowError(
-            f"{scene} has labels of other settings or of another program: give overwrite=true, or label a copy"
-        )

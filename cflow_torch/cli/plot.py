@@ -49,7 +49,6 @@ _PAIR = 3  # default; some history precedes it
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow plot`."""
     output = run.local_folder(cfg)
     blank_figure((1, 1), 100)  # fails now if matplotlib is missing, not after the work
     model = run.make_model(cfg)

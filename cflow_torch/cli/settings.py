@@ -55,7 +55,6 @@ _Z = 1000.0  # metres; the harness computes with the region, so infinite bounds 
 
 
 def task(arguments: list[str]) -> None:
-    """Run `cflow settings`."""
     if not arguments:
         sections = (f"## {title}\n\n" + "\n".join(lines) for _, title, lines in _sections())
         print("\n\n".join([_PAGE, *sections]))

@@ -27,7 +27,6 @@ from cflow_torch.types import CFlowError
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow stream`."""
     output, pace = run.output_folder(cfg), cfg.pace
     if pace is not None and not (isinstance(pace, (int, float)) and pace > 0):
         raise CFlowError(f"pace={pace}: give a number above 0, 1 = as recorded, or null = as fast as possible")

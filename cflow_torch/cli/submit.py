@@ -28,24 +28,9 @@ from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.files import json_ready
 from cflow_torch.data.log import Log
-from cflow_torch.evaluation.submission.archive import (
-    SubmissionVersion,
-    check_submission,
-    encode,
-    get_version,
-    is_complete,
-    pack,
-    write_frame,
-)
-from cflow_torch.evaluation.submission.frames import (
-    Frame,
-    MaskArchive,
-    log_mask,
-    plan_log,
-    point_mask,
-    read_frame_list,
-    require_logs,
-)
+from cflow_torch.evaluation.submission import archive, frames
+from cflow_torch.evaluation.submission.archive import SubmissionVersion
+from cflow_torch.evaluation.submission.frames import Frame, MaskArchive
 from cflow_torch.fleet.manifest import claim_folder
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.stages import TimedModel
@@ -58,14 +43,13 @@ _SETTINGS = ("version", "model", "data", "frames", "masks")  # a file depends on
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow submit`."""
-    version, output = get_version(cfg.version), run.output_folder(cfg)
+    version, output = archive.get_version(cfg.version), run.output_folder(cfg)
     if cfg.masks is not None and not version.is_masked:
         raise CFlowError(f"version {version.number} contains every point: masks= is only for version 1")
     if cfg.masks is not None and cfg.frames is not None:
         raise CFlowError("masks= already lists the frames that are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
-    listed = read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
+    listed = frames.read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
     model = TimedModel(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
     plan, unreadable = _plan(logs, version, listed, masks)
@@ -79,7 +63,7 @@ def task(cfg: DictConfig) -> None:
     failures += _write(plan, model, version, masks, folder)
     run.finish(failures)
     _check(folder, version, plan)
-    pack(folder, [frame.name for frame, _ in plan], file)
+    archive.pack(folder, [frame.name for frame, _ in plan], file)
     try:
         _check(file, version, plan)
     except SystemExit:  # the archive stays only if it passes
@@ -102,15 +86,15 @@ def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
 
 def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, masks: _Masks) -> tuple[Plan, Failures]:
     """List the frames that are needed, with their rows; collect those whose sweep cannot be read."""
-    require_logs(logs, listed)
-    frames = [frame for log in logs for frame in plan_log(log, listed)]
-    if not frames:
+    frames.require_logs(logs, listed)
+    wanted = [frame for log in logs for frame in frames.plan_log(log, listed)]
+    if not wanted:
         raise CFlowError("there is no frame to submit: the logs are too short, or the list names none of their sweeps")
-    if version.is_masked and masks is None and any(log_mask(f.log, f.index) is None for f in frames):
+    if version.is_masked and masks is None and any(frames.log_mask(f.log, f.index) is None for f in wanted):
         print("no masks given: the official rule is applied, which can differ by a point from the server's masks")
     plan: Plan = []
     failures: Failures = []
-    for frame in counted(frames, "rows"):
+    for frame in counted(wanted, "rows"):
         with run.collect_failures(failures, frame.name):
             plan.append((frame, frame.count_rows(version, masks)))
     return plan, failures
@@ -119,13 +103,13 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
 def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Masks, folder: Path) -> Failures:
     """Estimate and write the frames that do not exist yet."""
     largest, total, count = 0.0, 0.0, 0
-    todo = [frame for frame, rows in plan if not is_complete(folder, frame.name, rows, version)]
+    todo = [frame for frame, rows in plan if not archive.is_complete(folder, frame.name, rows, version)]
 
     def write(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         nonlocal largest, total, count
-        mask = point_mask(log, index, sweeps.pc0, masks) if version.is_masked else None
-        columns, error = encode(version, result, sweeps.pc0.is_ground, mask)
-        write_frame(folder, Frame(log, index).name, columns)
+        mask = frames.point_mask(log, index, sweeps.pc0, masks) if version.is_masked else None
+        columns, error = archive.encode(version, result, sweeps.pc0.is_ground, mask)
+        archive.write_frame(folder, Frame(log, index).name, columns)
         largest, total, count = max(largest, error.max(initial=0.0)), total + error.sum(), count + len(error)
 
     failures = for_each_pair([(frame.log, frame.index) for frame in todo], model, write)
@@ -138,7 +122,7 @@ def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Ma
 
 def _check(path: Any, version: SubmissionVersion, plan: Plan) -> None:
     """Print what was checked. If there are problems, list them all and exit with status 1."""
-    problems = check_submission(path, version, {frame.name: rows for frame, rows in plan})
+    problems = archive.check_submission(path, version, {frame.name: rows for frame, rows in plan})
     if problems:
         print(f"{path} is not a valid version {version.number} submission for this data:", file=sys.stderr)
         for problem in problems:

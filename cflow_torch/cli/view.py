@@ -41,7 +41,6 @@ FORMATS = {"html": ".html", "rerun": ".rrd"}
 
 
 def task(cfg: DictConfig) -> None:
-    """Run `cflow view`."""
     if cfg.format not in FORMATS:
         raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
     load_k3d() if cfg.format == "html" else load_rerun()  # fails now if it is missing, not after the work
