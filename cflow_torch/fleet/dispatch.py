@@ -28,15 +28,14 @@ def dispatch(
 ) -> Iterator[Event]:
     """Do all units, and yield events as they happen. If no worker can start, that is a `CFlowError`.
 
-    When a process dies, its unit is repeated, then each of the unit's frames by itself. This does no harm: files are
-    written as a whole or not at all, and complete ones are skipped.
+    When a process dies, its unit is repeated, then each of the unit's frames by itself, `retries` times each. This does
+    no harm: files are written as a whole or not at all, and complete ones are skipped.
 
     Args:
         processes: one per worker, not started yet, whose calls take a unit and yield its events. Each is used by a
             thread of its own, except for `stop` and `close`.
         units: numbered as in `split`.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
-        retries: how often a unit, and then each of its frames by itself, is repeated.
     """
     processes = processes[: len(units)]
     todo: Queue[Unit | None] = Queue()

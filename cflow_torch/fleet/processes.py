@@ -18,15 +18,13 @@ class WorkerDied(Exception):
 
 
 class ChildProcess:
-    """A child process that does one call at a time.
+    """A child process that does one call at a time. It ignores `SIGNALS` and ends when its parent does.
 
     Args:
         make: called in the child process; returns the generator function that does the calls. It gets the arguments of
             a call, then a function that is True after `stop`.
         arguments: of `make`. They are pickled, like all that a call takes and yields.
         timeout: seconds after which a process that has not answered is ended; None = no limit.
-
-    Convention: the child process ignores `SIGNALS` and ends when its parent does.
     """
 
     def __init__(self, make: Callable[..., Callable[..., Iterator[Any]]], *arguments: Any, timeout: Any = None) -> None:

@@ -39,12 +39,10 @@ def run_ray(
 
     The driver and the workers exchange units and events, a few kB each; workers read and write files themselves. On a
     cluster, all machines must reach data and output under the same names (a shared file system, an object store) and
-    have the same versions of cflow_torch, torch and numpy. A node that differs is refused.
+    have the same versions of cflow_torch, torch and numpy. A node that differs is refused. Workers that do not fit into
+    the cluster start when there is room. Ray chooses the GPUs.
 
     Args:
-        job, units, stop: as for `run_local`.
-        layout: one worker per device. Workers that do not fit into the cluster start when there is room. Ray chooses
-            the GPUs.
         address: None = start a cluster in this process, and end it; "auto" or "HOST:PORT" = join the cluster that this
             machine is part of. An existing connection of the caller is used and kept.
         num_cpus: CPUs of the cluster that a worker takes; "auto" = 1 without a GPU, 0 with one.

@@ -35,15 +35,11 @@ def run_local(
     timeout: float = 600.0,
     memory: float | None = None,
 ) -> Iterator[Event]:
-    """Do all units with processes of this machine, and yield events as they happen.
+    """Do all units with processes of this machine, one per device, and yield events as they happen, see `dispatch`.
 
-    A worker that dies is replaced and its unit is repeated, see `dispatch`.
+    A single worker without a memory limit runs in this process.
 
     Args:
-        job: the run; its folder is claimed already (`manifest.claim_folder`).
-        units: numbered as in `split`.
-        layout: one worker per device. A single worker without a memory limit runs in this process.
-        stop: called often. Once it returns True, frames that have begun are finished and no others begin.
         timeout: seconds after which a worker process that has not answered is replaced.
         memory: bytes of address space that each worker process may use, of which Python and torch need about 3e9;
             None = no limit. Use it on a CPU only: the driver of a GPU reserves far more than it uses.
@@ -76,19 +72,12 @@ def run_fleet(
 ) -> dict[str, Any]:
     """Compute the frames of a shard that are not complete, and write a report.
 
-    Args:
-        job: the run; its folder is claimed already (`manifest.claim_folder`).
-        sources: all logs, of all shards.
-        layout: workers of this machine.
-        shard: which share of the logs to do.
-        engine: "local" or "ray".
-        about: more entries of the report.
-        **engine_settings: settings of the engine.
+    The folder of the job is claimed already (`manifest.claim_folder`). `sources` are all logs, of all shards.
 
     Returns:
-        The report of `Counters.report`, which is also in OUTPUT/reports/<shard>.json. "exit_status" is 0 if every frame
-        of the shard is on disk, 1 if not or if the report could not be written, 130, 143 or 129 if Ctrl-C, SIGTERM or
-        SIGHUP came first.
+        The report of `Counters.report`, with the entries of `about`, which is also in OUTPUT/reports/<shard>.json.
+        "exit_status" is 0 if every frame of the shard is on disk, 1 if not or if the report could not be written, 130,
+        143 or 129 if Ctrl-C, SIGTERM or SIGHUP came first.
     """
     if engine not in ENGINES:
         raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")
