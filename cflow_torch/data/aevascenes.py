@@ -109,9 +109,6 @@ class AevaScenesLog(BoxLog):
 
         In compensated clouds the motion of the vehicle is removed, so static points have about 0. Third parties
         measured the sign, which contradicts a comment in the SDK.
-
-        Raises:
-            CFlowError: no such sweep, or a cloud is missing or cannot be read.
         """
         return np.concatenate([cloud.column("velocity", np.floating) for cloud in self._clouds_of(index)])
 

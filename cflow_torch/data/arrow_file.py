@@ -15,10 +15,8 @@ from cflow_torch.types import CFlowError
 class FeatherFile:
     """A feather file in memory, with the `names` of its columns and `num_rows`; a damaged one is a `CFlowError`.
 
-    Args:
-        file: its path; if you pass `data`, only its name in messages.
-        data: its contents; None = read them from `file`, all at once, so that a file that shrinks meanwhile does no
-            harm.
+    If you pass its contents as `data`, `file` is only its name in messages. Otherwise they are read all at once, so
+    that a file that shrinks meanwhile does no harm.
     """
 
     def __init__(self, file: Any, data: bytes | None = None) -> None:
@@ -38,10 +36,8 @@ class FeatherFile:
     def floats(self, columns: Sequence[str], dtype: type = np.float64) -> np.ndarray:
         """Return K floating-point columns as (rows, K); another type or an empty entry is a `CFlowError`."""
         check_columns(self.file, self.names, columns)
-        values: np.ndarray = np.empty((self.num_rows, len(columns)), dtype)
-        for position, name in enumerate(columns):
-            values[:, position] = self._column(name, "floating point", pa.types.is_floating).to_numpy()
-        return values
+        values = [self._column(name, "floating point", pa.types.is_floating).to_numpy() for name in columns]
+        return np.stack(values, axis=1).astype(dtype, copy=False)
 
     def integers(self, column: str) -> np.ndarray:
         """Return an integer column as (rows,) int64."""

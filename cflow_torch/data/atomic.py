@@ -25,16 +25,10 @@ _ABANDONED = 3600.0  # seconds without a change after which a temporary file bel
 def atomic_file(path: PathLike) -> Iterator[Any]:
     """Open a binary file for writing that takes its name only when everything is written.
 
-    If the block raises, the new file is removed and an older one stays. Missing folders are created.
-
-    Convention:
-        - Local files get a temporary name in the same folder, `.NAME.<random>.tmp`, and are renamed at the end. Only a
-          killed process leaves the temporary file behind, see `remove_stale`.
-        - Remote files are written locally first. An object store receives them under their name; on other file
-          systems they are put under a temporary name and then moved.
-
-    Raises:
-        OSError: the file cannot be written, or the remote file system cannot be reached.
+    If the block raises, the new file is removed and an older one stays. Missing folders are created. Local files get a
+    temporary name in the same folder, `.NAME.<random>.tmp`, and are renamed at the end. Only a killed process leaves
+    the temporary file behind, see `remove_stale`. Remote files are written locally first. An object store receives them
+    under their name; on other file systems they are put under a temporary name and then moved.
     """
     path = as_path(path)
     if is_remote(path):

@@ -107,14 +107,11 @@ class AV2Log(BoxLog):
 
     def __init__(self, folder: PathLike, ground: str | None = "av2-api") -> None:
         self.folder = as_path(folder)
-        if not _is_log(self.folder):
+        sweeps = self.folder / "sensors" / "lidar"
+        if not sweeps.is_dir():
             raise CFlowError(f"{self.folder} is not an Argoverse 2 log: it has no folder sensors/lidar")
         self.log_id = self.folder.resolve().name
-        self._files: dict[int, Path] = {
-            int(file.stem): file
-            for file in (self.folder / "sensors" / "lidar").glob("*.feather")
-            if is_timestamp(file.stem)
-        }
+        self._files = {int(file.stem): file for file in sweeps.glob("*.feather") if is_timestamp(file.stem)}
         self.timestamps = sorted(self._files)
         self._check_count(f"{self.folder}: sensors/lidar/<nanoseconds>.feather")
         self._poses = self._read_poses()
@@ -129,9 +126,8 @@ class AV2Log(BoxLog):
         timestamp = self._timestamp(index)
         stored, pose, is_ground = FeatherFile(self._files[timestamp]), self._poses[index], None
         points = stored.floats("xyz", np.float32)
-        times = None  # logs of other writers may lack them
-        if "offset_ns" in stored.names:
-            times = stored.integers("offset_ns") * 1e-9
+        # Logs of other writers may lack the times.
+        times = stored.integers("offset_ns") * 1e-9 if "offset_ns" in stored.names else None
         if self._raster is not None and self._rule is not None:
             is_ground = self._raster.is_ground(transform_points(points, pose), self._rule)
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
@@ -195,10 +191,6 @@ class AV2Log(BoxLog):
         with file_errors(stored.file):
             category = category_indices(names, {name: name for name in CATEGORIES[1:]})
             return make_boxes(tracks, category, stored.floats(_SIZE)[rows], _poses(stored, rows, tracks))
-
-
-def _is_log(folder: Path) -> bool:
-    return (folder / "sensors" / "lidar").is_dir()
 
 
 def _poses(stored: FeatherFile, rows: np.ndarray, names: Sequence[int | str]) -> np.ndarray:

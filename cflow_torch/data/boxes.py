@@ -83,16 +83,12 @@ class BoxLog(Log):
         """Read the boxes of a sweep; None = it is not annotated."""
         raise NotImplementedError
 
-    def _motion(self, index: int) -> np.ndarray:
-        """Return the (4, 4) float64 `T_ego1_ego0` of a pair."""
-        T_ego1_ego0: np.ndarray = np.linalg.inv(self._poses[index + 1]) @ self._poses[index]
-        return T_ego1_ego0
-
     def _labels(self, index: int) -> FlowLabels | None:
         boxes0, boxes1 = self._boxes(index), self._boxes(index + 1)
         if boxes0 is None or boxes1 is None:
             return None
-        return flow_from_boxes(self._points(index), boxes0, boxes1, self._motion(index))
+        T_ego1_ego0 = np.linalg.inv(self._poses[index + 1]) @ self._poses[index]
+        return flow_from_boxes(self._points(index), boxes0, boxes1, T_ego1_ego0)
 
 
 def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego0: np.ndarray) -> FlowLabels:

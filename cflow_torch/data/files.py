@@ -25,11 +25,7 @@ def file_errors(file: Any, hint: str = "copy it again", doing: str = "read") -> 
     """Turn any exception of the block into one `CFlowError` that names the file.
 
     Libraries raise nearly anything for a damaged file (OSError, ValueError, KeyError, struct.error, MemoryError, ...).
-
-    Args:
-        file: a path, or a text that begins with one.
-        hint: what the user can do; it ends the message.
-        doing: what is done with the file, for the message.
+    `file` is a path, or a text that begins with one, and `hint` is what the user can do.
     """
     try:
         yield
@@ -119,14 +115,10 @@ def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:
 
 
 def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Test = lambda folder: True) -> list[Path]:
-    """Find the folders that are logs, `root` among them, sorted. Folders below a log and hidden ones are not searched.
+    """Find the folders that are logs, `root` among them and at most `depth` levels below it, sorted.
 
-    Args:
-        root: where the search begins; a path that is not a folder is a `CFlowError`.
-        is_log: whether a folder is a log.
-        depth: levels below `root` that are searched.
-        what: what the user should pass instead, for the error.
-        is_passed: whether to search a folder.
+    Folders below a log, hidden ones and those that are not `is_passed` are not searched. A root that is not a folder is
+    a `CFlowError` that says `what` to pass.
     """
     if not root.is_dir():
         raise CFlowError(f"{root} is not a folder; pass {what}")

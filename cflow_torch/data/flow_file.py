@@ -30,9 +30,7 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
         ego1, cluster_id int64, score and confidence float32, is_valid bool.
-
-    Raises:
-        CFlowError: you asked for the confidence, but the result has none.
+        Asking for a confidence that the result lacks is a `CFlowError`.
     """
     columns = result.columns()
     names = [column for name in contents for column in (vector_columns(name) if name in VECTORS else [name])]

@@ -130,16 +130,13 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
     The window is shorter near the start of the log, where fewer than `num_history` sweeps precede it, and near its
     end, where fewer than `num_future` follow `index + 1`.
 
-    Raises:
-        CFlowError: `index` has no successor, or a sweep cannot be read.
+    If `index` has no successor, or a sweep cannot be read, that is a `CFlowError`.
     """
-    if not 0 <= index < len(log.timestamps) - 1:
-        raise CFlowError(
-            f"log {log.log_id} has {len(log.timestamps)} sweeps; a pair needs 0 <= index < "
-            f"{len(log.timestamps) - 1}, got {index}"
-        )
+    count = len(log.timestamps)
+    if not 0 <= index < count - 1:
+        raise CFlowError(f"log {log.log_id} has {count} sweeps; a pair needs 0 <= index < {count - 1}, got {index}")
     history = range(index - 1, max(index - 1 - num_history, -1), -1)
-    future = range(index + 2, min(index + 2 + num_future, len(log.timestamps)))
+    future = range(index + 2, min(index + 2 + num_future, count))
     past, later = (tuple(log.sweep(i) for i in indices) for indices in (history, future))
     return Window(log.sweep(index), log.sweep(index + 1), past, later)
 

@@ -30,26 +30,17 @@ _ALIGNED = 0.5  # share of `own` from which a fit has converged; a LiDAR at a wr
 
 @dataclass(frozen=True)
 class StaticResidual:
-    """Motion of the static world that remains after ego motion is removed.
-
-    Args:
-        index, later: the two sweeps.
-        shift: (2,) float64 metres, x and y of the later sweep's frame: offset between the structure of `index`, after
-            the poses have moved it, and that of `later`.
-        rotation: radians about z, between the same two.
-        agreement: 0 ... 1, how well the two coincide under the poses; 0.3 to 0.5 for two sweeps of a street. NaN if
-            too little can be compared.
-        aligned: agreement after `shift` and `rotation` are removed.
-        verdict: the likely mistake, "" = none.
-    """
+    """Motion of the static world that remains after ego motion is removed, between the sweeps `index` and `later`."""
 
     index: int
     later: int
+    # (2,) float64 metres, x and y of the frame of `later`, between its structure and that of `index` under the poses
     shift: np.ndarray
-    rotation: float
+    rotation: float  # radians about z, between the same two
+    # 0 ... 1, how well the two coincide under the poses: 0.3 to 0.5 on a street. NaN if too little can be compared.
     agreement: float
-    aligned: float
-    verdict: str
+    aligned: float  # agreement after `shift` and `rotation` are removed
+    verdict: str  # the likely mistake, "" = none
 
 
 def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> StaticResidual:
@@ -114,11 +105,8 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
 def check_static_world(log: Log) -> list[StaticResidual]:
     """Measure whether the static world moves between two sweeps of a log, and warn if it does.
 
-    We compare the two pairs over which the vehicle turns most if the log has `poses`, else first and last. There is one
-    warning, with the verdict on the worst pair.
-
-    Returns:
-        The residuals; empty for a log of one sweep.
+    We compare the two pairs over which the vehicle turns most if the log has `poses`, else first and last, and return
+    their residuals; none for a log of one sweep. There is one warning, with the verdict on the worst pair.
 
     Cost: reads two sweeps per pair; 0.15 s each.
     """

@@ -13,12 +13,10 @@ QUATERNION_TOLERANCE = 1e-3  # only quaternions of length 1 are rotations; those
 
 
 def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[int], str]) -> np.ndarray:
-    """Build (K, 4, 4) float64 poses from translations and quaternions, as files store them.
+    """Build (K, 4, 4) float64 poses from (K, 3) translations and (K, 4) quaternions, as files store them; K may be 0.
 
-    Args:
-        translation: (K, 3) numbers, metres; K may be 0.
-        quaternion: (K, 4) numbers, scalar first (w, x, y, z), of length 1 within `QUATERNION_TOLERANCE`.
-        what: row -> where it comes from, for the message of the `CFlowError` about a row that is not a pose.
+    Quaternions are scalar first (w, x, y, z), and of length 1 within `QUATERNION_TOLERANCE`. A row that is not a pose
+    is a `CFlowError`, in which `what` says where that row comes from.
     """
     shift = np.asarray(translation, dtype=np.float64).reshape(-1, 3)
     rotation = np.asarray(quaternion, dtype=np.float64).reshape(-1, 4)
@@ -57,7 +55,13 @@ def interpolate_poses(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarr
 
     `fraction` is (K,) float64, 0 = the first pose, 1 = the second. Other values extrapolate at the same rate.
     """
-    rotation = _rotations_between(poses0[:, :3, :3], poses1[:, :3, :3], fraction)
+    # Not kornia's `Quaternion.slerp`: before kornia 0.8 it may take the longer arc, and gives NaN for equal rotations.
+    from kornia.geometry.conversions import axis_angle_to_quaternion, quaternion_to_axis_angle
+
+    first, last = poses0[:, :3, :3], poses1[:, :3, :3]
+    axis_angle = quaternion_to_axis_angle(torch.from_numpy(to_quaternions(np.swapaxes(first, 1, 2) @ last)))
+    rotated = axis_angle_to_quaternion(axis_angle * torch.from_numpy(np.asarray(fraction, np.float64))[:, None])
+    rotation = np.asarray(first, np.float64) @ to_rotations(rotated.numpy())
     return _poses(rotation, poses0[:, :3, 3] + fraction[:, None] * (poses1[:, :3, 3] - poses0[:, :3, 3]))
 
 
@@ -81,15 +85,6 @@ def to_rotations(quaternions: np.ndarray) -> np.ndarray:
     from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
     return quaternion_to_rotation_matrix(torch.from_numpy(np.array(quaternions, np.float64))).numpy()
-
-
-def _rotations_between(first: np.ndarray, last: np.ndarray, share: np.ndarray) -> np.ndarray:
-    # Not kornia's `Quaternion.slerp`: before kornia 0.8 it may take the longer arc, and gives NaN for equal rotations.
-    from kornia.geometry.conversions import axis_angle_to_quaternion, quaternion_to_axis_angle
-
-    axis_angle = quaternion_to_axis_angle(torch.from_numpy(to_quaternions(np.swapaxes(first, 1, 2) @ last)))
-    rotated = axis_angle_to_quaternion(axis_angle * torch.from_numpy(np.asarray(share, np.float64))[:, None])
-    return np.asarray(first, np.float64) @ to_rotations(rotated.numpy())
 
 
 def _poses(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:

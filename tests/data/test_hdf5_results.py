@@ -89,7 +89,7 @@ def test_reserved_and_invalid_names_are_refused(scene: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "stamp", "flow", "complaint"),
     [
-        ("cflow", STAMPS[0], flow_of(1), r"\(51, 3\), expected \(50, 3\)"),
+        ("cflow", STAMPS[0], flow_of(1), r"\(51, 3\): give \(50, 3\)"),
         ("cflow", STAMPS[0], flow_of(0)[:, :2], r"\(50, 2\)"),
         ("cflow", 17, flow_of(0), "no sweep 17"),
         ("mine", STAMPS[0], flow_of(0), "mine.*not a flow result"),

@@ -34,38 +34,32 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", poses: str
         CFlowError: an unknown suffix or format, poses requested but missing, or the folder exists.
     """
     if suffix not in SUFFIXES or poses not in ("kitti", "tum", "npy", None):
-        raise CFlowError(
-            f"suffix={suffix!r}, poses={poses!r}: pass one of {SUFFIXES} and 'kitti', 'tum', 'npy' or None"
-        )
-    with new_folder(root, log.log_id) as folder:
-        _write(log, folder, suffix, poses)
-    return Path(root) / log.log_id
-
-
-def _write(log: Log, folder: Path, suffix: str, poses: str | None) -> None:
+        allowed = f"one of {SUFFIXES} and 'kitti', 'tum', 'npy' or None"
+        raise CFlowError(f"suffix={suffix!r}, poses={poses!r}: pass {allowed}")
     transforms, times, masks = [], [], []
-    for index in range(len(log.timestamps)):
-        sweep = log.sweep(index)
-        points = np.asarray(sweep.points)[:, :3]
-        write_cloud(folder / "points" / f"{index:06d}{suffix}", points, log.columns(index))
-        transforms.append(sweep.pose)
-        times.append(sweep.timestamp_ns)
-        masks.append(sweep.is_ground)
-    if all(mask is not None for mask in masks):
-        (folder / GROUND_FOLDER).mkdir()
-        for index, mask in enumerate(masks):
-            np.save(folder / GROUND_FOLDER / f"{index:06d}.npy", np.asarray(mask))
-    known = [time for time in times if time is not None]
-    if len(known) == len(times):
-        write_times(folder / "times.txt", known)
-    if poses is None:
-        return
-    if any(pose is None for pose in transforms) or (poses == "tum" and len(known) < len(times)):
-        raise CFlowError(f"log {log.log_id} has sweeps without pose or time; write it with poses=None")
-    stacked = np.stack([np.asarray(pose, np.float64) for pose in transforms])
-    if poses == "kitti":
-        write_kitti_poses(folder / "poses.txt", stacked)
-    elif poses == "tum":
-        write_tum_poses(folder / "poses.txt", known, stacked)
-    else:
-        np.save(folder / "poses.npy", stacked)
+    with new_folder(root, log.log_id) as folder:
+        for index in range(len(log.timestamps)):
+            sweep = log.sweep(index)
+            points = np.asarray(sweep.points)[:, :3]
+            write_cloud(folder / "points" / f"{index:06d}{suffix}", points, log.columns(index))
+            transforms.append(sweep.pose)
+            times.append(sweep.timestamp_ns)
+            masks.append(sweep.is_ground)
+        if all(mask is not None for mask in masks):
+            (folder / GROUND_FOLDER).mkdir()
+            for index, mask in enumerate(masks):
+                np.save(folder / GROUND_FOLDER / f"{index:06d}.npy", np.asarray(mask))
+        known = [time for time in times if time is not None]
+        if len(known) == len(times):
+            write_times(folder / "times.txt", known)
+        if poses is not None:
+            if any(pose is None for pose in transforms) or (poses == "tum" and len(known) < len(times)):
+                raise CFlowError(f"log {log.log_id} has sweeps without pose or time; write it with poses=None")
+            stacked = np.stack([np.asarray(pose, np.float64) for pose in transforms])
+            if poses == "kitti":
+                write_kitti_poses(folder / "poses.txt", stacked)
+            elif poses == "tum":
+                write_tum_poses(folder / "poses.txt", known, stacked)
+            else:
+                np.save(folder / "poses.npy", stacked)
+    return Path(root) / log.log_id

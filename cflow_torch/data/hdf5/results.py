@@ -15,7 +15,7 @@ from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.hdf5.reader import import_h5py, member, open_scene
 from cflow_torch.data.paths import is_timestamp
-from cflow_torch.types import Array, CFlowError, as_numpy
+from cflow_torch.types import Array, CFlowError, as_numpy, check_array
 
 LABELS = ("dufo", "cluster", "dufocluster", "nnd")  # keys of labels for self-supervised training
 LABELLED = "cflow_labels"  # attribute of a scene that has ours
@@ -68,8 +68,7 @@ def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int,
         new one. Readers that have it open continue with the old one. Only one process may write into a scene at a time.
 
     Raises:
-        CFlowError: h5py is missing; the name is a key of scenes; the file is read-only or not a scene; a sweep is not
-            in it; or the numbers of rows differ. The scene is then unchanged.
+        CFlowError: the name, the scene or a result cannot be used. The scene is then unchanged.
 
     Cost: one copy of the scene, in time and, until the end, in space.
     """
@@ -83,7 +82,7 @@ def write_hdf5_labels(
     made_by: str = "",
     overwrite: bool = False,
 ) -> int:
-    """Write labels for self-supervised training into a copy of a scene, which replaces it at the end.
+    """Write labels for self-supervised training into a copy of a scene, which replaces it; return how many sweeps.
 
     Args:
         file: `<scene>.h5`; every other key keeps its contents.
@@ -91,9 +90,6 @@ def write_hdf5_labels(
             if the sweep has none; consumed one by one.
         made_by: description of the method, stored as the attribute `LABELLED` of the scene.
         overwrite: replace existing labels; if it is False, a scene with labels is a `CFlowError`.
-
-    Returns:
-        Number of sweeps written.
     """
     if not overwrite and labelled_by(file) is not None:
         raise CFlowError(f"{file} already has labels: overwrite=true replaces them, or label a copy")
@@ -132,25 +128,20 @@ def _write(file: str | Path, sweeps: Iterable[Any], store: Callable[..., None], 
 
 
 def _store_flow(sweep: Any, name: str, older: Any, flow: np.ndarray) -> None:
-    _check_shape(flow, (len(sweep["lidar"]), 3))
+    check_array(flow, name, (len(sweep["lidar"]), 3), "f", f"({len(sweep['lidar'])}, 3) floats")
     if older is not None and (older.shape, older.dtype) != (flow.shape, np.float32):
         raise CFlowError(f"{name} is not a flow result, so it is not replaced")
     _store(sweep, name, older, flow.astype(np.float32))
 
 
 def _store_label(sweep: Any, key: str, older: Any, values: np.ndarray) -> None:
-    _check_shape(values, (len(sweep["lidar"]),))
+    check_array(values, key, (len(sweep["lidar"]),), "biuf", f"({len(sweep['lidar'])},) numbers")
     if older is not None and key not in LABELS:
         return
     if older is not None and (older.shape, older.dtype) != (values.shape, values.dtype):
         del sweep[key]
         older = None
     _store(sweep, key, older, values)
-
-
-def _check_shape(values: np.ndarray, shape: tuple[int, ...]) -> None:
-    if values.shape != shape:
-        raise CFlowError(f"it has shape {values.shape}, expected {shape}")
 
 
 def _store(sweep: Any, key: str, older: Any, values: np.ndarray) -> None:

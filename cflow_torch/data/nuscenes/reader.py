@@ -216,10 +216,7 @@ class NuScenesLog(Log):
 
 
 def pcd_bin_points(content: bytes, file: PathLike) -> np.ndarray:
-    """Return the (N, 3) float32 points, metres in the frame of the LiDAR, in the content of a `.pcd.bin`.
-
-    Its rows are little-endian float32 x, y, z, intensity and ring; other content is a `CFlowError` that names the file.
-    """
+    """Return the (N, 3) float32 points of a `.pcd.bin`, whose rows are float32 x, y, z, intensity and ring."""
     if not content or len(content) % (_COLUMNS * _ROW.itemsize):
         raise CFlowError(
             f"{file} has {len(content)} bytes, not a multiple of a row of five float32: it is truncated; copy it again"

@@ -72,11 +72,8 @@ class Annotations:
 def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list[SceneSource]:
     """Find the scenes of all versions under a folder, sorted by folder and name. Scenes of a version share its tables.
 
-    Args:
-        root: data root (it holds `v1.0-mini` or the like), the folder of one version, or a folder up to two levels
-            above data roots.
-        foreign: tables that only the related data set has, by which we recognise its versions.
-        data_set: name of the data set, for error messages.
+    The root is a data root (it holds `v1.0-mini` or the like), the folder of one version, or a folder up to two levels
+    above data roots. A version with one of the `foreign` tables is of the related data set.
     """
     what = "the data root, which holds v1.0-mini or the like"
     versions = find_folders(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.data.rigid_motion import to_rotations, transform_points
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -56,12 +56,10 @@ def directions(azimuth: np.ndarray, inclination: np.ndarray) -> np.ndarray:
 
 def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
     """Return the (N, 3, 3) float64 rotations Rz(yaw) Ry(pitch) Rx(roll) of (N, 3) roll, pitch, yaw in radians."""
-    from kornia.geometry.conversions import quaternion_from_euler, quaternion_to_rotation_matrix
+    from kornia.geometry.conversions import quaternion_from_euler
 
     roll, pitch, yaw = torch.from_numpy(np.asarray(angles, dtype=np.float64)).unbind(1)
-    quaternion = torch.stack(quaternion_from_euler(roll, pitch, yaw), dim=1)
-    rotation: np.ndarray = quaternion_to_rotation_matrix(quaternion).numpy()
-    return rotation
+    return to_rotations(torch.stack(quaternion_from_euler(roll, pitch, yaw), dim=1).numpy())
 
 
 def range_image_points(
@@ -70,7 +68,10 @@ def range_image_points(
     pixel_poses: np.ndarray | None = None,
     T_world_ego: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of all pixels that have a return.
+    """Return the (N, 3) float64 points of all pixels with a return, and (N,) int64 pixels, row * W + column, ascending.
+
+    Points are in metres, in the vehicle frame of the frame. We compute in float64, because world coordinates are about
+    10 km, where float32 has steps of 1 mm.
 
     Args:
         image: (H, W, 4) float: range (metres), intensity, elongation, no-label-zone flag.
@@ -78,12 +79,6 @@ def range_image_points(
         pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of `T_world_ego` at the time of each pixel. Only the TOP laser
             has them; the images of the others are made for the vehicle pose of the frame.
         T_world_ego: (4, 4) float64 vehicle pose of the frame; needed with `pixel_poses`.
-
-    Returns:
-        points: (N, 3) float64, metres, vehicle frame of the frame.
-        pixels: (N,) int64, row * W + column, ascending.
-
-    Convention: float64 throughout, because world coordinates are about 10 km, where float32 has steps of 1 mm.
     """
     num_rows, num_columns = image.shape[:2]
     pixels = np.flatnonzero(image[..., RANGE] > 0)

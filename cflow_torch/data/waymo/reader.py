@@ -14,18 +14,8 @@ from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, make_boxes, 
 from cflow_torch.data.files import file_errors, find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, as_path, remote_errors
-from cflow_torch.data.waymo.parquet import (
-    BOX,
-    CALIBRATION,
-    LASER,
-    LIDAR,
-    PIXEL_POSE,
-    TIME,
-    TRACK,
-    VEHICLE_POSE,
-    Component,
-    matrix_of,
-)
+from cflow_torch.data.waymo import parquet
+from cflow_torch.data.waymo.parquet import BOX, CALIBRATION, LASER, TIME, TRACK, Component, matrix_of
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
 from cflow_torch.types import CFlowError, Sweep
 
@@ -118,10 +108,10 @@ class WaymoLog(BoxLog):
         """Read the (N, 3) float32 points in the vehicle frame, and (N,) bool whether each lies in a no-label zone."""
         time = self.timestamps[index] // 1000
         keys = [(time, laser) for laser in self._lasers]
-        images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
+        images = [self._images.images(keys, f"{parquet.LIDAR}{number}", 4) for number in self._returns]
         pixel_pose = None
         if TOP in self._lasers:
-            pixel_pose = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6)[time, TOP]
+            pixel_pose = self._pixel_poses.images([(time, TOP)], parquet.PIXEL_POSE, 6)[time, TOP]
             if pixel_pose is None:
                 raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
         points, zone = [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
@@ -156,7 +146,7 @@ class WaymoLog(BoxLog):
 
     def _read_poses(self, times: Sequence[int]) -> np.ndarray:
         component = Component(self.file, "vehicle_pose")
-        stored = {row[TIME]: row[VEHICLE_POSE] for row in component.rows((TIME, VEHICLE_POSE))}
+        stored = {row[TIME]: row[parquet.VEHICLE_POSE] for row in component.rows((TIME, parquet.VEHICLE_POSE))}
         missing = [time for time in times if time not in stored]
         if missing:
             raise CFlowError(f"{component.file} has no pose for frame {missing[0]}; copy it again")
