@@ -80,7 +80,6 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
 
 
 def format_report(report: dict[str, Any]) -> str:
-    """The report as Markdown."""
     seconds, model = report["seconds"], report["model"]
     peak = "unknown" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
     rows = {"total, median": seconds["median"], "min": seconds["min"], "max": seconds["max"], **seconds["stages"]}

@@ -25,7 +25,6 @@ def groups(command: str) -> dict[str, list[str]]:
 
 
 def files(group: str) -> list[Path]:
-    """The YAML files of a group, sorted by name."""
     return sorted((CONFIGS / group).glob("*.yaml"))
 
 

@@ -30,7 +30,6 @@ class Comparison(Callback):
     """At the end of a sweep, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv."""
 
     def on_multirun_end(self, config: Any, **kwargs: Any) -> None:
-        """Compare all jobs. Hydra calls this in the process that started them."""
         from cflow_torch.data.atomic import write_text
         from cflow_torch.data.paths import as_path
         from cflow_torch.evaluation.tables import markdown

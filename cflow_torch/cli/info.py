@@ -43,7 +43,6 @@ def task(arguments: list[str]) -> None:
 
 
 def processor() -> str:
-    """Name of the processor."""
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:
         for line in file:
             if line.startswith("model name"):

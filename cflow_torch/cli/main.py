@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import sys
 import traceback
 from difflib import get_close_matches
@@ -29,6 +30,14 @@ COMMANDS = {
 }
 
 _WITHOUT_SETTINGS = ("settings", "info")
+
+# Settings that name a file, a folder or a log. Their values are text, even if they look like a number.
+_NAMES = ("output", "log", "flow", "archive", "frames", "masks", "result_name", "data.root", "data.cache")
+# Hydra reads these values as numbers or booleans: 1e5, 2024_11_22, true.
+_NOT_TEXT = re.compile(r"[+-]?[._]*\d[\d._]*(e[+-]?[\d_]+)?|true|false", re.IGNORECASE)
+_READABLE = re.compile(r"[\w./\\:+%@?|*$ -]*", re.ASCII)  # without quotes
+_WITH_VALUE = ("-c", "--cfg", "-p", "--package", "-i", "--info", "-cd", "--config-dir", "-cn", "--config-name", "-cp")
+_GRAMMAR = re.compile(r"['\"\[{]|(choice|glob|range|shuffle|sort|str|tag)\(|.*\$\{")  # Hydra's own syntax
 
 HELP = f"""cflow: training-free LiDAR scene flow
 
@@ -104,7 +113,6 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
     import hydra
 
     from cflow_torch.cli import schemas  # noqa: F401 (registers them)
-    from cflow_torch.cli.arguments import fixed_settings, split, unknown_options
     from cflow_torch.cli.refusals import UnfinishedJob, explain
 
     overrides, options = split(rest)
@@ -124,6 +132,55 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
     except Exception as error:
         _exit_if_refused(error)
         _exit_wrong(explain(error, command))
+
+
+def split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Split the arguments of a command into settings, with quoted names, and options with their values.
+
+    Hydra accepts them in this order only: no `-m` between two settings. A path by itself means data.root. Without
+    quotes, Hydra would read the Waymo segment log=10203656353524179475_7625_000_7645_000 as a whole number, and reject
+    output=Ausgänge.
+    """
+    overrides, options = [], []
+    for before, word in zip(["", *arguments], arguments):
+        if word.startswith("-") or before in _WITH_VALUE:
+            options.append(word)
+        elif "=" in word or word[0:1] in ("+", "~"):
+            overrides.append(_quoted(word))
+        else:
+            overrides.append(f"data.root={_text(word)}")
+    return overrides, options
+
+
+def fixed_settings(overrides: list[str]) -> list[str]:
+    """Names of the settings with one value, by which the jobs of a sweep do not differ."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import OverrideParseException
+
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+    except OverrideParseException:  # Hydra meets the error again and reports it
+        return []
+    return [str(one.key_or_group) for one in parsed if not one.is_sweep_override() and not one.is_hydra_override()]
+
+
+def unknown_options(options: list[str]) -> list[str]:
+    from hydra._internal.utils import get_args_parser
+
+    return get_args_parser().parse_known_args(options)[1]
+
+
+def _quoted(override: str) -> str:
+    key, _, value = override.partition("=")
+    if key.lstrip("+") not in _NAMES or _GRAMMAR.match(value):
+        return override
+    values = value.split(",")  # of a sweep
+    is_quoted = [_NOT_TEXT.fullmatch(one.strip()) or not _READABLE.fullmatch(one) for one in values]
+    return f"{key}={','.join(_text(one) if quoted else one for one, quoted in zip(values, is_quoted))}"
+
+
+def _text(value: str) -> str:
+    return '"' + value.replace('"', r"\"") + '"'
 
 
 def _run_job(command: str, cfg: Any) -> Any:
@@ -159,7 +216,6 @@ def _run_job(command: str, cfg: Any) -> Any:
 
 
 def _exit_wrong(message: object) -> None:
-    """Exit after a wrong call."""
     print(f"error: {message}", file=sys.stderr)
     raise SystemExit(2) from None
 

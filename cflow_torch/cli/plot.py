@@ -85,7 +85,6 @@ def find_log(cfg: DictConfig) -> Log:
 
 
 def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:
-    """Draw picture=flow or picture=clusters."""
     points, (result,) = sweeps.pc0.points, model([sweeps])
     if cfg.deskew:
         points = deskew(sweeps, result).cpu()

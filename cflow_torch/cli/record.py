@@ -87,9 +87,8 @@ def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
         objective(record["results"])
         before = {"versions": record["versions"], "generator": record["data"]["generator"], "config": record["config"]}
     except (ValueError, KeyError, TypeError) as error:
-        raise CFlowError(
-            f"{file} is not a results file of this version ({error!r}): give output=FOLDER, or overwrite=true"
-        ) from None
+        hint = "give output=FOLDER, or overwrite=true"
+        raise CFlowError(f"{file} is not a results file of this version ({error!r}): {hint}") from None
     now = {"versions": versions(), "generator": _generator(cfg), "config": _plain(cfg)}
     changed = describe_changes(before, now, _PATHS)
     if changed:

@@ -37,7 +37,6 @@ _NOT_OF_READER = ("label", "first", "step")
 
 
 def versions() -> dict[str, str]:
-    """Versions that a result depends on."""
     return {
         "cflow_torch": __version__,
         "torch": str(torch.__version__),
@@ -65,12 +64,10 @@ def make_model(cfg: DictConfig) -> SceneFlowModel:
 
 
 def is_sweep() -> bool:
-    """True in a job of a sweep (`-m`)."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def preset() -> str:
-    """The name of the chosen preset, `model=`."""
     return str(HydraConfig.get().runtime.choices["model"])
 
 
@@ -145,7 +142,6 @@ class Sources(NamedTuple):
     logs: list[Any]
 
     def open(self, source: Any) -> Log:
-        """Open one of the logs, see `open_log`."""
         return open_log(self.reader, source, **self.settings)
 
 

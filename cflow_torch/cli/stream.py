@@ -79,7 +79,6 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
 
 
 def format_report(report: dict[str, Any]) -> str:
-    """Return the lines of text that show a report."""
     p50, p99 = (1000 * report["latency"][name] for name in ("p50", "p99"))
     lines = [
         f"log {report['log']}: {report['sweeps']} sweeps, {report['results']} results, {report['rate']:.1f} sweeps/s",

@@ -101,7 +101,6 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
 
 
 def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Masks, folder: Path) -> Failures:
-    """Estimate and write the frames that do not exist yet."""
     largest, total, count = 0.0, 0.0, 0
     todo = [frame for frame, rows in plan if not archive.is_complete(folder, frame.name, rows, version)]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_logs import SMALL_LOGS, write_small_log
 
-from cflow_torch.cli.arguments import split
+from cflow_torch.cli.main import split
 from cflow_torch.data.catalog import DATA_SETS, recognise
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.types import CFlowError
