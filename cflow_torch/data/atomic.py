@@ -57,7 +57,6 @@ def atomic_name(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: PathLike, text: str) -> None:
-    """Write a text file atomically, as UTF-8."""
     with atomic_file(path) as file:
         file.write(text.encode())
 

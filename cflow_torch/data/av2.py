@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Callable, Sequence
+from typing import Any, Callable, NamedTuple, Sequence
 
 import numpy as np
 
@@ -33,8 +32,7 @@ _SIZE = ("length_m", "width_m", "height_m")
 _FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
-@dataclass(frozen=True)
-class GroundRaster:
+class GroundRaster(NamedTuple):
     """Ground height on a grid of the city.
 
     Source: layout of the Argoverse 2 map folder, `*_ground_height_surface____*.npy` and `*___img_Sim2_city.json`.
@@ -194,6 +192,5 @@ class AV2Log(BoxLog):
 
 
 def _poses(stored: FeatherFile, rows: np.ndarray, names: Sequence[int | str]) -> np.ndarray:
-    """Return the (K, 4, 4) float64 poses of K rows."""
     values = stored.floats(_POSE)[rows]
     return poses_from_quaternions(values[:, 4:], values[:, :4], lambda row: f"{stored.file}: the pose of {names[row]}")

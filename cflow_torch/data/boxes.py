@@ -92,12 +92,9 @@ class BoxLog(Log):
 
 
 def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego0: np.ndarray) -> FlowLabels:
-    """Compute the truth of a pair of sweeps from the boxes of both.
+    """Compute the truth of a pair of sweeps from the boxes of both, each in the ego frame of its sweep.
 
-    Args:
-        points: (N, 3) float, metres, ego frame of t.
-        boxes0, boxes1: boxes of sweep t and t+1, each in the ego frame of its sweep.
-        T_ego1_ego0: (4, 4) float64, ego coordinates of t to those of t+1.
+    `points` are (N, 3) float, metres, in the ego frame of t, and `T_ego1_ego0` is (4, 4) float64.
 
     Convention: computed in float64, TOTAL flow is rounded to float32 once at the end. Points in a box whose track ends
         have the category of the box, the flow of ego motion and `is_valid` False. A point in several boxes takes the

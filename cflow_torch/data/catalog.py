@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import inspect
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import import_module
 from typing import Any, Mapping, NamedTuple, Sequence
 
-from cflow_torch.data.files import find_folders
+from cflow_torch.data.files import find_folders, shortened
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
@@ -51,8 +51,7 @@ DATA_SETS: dict[str, DataSet] = {
 _DEEPEST = 6  # levels below the root that are searched for a mark
 
 
-@dataclass(frozen=True)
-class UserSource:
+class UserSource(NamedTuple):
     """One of the logs that your own reader returns."""
 
     name: str
@@ -121,9 +120,7 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
         if not isinstance(cause, ImportError):
             _log.error("the reader %s fails", target, exc_info=cause)  # shows its author the line
             hint = ""
-        raise CFlowError(
-            f"the reader {target} fails: {type(cause).__name__}: {' '.join(str(cause).split())}{hint}"
-        ) from error
+        raise CFlowError(f"the reader {target} fails: {type(cause).__name__}: {shortened(cause)}{hint}") from error
     if hasattr(made, "sweep"):
         return [made]
     return made if hasattr(made, "__getitem__") else list(made)

@@ -54,7 +54,6 @@ class KissICPLog(Log):
             raise CFlowError(f"{self._what}: {len(self._poses)} poses for {len(self)} sweeps; copy the data set again")
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`: points, and the pose if the data set has it."""
         self._timestamp(index)
         with _loader_errors(f"{self._what}, sweep {index}"):
             found = self._dataset[index]

@@ -199,7 +199,6 @@ class LogWrapper(Log):
 
     @property
     def unwrapped(self) -> Log:
-        """The innermost log."""
         return self.log.unwrapped
 
     def __getattr__(self, name: str) -> Any:
@@ -220,5 +219,4 @@ class CachedLog(LogWrapper):
         return CachedLog, (self.log, self._count)
 
     def sweep(self, index: int) -> Sweep:
-        """Read a sweep of the wrapped log, or return the one in memory."""
         return self._sweep(index)

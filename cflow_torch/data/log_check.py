@@ -44,19 +44,13 @@ class StaticResidual:
 
 
 def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> StaticResidual:
-    """Compare two sweeps of a log in one frame.
+    """Compare the sweeps `index` and `index + baseline` of a log in one frame.
 
-    Args:
-        log: without poses the sensor is assumed to be static; without ground masks, a simple rule removes low points.
-        index: the older sweep.
-        baseline: sweeps between the two.
-
-    Convention:
-        Only the horizontal plane is compared. The points of the later sweep above ground, 2.5 to 50 m away, become
-        Gaussian patches in cells of 1 m. A Gauss-Newton fit with robust weights (for moving objects) finds the shift
-        and rotation that align the older sweep with them. Along a wall without corners no shift is detected. A LiDAR at
-        another position than the poses state shows only when the vehicle turns: by its distance times the rotation, 12
-        cm for 1.35 m and 5 degrees.
+    Without poses the sensor is assumed to be static. Without ground masks, a simple rule removes low points. Only the
+    horizontal plane is compared. The points of the later sweep above ground, 2.5 to 50 m away, become Gaussian patches
+    in cells of 1 m. A Gauss-Newton fit with robust weights (for moving objects) finds the shift and rotation that align
+    the older sweep with them. Along a wall without corners no shift is detected. A LiDAR at another position than the
+    poses state shows only when the vehicle turns: by its distance times the rotation, 12 cm for 1.35 m and 5 degrees.
 
     Cost: reads two sweeps and takes about 0.15 s on one core.
 
@@ -202,7 +196,6 @@ def _skew(log: Log) -> str:
 
 
 def _order(log: Log) -> str:
-    """Compare the first sweeps in a row."""
     first = [log.sweep(index) for index in range(min(3, len(log.timestamps)))]
     for pc0, pc1 in zip(first, first[1:]):
         if repeats(pc0, pc1):

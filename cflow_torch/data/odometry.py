@@ -90,7 +90,6 @@ class PosedLog(LogWrapper):
         self.poses = np.stack([rigid_transform(pose, f"poses[{index}]") for index, pose in enumerate(poses)])
 
     def sweep(self, index: int) -> Sweep:
-        """Read the log's sweep and replace its pose."""
         return replace(self.log.sweep(index), pose=self.poses[index].copy())
 
 

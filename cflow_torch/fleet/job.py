@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Mapping, Sequence, Union
+from typing import Any, Mapping, NamedTuple, Sequence, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
@@ -46,8 +46,7 @@ class Unit:
         return range(int(self.first * num_pairs), int(self.last * num_pairs))
 
 
-@dataclass(frozen=True)
-class Opened:
+class Opened(NamedTuple):
     """A unit has begun: time stamps of its `frames`, and of those `todo` that are not complete yet."""
 
     unit: int
@@ -56,8 +55,7 @@ class Opened:
     todo: tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class Done:
+class Done(NamedTuple):
     """A frame is on disk. `seconds` by stage are those of its batch, divided by the number of frames."""
 
     unit: int
@@ -65,8 +63,7 @@ class Done:
     seconds: dict[str, float]
 
 
-@dataclass(frozen=True)
-class Failed:
+class Failed(NamedTuple):
     """A frame has no result; `timestamp` None: the whole unit has none."""
 
     unit: int
@@ -75,8 +72,7 @@ class Failed:
     timestamp: int | None = None
 
 
-@dataclass(frozen=True)
-class Noted:
+class Noted(NamedTuple):
     """Something that a user should know about a log, or about a worker."""
 
     unit: int
@@ -107,10 +103,8 @@ class Shard:
 
     def __post_init__(self) -> None:
         if self.count < 1 or not 0 <= self.index < self.count:
-            raise CFlowError(
-                f"shard.index={self.index} of shard.count={self.count}: give a count of at least 1 and an "
-                "index of 0 ... count - 1"
-            )
+            allowed = "a count of at least 1 and an index of 0 ... count - 1"
+            raise CFlowError(f"shard.index={self.index} of shard.count={self.count}: give {allowed}")
 
     def units(self, sources: Sequence[Any]) -> list[Unit]:
         """Return this shard's share of the logs.

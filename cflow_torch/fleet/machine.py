@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Mapping
+from typing import Any, Mapping, NamedTuple
 
 import torch
 
@@ -22,8 +21,7 @@ WORKER_MEMORY = 1_500_000_000
 CPU_BATCH, GPU_BATCH = 4, 32
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """The use of a machine by a run."""
 
     devices: tuple[str, ...]  # one per worker

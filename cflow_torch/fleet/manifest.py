@@ -132,12 +132,10 @@ def complete_frames(folder: Path) -> set[int]:
 
 
 def frame_file(folder: Path, timestamp: int) -> Path:
-    """Return the path of a frame's flow."""
     return folder / f"{timestamp}.feather"
 
 
 def _is_whole(file: Path) -> bool:
-    """Return whether a file ends like a complete feather file."""
     with suppress(OSError), open(file, "rb") as opened:
         opened.seek(-len(_ENDING), os.SEEK_END)
         return opened.read() == _ENDING

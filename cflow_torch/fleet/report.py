@@ -69,7 +69,6 @@ class Counters:
 
     @property
     def is_complete(self) -> bool:
-        """True if every frame is on disk."""
         return not (self.failures or self._unopened or self._waiting)
 
     def times_noted(self, message: str) -> int:

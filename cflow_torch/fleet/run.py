@@ -108,7 +108,6 @@ def run_fleet(
 
 
 def report_file(output: str, shard: Shard) -> Any:
-    """Return the path of a shard's report."""
     return as_path(output) / "reports" / f"shard-{shard.index}-of-{shard.count}.json"
 
 
@@ -150,7 +149,6 @@ class StopSignal:
             signal.signal(number, handler)
 
     def __call__(self) -> bool:
-        """True if a signal has come."""
         return self.received is not None
 
     def _receive(self, number: int, _: Any) -> None:

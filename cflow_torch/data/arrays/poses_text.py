@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import io
 import warnings
-from dataclasses import dataclass
 from decimal import Decimal
-from typing import Sequence
+from typing import NamedTuple, Sequence
 
 import numpy as np
 
@@ -20,9 +19,8 @@ CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, 
 _LONGEST_GAP_NS = 500_000_000  # longest gap between two poses that we interpolate
 
 
-@dataclass(frozen=True)
-class Trajectory:
-    """K poses of a file."""
+class Trajectory(NamedTuple):
+    """K poses."""
 
     poses: np.ndarray  # (K, 4, 4) float64 `T_world_frame`; the file does not say which frame
     times_ns: np.ndarray | None  # (K,) int64 nanoseconds, ascending; None if the format has no times

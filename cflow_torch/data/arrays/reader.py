@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -127,7 +126,7 @@ class ArraysLog(Log):
                 return trajectory, str(file), False
             T_cam_lidar = poses_text.read_calibration(chosen)
             in_lidar = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
-            return replace(trajectory, poses=in_lidar), str(file), True
+            return trajectory._replace(poses=in_lidar), str(file), True
         if poses is None:
             return None, "", False
         return Trajectory(poses_text.checked_poses(np.asarray(poses), "poses"), None, "matrix"), "poses", False
@@ -149,7 +148,6 @@ class ArraysLog(Log):
         return None
 
     def _one_each(self, trajectory: Trajectory, source: str, stamps: list[int] | None) -> np.ndarray:
-        """Return (K, 4, 4), one pose per sweep."""
         if trajectory.times_ns is not None and stamps is not None:
             return poses_text.covered_poses(trajectory, stamps, source)
         if len(trajectory.poses) != len(self.files):

@@ -98,7 +98,6 @@ class Frames:
         return chain
 
     def are_joined(self, frame: str, other: str) -> bool:
-        """Test whether transforms connect the two frames."""
         return self.chain(frame)[-1] == self.chain(other)[-1]
 
     def change_times(self, frame: str) -> np.ndarray:
@@ -124,7 +123,6 @@ class Frames:
 
 
 def sample(time_ns: int, position: Any, rotation: Any) -> Sample:
-    """Build a sample from a time and two messages."""
     return (time_ns, position.x, position.y, position.z, rotation.w, rotation.x, rotation.y, rotation.z)
 
 

@@ -201,7 +201,6 @@ class BagLog(Log):
         return times, matrices
 
     def _cloud(self, time: int) -> Any:
-        """Read the message of a sweep."""
         reader, arrived = self._reader(), self._arrival[time]
         clouds = [connection for connection in reader.connections if connection.topic == self.topic]
         for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):

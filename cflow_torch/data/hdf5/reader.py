@@ -77,7 +77,6 @@ class HDF5Log(Log):
         return HDF5Log, (self.file, self.ego_T_lidar, self._needs_poses)  # another process opens the file itself
 
     def close(self) -> None:
-        """Close the scene's file."""
         self._scene.close()
 
     def sweep(self, index: int) -> Sweep:
@@ -212,7 +211,6 @@ scene_errors = partial(file_errors, hint="copy or write the scene again")
 
 
 def import_h5py() -> Any:
-    """Import h5py; a missing package is a `CFlowError`."""
     return import_optional("h5py", "HDF5 scenes need h5py: pip install h5py")
 
 

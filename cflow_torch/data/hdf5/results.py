@@ -33,9 +33,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 def check_result_name(name: str) -> None:
     """Raise a `CFlowError` for a result name that is taken or that a viewer's command line cannot carry."""
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
-        raise CFlowError(
-            f"{name!r} is not a result name: begin with a letter, then use letters, digits, '_', '-', '.', at most 64"
-        )
+        raise CFlowError(f"{name!r} is not a result name: use up to 64 letters, digits, '_', '-', '.', a letter first")
     if name in RESERVED_KEYS:
         raise CFlowError(f"{name} is a key of the scenes themselves; choose another name, for example cflow")
 

@@ -170,7 +170,6 @@ class NuScenesLog(Log):
         return np.concatenate([points for points, _ in clouds]), np.concatenate([lag for _, lag in clouds])
 
     def _unit_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Read one sweep of one LiDAR, see `_cloud`."""
         file = path_inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
         with file_errors(file, f"copy the sensor data of scene {self.log_id} next to the tables"):
             content = read_bytes(file)
@@ -218,9 +217,7 @@ class NuScenesLog(Log):
 def pcd_bin_points(content: bytes, file: PathLike) -> np.ndarray:
     """Return the (N, 3) float32 points of a `.pcd.bin`, whose rows are float32 x, y, z, intensity and ring."""
     if not content or len(content) % (_COLUMNS * _ROW.itemsize):
-        raise CFlowError(
-            f"{file} has {len(content)} bytes, not a multiple of a row of five float32: it is truncated; copy it again"
-        )
+        raise CFlowError(f"{file} has {len(content)} bytes, not a multiple of a row of five float32; copy it again")
     rows = np.frombuffer(content, dtype=_ROW).reshape(-1, _COLUMNS)
     ring = rows[:, 4]
     if not (np.isfinite(ring) & (ring >= 0) & (ring < 256) & (ring == np.floor(ring))).all():

@@ -6,7 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Collection, Dict, Sequence
+from typing import Any, Collection, Dict, NamedTuple, Sequence
 
 import numpy as np
 
@@ -47,8 +47,7 @@ class SceneSource:
     tables: Tables | None = field(default=None, repr=False, compare=False)
 
 
-@dataclass(frozen=True)
-class LidarChain:
+class LidarChain(NamedTuple):
     """The M sweeps of one LiDAR in one scene, ordered by time."""
 
     times: np.ndarray  # (M,) int64, microseconds
@@ -58,8 +57,7 @@ class LidarChain:
     mount: np.ndarray  # (M, 4, 4) float64 `T_ego_sensor`
 
 
-@dataclass(frozen=True)
-class Annotations:
+class Annotations(NamedTuple):
     """The A boxes of one scene, at its samples."""
 
     time: np.ndarray  # (A,) int64, microseconds

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,8 +19,7 @@ RANGE, INTENSITY, ELONGATION, NO_LABEL_ZONE = range(4)
 """Channels of a range image. Range is in metres, > 0 where there is a return; the zone is 1 inside, else outside."""
 
 
-@dataclass(frozen=True)
-class LaserCalibration:
+class LaserCalibration(NamedTuple):
     """Mounting of one laser and the inclinations of its rows."""
 
     T_ego_sensor: np.ndarray  # (4, 4) float64, laser coordinates to the vehicle's

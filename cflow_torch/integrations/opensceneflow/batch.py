@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Mapping
+from typing import Any, Mapping, NamedTuple
 
 import numpy as np
 import torch
@@ -14,8 +13,7 @@ from cflow_torch.types import CFlowError, Sweep, Window
 from cflow_torch.windows.ego_motion import relative_transform, rigid_transform
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):
     """One pair of sweeps of a batch, with its history."""
 
     # Points that are finite and not ground, with the poses of the frame of the points. If the batch has the whole sweep

@@ -9,7 +9,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Mapping
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -69,7 +68,8 @@ class CFlow(nn.Module):
         if output not in OUTPUTS:
             raise CFlowError(f"output={output!r}: give one of {', '.join(map(repr, OUTPUTS))}")
         self.output = output
-        self.ego_T_lidar = _extrinsics(ego_T_lidar)
+        has_matrix = ego_T_lidar is not None and not (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto")
+        self.ego_T_lidar = rigid_transform(ego_T_lidar, "ego_T_lidar") if has_matrix else ego_T_lidar
         self.timer: Any = None
         with suppress(ImportError):  # the harness always has it, and requires the attribute
             self.timer = import_module("dztimer").Timing()
@@ -141,17 +141,6 @@ def _with_history(config: Config, num_frames: Any) -> Config:
     if not isinstance(num_frames, int) or num_frames < 2 or config.method == "keypoints":
         raise CFlowError(f"num_frames={num_frames!r}: give an integer of at least 2; for key points, 2")
     return config.replace(num_history=num_frames - 2)
-
-
-def _extrinsics(ego_T_lidar: Any) -> Any:
-    """Check `ego_T_lidar`; return None, "auto", or (4, 4) float64."""
-    if ego_T_lidar is None or (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto"):
-        return ego_T_lidar
-    try:  # Hydra passes lists of its own type
-        rows = np.array([[float(value) for value in row] for row in ego_T_lidar])
-    except (TypeError, ValueError):
-        raise CFlowError(f"ego_T_lidar={ego_T_lidar!r}: give 'auto', null, or a (4, 4) matrix") from None
-    return rigid_transform(rows, "ego_T_lidar")
 
 
 def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
