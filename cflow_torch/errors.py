@@ -26,11 +26,11 @@ class NoActivePoints(CFlowWarning):
     """A window without an active point, so its result is empty."""
 
 
-def import_optional(module: str, need: str) -> Any:
-    """Import a module of a package that may be missing; `need` is the error then, and says how to install it."""
+def import_optional(module: str, need: str, name: str | None = None) -> Any:
+    """Import a module that may be missing, or a name from it; `need` is the error then, and says how to install it."""
     try:
-        return import_module(module)
-    except ImportError as error:
+        return getattr(import_module(module), name) if name else import_module(module)
+    except (ImportError, AttributeError) as error:
         raise CFlowError(need) from error
 
 

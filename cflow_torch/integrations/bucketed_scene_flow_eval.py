@@ -7,7 +7,8 @@ from typing import Any, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.integrations.sequence import Frame, SequenceFlow, import_from, times_in_ns
+from cflow_torch.errors import import_optional
+from cflow_torch.integrations.sequence import Frame, SequenceFlow, times_in_ns
 from cflow_torch.types import CFlowError, check_array
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -70,8 +71,8 @@ class CorrelationFlowEstimator:
         return evaluator
 
     def _flows(self, frames: Sequence[_LogFrame], first: int) -> list[Any]:
-        how = "pip install 'bucketed-scene-flow-eval>=2.0.25' (it needs Python 3.10 and open3d)"
-        flow_class = import_from("bucketed_scene_flow_eval.datastructures", "EgoLidarFlow", how)
+        need = "this needs pip install 'bucketed-scene-flow-eval>=2.0.25', which needs Python 3.10 and open3d"
+        flow_class = import_optional("bucketed_scene_flow_eval.datastructures", need, "EgoLidarFlow")
         (flows,) = self.sequence_flow([[frame.sweep for frame in frames]], [first])
         return [
             flow_class(full_flow=flow.cpu().numpy(), mask=frame.mask.copy())  # the evaluator overwrites masks

@@ -7,11 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.integrations.sequence import Frame, SequenceFlow, import_from
+from cflow_torch.errors import import_optional
+from cflow_torch.integrations.sequence import Frame, SequenceFlow
 from cflow_torch.types import CFlowError, check_array
 from cflow_torch.windows.ego_motion import rigid_transform
 
-_HOW = (
+_NEED = (
     "SceneFlowZoo is not a package: clone github.com/kylevedder/SceneFlowZoo, install its requirements, and run from "
     "its root folder or add that to PYTHONPATH"
 )
@@ -49,7 +50,7 @@ class CorrelationFlowModel(nn.Module):
 
         A `CFlowError` names a bad field ("batched_sequence[0].full_pc_mask").
         """
-        output_class = import_from("dataloaders", "TorchFullFrameOutputSequence", _HOW)
+        output_class = import_optional("dataloaders", _NEED, "TorchFullFrameOutputSequence")
         read = [_read_sequence(sequence, f"batched_sequence[{i}]") for i, sequence in enumerate(batched_sequence)]
         flows = self.sequence_flow([frames for frames, _, _ in read], [first for _, first, _ in read])
         outputs = []
@@ -67,7 +68,7 @@ class CorrelationFlowModel(nn.Module):
 
 def register(name: str = "CorrelationFlow") -> None:
     """Register the model with `models.construct_model` of the checkout, so that a config can name it."""
-    import_from("models", "name_to_class_lookup", _HOW)[name.lower()] = CorrelationFlowModel
+    import_optional("models", _NEED, "name_to_class_lookup")[name.lower()] = CorrelationFlowModel
 
 
 def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:

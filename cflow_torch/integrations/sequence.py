@@ -5,7 +5,6 @@ BucketedSceneFlowEval and SceneFlowZoo, which builds on it, both pass such seque
 
 from __future__ import annotations
 
-import importlib
 import warnings
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -126,14 +125,6 @@ def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Te
     global_R_sensor = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]
     rotation[:3, :3] = global_R_sensor.T @ following.ego_to_global[:3, :3]
     return compensate(residual_flow.double().t(), rotation).t().float().contiguous()
-
-
-def import_from(module: str, name: str, how: str) -> Any:
-    """Import a name from a module of a harness. If it is missing, a `CFlowError` says `how` to install it."""
-    try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise CFlowError(f"{module}.{name} cannot be used ({error}): {how}") from None
 
 
 def times_in_ns(stamps: Sequence[Any]) -> tuple[int | None, ...]:
