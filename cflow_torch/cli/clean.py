@@ -27,7 +27,6 @@ from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.files import describe_changes
-from cflow_torch.data.log import Log
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.bev import plot_map, save_picture
 
@@ -47,7 +46,8 @@ def task(cfg: DictConfig) -> None:
         folder, file = output / log.log_id, output / f"{log.log_id}.ply"
         flow: Callable[[int], FlowResult] | None = None if stored is None else partial(stored, log)
         with run.collect_failures(failures, log.log_id):
-            suffix, more = cfg.suffix or _own_suffix(log), ""
+            own, more = log.unwrapped, ""
+            suffix = cfg.suffix or (own.files[0].suffix.lower() if isinstance(own, ArraysLog) else ".npy")
             if not folder.exists():
                 clean = CleanLog(log, model, flow, cfg.remove_stopped)
                 poses = None if log.sweep(0).pose is None else "kitti"
@@ -83,9 +83,3 @@ def _claim(cfg: DictConfig, output: Path) -> None:
         if changed:
             raise CFlowError(f"{output} has logs of another run ({changed}): remove it, or give output=FOLDER")
     run.write_config(cfg, output)
-
-
-def _own_suffix(log: Log) -> str:
-    """Suffix of the log's own point clouds; ".npy" if the log has other files."""
-    inner = log.unwrapped
-    return str(inner.files[0].suffix.lower()) if isinstance(inner, ArraysLog) else ".npy"

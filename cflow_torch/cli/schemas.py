@@ -33,15 +33,13 @@ _TYPES: dict[str, Any] = {
 
 
 def _schema(file: Path, *bases: type) -> type:
-    types = {name.partition(".")[0]: _type(name, value) for name, value in own_settings(file).items()}
+    types = {}
+    for name, value in own_settings(file).items():
+        any_value = value is None or value == "auto" or isinstance(value, list)
+        types[name.partition(".")[0]] = _TYPES.get(name, Any if any_value else type(value))
     if not bases:
         types.update({group: Any for group in groups(file.stem) if group not in SETTERS})
     return make_dataclass(file.stem, [(name, kind, MISSING) for name, kind in types.items()], bases=bases)
-
-
-def _type(name: str, value: Any) -> Any:
-    any_value = value is None or value == "auto" or isinstance(value, list)
-    return _TYPES.get(name, Any if any_value else type(value))
 
 
 def _node(config: Config) -> Any:

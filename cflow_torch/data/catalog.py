@@ -66,7 +66,6 @@ def recognise(root: Any) -> str:
 
     Raises:
         CFlowError: the path does not exist, or no format fits, or several do.
-        OSError: a remote path cannot be reached.
     """
     top = as_path(root)
     with remote_errors(top):

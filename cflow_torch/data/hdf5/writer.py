@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -65,6 +64,7 @@ def write_index_files(folder: str | Path) -> None:
 
 
 def _sweep(log: Log, index: int, eval_step: int, identity: dict[str, int]) -> dict[str, np.ndarray]:
+    """Return the keys and values of one group; `identity` has the object id of each track so far."""
     sweep, labels = log.sweep(index), log.labels(index)
     if sweep.pose is None:
         raise CFlowError(f"sweep {index} of log {log.log_id} has no pose, which the layout needs")
@@ -83,24 +83,14 @@ def _sweep(log: Log, index: int, eval_step: int, identity: dict[str, int]) -> di
             ground = values.get("ground_mask", np.zeros(len(points), bool))
             values["eval_mask"] = (labels.is_valid & ~ground)[:, None]
     if hasattr(log, "units"):
-        values.update(_units(log.units(index)))
+        units = log.units(index)
+        number = np.arange(1, len(units) + 1, dtype=np.uint8)
+        values["lidar_id"] = np.repeat(number, [len(unit.points) for unit in units])
+        values["lidar_dt"] = np.concatenate([unit.offset_ns / 1e9 for unit in units]).astype(np.float32)
+        values["lidar_center"] = np.stack([unit.T_ego_sensor for unit in units]).astype(np.float32)
     if hasattr(log, "boxes"):
-        values["flow_instance_id"] = _instances(log.boxes(index), points, identity)
+        boxes, instance = log.boxes(index), np.zeros(len(points), np.int16)  # 0 = in no box
+        for track, size, T_ego_box in zip(boxes.track_id, boxes.size, boxes.pose):
+            instance[points_in_box(points, size, T_ego_box)] = identity.setdefault(track, len(identity) + 1)
+        values["flow_instance_id"] = instance
     return values
-
-
-def _units(units: list[Any]) -> dict[str, np.ndarray]:
-    count = [len(unit.points) for unit in units]
-    return {
-        "lidar_id": np.repeat(np.arange(1, len(units) + 1, dtype=np.uint8), count),
-        "lidar_dt": np.concatenate([unit.offset_ns / 1e9 for unit in units]).astype(np.float32),
-        "lidar_center": np.stack([unit.T_ego_sensor for unit in units]).astype(np.float32),
-    }
-
-
-def _instances(boxes: Any, points: np.ndarray, identity: dict[str, int]) -> np.ndarray:
-    """Return (N,) int16 object ids, the same for a track in every sweep; 0 = in no box."""
-    instance = np.zeros(len(points), np.int16)
-    for track, size, pose in zip(boxes.track_id, boxes.size, boxes.pose):
-        instance[points_in_box(points, size, pose)] = identity.setdefault(track, len(identity) + 1)
-    return instance

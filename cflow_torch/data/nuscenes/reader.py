@@ -110,7 +110,10 @@ class NuScenesLog(Log):
             raise CFlowError(f"scene {self.log_id} in {folder} has no LiDAR {missing or ''}; it has {list(known)}")
         self._lidars = {name: known[name] for name in lidars or known}
         reference = self._lidars[self._reference if self._reference in self._lidars else next(iter(self._lidars))]
-        kept = np.flatnonzero(_is_kept(reference.is_key_frame, sweep_step))
+        # Key frames, and every `sweep_step`-th sweep counted from the last key frame.
+        row = np.arange(len(reference.times))
+        last_key = np.maximum.accumulate(np.where(reference.is_key_frame, row, 0))
+        kept = np.flatnonzero((row - last_key) % sweep_step == 0)
         self.timestamps = reference.times[kept].tolist()
         self._check_count(f"scene {self.log_id} in {folder}")
         self._poses, self._T_ego_world = reference.ego[kept], np.linalg.inv(reference.ego[kept])
@@ -124,25 +127,22 @@ class NuScenesLog(Log):
         return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000, times)
 
     def _labels(self, index: int) -> FlowLabels | None:
-        if None in map(self._tracks.at, self.timestamps[index : index + 2]):
+        time0, time1 = self.timestamps[index : index + 2]
+        if None in (self._tracks.at(time0), self._tracks.at(time1)):
             return None
         points, lag = self._cloud(index)
+        T_ego1_ego0 = self._T_ego_world[index + 1] @ self._poses[index]
         flow = np.zeros((len(points), 3), dtype=np.float32)
         category, is_valid = np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=bool)
         # A shot hits an object where its box is at that time, so the boxes of both ends are shifted by the same lag.
         slices, group = np.unique(lag // _TIME_SLICE, return_inverse=True)
         for position, middle in enumerate(slices * _TIME_SLICE + (_TIME_SLICE // 2 if lag.any() else 0)):
             rows = np.flatnonzero(group == position)
-            found = self._labels_of(points[rows], index, int(middle))
+            shift = int(np.clip(middle, self._tracks.start - time0, self._tracks.end - time1))
+            boxes0, boxes1 = self._boxes(time0 + shift, index), self._boxes(time1 + shift, index + 1)
+            found = flow_from_boxes(points[rows], boxes0, boxes1, T_ego1_ego0)
             flow[rows], category[rows], is_valid[rows] = found.flow, found.category, found.is_valid
         return FlowLabels(flow, category, is_valid)
-
-    def _labels_of(self, points: np.ndarray, index: int, lag: int) -> FlowLabels:
-        """Compute the labels of points that were measured `lag` microseconds after the time stamp of sweep `index`."""
-        time0, time1 = self.timestamps[index], self.timestamps[index + 1]
-        lag = int(np.clip(lag, self._tracks.start - time0, self._tracks.end - time1))
-        boxes0, boxes1 = self._boxes(time0 + lag, index), self._boxes(time1 + lag, index + 1)
-        return flow_from_boxes(points, boxes0, boxes1, self._T_ego_world[index + 1] @ self._poses[index])
 
     def _boxes(self, time: int, index: int) -> Boxes:
         """Return the boxes at a time in the ego frame of sweep `index`; a guessed box is renamed, so its track ends."""
@@ -223,10 +223,3 @@ def pcd_bin_points(content: bytes, file: PathLike) -> np.ndarray:
     if not (np.isfinite(ring) & (ring >= 0) & (ring < 256) & (ring == np.floor(ring))).all():
         raise CFlowError(f"{file}: column 5 is not a ring index (0 ... 255); is it a .pcd.bin of nuScenes?")
     return rows[:, :3].astype(np.float32)
-
-
-def _is_kept(is_key_frame: np.ndarray, step: int) -> np.ndarray:
-    """Return (M,) bool: key frames, and every `step`-th sweep counted from the last key frame."""
-    row = np.arange(len(is_key_frame))
-    last_key = np.maximum.accumulate(np.where(is_key_frame, row, 0))
-    return (row - last_key) % step == 0
