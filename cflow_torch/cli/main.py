@@ -153,7 +153,7 @@ def split(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def fixed_settings(overrides: list[str]) -> list[str]:
-    """Names of the settings with one value, by which the jobs of a sweep do not differ."""
+    """Return the names of the settings that have one value, so that all jobs of a sweep share it."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import OverrideParseException
 
