@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Check a GPU within minutes: equality with the CPU, speed, launches, memory. Then run `pytest -m cuda`.
+"""Check a GPU within minutes: equality with the CPU, speed, launches, memory.
 
   PYTHONPATH=. python scripts/benchmarks/gpu_check.py                      tables, and outputs/gpu_check.json
   PYTHONPATH=. python scripts/benchmarks/gpu_check.py --output FILE --skip memory
@@ -11,11 +11,10 @@ tests the script.
 from __future__ import annotations
 
 import argparse
-import json
 import platform
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Sequence
+from typing import Any, Callable, Dict, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -24,6 +23,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
 from cflow_torch.cli.bench import measure
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
 from cflow_torch.stages import stage_seconds
@@ -61,12 +61,14 @@ MEASURED: dict[str, Config] = {
     "preset default": DEFAULT,
 }
 # Prefixes of CUDA functions, because the suffixes differ from version to version.
-LAUNCHES = ("cudaLaunchKernel", "cuLaunchKernel")
-WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
-COPIES = ("cudaMemcpy", "cudaMemset")
+CALLS = {
+    "launches": ("cudaLaunchKernel", "cuLaunchKernel"),
+    "syncs": ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"),
+    "copies": ("cudaMemcpy", "cudaMemset"),
+}
 SEEDS, SWEEPS = (7, 8, 9), 6  # t + 1, t, and a history of four
 STREETS: list[Window] = []  # filled by `main`
-Rows = List[Dict[str, Any]]
+Rows = Iterator[Dict[str, Any]]
 
 
 def windows_for(config: Config, number: int) -> list[Window]:
@@ -77,39 +79,35 @@ def windows_for(config: Config, number: int) -> list[Window]:
 
 def check_equality(device: str) -> Rows:
     """Compare GPU and CPU in every variant: rows that differ in each field, the largest difference of the floats."""
-    rows = []
     for name, (config, number) in VARIANTS.items():
         results = (make_model(config, where)(windows_for(config, number)) for where in (device, "cpu"))
-        rows.append({"variant": name, **compare(*results)})
-    return rows
+        yield {"variant": name, **compare(*results)}
 
 
 def compare(results: Sequence[FlowResult], expected: Sequence[FlowResult]) -> dict[str, Any]:
     """Points, points that differ in each field, the largest difference of a float, and whether all is equal."""
     row: dict[str, Any] = {"points": sum(len(result.flow) for result in expected)}
-    row.update((field.name, 0) for field in fields(FlowResult))
     largest = 0.0
-    for name in expected[0].numpy():
-        for a, b in zip(results, expected):
-            x, y = a.numpy()[name], b.numpy()[name]
-            row[name] += int((x != y).reshape(len(y), -1).any(1).sum())
+    for a, b in zip(results, expected):
+        of_device = a.numpy()
+        for name, y in b.numpy().items():
+            x = of_device[name]
+            row[name] = row.get(name, 0) + int((x != y).reshape(len(y), -1).any(1).sum())
             if y.dtype.kind == "f":
                 largest = max(largest, float(np.abs(x - y).max(initial=0)))
-    row["largest_difference"] = largest
-    row["same"] = all(row[name] == 0 for name in EXACT) and largest <= TOLERANCE
-    return row
+    is_same = all(row[name] == 0 for name in EXACT) and largest <= TOLERANCE
+    return {**row, "largest_difference": largest, "same": is_same}
 
 
 def measure_speed(device: str) -> Rows:
     """Milliseconds of a batch and windows per second, from NumPy arrays and from tensors on the device."""
-    rows, sizes = [], (1, 8, 32) if device == "cuda" else (1, 2)
     for name, config in MEASURED.items():
         host = windows_for(config, len(STREETS))
         for kind, windows in (("arrays", host), (device, [on_device(each, device) for each in host])):
+            sizes = (1, 8, 32) if device == "cuda" else (1, 2)
             for size, found in measure(make_model(config, device), windows, 3, sizes)["batches"].items():
                 of_batch = {"ms": 1000 * found["median"], "windows/s": found["windows_per_s"]}
-                rows.append({"work": name, "input": kind, "batch": size, **of_batch})
-    return rows
+                yield {"work": name, "input": kind, "batch": size, **of_batch}
 
 
 def on_device(sweeps: Window, device: str) -> Window:
@@ -123,14 +121,12 @@ def on_device(sweeps: Window, device: str) -> Window:
 
 
 def count_launches(device: str) -> Rows:
-    """Kernel launches, waits and copies of warm batches."""
-    rows = []
+    """Kernel launches, waits and copies of warm batches; on a GPU only (tests/test_devices.py counts on a CPU)."""
     for name, config in MEASURED.items() if device == "cuda" else ():
         model = make_model(config, device)
         for size in (1, 16):
             windows = windows_for(config, size)
-            rows.append({"work": name, "batch": size, **by_profiler(lambda: model(windows))})  # noqa: B023
-    return rows or [{"work": "none: tests/test_devices.py counts on a simulated accelerator"}]
+            yield {"work": name, "batch": size, **by_profiler(lambda: model(windows))}  # noqa: B023
 
 
 def by_profiler(run: Callable[[], Any]) -> dict[str, Any]:
@@ -143,32 +139,19 @@ def by_profiler(run: Callable[[], Any]) -> dict[str, Any]:
         torch.cuda.synchronize()
     events = profiler.events() or []
     on_gpu = [e for e in events if e.device_type == torch.autograd.DeviceType.CUDA and e.name not in stages]
-    return {
-        "launches": sum(event.name.startswith(LAUNCHES) for event in events),
-        "syncs": sum(event.name.startswith(WAITS) for event in events) - 1,  # without our own
-        "copies": sum(event.name.startswith(COPIES) for event in events),
-        "gpu_ms": sum(event.time_range.elapsed_us() for event in on_gpu) / 1000,
-    }
+    counts = {kind: sum(event.name.startswith(names) for event in events) for kind, names in CALLS.items()}
+    counts["syncs"] -= 1  # our own
+    return {**counts, "gpu_ms": sum(event.time_range.elapsed_us() for event in on_gpu) / 1000}
 
 
 def measure_memory(device: str) -> Rows:
-    """Peak memory on a GPU, with and without a limit; the limit must not change the flow."""
-    rows = []
+    """Peak memory of a batch, on a CPU that of the process so far, with and without a limit."""
     size = 32 if device == "cuda" else 2
     for name, config in MEASURED.items():
-        batch = windows_for(config, size)
-        free = [result.to("cpu") for result in make_model(config, device)(batch)]
         for limit in (None, 1_000_000_000, 200_000_000):
             model = make_model(config.replace(max_memory=limit), device)
-            model(batch)  # the first run allocates caches
-            if device == "cuda":
-                torch.cuda.reset_peak_memory_stats()
-                before = torch.cuda.memory_allocated()
-            results = model(batch)
-            peak = (torch.cuda.max_memory_allocated() - before) / 1e6 if device == "cuda" else None
-            row = {"work": name, "batch": size, "max_memory_MB": limit and limit / 1e6, "peak_MB": peak}
-            rows.append({**row, "same": compare(results, free)["same"]})
-    return rows
+            peak = measure(model, windows_for(config, size), 1, [size])["peak_bytes"] or 0
+            yield {"work": name, "batch": size, "max_memory_MB": limit and limit / 1e6, "peak_MB": peak / 1e6}
 
 
 PARTS: dict[str, Callable[[str], Rows]] = {
@@ -189,22 +172,17 @@ def main() -> None:
     STREETS.extend(window(make_drive(seed=seed, num_sweeps=SWEEPS), SWEEPS - 2, SWEEPS - 2) for seed in SEEDS)
     name = torch.cuda.get_device_name() if given.device == "cuda" else "no GPU: the CPU is compared with itself"
     report: dict[str, Any] = {"device": name, "platform": platform.platform(), "torch": torch.__version__}
-    print(json.dumps(report))
+    print(report)
     wrong: list[str] = []
-    for title, part in PARTS.items():
-        if title in given.skip:
-            continue
+    for title in (title for title in PARTS if title not in given.skip):
         try:
-            rows = report[title] = part(given.device)
+            rows = report[title] = list(PARTS[title](given.device))
         except Exception as error:  # go on with the other parts
-            report[title] = f"{type(error).__name__}: {error}"
-            print(f"\n## {title}: {report[title]}")
-            wrong.append(title)
-            continue
+            rows, report[title] = [], f"{type(error).__name__}: {error}"
+            wrong.append(f"{title}: {report[title]}")
         print(f"\n## {title}\n\n{markdown(rows)}", flush=True)
-        wrong += [f"{title}: {next(iter(row.values()))}" for row in rows if not row.get("same", True)]
-        given.output.parent.mkdir(parents=True, exist_ok=True)
-        given.output.write_text(json.dumps(report, indent=1) + "\n")
+        wrong += [f"{title}: {row['variant']}" for row in rows if not row.get("same", True)]
+        write_json(given.output, report)
     if wrong:
         raise SystemExit("wrong: " + "; ".join(wrong))
 
