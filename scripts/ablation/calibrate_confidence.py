@@ -109,28 +109,28 @@ def calibration_error(sums: np.ndarray, dynamic: bool) -> float:
     return float(gaps.sum() / max(points.sum(), 1))
 
 
-def sparsification(sums: np.ndarray, dynamic: bool) -> list[float]:
-    """Mean error after each of the shares `DROPPED` is dropped. Ties: dropped proportionally."""
+def least_trusted(points: np.ndarray, share: float) -> np.ndarray:
+    """(C,) share of each bin that is among the least trusted `share` of the points (C,). Ties: proportional."""
     order = np.argsort(confidence.TABLE["probabilities"], kind="stable")
-    points, error = sums[order, DYNAMIC], sums[order, DYNAMIC_ERROR]
+    before = np.cumsum(points[order]) - points[order]
+    taken = np.empty(len(points))
+    taken[order] = np.clip((share * points.sum() - before) / np.maximum(points[order], 1), 0, 1)
+    return taken
+
+
+def sparsification(sums: np.ndarray, dynamic: bool) -> list[float]:
+    """Mean error after each of the shares `DROPPED` is dropped."""
+    points, error = sums[:, DYNAMIC], sums[:, DYNAMIC_ERROR]
     if not dynamic:
-        points, error = sums[order, POINTS] - points, sums[order, ERROR] - error
-    mean = error / np.maximum(points, 1)
-    before = np.concatenate(([0.0], np.cumsum(points)[:-1]))
-    result = []
-    for share in DROPPED:
-        left = np.clip(before + points - share * points.sum(), 0, points)
-        result.append(float((mean * left).sum() / max(left.sum(), 1)))
-    return result
+        points, error = sums[:, POINTS] - points, sums[:, ERROR] - error
+    kept = [1 - least_trusted(points, share) for share in DROPPED]
+    return [float((error * left).sum() / max((points * left).sum(), 1)) for left in kept]
 
 
 def share_of_missed_found(sums: np.ndarray) -> float:
     """Share of the missed points among the least trusted ones that hold `FALSE_ALARMS` of the static points."""
-    order = np.argsort(confidence.TABLE["probabilities"], kind="stable")
-    missed, static = sums[order, MISSED], sums[order, POINTS] - sums[order, DYNAMIC]
-    before = np.concatenate(([0.0], np.cumsum(static)[:-1]))
-    taken = np.clip((FALSE_ALARMS * static.sum() - before) / np.maximum(static, 1), 0, 1)
-    return float((missed * taken).sum() / max(missed.sum(), 1))
+    taken = least_trusted(sums[:, POINTS] - sums[:, DYNAMIC], FALSE_ALARMS)
+    return float((sums[:, MISSED] * taken).sum() / max(sums[:, MISSED].sum(), 1))
 
 
 def main() -> None:

@@ -29,6 +29,7 @@ from PIL import Image
 from cflow_torch import Sweep, make_config, make_model
 from cflow_torch.data.catalog import GroundSegmentedLog, LogWrapper
 from cflow_torch.data.log import window
+from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.viz import plot_flow
 
@@ -67,8 +68,9 @@ def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: d
     def attempt(staged: Staged) -> Attempt:
         config, drive = make_config(preset, **overrides), staged.drive
         (result,) = make_model(config)([window(of(drive), PAIR, config.num_history, config.num_future)])
-        residual, is_scored = result.flow.numpy() - _pose_flow(drive), np.isin(body_of(drive), list(staged.bodies))
-        error = np.linalg.norm(residual - _truth(drive), axis=1)[is_scored].mean()
+        is_scored = np.isin(body_of(drive), list(staged.bodies))
+        residual, truth = (residual_of(flow, drive) for flow in (result.flow.numpy(), drive.labels(PAIR).flow))
+        error = np.linalg.norm(residual - truth, axis=1)[is_scored].mean()
         confidence = math.nan if result.confidence is None else result.confidence.numpy()[is_scored].mean()
         return Attempt(described, residual, float(error), float(confidence))
 
@@ -92,35 +94,26 @@ class WithoutMasks(LogWrapper):
         return replace(self.log.sweep(index), is_ground=None)
 
 
-_DEFAULT = (by("default"),)
-_PAPER_AND_DEFAULT = (by("paper"), by("default"))
-_HISTORY_OR_NOT = (by("default"), by("default", num_history=0))
+_DEFAULT, _PAIR = (by("default"),), by("default", num_history=0)
+_PAPER_AND_DEFAULT = (by("paper"), *_DEFAULT)
+_GROUND_LEFT_IN = by("default", "`default`, ground=None", WithoutMasks)
+_GROUND_FOUND = by("default", "`default`, ground='auto'", lambda drive: GroundSegmentedLog(WithoutMasks(drive)))
+_WRONG_FRAME = by("default", "`default`, wrong frame", MisplacedPoses)
 # The drive, the settings (the first one fails), and the seed of the picture.
 CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] = {
     "long_side": (drives.tram, [by(p, num_history=h) for p, h in (("default", 0), ("offline", 0), ("default", 4))], 0),
     "rail": (drives.rail, _PAPER_AND_DEFAULT, 0),
     "bridge": (drives.bridge, _DEFAULT, 0),
     "gantry": (drives.gantry, _DEFAULT, None),
-    "crowd": (drives.crowd, _HISTORY_OR_NOT, None),
+    "crowd": (drives.crowd, (*_DEFAULT, _PAIR), None),
     "touching": (drives.touching, _PAPER_AND_DEFAULT, 0),
-    "turning": (drives.turning, (by("paper", num_history=4), *_HISTORY_OR_NOT), 4),
+    "turning": (drives.turning, (by("paper", num_history=4), *_DEFAULT, _PAIR), 4),
     "abreast": (drives.abreast, _DEFAULT, None),
     "vertical": (drives.vertical, [by("paper", num_history=4, sectional_view=on) for on in (False, True)], None),
     "fast": (drives.fast, (by("default", max_speed=40), by("default")), 2),
     "beyond_region": (drives.far, (by("default"), by("default", "`default`, ±100 m", point_cloud_range=WIDE)), None),
-    "ground_left_in": (
-        drives.street,
-        (
-            by("default", "`default`, ground=None", WithoutMasks),
-            by("default", "`default`, ground='auto'", lambda drive: GroundSegmentedLog(WithoutMasks(drive))),
-        ),
-        1,
-    ),
-    "wrong_frame": (
-        drives.turn,
-        (by("default", "`default`, wrong frame", MisplacedPoses), by("default", "`default`, right frame")),
-        0,
-    ),
+    "ground_left_in": (drives.street, (_GROUND_LEFT_IN, _GROUND_FOUND), 1),
+    "wrong_frame": (drives.turn, (_WRONG_FRAME, by("default", "`default`, right frame")), 0),
     "appearing": (drives.appearing, (by("default"), by("offline")), 0),
     "appeared": (partial(drives.appearing, later=4), _DEFAULT, None),
     "rolling_shutter": (drives.rolling_shutter, _DEFAULT, None),
@@ -132,18 +125,14 @@ def make_case(name: str, seed: int) -> Case:
     """Simulate a drive, and estimate the flow of its pair with each setting."""
     stage, settings, _ = CASES[name]
     staged = stage(seed)
-    return Case(staged, _truth(staged.drive), [setting(staged) for setting in settings])
+    truth = residual_of(staged.drive.labels(PAIR).flow, staged.drive)
+    return Case(staged, truth, [setting(staged) for setting in settings])
 
 
-def _truth(drive: Drive) -> np.ndarray:
-    return drive.labels(PAIR).flow - _pose_flow(drive)
-
-
-def _pose_flow(drive: Drive) -> np.ndarray:
-    """(N, 3) true flow of ego motion alone, PAIR -> PAIR + 1."""
-    points = drive.sweep(PAIR).points.astype(np.float64)
-    T = np.linalg.inv(drive.poses[PAIR + 1]) @ drive.poses[PAIR]
-    return points @ T[:3, :3].T + T[:3, 3] - points
+def residual_of(flow: np.ndarray, drive: Drive) -> np.ndarray:
+    """(N, 3) total flow of the scored pair minus that of the true ego motion, metres per sweep."""
+    T_ego1_ego0 = np.linalg.inv(drive.poses[PAIR + 1]) @ drive.poses[PAIR]
+    return flow - ego_motion_flow(drive.sweep(PAIR).points, T_ego1_ego0)
 
 
 def draw(case: Case) -> Image.Image:

@@ -8,7 +8,6 @@ NAME.md has all methods. Missing runs are "-" in the tables, and are listed on t
 from __future__ import annotations
 
 import csv
-import io
 import math
 import sys
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any, List
 
 from results import CLASSES, METHODS, RANGES, Ours, Runs, load_paper, load_runs, protocol, range_errors
 
-from cflow_torch.data.atomic import atomic_file, write_text
+from cflow_torch.data.atomic import atomic_name, write_text
 
 PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets, not classes
 INTRODUCTION = """# The paper's tables next to ours
@@ -129,13 +128,6 @@ def markdown(cells: Cells) -> str:
     return "".join("| " + " | ".join(row) + " |\n" for row in (cells[0], rule, *cells[1:]))
 
 
-def comma_separated(cells: Cells) -> str:
-    """The table as CSV."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(cells)
-    return text.getvalue()
-
-
 def write_pages(results: Path, output: Path) -> None:
     """Write OUTPUT.md, and its tables and figures to the folder OUTPUT, from results.json files at any depth."""
     paper = load_paper()
@@ -145,35 +137,32 @@ def write_pages(results: Path, output: Path) -> None:
     except ImportError as error:
         draw = None
         remarks.append(f"no pictures: {error}")
-    page: list[str] = [INTRODUCTION]
-    last_described: list[str] = []
+    page, last_described = [INTRODUCTION], []
     for name, about in paper.items():
         ours = runs.get(name, {})
         cells = (set_cells if name in PER_SET else class_cells)(about, ours)
         write_text(output / f"{name}.md", markdown(cells))
-        write_text(output / f"{name}.csv", comma_separated(cells))
+        with atomic_name(output / f"{name}.csv") as temporary, temporary.open(
+            "w", encoding="utf-8", newline=""
+        ) as file:
+            csv.writer(file, lineterminator="\n").writerows(cells)
         is_figure = "at" in about
-        shown = cells
-        if name in PER_SET:
-            kept = [column for column, name in enumerate(cells[0]) if column < 2 or name in METHODS.values()]
-            shown = [[row[column] for column in kept] for row in cells]
-        elif is_figure:
-            shown = mean_cells(cells)
-        else:
-            shown = [[*row[:2], *row[-2:]] for row in cells]
-        page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
         described = about_runs(ours)
         notes = [] if described == last_described else list(described)
         notes += [about["note"]] if "note" in about else []
         last_described = described or last_described
         if name in PER_SET:
-            if name == PER_SET[0]:
-                notes.append(ABOUT_OTHERS)
+            kept = [column for column, name in enumerate(cells[0]) if column < 2 or name in METHODS.values()]
+            shown = [[row[column] for column in kept] for row in cells]
+            notes += [ABOUT_OTHERS] if name == PER_SET[0] else []
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
+        else:
+            shown = mean_cells(cells) if is_figure else [[*row[:2], *row[-2:]] for row in cells]
+        page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
         page += [*(f"- {line}" for line in notes), ""] if notes else []
         if draw is not None and is_figure:
-            with atomic_file(output / f"{name}.png") as stream:
-                draw(name, about, ours).savefig(stream, format="png", dpi=130)
+            with atomic_name(output / f"{name}.png") as temporary:
+                draw(name, about, ours).savefig(temporary, format="png", dpi=130)
             page += [f"![{about['title']}]({output.name}/{name}.png)", ""]
     missing = missing_runs(paper, runs)
     for title, lines in (("Missing runs", missing), ("Remarks", remarks)):
