@@ -43,11 +43,9 @@ class Motion:
         return out
 
     def residual_flow(self, points: slice, positions: Tensor) -> Tensor:
-        """(K, 3) float32 flow of some points.
+        """(K, 3) float32 flow of a slice of points, at positions (A, K) float64, metres, frame of t+1.
 
-        Args:
-            points: slice of the batch.
-            positions: (A, K) float64, metres, frame of t+1; used by methods whose clusters rotate.
+        Methods whose clusters rotate use the positions.
         """
         cluster = self.cluster(points)
         if self.before is None:

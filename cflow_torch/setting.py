@@ -27,16 +27,11 @@ def setting(
     high: float = math.inf,
     choices: tuple[Any, ...] = (),
 ) -> Any:
-    """A field of a `Config`.
+    """A field of a `Config` with its default value, its meaning and unit, and its bounds.
 
-    Args:
-        default: its default value.
-        help: its meaning and unit.
-        kind: int, float, bool, str or tuple (of floats); None = the type of the default.
-        optional: None is a value as well.
-        low, high: smallest and largest value, both allowed.
-        above: largest value that is not allowed.
-        choices: all values, if they can be listed.
+    The `kind` is int, float, bool, str or tuple (of floats); None = the type of the default. With `optional`, None is a
+    value as well. `low` and `high` are the smallest and the largest value, both allowed; `above` is the largest value
+    that is not. `choices` are all values, if they can be listed.
     """
     limits = {"kind": kind or type(default), "optional": optional, "low": low, "above": above, "high": high}
     return field(default=default, metadata={"help": help, "choices": choices, **limits})

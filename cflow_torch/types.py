@@ -33,14 +33,10 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
 
 
 def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str, wanted: str) -> None:
-    """Check the type, shape and dtype of a dense array or tensor.
+    """Check the type, shape (None = any length) and dtype of a dense array or tensor.
 
-    Args:
-        array: anything.
-        name: in the message.
-        shape: None = any length.
-        kinds: allowed kinds of dtypes, of "b" bool, "iu" integers, "f" floats.
-        wanted: what to give, for the message.
+    The allowed `kinds` of dtypes are some of "b" bool, "iu" integers, "f" floats. The message has the name and what is
+    `wanted`.
     """
     if not isinstance(array, (np.ndarray, Tensor)):
         raise CFlowError(f"{name} is {type(array).__name__}: give {wanted}, a NumPy array or a torch tensor")

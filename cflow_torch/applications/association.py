@@ -53,9 +53,8 @@ def divide(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
 def settle(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
     """Take a moving group as static if it is a small piece of a confirmed object that has stopped.
 
-    While the vehicle passes a stopped object, its visible outline changes, and a piece of it seems to move. We take a
-    group for such a piece if the box of the object holds most of its points, and static points in a larger number.
-    Otherwise the track would follow the piece.
+    While the vehicle passes a stopped object, its outline changes, and a piece of it seems to move; the track would
+    follow the piece. It is such a piece if the object's box holds most of its points, and more static points.
     """
     known = tracks.is_confirmed.nonzero()[:, 0]
     box = box_of_point(groups.point, tracks.box[known], tracks.size[known] + _MARGIN, tracks.heading[known])
@@ -101,19 +100,11 @@ def link_in_voxels(
 ) -> tuple[Tensor, Tensor]:
     """Match groups of two sweeps that share voxels, one to one.
 
-    Args:
-        points0: (N0, 3) float64, metres: points of the earlier groups, moved to where they should be now.
-        group0: (N0,) int64, group of each, from 0.
-        points1, group1: (N1, 3) and (N1,), the groups of the current sweep, in the same frame.
-        min_share: least overlap of a match: common voxels over the voxels of either group (intersection over union).
-        side: of a voxel, metres.
+    Each group (N,) int64, from 0, has points (N, 3) float64 in metres; those of the earlier sweep are where they should
+    be now. `min_share` is the least overlap of a match: common voxels over the voxels of either group (intersection
+    over union). The side of a voxel is in metres. Returns (K,) int64 earlier groups and (K,) int64 current ones.
 
-    Returns:
-        (K,) int64 earlier groups and (K,) int64 current groups.
-
-    Convention:
-        Greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
-
+    Convention: greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
     Cost: three sorts of the points, and as many rounds as it takes to match all groups, mostly two or three.
     """
     voxel0, voxel1 = _voxels(points0, points1, side)

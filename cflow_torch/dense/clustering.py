@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import ClusteringConfig
+from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.dense.components import PixelIndices, components_by_size
-from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.ops.indices import flat_nonzero, floor_divide, gather, lazy_empty, renumber, split_index
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.segments import segment_minmax
@@ -39,9 +39,7 @@ class Clusters:
 def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Clusters, Tensor, Tensor]:
     """Aggregate the sweeps of each window, dilate, label, split oversized components, drop those that cannot move.
 
-    Args:
-        sweeps: images of B windows of S sweeps.
-        config: `connectivity`, `max_extent` (d^max), `labeling`, whose engines return identical clusters.
+    All engines of `labeling` return identical clusters.
 
     Returns:
         clusters: M clusters, which never join across windows (Alg. clustering).

@@ -1,17 +1,61 @@
-"""Coarse to fine (the paper's multi-scale strategy): estimate, warp the points by the flow so far, refine."""
+"""Coarse to fine (the paper's multi-scale strategy): warp the sweeps by the flow so far, project, estimate, repeat."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from cflow_torch.dense.projection import ProjectedSweeps, project
 from cflow_torch.model import Motion, SceneFlowModel
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.stages import stage
+from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
+
+
+@dataclass(frozen=True)
+class ProjectedSweeps:
+    """Occupancy images of all sweeps of all windows."""
+
+    batch: Batch  # points of all windows
+    grid: Grid  # pixels of the bird's-eye view
+    # (A, P) float64, metres per sweep interval, flow so far of every point before t+1. None = no flow yet.
+    flow: Tensor | None
+    occupancy: Tensor  # (B, S, H, W) bool; index 0 of S is sweep t+1
+    pixel: Tensor  # (P,) int64, flat index into `occupancy`; its size for ignored points
+
+    def positions(self) -> Tensor:
+        """(A, P) float64, metres, frame of t+1: the warped positions of all points."""
+        if self.flow is None:
+            return self.batch.positions
+        before = slice(self.batch.num_newest, None)
+        return torch.cat((self.batch.positions[:, : before.start], _warp(self.batch, self.flow, before)), 1)
+
+
+def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
+    """Warp every sweep m by (t+1-m) times its flow so far and draw it (Eq. 3d_to_bev); `flow` as in `ProjectedSweeps`.
+
+    Points that are warped out of the region are ignored at this scale.
+    """
+    num_images, num_points = batch.num_windows * batch.num_steps, len(batch.image)
+    pixel = torch.empty(num_points, dtype=torch.int64, device=batch.image.device)
+    for points in chunks(0, batch.num_newest, pixel.device):
+        pixel[points] = grid.pixel_of_image(batch.positions[:, points], batch.image[points], num_images)
+    for points in chunks(batch.num_newest, num_points, pixel.device):
+        positions, is_active = batch.positions[:, points], batch.is_active[points]
+        if flow is not None:
+            positions = _warp(batch, flow, points)
+            is_active = grid.contains(positions).logical_and_(is_active)
+        pixel[points] = grid.pixel_of_image(positions, batch.image[points], num_images, is_active)
+    occupancy = grid.draw(pixel, num_images).unflatten(0, (batch.num_windows, batch.num_steps))
+    return ProjectedSweeps(batch, grid, flow, occupancy, pixel)
+
+
+def _warp(batch: Batch, flow: Tensor, points: slice) -> Tensor:
+    """(A, K) float64, metres: points before t+1, each moved by the flow so far times its interval to t+1."""
+    intervals = batch.elapsed.flatten().index_select(0, batch.image[points])
+    return (flow[:, points] * intervals).add_(batch.positions[:, points])
 
 
 class CoarseToFine(SceneFlowModel):

@@ -28,14 +28,8 @@ class PixelIndices:
 def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: ClusteringConfig) -> Tensor:
     """Label the components of dilated images; erode and label again those that are too long (Alg. clustering).
 
-    Args:
-        image: (B, H, W) bool.
-        pixels: (P,) int64, flat indices of the set pixels, ascending.
-        pixel_size: s, metres.
-        config: `connectivity`, `max_extent` (d^max), `labeling`.
-
-    Returns:
-        (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
+    The images are (B, H, W) bool, and `pixels` (P,) int64 are the flat indices of their set pixels, ascending. Returns
+    (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
     """
     _, height, width = image.shape
     padded = pad([image])

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters
+from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.dense.packing import Packing, Search, pack
-from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.cross_correlation import cross_correlate
@@ -66,13 +66,10 @@ def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) 
 
 
 def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | None = None) -> tuple[Tensor, Tensor]:
-    """Find the shift of each template that maximises the normalised cross-correlation with its target.
+    """Find the shift of each of J templates that maximises the normalised cross-correlation with its target.
 
-    Args:
-        pairs: J pairs.
-        engine: "fft" or "conv"; the result is identical.
-        max_memory: bytes of working memory to plan with. We process the pairs in runs that fit; the result is
-            identical. None = no limit.
+    The result is identical for the engines "fft" and "conv", and for any `max_memory`, bytes of working memory to plan
+    with; None = no limit.
 
     Returns:
         shift: (J, 2) int64, (dy, dx), pixels.
@@ -154,13 +151,8 @@ def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor
     """Find the shifts that may be the best of their pair: (4, K) int64, packed pair, dy, dx, count.
 
     The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
-    count^2 / target energy and count. A shift whose count is below the largest of these lower bounds cannot win.
-
-    Args:
-        run: counts; samples outside the search range are ignored.
-        search: search range of each packed pair.
-        target_energy: (J,) int64, pixels of each pair's target.
-        radius: (J,) float64, pixels; None = no limit.
+    count^2 / target energy and count. A shift whose count is below the largest of these lower bounds cannot win. The
+    target energies (J,) int64 and the radius (J,) float64, None = no limit, are in pixels.
     """
     low, high, stride = search.low[:, run.pairs], search.high[:, run.pairs], search.stride[run.pairs]
     searched = search.searched[run.pairs]
@@ -193,14 +185,9 @@ def _best_of_each_pair(
 ) -> Tensor:
     """Choose the best candidate of each pair: (4, J) int64, dy, dx, count, energy, all 0 for a pair without candidates.
 
-    Args:
-        windows: the targets. The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels
-            under the H x W window at that shift.
-        pair, target, count: (K,) int64, of each candidate. Those of a pair are in order of dy, then of dx.
-        shift: (2, K) int64, dy and dx of each candidate.
-        num_pairs: J.
-
-    Convention: ties as in `best_shifts`.
+    The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels under the H x W window at
+    that shift. The pair, target, count (K,) and shift (2, K) of each candidate are int64. Those of a pair are in order
+    of dy, then of dx. Ties: as in `best_shifts`.
     """
     # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
     parts = [windows.bounds(target[some], shift[:, some]) for some in chunks(0, len(pair), pair.device, 16)]

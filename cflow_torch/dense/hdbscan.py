@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters, Pixels
-from cflow_torch.dense.projection import ProjectedSweeps
+from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.errors import import_optional
 from cflow_torch.ops.indices import renumber
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
@@ -18,12 +18,10 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
     """Cluster the points of all sweeps of each window (t+1, t, t-1, ...) by HDBSCAN on x, y, z.
 
     Returns:
-        clusters: M clusters, each with pixels at t+1 and before. Unlike components, clusters may share pixels.
+        clusters: M clusters, each with pixels at t+1 and before, in order of window, then of first pixel in raster
+            order, then of HDBSCAN's label. Unlike components, clusters may share pixels.
         cluster_of_cell: (P,) int64, cluster of each point, M = none (HDBSCAN's noise included).
         cell_of_point: (P,) int64, 0 ... P - 1: every point is a cell of its own.
-
-    Convention:
-        Clusters are in order of window, then of first pixel in raster order, then of HDBSCAN's label.
 
     Cost: N log N in points, on the CPU, window by window; seconds for a full pair of sweeps.
     """

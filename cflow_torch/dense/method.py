@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch.nn.functional as F
 
 from cflow_torch.dense.clustering import find_clusters
-from cflow_torch.dense.coarse_to_fine import CoarseToFine
+from cflow_torch.dense.coarse_to_fine import CoarseToFine, ProjectedSweeps
 from cflow_torch.dense.correlation import correlate
 from cflow_torch.dense.hdbscan import find_dense_clusters
 from cflow_torch.dense.history import pool
-from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.dense.sectional_view import add_sectional_view
 from cflow_torch.model import Motion
 from cflow_torch.ops.indices import index_in_group

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import DenseConfig
+from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.dense.correlation import Estimates, best_shifts
-from cflow_torch.dense.projection import ProjectedSweeps
 from cflow_torch.dense.templates import Images, TemplatePairs
 from cflow_torch.ops.indices import concat_ranges, renumber
 from cflow_torch.ops.segments import bounding_boxes

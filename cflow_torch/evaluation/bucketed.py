@@ -91,10 +91,8 @@ class BucketedEPE(BucketedByRange):
 
     Let e and v be the mean end-point error and the mean true speed of all points of a class in a bucket, over all
     frames. `static_epe` is e of the first bucket, in metres. `dynamic_error` is the mean of e / v over the other
-    buckets that have points, each bucket with the same weight. It is exactly 1 if every residual is predicted as 0.
-
-    Convention: a bucket contains its lower edge, not its upper one. Classes without points are NaN and are not part of
-    the mean over classes.
+    buckets that have points. It is exactly 1 if every residual is predicted as 0. A bucket contains its lower edge, not
+    its upper one. Classes without points are NaN and are not part of the mean over classes.
     """
 
     def __init__(self, definition: Definition) -> None:

@@ -31,14 +31,9 @@ class DenseShift:
 def densify(
     images: Tensor, matched: Tensor, matches: Matches, pixel_size: float, config: KeypointsConfig
 ) -> DenseShift:
-    """Find the shift of every occupied pixel of sweep t.
+    """Find the shift of every occupied pixel of sweep t, whose images are (B, H, W) bool.
 
-    Args:
-        images: (B, H, W) bool, occupancy of sweep t.
-        matched: (M,) int64, flat indices into `images` of the matched key points, ascending.
-        matches: shift and score of each matched key point.
-        pixel_size: s, metres.
-        config: `densify`, `connectivity`, `labeling`, `max_extent`.
+    `matched` (M,) int64 are flat indices into the images of the key points that have `matches`, ascending.
 
     Returns:
         With "components", a group is a connected component of the image. Its shift is the median of dy and the median

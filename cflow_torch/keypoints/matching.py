@@ -46,11 +46,9 @@ class Matches:
 def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> Matches:
     """Find the best match of every key point of t and apply the ratio test (Eq. descriptor_ncc, best_match).
 
-    `reach` is (B,) float64, pixels, the longest distance of a match in each window.
-
-    Convention:
-        Scores are compared exactly, as count^2 / energy of the candidate. A match is accepted if R > rho R' holds in
-        integers for the second best R'. Ties: rejected. A match without a second candidate is accepted.
+    `reach` is (B,) float64, pixels, the longest distance of a match in each window. Scores are compared exactly, as
+    count^2 / energy of the candidate. A match is accepted if R > rho R' holds in integers for the second best R'. Ties:
+    rejected. A match without a second candidate is accepted.
 
     Cost: time (key points x match candidates) x L^2; memory a fixed number of pairs, plus L^2 bytes a point.
     """
@@ -93,12 +91,10 @@ def _shift(pc0: KeyPoints, pc1: KeyPoints, source: Tensor, target: Tensor) -> tu
 def _contenders(
     source: KeyPoints, target: KeyPoints, reach: Tensor, share: float, num_pairs: int
 ) -> Iterator[tuple[Tensor, ...]]:
-    """Find the pairs that come near the best of their key point; all pairs of a key point of `source` at once.
+    """Yield pairs of key points of `source` and `target`, and their counts, (N,) int64 each.
 
-    A pair is found if its count^2 / energy is at least `share` of the best one of its `source`.
-
-    Yields:
-        Key points of `source`, of `target` and counts, (N,) int64 each.
+    These are the pairs whose count^2 / energy is at least `share` of the best one of its `source`. All pairs of a key
+    point of `source` come at once.
     """
     if source.row.numel() == 0 or target.row.numel() == 0:
         return

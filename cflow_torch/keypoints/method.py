@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 
-from cflow_torch.dense.coarse_to_fine import CoarseToFine
-from cflow_torch.dense.projection import ProjectedSweeps
+from cflow_torch.dense.coarse_to_fine import CoarseToFine, ProjectedSweeps
 from cflow_torch.keypoints.densify import densify
 from cflow_torch.keypoints.descriptors import describe
 from cflow_torch.keypoints.match_candidates import match_radius

@@ -22,19 +22,12 @@ _SHORTEST = 2  # hundredths of a second; viewers slow down a .gif with shorter f
 
 @dataclass(frozen=True)
 class Frame:
-    """One pair of an animation.
+    """One pair of an animation."""
 
-    Args:
-        points: (N, 3+), metres, ego frame of sweep t.
-        result: flow of these points. Only the residual flow and the clusters are drawn.
-        is_ground: (N,) bool; None = no point is ground.
-        title: one line above the picture.
-    """
-
-    points: Array
-    result: FlowResult
-    is_ground: Array | None = None
-    title: str | None = None
+    points: Array  # (N, 3+), metres, ego frame of sweep t
+    result: FlowResult  # flow of these points; only the residual flow and the clusters are drawn
+    is_ground: Array | None = None  # (N,) bool; None = no point is ground
+    title: str | None = None  # one line above the picture
 
 
 def flow_figures(
@@ -49,9 +42,8 @@ def flow_figures(
 
     Args:
         frames: at least one pair, in order.
-        point_cloud_range: as for `plot_flow`; open sides end where the points of all frames end.
+        point_cloud_range, legend: as for `plot_flow`; open sides end where the points of all frames end.
         max_flow: residual flow at the rim of the colour wheel, metres per sweep; None = the longest of all frames.
-        legend: corner of the colour wheel, see `plot_flow`.
         width: of a picture, pixels, 200 ... 4000.
     """
     if not 200 <= width <= 4000:

@@ -71,12 +71,8 @@ def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Seq
     """Choose a colour for each cluster, so that neighbours differ: (N, 3) uint8 RGB.
 
     The largest cluster is coloured first. Each cluster gets the colour of `PALETTE` whose nearest cluster is farthest
-    away, measured between bounding boxes. Ties: the colour that fewest clusters have.
-
-    Args:
-        position: (N, 2+) float64, metres, finite; x and y count.
-        cluster_id: (N,) integers, negative = in no cluster.
-        no_cluster: RGB, 0 ... 255, of points in no cluster.
+    away, measured between bounding boxes in x and y. Ties: the colour that fewest clusters have. Positions (N, 2+) are
+    finite metres. Negative ids (N,) are points in no cluster, which get the colour `no_cluster`, 0 ... 255.
 
     Cost: quadratic in the number of clusters, about 0.1 s for a thousand.
     """

@@ -35,12 +35,9 @@ def new_figure(
 ) -> tuple[Figure, list[Axes]]:
     """Create a figure with one framed panel per name, in a row, and range rings around the ego vehicle.
 
-    Args:
-        names: headings of the panels, "" = none.
-        view: (2, 2) float64, metres, low and high corner (x, y). A view that is too long and thin for a panel gets
-            empty space along its long sides.
-        title: heading of the figure, None = none.
-        caption: one line below the panels that explains the colours. The distance of the rings is added.
+    "" is a panel without a heading. The view is (2, 2) float64 metres, low and high corner (x, y); one that is too long
+    and thin for a panel gets empty space along its long sides. The caption is one line below the panels that explains
+    the colours; the distance of the rings is added.
     """
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
@@ -133,12 +130,9 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
 
 
 def group_medians(group: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Median of each column of (N, C) values within each group (N,), negative = in no group.
+    """Numbers (G,) of groups, medians (G, C) and rows (G,) of (N, C) values within each group (N,), negative = in none.
 
-    Returns:
-        number: (G,) int64, the groups, ascending.
-        median: (G, C) float64, the upper one of an even count.
-        count: (G,) int64, rows of each group.
+    Groups are in ascending order. The median of an even count is the upper one.
     """
     values, group = values[group >= 0], group[group >= 0]
     number, start, count = np.unique(np.sort(group), return_index=True, return_counts=True)

@@ -57,12 +57,9 @@ class Scene:
         )
 
     def arrows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Motion of each cluster with enough moving points.
+        """Ids (A,), ascending, of clusters with enough moving points, and medians of these points, (A, 3) float64 each.
 
-        Returns:
-            cluster_id: (A,) int64, ascending.
-            start: (A, 3) float64, metres, median of its moving points.
-            flow: (A, 3) float64, metres per sweep, median of their residual flow.
+        The medians are of the position, metres, and of the residual flow, metres per sweep.
         """
         moving = ~self.is_ground & (np.linalg.norm(self.residual, axis=1) > MOVING)
         columns = np.concatenate([self.position[moving], self.residual[moving]], axis=1)

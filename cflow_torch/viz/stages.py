@@ -18,8 +18,8 @@ from torch import Tensor
 
 from cflow_torch.config import Config, DenseConfig, KeypointsConfig
 from cflow_torch.dense.clustering import find_clusters
+from cflow_torch.dense.coarse_to_fine import ProjectedSweeps, project
 from cflow_torch.dense.correlation import best_shifts
-from cflow_torch.dense.projection import ProjectedSweeps, project
 from cflow_torch.dense.templates import Images, make_pairs
 from cflow_torch.estimate import make_model
 from cflow_torch.keypoints.descriptors import describe

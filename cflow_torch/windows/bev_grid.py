@@ -87,18 +87,11 @@ class Grid:
     def pixel_of_image(
         self, positions: Tensor, image: Tensor, num_images: int, is_active: Tensor | None = None
     ) -> Tensor:
-        """Pixel of every point in a stack of images.
+        """(N,) int32 pixel of every point in a stack of images, int64 where int32 is too small.
 
-        Args:
-            positions: (2, N) or (3, N) float64, metres, frame of t+1.
-            image: (N,) int32 or int64, image of each point.
-            num_images: B.
-            is_active: (N,) bool, False = leave the point out; it must be False outside the region. None = all points
-                are active and inside.
-
-        Returns:
-            (N,) int32, or int64 where int32 is too small: flat index into B x H x W pixels; B * H * W for points that
-            are left out.
+        It is the flat index into B x H x W pixels, and B * H * W for points that `is_active` (N,) bool leaves out,
+        which must be False outside the region; None = all points are active and inside. Positions are (2, N) or (3, N)
+        float64 metres, frame of t+1, and the image of each point is (N,) int32 or int64.
         """
         num_pixels = num_images * self.height * self.width
         pixel = self.pixel(positions)

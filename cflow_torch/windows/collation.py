@@ -56,12 +56,10 @@ class Batch:
         return replace(self, num_windows=2 * self.num_windows, elapsed=elapsed, seconds=seconds, origin=origin)
 
     def split_past_and_future(self) -> tuple[Batch, Tensor]:
-        """Give the sweeps after t+1 windows of their own.
+        """Give the sweeps after t+1 windows of their own; also return the points that have copies, (K,) int64.
 
-        Returns:
-            A batch of 2 B windows: window w has the sweeps up to t+1, window B + w has t+1, t and the sweeps after t+1.
-            Its points are those of this batch, then copies of all points of t+1 and t for the windows B ... 2 B - 1.
-            Second, the points that have copies, (K,) int64.
+        Of the 2 B windows, window w has the sweeps up to t+1, and window B + w has t+1, t and the sweeps after t+1. The
+        points are those of this batch, then copies of all points of t+1 and t for the windows B ... 2 B - 1.
         """
         num_future = int((self.elapsed < 0).any(0).sum())
         num_past = self.num_steps - num_future
@@ -111,16 +109,11 @@ def make_batch(
 
     Args:
         windows: B windows, at least one.
-        config: `ego_box`, `sweep_interval`, `point_cloud_range`, `num_history` and `num_future` are used. If a
-            history is longer, its nearest sweeps are used.
+        config: of a method. If a history is longer, its nearest sweeps are used.
         grid: the images of any scale; they contain the region.
         device: device of the batch.
         num_axes: coordinates to keep, 2 or 3.
-        needs_ground: keep the heights of the ground as well.
-        needs_times: keep the times of the points as well.
-
-    Returns:
-        The batch.
+        needs_ground, needs_times: keep the heights of the ground, the times of the points as well.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, tensors on several devices, poses for some

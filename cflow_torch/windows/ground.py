@@ -67,9 +67,7 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
 def find_ground_batch(
     clouds: Sequence[Array], method: str = "grid", threshold: float = THRESHOLD, device: Any = "auto"
 ) -> list[Array]:
-    """Segment the ground points of several sweeps at once. The results equal those of `find_ground`.
-
-    Tensors must be on one device.
+    """Segment the ground points of several sweeps at once, as `find_ground` does each. Tensors must be on one device.
 
     Cost: two sorts of all points, some 60 passes over 256 x 256 cells per sweep; 100,000 points take 20 ms on one CPU
     thread (docs/data.md).

@@ -69,15 +69,11 @@ class GroundHeights:
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
 
     def slopes(self, centre: Tensor, window: Tensor) -> Tensor:
-        """Slope of the ground around objects, from a plane through the mean heights of the blocks around them.
+        """(G, 2) float64 slopes of the ground around objects, metres of height per metre in x and in y.
 
-        Args:
-            centre: (G, 2) float64, x and y, metres, frame of t+1; anywhere.
-            window: (G,) int64; B + w is window w once more, for copies of its points.
-
-        Returns:
-            (G, 2) float64, metres of height per metre in x and in y; 0 where the plane is steeper than 0.3, or where
-            fewer than five blocks are known, or all of them lie nearly on a line.
+        A plane is fitted to the mean heights of the blocks around each centre (G, 2) float64, x and y, metres, frame of
+        t+1; anywhere. The slope is 0 where the plane is steeper than 0.3, or where fewer than five blocks are known,
+        or all of them lie nearly on a line. Window B + w is window w once more, for copies of its points.
 
         Convention: block heights are whole millimetres, rounded down. So all sums are exact.
         """

@@ -41,11 +41,7 @@ class Plane:
 def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int) -> Plane:
     """Fit the plane on which most flat spots near the vehicle lie. Ties: the lowest height.
 
-    Args:
-        points: (3, N) int64, mm.
-        sweep: (N,) int64, sweep of each point.
-        is_active: (N,) bool, False = leave the point out.
-        num_sweeps: B.
+    The points (3, N) int64 are in mm, `sweep` is that of each point, and inactive points are left out.
     """
     size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
     col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
@@ -73,14 +69,10 @@ def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int
 
 
 def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Tenth percentile, median and number of the heights of each cell.
+    """Tenth percentile, median and number of the heights of each cell, (num_cells,) int64 each.
 
-    Args:
-        cell: (N,) int64, 0 ... num_cells; those in cell num_cells are left out.
-        height: (N,) int64, mm, |height| < 2^36.
-
-    Returns:
-        Three times (num_cells,) int64; the first two are undefined where the number is 0.
+    The first two are undefined where the number is 0. Heights (N,) int64 are in mm, |height| < 2^36; those in cell
+    `num_cells` are left out.
     """
     offset, bits = 1 << 36, 37
     key = (cell << bits).add_(height).add_(offset).sort().values  # by cell, then by height

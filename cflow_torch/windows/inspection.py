@@ -15,6 +15,7 @@ from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.ego_motion import relative_transform
 from cflow_torch.windows.ground import has_ground, is_upside_down
 from cflow_torch.windows.structure import FEWEST_IN_PLACE, Patches, is_better_inverted, move, structure
+from cflow_torch.windows.validation import have_same_points
 
 UPSIDE_DOWN = "z seems to point down, because nearly all points lie below the ground: give points with z up"
 REPEATED = "pc1 has the same points as pc0, so everything seems to move with the sensor: give two different sweeps"
@@ -63,14 +64,11 @@ class Inspection:
 
 
 def repeats(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether two sweeps have the same points. False for tensors on a GPU, because we would wait for the GPU."""
-    a, b = pc0.points, pc1.points
-    if a.shape != b.shape or len(a) < _FEWEST_REPEATED:
-        return False
-    if any(isinstance(points, torch.Tensor) and points.device.type != "cpu" for points in (a, b)):
-        return False
-    few = slice(_FEWEST_REPEATED)  # different sweeps mostly differ in these points already
-    return all(np.array_equal(as_numpy(a[rows]), as_numpy(b[rows]), equal_nan=True) for rows in (few, slice(None)))
+    """Test whether two sweeps have the same points. Tensors on a GPU are not compared: that would wait for it."""
+    for points in (pc0.points, pc1.points):
+        if len(points) < _FEWEST_REPEATED or (isinstance(points, torch.Tensor) and points.device.type != "cpu"):
+            return False
+    return have_same_points(pc0, pc1)
 
 
 def has_moved(pc0: Sweep, pc1: Sweep) -> bool:

@@ -76,17 +76,10 @@ def control_groups() -> list[Path]:
 def split_windows(
     windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: float | None
 ) -> list[list[Window]]:
-    """Split windows into groups that fit into memory, in their order. Results do not depend on the grouping.
+    """Split checked windows into groups that fit into memory, in order. Results do not depend on the grouping.
 
-    Args:
-        windows: B windows, checked.
-        grid: that of the finest scale, whose images are the largest.
-        device: where the windows are processed.
-        bytes_per_point: working memory of the method per point.
-        max_memory: bytes per group; None = no limit on a GPU, 512 MiB on a CPU, where large groups are slower.
-
-    Raises:
-        CFlowError: a window does not fit into memory by itself.
+    The grid is that of the finest scale, whose images are the largest. `max_memory` is in bytes; None = no limit on a
+    GPU, 512 MiB per group on a CPU, where large groups are slower. A window that does not fit is a `CFlowError`.
     """
     groups: list[list[Window]] = []
     if max_memory is None and device.type == "cpu":
