@@ -112,7 +112,11 @@ class Tracker:
         seen = seen + torch.where(moves[has_track, None], groups.step[has_track], step[track_of_point])
         table = self._table(tracks, times.now, sweeps.pc0.timestamp_ns)
         track_index = torch.cat([track_index[is_missing], track_of_point])
-        self._keep(tracks._replace(box=tracks.box + step), torch.cat([missing, seen]), track_index)
+        points, tracks = torch.cat([missing, seen]), tracks._replace(box=tracks.box + step)
+        is_kept = tracks.missed <= _MAX_MISSED
+        track_index = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)[track_index]
+        self._tracks = tracks.take(is_kept)
+        self._points, self._track_index = points[track_index >= 0], track_index[track_index >= 0]
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
 
@@ -214,13 +218,6 @@ class Tracker:
             "num_points": rows.num_points,
             "confidence": rows.confidence,
         }
-
-    def _keep(self, tracks: Tracks, points: Tensor, track_index: Tensor) -> None:
-        """Store the tracks, without those that have not been seen for too long."""
-        is_kept = tracks.missed <= _MAX_MISSED
-        track_index = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)[track_index]
-        self._tracks = tracks.take(is_kept)
-        self._points, self._track_index = points[track_index >= 0], track_index[track_index >= 0]
 
 
 def track(

@@ -50,7 +50,11 @@ def add_sectional_view(
     target_pair = concat_ranges(torch.searchsorted(slots // num_sources, cluster[newest]), copies)
 
     pair = torch.cat((template_pair, target_pair))
-    row, col = _project(torch.cat((moved, target), 1), heading[:, pair], pixel_size)
+    # Rotate by minus the heading, then apply Eq. 3d_to_bev to (x', z).
+    (x_of_point, y_of_point, up), (cos, sin) = torch.cat((moved, target), 1), heading[:, pair]
+    side = torch.full((), pixel_size, dtype=up.dtype, device=up.device)
+    along = cos * x_of_point + sin * y_of_point
+    row, col = torch.floor(up / side).long(), torch.floor(along / side).long()
     first, size = bounding_boxes(row, col, pair, slots.numel())
     row, col = row - first[pair, 0], col - first[pair, 1]
     split = template_pair.numel()
@@ -66,13 +70,6 @@ def add_sectional_view(
     displacement = estimates.displacement.clone()
     displacement.view(-1, 3)[slots] = torch.stack((x + along * heading[0], y + along * heading[1], up), 1)
     return replace(estimates, displacement=displacement)
-
-
-def _project(positions: Tensor, heading: Tensor, pixel_size: float) -> tuple[Tensor, Tensor]:
-    """(row, col) of points in the X-Z view: rotate by minus the heading, then apply Eq. 3d_to_bev to (x', z)."""
-    size = torch.full((), pixel_size, dtype=positions.dtype, device=positions.device)
-    along = heading[0] * positions[0] + heading[1] * positions[1]
-    return torch.floor(positions[2] / size).long(), torch.floor(along / size).long()
 
 
 def _draw(pair: Tensor, row: Tensor, col: Tensor, size: Tensor) -> Images:

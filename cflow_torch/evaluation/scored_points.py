@@ -80,7 +80,9 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     """
     points, true_total = as_numpy(frame.points), frame.labels.flow
     pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]
-    position, total = _position(frame, definition), _predicted_total(frame)
+    total = _predicted_total(frame)
+    # In the frame in which ranges are measured: float32 at t, float64 at t+1.
+    position = points if definition.region_axes == "t" else transform_points(points, frame.transform())
     keep = _candidates(frame, definition, position)
     has_nan = np.isnan(np.concatenate([total, pose_flow, points, true_total], axis=1)).any(axis=1)
     num_nan = int((keep & has_nan).sum())
@@ -156,9 +158,3 @@ def _candidates(frame: EvalFrame, definition: Definition, position: np.ndarray) 
         crop = np.asarray(definition.point_cloud_range, dtype=np.float64)
         keep &= ((position > crop[:3]) & (position < crop[3:])).all(axis=1)
     return keep
-
-
-def _position(frame: EvalFrame, definition: Definition) -> np.ndarray:
-    """Return the (N, 3) points in the frame in which ranges are measured: float32 at t, float64 at t+1."""
-    points = as_numpy(frame.points)
-    return points if definition.region_axes == "t" else transform_points(points, frame.transform())

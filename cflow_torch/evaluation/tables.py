@@ -27,21 +27,12 @@ def format_table(results: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _bucketed(scores: dict[str, Any]) -> Table:
-    return _static_and_dynamic("class", "dynamic error", "dynamic_error", scores["classes"], scores["mean"])
-
-
-def _range_wise(scores: dict[str, Any]) -> Table:
-    ranges = {name: row for name, row in scores.items() if name != "mean"}
-    return _static_and_dynamic("range [m]", "dynamic EPE [m]", "dynamic_epe", ranges, scores["mean"])
-
-
-def _static_and_dynamic(of: str, title: str, key: str, scores: dict[str, Any], mean: dict[str, float]) -> Table:
-    rows = [
-        [name, _number(row["static_epe"]), _number(row[key]), row["num_static"], row["num_dynamic"]]
-        for name, row in scores.items()
-    ]
-    rows.append(["**mean**", _number(mean["static_epe"]), _number(mean[key]), "", ""])
+def _static_and_dynamic(of: str, title: str, key: str, scores: dict[str, Any]) -> Table:
+    rows = []
+    for name, row in scores.items():
+        counts = [row.get("num_static", ""), row.get("num_dynamic", "")]
+        label = "**mean**" if name == "mean" else name
+        rows.append([label, _number(row["static_epe"]), _number(row[key]), *counts])
     return [of, "static EPE [m]", title, "static points", "dynamic points"], rows
 
 
@@ -63,10 +54,12 @@ def _three_way(scores: dict[str, Any]) -> Table:
 
 
 _TABLES: dict[str, Callable[[dict[str, Any]], Table]] = {
-    "bucketed": _bucketed,
+    "bucketed": lambda scores: _static_and_dynamic(
+        "class", "dynamic error", "dynamic_error", {**scores["classes"], "mean": scores["mean"]}
+    ),
     "bucketed_by_range": _by_range,
     "three_way": _three_way,
-    "range_wise": _range_wise,
+    "range_wise": lambda scores: _static_and_dynamic("range [m]", "dynamic EPE [m]", "dynamic_epe", scores),
 }
 
 

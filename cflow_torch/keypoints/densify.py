@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
-from cflow_torch.dense.components import label_components
+from cflow_torch.dense.clustering import label_components
 from cflow_torch.keypoints.matching import Matches
 from cflow_torch.ops.indices import flat_nonzero, index_in_group
 from cflow_torch.ops.kornia_engine import connected_components_kornia

@@ -1,4 +1,4 @@
-"""Match candidates: the key points of t+1 that lie within a radius of a key point of t.
+"""Key points, their descriptors, and match candidates: the key points of t+1 within a radius of a key point of t.
 
 We group the key points of t by small tiles of the image. The key points of t+1 are sorted by band of rows, then by
 column, so those within the radius of a group are a few ranges of that list. Nothing is ever as large as all key points
@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
-from cflow_torch.keypoints.descriptors import KeyPoints
-from cflow_torch.ops.indices import concat_ranges, gather, index_in_group
+from cflow_torch.ops.indices import concat_ranges, flat_nonzero, gather, index_in_group, split_index
+from cflow_torch.ops.morphology import erode_cross
+from cflow_torch.ops.patches import gather_patches
 from cflow_torch.windows.collation import Batch
 
 # Rows and columns of a tile, rows of a band, key points in a group. Of the settings that we counted for groups of 16,
@@ -32,6 +33,38 @@ _BYTES_PER_PAIR = 64
 _LENGTH_STEP = 8
 # `gate_radius` is the longest distance of a match in this time.
 _GATE_SECONDS = 0.1
+
+
+@dataclass(frozen=True)
+class KeyPoints:
+    """Key points of one sweep of every window, in order of window, row and column."""
+
+    pixel: Tensor  # (K,) int64, flat indices into the images, ascending
+    window: Tensor  # (K,) int64
+    row: Tensor  # (K,) int64, row in the image of the window
+    col: Tensor  # (K,) int64, column in the image of the window
+    patch: Tensor  # (K, L * L) uint8, zeros and ones
+    energy: Tensor  # (K,) int64, number of ones, at least 1
+
+
+def detect(occupancy: Tensor) -> Tensor:
+    """Find the key points of (..., H, W) bool images: pixels at distance 1 from the background (Sec. Keypoints).
+
+    The distance is Euclidean, so a key point has a free pixel among its four neighbours. The outside of the image is
+    background.
+    """
+    return occupancy & ~erode_cross(occupancy)
+
+
+def describe(images: Tensor, patch_size: int) -> KeyPoints:
+    """Find the key points of one sweep and describe each by the L x L pixels around it (Sec. Descriptor).
+
+    The images are (B, H, W) bool; patches are zero outside. Cost: memory K L^2 bytes; the images are not unfolded.
+    """
+    pixel = flat_nonzero(detect(images))
+    line, col = split_index(pixel, images.shape[2])
+    window, row = split_index(line, images.shape[1])
+    return KeyPoints(pixel, window, row, col, *gather_patches(images, window, row, col, patch_size))
 
 
 def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Tensor:

@@ -15,8 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
-from cflow_torch.keypoints.descriptors import KeyPoints
-from cflow_torch.keypoints.match_candidates import chunks, pair, pairs_at_once
+from cflow_torch.keypoints.match_candidates import KeyPoints, chunks, pair, pairs_at_once
 from cflow_torch.ops.indices import flat_nonzero, gather
 
 # The ratio rho is used to four decimals, so that the ratio test compares integers.
@@ -78,14 +77,8 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig
     source, by_source = source.sort()
     target, count = gather(by_source, target, count)
     energies = pc0.energy.index_select(0, source) * pc1.energy.index_select(0, target)
-    shift = torch.stack(_shift(pc0, pc1, source, target), 1)
-    return Matches(source, shift, count.double() / torch.sqrt(energies.double()))
-
-
-def _shift(pc0: KeyPoints, pc1: KeyPoints, source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """dy, dx from key points of t to key points of t+1."""
     (row0, col0), (row1, col1) = gather(source, pc0.row, pc0.col), gather(target, pc1.row, pc1.col)
-    return row1 - row0, col1 - col0
+    return Matches(source, torch.stack((row1 - row0, col1 - col0), 1), count.double() / torch.sqrt(energies.double()))
 
 
 def _contenders(

@@ -7,8 +7,7 @@ import torch.nn.functional as F
 
 from cflow_torch.dense.coarse_to_fine import CoarseToFine, ProjectedSweeps
 from cflow_torch.keypoints.densify import densify
-from cflow_torch.keypoints.descriptors import describe
-from cflow_torch.keypoints.match_candidates import match_radius
+from cflow_torch.keypoints.match_candidates import describe, match_radius
 from cflow_torch.keypoints.matching import match
 from cflow_torch.model import Motion
 from cflow_torch.stages import stage

@@ -22,7 +22,8 @@ def make_colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
     """All colourings of the page, with palettes and legends; the rim of the wheel is `max_flow`, metres per sweep."""
     speed = max_flow / interval
     rim = f"right: ahead of the vehicle; rim: {max_flow:.4g} m per sweep, {speed:.3g}\u00a0m/s"
-    wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), np.concatenate([PALETTE, _faded()]).tolist()
+    faded = np.rint(_FADED * PALETTE + (1 - _FADED) * _GREY).astype(np.uint8)
+    wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), np.concatenate([PALETTE, faded]).tolist()
     likely = "probability of an error below 0.1 m"
     rows = (
         # name, text, palette, scale, note, meaning of the greys
@@ -61,11 +62,6 @@ def _ramp() -> np.ndarray:
 def ramp_entry(value: np.ndarray, most: float) -> np.ndarray:
     """(N,) int64 entries of `_ramp`."""
     return FIRST + (np.nan_to_num(value) / most * _STEPS).clip(0, _STEPS - 1).astype(np.int64)
-
-
-def _faded() -> np.ndarray:
-    """(10, 3) uint8 colours of static objects."""
-    return np.rint(_FADED * PALETTE + (1 - _FADED) * _GREY).astype(np.uint8)
 
 
 def object_entry(position: np.ndarray, cluster: np.ndarray, moving: np.ndarray, ground: np.ndarray) -> np.ndarray:

@@ -22,8 +22,7 @@ from cflow_torch.dense.coarse_to_fine import ProjectedSweeps, project
 from cflow_torch.dense.correlation import best_shifts
 from cflow_torch.dense.templates import Images, make_pairs
 from cflow_torch.estimate import make_model
-from cflow_torch.keypoints.descriptors import describe
-from cflow_torch.keypoints.match_candidates import match_radius
+from cflow_torch.keypoints.match_candidates import describe, match_radius
 from cflow_torch.keypoints.matching import match
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero

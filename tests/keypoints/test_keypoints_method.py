@@ -15,7 +15,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.keypoints import match_candidates, matching
-from cflow_torch.keypoints.descriptors import KeyPoints, describe
+from cflow_torch.keypoints.match_candidates import KeyPoints, describe
 from cflow_torch.keypoints.matching import match
 
 DENSIFIERS = ("components", "clusters", "nearest")
