@@ -12,7 +12,7 @@ import importlib
 import io
 import sys
 import types
-from functools import lru_cache
+from functools import lru_cache, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -130,10 +130,8 @@ def euler_angles(matrix: Tensor, convention: str) -> Tensor:
     """(B, 3) angles a, b, c in radians of (B, 3, 3) rotations Rz(a) Ry(b) Rx(c)."""
     if convention != "ZYX":
         raise NotImplementedError("this replacement knows the convention ZYX")
-    middle = torch.asin((-matrix[:, 2, 0]).clamp(-1, 1))
-    outer = (torch.atan2(matrix[:, row, column], matrix[:, last, last]) for row, column, last in ((1, 0, 0), (2, 1, 2)))
-    yaw, roll = outer
-    return torch.stack([yaw, middle, roll], 1)
+    yaw, roll = (torch.atan2(matrix[:, row, column], matrix[:, of, of]) for row, column, of in ((1, 0, 0), (2, 1, 2)))
+    return torch.stack([yaw, torch.asin((-matrix[:, 2, 0]).clamp(-1, 1)), roll], 1)
 
 
 # ------------------------------------------------------------------------------------------------ FastGeodis
@@ -160,17 +158,13 @@ def _not_available(*arguments: Any, **settings: Any) -> None:
     raise RuntimeError("this compiled extension is not available on a CPU")
 
 
-def _chain(steps: Any, data: Any) -> Any:
-    for step in steps:
-        data = step(data)
-    return data
-
-
 _VOXELS = ("dynamic_voxelize_forward", "hard_voxelize_forward")
 _VOXELS += ("dynamic_point_to_voxel_forward", "dynamic_point_to_voxel_backward")
 REPLACEMENTS: dict[str, dict[str, Any]] = {  # module -> what the harness imports from it
     "torchvision": {
-        "transforms": types.SimpleNamespace(Compose=lambda steps: lambda data: _chain(steps, data)),
+        "transforms": types.SimpleNamespace(
+            Compose=lambda steps: lambda data: reduce(lambda value, step: step(value), steps, data)
+        ),
     },
     "wandb": {"finish": lambda: None},
     "fire": {},

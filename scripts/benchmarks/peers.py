@@ -206,19 +206,14 @@ def measure(method: Method, case: Case, reach: float) -> dict[str, float]:
     return {**{name: figures[name] for name in ("dynamic", "ratio", "static")}, "cpu": seconds}
 
 
-def mean_of(rows: Sequence[dict[str, Any]], column: str) -> float:
-    """Mean over the sets of the mean over the windows."""
-    of_sets: dict[str, list[float]] = {}
-    for row in rows:
-        of_sets.setdefault(row["set"], []).append(row[column])
-    return float(np.nanmean([np.nanmean(values) for values in of_sets.values()]))
-
-
 def errors(rows: Sequence[dict[str, Any]]) -> str:
-    """Dynamic error in metres, error over speed, static error in centimetres."""
+    """Dynamic error in metres, error over speed, static error in centimetres: mean over sets of that over windows."""
     if not rows:
         return ""
-    dynamic, ratio, static = (mean_of(rows, column) for column in ("dynamic", "ratio", "static"))
+    of_sets: dict[str, list[list[float]]] = {}
+    for row in rows:
+        of_sets.setdefault(row["set"], []).append([row[column] for column in ("dynamic", "ratio", "static")])
+    dynamic, ratio, static = np.nanmean([np.nanmean(values, 0) for values in of_sets.values()], 0)
     return f"{dynamic:.3f} / {ratio:.2f} / {100 * static:.1f}"
 
 
@@ -227,8 +222,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     older = {row["window"] for row in rows if row["history"] > 0}
     windows, lines = {row["window"] for row in rows}, []
     for name in dict.fromkeys(row["method"] for row in rows):
-        pairs, longer = ([row for row in rows if row["method"] == name and (row["history"] > 0) == is_longer]
-                         for is_longer in (False, True))  # fmt: skip
+        own = [row for row in rows if row["method"] == name]
+        pairs, longer = ([row for row in own if (row["history"] > 0) == is_longer] for is_longer in (False, True))
+        seconds, older_seconds = (np.mean([row["cpu"] for row in some] or [np.nan]) for some in (pairs, longer))
         run = {row["window"] for row in pairs}
         same = [row for row in rows if (row["method"], row["history"]) == ("default", 0) and row["window"] in run]
         lines.append(
@@ -236,19 +232,14 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
                 "method": name,
                 "windows": f"{len(pairs)}",
                 "two sweeps": errors(pairs),
-                "CPU s": seconds(pairs),
+                "CPU s": f"{seconds:.2f}" if pairs else "",
                 "two sweeps, sets with older ones": errors([row for row in pairs if row["window"] in older]),
                 "older sweeps": errors(longer),
-                "CPU s, older sweeps": seconds(longer),
+                "CPU s, older sweeps": f"{older_seconds:.2f}" if longer else "",
                 "`default` on these windows": errors(same) if run < windows else "",
             }
         )
     return markdown(lines)
-
-
-def seconds(rows: Sequence[dict[str, Any]]) -> str:
-    """Mean of processor seconds."""
-    return f"{np.mean([row['cpu'] for row in rows]):.2f}" if rows else ""
 
 
 def main() -> None:

@@ -12,14 +12,15 @@ import tempfile
 import time
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Callable, Sequence
+from typing import Any, Callable
 
 import drives
 import matplotlib
 import numpy as np
 import torch
+from matplotlib.patches import Rectangle
 
-from cflow_torch import CleanLog, FlowResult, FlowStream, Sweep, make_config, make_model, static_map, track
+from cflow_torch import CleanLog, FlowResult, FlowStream, make_config, make_model, static_map, track
 from cflow_torch.applications.deskewing import deskew
 from cflow_torch.applications.labels import label_scene
 from cflow_torch.applications.moving_groups import MOVING
@@ -69,10 +70,9 @@ def draw_tracks(axes: Any, points: np.ndarray, table: dict[str, np.ndarray], ind
         before = (table["id"] == number) & (table["sweep"] <= index)
         axes.plot(table["x"][before], table["y"][before], color=colour, lw=1.2)
         x, y, angle = (table[name][row] for name in ("x", "y", "heading"))
-        along = table["length"][row] / 2 * np.array([np.cos(angle), np.sin(angle)])
-        across = table["width"][row] / 2 * np.array([-np.sin(angle), np.cos(angle)])
-        corners = np.stack([a * along + b * across for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))])
-        axes.plot(x + corners[:, 0], y + corners[:, 1], color=colour, lw=1.2)
+        length, width = table["length"][row], table["width"][row]
+        box = {"angle": np.degrees(angle), "rotation_point": "center", "fill": False, "color": colour, "lw": 1.2}
+        axes.add_patch(Rectangle((x - length / 2, y - width / 2), length, width, **box))
         if max(abs(x), abs(y)) < VIEW - 3:
             speed = np.hypot(table["vx"][row], table["vy"][row])
             axes.annotate(f"{number}: {speed:.1f}", (x + 0.6, y + 0.9), fontsize=6, color=0.7 * colour)
@@ -134,11 +134,16 @@ def labels(file: Path) -> None:
 
 
 def stream(file: Path) -> None:
-    """Latency of each sweep of a drive; also print the medians."""
+    """Processor time from each sweep of a drive to the flow of the one before it; also print the medians."""
     sweeps = list(make_drive(seed=0, num_sweeps=STREAMED, profile="av2"))
     figure, axes = plt.subplots(figsize=(7.0, 2.6), layout="constrained")
     for preset, num_history in (("default", 4), ("default", 2), ("default", 0), ("paper", 0)):
-        ms = 1000 * np.array(latencies(FlowStream(preset, num_history=num_history, device="cpu"), sweeps))
+        flows, ms = FlowStream(preset, num_history=num_history, device="cpu"), []
+        for sweep in sweeps:
+            begin = time.process_time()
+            flows.push(sweep)
+            ms.append(1000 * (time.process_time() - begin))
+        del ms[0]  # there is no flow yet
         name = f"{preset}, h = {num_history}"
         print(f"{name}: median {np.median(ms):.0f} ms, 99 % within {np.percentile(ms, 99):.0f} ms")
         axes.plot(range(1, STREAMED), ms, ".-", label=name)
@@ -147,16 +152,6 @@ def stream(file: Path) -> None:
     axes.set(xlabel="sweep", ylabel="latency on one core (ms)", ylim=(0, None))
     figure.legend(frameon=False, ncols=4, loc="outside upper center", fontsize=8)
     figure.savefig(file, dpi=110)
-
-
-def latencies(flows: FlowStream, sweeps: Sequence[Sweep]) -> list[float]:
-    """Processor seconds from each sweep but the first to the flow of the one before it."""
-    seconds = []
-    for sweep in sweeps:
-        begin = time.process_time()
-        flows.push(sweep)
-        seconds.append(time.process_time() - begin)
-    return seconds[1:]
 
 
 def deskewed(file: Path) -> None:

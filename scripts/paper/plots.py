@@ -39,13 +39,14 @@ def draw(name: str, paper: dict[str, Any], ours: Ours) -> Figure:
         return _bars(panels, at, ["Overall", *ours])
     columns = {"history": len(panels), "scales": len(SHOWN), "range_split": math.ceil(len(panels) / 2)}[name]
     rows = math.ceil(len(panels) / columns)
+    errors = [v for _, lines in panels for values in lines.values() for v in values if not math.isnan(v)]
     figure = Figure(figsize=(min(13.0, 4.8 * columns), 3.6 * rows), layout="constrained")
     all_axes: list[Axes] = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
     for axes, (title, lines) in zip(all_axes, panels):
         for label, values in lines.items():
             axes.plot(range(len(at)), values, label=label, clip_on=False, **STYLES[label])
         axes.set(title=title, xticks=range(len(at)), xticklabels=at, xlabel=paper.get("x", "metres"))
-        axes.set_ylim(0, 1.05 * max(0.38, *_errors(panels)))
+        axes.set_ylim(0, 1.05 * max(0.38, *errors))
         axes.grid(axis="y", linestyle="--", alpha=0.6)
     for axes in all_axes[::columns]:
         axes.set_ylabel(ERROR)
@@ -73,11 +74,6 @@ def _panels(name: str, paper: dict[str, Any], ours: Ours) -> Panels:
         return [("paper, test set of the 2026 challenge", paper["bars"]), *([("this package", bars)] if bars else [])]
     mine = [(d, {m: range_errors(runs[m]) for m in METHODS.values() if m in runs}) for d, runs in ours.items()]
     return [*((f"{data_set} (paper)", lines) for data_set, lines in paper["panels"].items()), *mine]
-
-
-def _errors(panels: Panels) -> list[float]:
-    """All errors that are not NaN."""
-    return [v for _, lines in panels for values in lines.values() for v in values if not math.isnan(v)]
 
 
 def _of_class(runs: Mapping[str, Run], rows: Sequence[str], which: str) -> list[float]:
