@@ -275,11 +275,7 @@ def removed_preset(name: str) -> str:
 
 
 def config_from(settings: dict[str, Any]) -> Config:
-    """Make the settings of a dictionary from `Config.as_dict`; missing fields have the method's defaults.
-
-    Raises:
-        CFlowError: a missing or unknown method, an unknown field, an invalid value.
-    """
+    """Make settings from `Config.as_dict`; missing fields have defaults, and wrong ones are a `CFlowError`."""
     return _class_of(settings.get("method"))().replace(**settings)
 
 

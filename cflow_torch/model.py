@@ -43,10 +43,7 @@ class Motion:
         return out
 
     def residual_flow(self, points: slice, positions: Tensor) -> Tensor:
-        """(K, 3) float32 flow of a slice of points, at positions (A, K) float64, metres, frame of t+1.
-
-        Methods whose clusters rotate use the positions.
-        """
+        """(K, 3) float32 flow of some points at (A, K) float64 metres, which clusters that rotate need."""
         cluster = self.cluster(points)
         if self.before is None:
             return self.flow.float().index_select(0, cluster)

@@ -83,10 +83,7 @@ def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: Moving
 
 
 def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
-    """Match groups of two sweeps that overlap, one to one: in small voxels, and what remains in larger ones.
-
-    Args and Returns: as `link_in_voxels`.
-    """
+    """Match groups of two sweeps as `link_in_voxels` does: in small voxels, and what remains in larger ones."""
     earlier, current = (torch.zeros(0, dtype=torch.int64, device=points0.device) for _ in range(2))
     for side in VOXELS:
         rest0, rest1 = ~torch.isin(group0, earlier), ~torch.isin(group1, current)
@@ -149,10 +146,7 @@ def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) 
 
 
 def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
-    """Centre and size, (K, 3) float64 each, of the upright boxes along `heading` (K,) around groups (N,) of points.
-
-    No group may be empty.
-    """
+    """(K, 3) float64 centres and sizes of upright boxes along `heading` (K,) around groups (N,); none may be empty."""
     along, across = rotate(points[:, 0], points[:, 1], -heading[group])
     local = torch.stack([along, across, points[:, 2]], 1)
     index, extremes = group[:, None].expand(-1, 3), local.new_zeros(len(heading), 3)

@@ -91,10 +91,7 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
 
 
 def _can_move(component: Tensor, num_components: int, occupied: Tensor) -> Tensor:
-    """(C,) bool: the component has a pixel at t+1 and a pixel before.
-
-    `component` is (P,) int64, below C; `occupied` is (S, P) bool, the sweeps that occupy each pixel, index 0 = t+1.
-    """
+    """(C,) bool: some pixels (P,) of the component are `occupied`, (S, P) bool, at t+1 (index 0), and some before."""
     newest, *older = occupied.unbind(0)
     before = reduce(torch.bitwise_or, older, torch.zeros_like(newest))
     kind = newest.byte() + (newest & before).byte()  # 0: occupied before only, 1: at t+1 only, 2: both

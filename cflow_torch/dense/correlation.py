@@ -48,10 +48,7 @@ class Estimates:
 
 
 def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) -> Estimates:
-    """Estimate the displacement m -> t+1 of every cluster from every earlier sweep m (Alg. scene_flow_1view, BEV).
-
-    The estimates have z = 0.
-    """
+    """Estimate the displacement m -> t+1, with z = 0, of every cluster and earlier sweep m (Alg. scene_flow_1view)."""
     batch, pixel_size = sweeps.batch, sweeps.grid.pixel_size
     pairs = make_pairs(clusters, batch, pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)

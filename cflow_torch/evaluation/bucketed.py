@@ -49,10 +49,9 @@ def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarra
 
 
 class BucketedByRange(Accumulator):
-    """`BucketedEPE` of every range between the definition's `region_edges`, in one pass.
+    """`BucketedEPE` of every range between the definition's `region_edges`, in one pass; a point is in at most one.
 
-    The definition's `region` ("box" or "disc"), `region_axes` and `closed` define how a range is measured; its
-    `max_range` does not apply. Each point is in at most one range.
+    `region` ("box" or "disc"), `region_axes` and `closed` define how a range is measured; `max_range` does not apply.
     """
 
     def __init__(self, definition: Definition, num_ranges: int | None = None) -> None:
@@ -74,11 +73,9 @@ class BucketedByRange(Accumulator):
         return cell, (scored.error[keep], scored.speed[keep])
 
     def compute(self) -> dict[str, Any]:
-        """Return the scores so far.
+        """Return "ranges": "0-35", ... -> "classes" and "mean" as of `BucketedEPE`; "mean" over them; "speed_edges".
 
-        Returns:
-            "ranges": "0-35", ... -> "classes" and "mean" as of `BucketedEPE`; "mean": `static_epe` and `dynamic_error`,
-            means over all ranges, NaN if a range has no points to score; "speed_edges".
+        The mean over the ranges, `static_epe` and `dynamic_error`, is NaN if a range has no points to score.
         """
         names = range_names(self.definition.region_edges)
         ranges = {name: bucket_scores(*sums) for name, *sums in zip(names, self.count, *self.sums)}
@@ -103,12 +100,10 @@ class BucketedEPE(BucketedByRange):
         return scored.in_region.astype(np.int64) - 1
 
     def compute(self) -> dict[str, Any]:
-        """Return the scores so far.
+        """Return "classes", "mean" over them (`static_epe`, `dynamic_error`) and "speed_edges", metres per frame.
 
-        Returns:
-            "classes": per meta class `static_epe` (metres), `dynamic_error` (ratio), `num_static`, `num_dynamic`
-            (points) and "buckets" (`count`, `epe`, `speed`, `normalized` per bucket); "mean": `static_epe`,
-            `dynamic_error`; "speed_edges": metres per frame.
+        A class has `static_epe` (metres), `dynamic_error` (ratio), `num_static`, `num_dynamic` (points) and "buckets":
+        `count`, `epe`, `speed`, `normalized` of each.
         """
         return {**bucket_scores(self.count[0], *self.sums[:, 0]), "speed_edges": list(self.definition.speed_edges)}
 

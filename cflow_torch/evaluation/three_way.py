@@ -72,12 +72,10 @@ class ThreeWayEPE(Accumulator):
         self.frame_sums += _values(count, sums, FRAME_COUNT_EPS, FRAME_IOU_EPS)
 
     def compute(self) -> dict[str, Any]:
-        """Return the scores so far.
+        """Return `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou`, `num_frames` and two breakdowns.
 
-        Returns:
-            `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou`, `num_frames`, and "breakdown":
-            "background" / "foreground" -> "static" / "dynamic" -> "all" / "close" / "far" -> `count`, `num_predicted`
-            (points predicted as dynamic) and the values of `QUANTITIES`; "by_class": the same per meta class.
+        "breakdown": "background" / "foreground" -> "static" / "dynamic" -> "all" / "close" / "far" -> `count`,
+        `num_predicted` (points predicted as dynamic) and the values of `QUANTITIES`; "by_class": the same per class.
         """
         values = _values(self.count, self.sums)
         if self.definition.average == "frames":

@@ -48,11 +48,7 @@ class KeyPoints:
 
 
 def detect(occupancy: Tensor) -> Tensor:
-    """Find the key points of (..., H, W) bool images: pixels at distance 1 from the background (Sec. Keypoints).
-
-    The distance is Euclidean, so a key point has a free pixel among its four neighbours. The outside of the image is
-    background.
-    """
+    """Key points of (..., H, W) bool images: pixels at distance 1 from the background or from the outside."""
     return occupancy & ~erode_cross(occupancy)
 
 

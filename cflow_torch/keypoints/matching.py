@@ -142,8 +142,7 @@ def _join(parts: Iterable[tuple[Tensor, ...]], enough: int) -> Iterator[tuple[Te
 def _pack(patch: Tensor, swapped: bool) -> tuple[Tensor, ...]:
     """Pack (K, L^2) zeros and ones into strips, (K + 1, N) uint8 each, two pixels in a number; the last row is zero.
 
-    Args:
-        swapped: whether the first half of the pixels is the higher digit.
+    If `swapped`, the first half of the pixels is the higher digit.
     """
     num_points, num_pixels = patch.shape
     half = -(-num_pixels // 2)

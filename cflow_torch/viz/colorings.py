@@ -65,10 +65,7 @@ def ramp_entry(value: np.ndarray, most: float) -> np.ndarray:
 
 
 def object_entry(position: np.ndarray, cluster: np.ndarray, moving: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """Colour clusters, -1 = none, neighbours differently: (N,) uint8 entries of the palette of objects.
-
-    A cluster has the pale colours of static objects unless at least half of its points move.
-    """
+    """(N,) uint8 entries of the palette of objects: neighbours differ; pale if less than half of a cluster moves."""
     entry = np.where(ground, GROUND, STATIC).astype(np.uint8)
     has_one = cluster >= 0
     colors = cluster_colors(position[has_one], cluster[has_one], (0, 0, 0))

@@ -60,10 +60,7 @@ def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
 
 
 def _busiest_view(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high corner of the view around the cell whose matches have the largest sum, or around the ego vehicle.
-
-    Matches are added as vectors, so those that agree count and those that cross cancel.
-    """
+    """Corners of the view around the cell in which the vectors of the matches add up to most, or around the vehicle."""
     flow = end - start
     middle = np.zeros(2)
     moves = np.linalg.norm(flow, axis=1) > MOVING

@@ -110,10 +110,7 @@ def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.nd
 
 
 def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.ndarray) -> None:
-    """Draw the end-point error of every point with known truth, on the field's scale from black (none) to white.
-
-    Positions (N, 3) are in metres, residual and true residual flow (N, 3) in metres per sweep, NaN = unknown.
-    """
+    """Draw the error of every point with known truth (not NaN) on the field's scale from black (none) to white."""
     error = np.linalg.norm(flow - truth, axis=1)
     is_known = np.isfinite(error)
     position, error = position[is_known], error[is_known]

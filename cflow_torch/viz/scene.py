@@ -57,10 +57,7 @@ class Scene:
         )
 
     def arrows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Ids (A,), ascending, of clusters with enough moving points, and medians of these points, (A, 3) float64 each.
-
-        The medians are of the position, metres, and of the residual flow, metres per sweep.
-        """
+        """Ids (A,), ascending, of clusters with enough moving points; median positions and flow, (A, 3) float64."""
         moving = ~self.is_ground & (np.linalg.norm(self.residual, axis=1) > MOVING)
         columns = np.concatenate([self.position[moving], self.residual[moving]], axis=1)
         cluster, middle, count = group_medians(self.cluster[moving], columns)

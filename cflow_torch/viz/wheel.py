@@ -54,11 +54,7 @@ def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
 
 
 def wheel_image(size: int) -> np.ndarray:
-    """Draw the wheel for a legend: +x to the right, +y up, zero flow in the middle, `max_flow` at the rim.
-
-    Returns:
-        (size, size, 4) uint8 RGBA, transparent outside the wheel; row 0 is the top.
-    """
+    """Draw the wheel, +x right, +y up, `max_flow` at the rim: (size, size, 4) uint8 RGBA, transparent outside of it."""
     axis = (np.arange(size) + 0.5) * (2 / size) - 1
     flow = np.stack(np.meshgrid(axis, -axis), axis=-1)
     distance = np.hypot(flow[..., 0], flow[..., 1])

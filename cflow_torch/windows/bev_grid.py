@@ -51,10 +51,7 @@ class Grid:
         return pixel.double().add_(0.5).mul_(self.pixel_size).add_(lower[:, None])
 
     def contains(self, positions: Tensor) -> Tensor:
-        """(N,) bool: positions, (2, N) or (3, N) float64 metres, are finite and inside the region, both ends included.
-
-        Without z every height is inside.
-        """
+        """(N,) bool: positions, (2, N) or (3, N) float64 metres, are finite and in the region, both ends included."""
         # A value is inside if clamping keeps it; NaN and infinity fail. eq_ writes ones and zeros in place: on the CPU
         # two comparisons that write bools take almost twice as long.
         largest = torch.finfo(positions.dtype).max

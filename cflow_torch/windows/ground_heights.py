@@ -61,10 +61,7 @@ class GroundHeights:
         return mean.masked_fill_(count < _FEWEST_POINTS, _UNKNOWN)
 
     def at(self, positions: Tensor, window: Tensor, mean: Tensor) -> Tensor:
-        """(N,) float64, centimetres: height of the ground around points, (3, N) metres, given the result of `mean`.
-
-        Undefined outside the region.
-        """
+        """(N,) float64 centimetres: ground around (3, N) metres in the region, given the result of `mean`."""
         block = torch.add(self._block(positions), window, alpha=mean.shape[1] * mean.shape[2])
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
 

@@ -39,10 +39,7 @@ class Plane:
 
 
 def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int) -> Plane:
-    """Fit the plane on which most flat spots near the vehicle lie. Ties: the lowest height.
-
-    The points (3, N) int64 are in mm, `sweep` is that of each point, and inactive points are left out.
-    """
+    """Fit the plane on which most flat spots of active points, (3, N) int64 mm, lie nearby. Ties: the lowest height."""
     size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
     col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
     is_near = (((col | row) & -size) == 0).logical_and_(is_active)  # both in 0 ... size - 1
