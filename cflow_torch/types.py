@@ -32,6 +32,15 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
     return np.asarray(value, dtype=dtype)
 
 
+def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray:
+    """Check an array of one row per point and return (N, 3) float64; N is the count, or any number."""
+    array = as_numpy(values)
+    if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
+        wanted = "(N, 3)" if count is None else f"({count}, 3)"
+        raise CFlowError(f"{name} has shape {array.shape}: give {wanted}, one row per point")
+    return array[:, :3].astype(np.float64)
+
+
 def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str, wanted: str) -> None:
     """Check the type, shape (None = any length) and dtype of a dense array or tensor.
 
@@ -306,12 +315,7 @@ class FlowResult:
 
     def _positions(self, points: Array) -> np.ndarray:
         """(N, 3) float64 of pc0."""
-        positions = as_numpy(points, np.float64)
-        if positions.ndim != 2 or positions.shape[1] < 3 or len(positions) != len(next(iter(self._given().values()))):
-            raise CFlowError(
-                f"points have shape {positions.shape}: give the (N, 3+) points of pc0, one row per row of the flow"
-            )
-        return positions[:, :3]
+        return point_rows("pc0", points, len(next(iter(self._given().values()))))
 
     def _given(self) -> dict[str, Tensor]:
         values = {f.name: getattr(self, f.name) for f in fields(self)}

@@ -11,7 +11,7 @@ import torch
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_pose_flow, residual_for_harness
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.rigid_motion import transform_points
-from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy
+from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy, point_rows
 
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
@@ -66,11 +66,9 @@ class EvalFrame:
             )
         if self.residual_axes not in ("t", "t+1"):
             raise CFlowError(f"residual_axes={self.residual_axes!r}: give 't' or 't+1'")
-        points, labels = as_numpy(self.points), self.labels
-        if points.ndim != 2 or points.shape[1] < 3:
-            raise CFlowError(f"points must have shape (N, 3) or more columns, got {points.shape}")
+        points, labels = point_rows("points", self.points), self.labels
         rows = len(points)
-        self._set("points", _checked("points", points[:, :3], np.float32, (rows, 3)))
+        self._set("points", points.astype(np.float32))
         for name, dtype, shape in (
             *((name, np.float32, (rows, 3)) for name in ("residual_flow", "flow", "pose_flow")),
             *((name, np.bool_, (rows,)) for name in ("is_ground", "eval_mask")),

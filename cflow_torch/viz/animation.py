@@ -12,8 +12,8 @@ import numpy as np
 
 from cflow_torch.data.atomic import atomic_name
 from cflow_torch.errors import import_optional
-from cflow_torch.types import Array, CFlowError, FlowResult
-from cflow_torch.viz.bev import longest_flow, plot_flow, point_rows, split_sweep
+from cflow_torch.types import Array, CFlowError, FlowResult, point_rows
+from cflow_torch.viz.bev import longest_flow, plot_flow, split_sweep
 from cflow_torch.viz.style import Figure, checked_path
 from cflow_torch.viz.wheel import wheel_image
 

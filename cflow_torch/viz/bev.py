@@ -9,7 +9,7 @@ import numpy as np
 
 from cflow_torch.config import DenseConfig
 from cflow_torch.data.atomic import atomic_name
-from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
+from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy, point_rows
 from cflow_torch.viz import style
 from cflow_torch.viz.panel import MOVING, dot_area, draw_error, draw_flow, draw_ground, new_figure
 from cflow_torch.viz.style import Figure
@@ -144,14 +144,6 @@ def save_picture(figure: Figure, path: str | Path) -> Path:
     with atomic_name(path) as temporary:
         figure.savefig(temporary, format="png", dpi=figure.dpi)
     return path
-
-
-def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray:
-    """Check an array of one row per point and return (N, 3) float64; N is the count, or any number."""
-    array = as_numpy(values)
-    if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
-        raise CFlowError(f"{name} has shape {array.shape}: give (N, 3), one row per point")
-    return array[:, :3].astype(np.float64)
 
 
 def split_sweep(

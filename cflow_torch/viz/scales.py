@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.types import FlowResult, Window
+from cflow_torch.types import FlowResult, Window, point_rows
 from cflow_torch.viz import style
-from cflow_torch.viz.bev import longest_flow, point_rows, view_of
+from cflow_torch.viz.bev import longest_flow, view_of
 from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
 from cflow_torch.viz.stages import Scale, choose_cluster, scales, sweep_marks
 from cflow_torch.viz.style import Axes, Figure
