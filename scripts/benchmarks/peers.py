@@ -1,9 +1,8 @@
 #!/usr/bin/env python3
 """Compare scene flow of this package with that of other methods without training: error and processor time.
 
-  python scripts/benchmarks/peers.py DATA/*.h5 DATA/av2/val --json ours.json
-  python scripts/benchmarks/peers.py DATA/*.h5 --opensceneflow PATH --methods icpflow-author nsfp --json peers.json
-  python scripts/benchmarks/peers.py --merge peers.json ours.json            prints the table of both
+  python scripts/benchmarks/peers.py DATA/*.h5 DATA/av2/val --json rows.json
+  python scripts/benchmarks/peers.py DATA/*.h5 --opensceneflow PATH --methods icpflow-author nsfp --json rows.json
 
   pip install open3d-cpu hdbscan scipy h5py                             # `nearest`, `clusters`
   pip install dztimer lightning torchmetrics tabulate                   # OpenSceneFlow's models, also the above
@@ -41,6 +40,7 @@ from table import markdown
 from cflow_torch import make_config, make_model
 from cflow_torch.config import PRESETS
 from cflow_torch.data.catalog import find_sources, open_log, recognise
+from cflow_torch.data.json_file import read_json, write_json
 from cflow_torch.data.log import window
 from cflow_torch.types import as_numpy
 
@@ -213,7 +213,8 @@ def errors(rows: Sequence[dict[str, Any]]) -> str:
     of_sets: dict[str, list[list[float]]] = {}
     for row in rows:
         of_sets.setdefault(row["set"], []).append([row[column] for column in ("dynamic", "ratio", "static")])
-    dynamic, ratio, static = np.nanmean([np.nanmean(values, 0) for values in of_sets.values()], 0)
+    of_windows = (np.array(values, float) for values in of_sets.values())  # JSON has null for NaN
+    dynamic, ratio, static = np.nanmean([np.nanmean(values, 0) for values in of_windows], 0)
     return f"{dynamic:.3f} / {ratio:.2f} / {100 * static:.1f}"
 
 
@@ -243,7 +244,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Run, print, merge."""
+    """Run, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", type=Path, nargs="*", help="labelled scenes, or folders that a reader knows")
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS, metavar="NAME")
@@ -253,12 +254,11 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=8, help="step between windows")
     parser.add_argument("--windows", type=int, help="at most so many windows of a set")
     parser.add_argument("--reach", type=float, default=35.0, help="metres, half side of the square")
-    parser.add_argument("--json", type=Path, help="file for the figures of every window")
-    parser.add_argument("--merge", type=Path, nargs="*", default=[], help="earlier runs; new figures replace them")
+    parser.add_argument("--json", type=Path, help="file for the figures of every window; those of other runs are kept")
     given = parser.parse_args()
     torch.set_num_threads(1)
     key = itemgetter("window", "method", "history")
-    rows = {key(row): row for file in given.merge for row in json.loads(file.read_text())}
+    rows = {key(row): row for row in (read_json(given.json) if given.json and given.json.is_file() else [])}
     runs = [(name, history) for name in given.methods for history in (given.history if name in OURS[:2] else (0,))]
     all_cases = [each for path in given.paths for each in cases(path, given)]
     for name, history in runs if all_cases else []:
@@ -275,7 +275,7 @@ def main() -> None:
             rows[key(row)] = row
             print(json.dumps(row), file=sys.stderr, flush=True)
             if given.json:
-                given.json.write_text(json.dumps(list(rows.values()), indent=1) + "\n", encoding="utf-8")
+                write_json(given.json, list(rows.values()))
     print(table(sorted(rows.values(), key=lambda row: (METHODS.index(row["method"]), row["history"]))))
 
 

@@ -170,7 +170,7 @@ def test_rows_of_a_scene(script: Any, scene: Path, tmp_path: Path, monkeypatch: 
     call = ["peers.py", str(scene), "--start", "2", "--history", "0", "2", "--json", str(file)]
     monkeypatch.setattr(sys, "argv", [*call, "--methods", "zero", "nearest", "nsfp"])
     peers.main()
-    monkeypatch.setattr(sys, "argv", [*call, "--merge", str(file), "--methods", "default", "zero"])
+    monkeypatch.setattr(sys, "argv", [*call, "--methods", "default", "zero"])
     peers.main()
     printed = capsys.readouterr()
     assert "skipped nsfp: give --opensceneflow PATH" in printed.err
