@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 PADDING = 1e7  # ICP-Flow pads clouds with points at 1e8 m
+_PAIRS_AT_ONCE = 1 << 22
 
 
 @lru_cache(maxsize=128)
@@ -33,9 +34,6 @@ def _tree(points: bytes) -> Any:
 def _nearest(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     """(N,) int64 index of the nearest of the (M, 3) target points to each of the (N, 3) points."""
     return _tree(np.ascontiguousarray(target, np.float32).tobytes()).query(points)[1]
-
-
-# ------------------------------------------------------------------------------------------------ chamfer3D
 
 
 def chamfer(pc0: Tensor, pc1: Tensor, distance0: Tensor, distance1: Tensor, index0: Tensor, index1: Tensor) -> None:
@@ -57,11 +55,6 @@ def chamfer_gradient(
         pull = 2 * out[:, None] * (start - target[index])
         own += pull
         other.index_add_(0, index, -pull)
-
-
-# ------------------------------------------------------------------------------------------------ histlib
-
-_PAIRS_AT_ONCE = 1 << 22
 
 
 def histogram(first: Tensor, second: Tensor, *bounds_and_sizes: Any) -> Tensor:
@@ -89,9 +82,6 @@ def histogram(first: Tensor, second: Tensor, *bounds_and_sizes: Any) -> Tensor:
             flat = (cell[:, 0] * sizes[1] + cell[:, 1]) * sizes[2] + cell[:, 2]
             total += np.bincount(flat[flat < len(total)], minlength=len(total))
     return torch.from_numpy(votes).reshape(len(first), *sizes.tolist())
-
-
-# ------------------------------------------------------------------------------------------------ pytorch3d
 
 
 class Neighbours(NamedTuple):
@@ -134,9 +124,6 @@ def euler_angles(matrix: Tensor, convention: str) -> Tensor:
     return torch.stack([yaw, torch.asin((-matrix[:, 2, 0]).clamp(-1, 1)), roll], 1)
 
 
-# ------------------------------------------------------------------------------------------------ FastGeodis
-
-
 def distance_transform(
     image: Tensor, mask: Tensor, spacing: Any, largest: float, weight: float, iterations: int
 ) -> Tensor:
@@ -149,9 +136,6 @@ def distance_transform(
     if weight != 0:
         raise NotImplementedError("this replacement computes distances without an image")
     return torch.from_numpy(distance_transform_edt(mask[0, 0].numpy() != 0, spacing)).float()[None, None]
-
-
-# ------------------------------------------------------------------------------------------------ modules
 
 
 def _not_available(*arguments: Any, **settings: Any) -> None:
