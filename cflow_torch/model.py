@@ -91,13 +91,8 @@ class SceneFlowModel(nn.Module):
     def from_preset(cls: type[Any], preset: str | None = None, device: Any = "auto", **overrides: Any) -> Any:
         """Make the method with the settings of a preset, with some fields replaced.
 
-        Args:
-            preset: a preset of the method; None = its first.
-            device: as for the class.
-            **overrides: any field of its settings.
-
-        Raises:
-            CFlowError: an unknown preset or field, a preset of another method, or an invalid value.
+        The preset is one of the method; None = its first. `overrides` are any of its settings. An unknown preset or
+        field, a preset of another method, or an invalid value is a `CFlowError`.
         """
         return cls(make_config(preset, cls.method, **overrides), device)
 

@@ -196,13 +196,9 @@ class FlowResult:
         return columns
 
     def to_pandas(self, points: Array | None = None) -> Any:
-        """A `pandas.DataFrame` with a row per point: x, y, z, if you pass the points, then `columns`.
+        """A `pandas.DataFrame` with a row per point: x, y, z, if you pass the (N, 3+) points of pc0, then `columns`.
 
-        Args:
-            points: (N, 3+) of pc0.
-
-        Raises:
-            CFlowError: pandas is not installed, or the number of points differs.
+        If pandas is not installed, or the number of points differs, that is a `CFlowError`.
         """
         need = "to_pandas needs pandas: pip install pandas; columns() returns the same as arrays"
         pandas = import_optional("pandas", need)
@@ -210,13 +206,9 @@ class FlowResult:
         return pandas.DataFrame({**positions, **self.columns()})
 
     def to_open3d(self, points: Array) -> Any:
-        """Return pc0 as an `open3d.t.geometry.PointCloud`, with an attribute for every field that is not None.
+        """An `open3d.t.geometry.PointCloud` of pc0, (N, 3+), with an attribute for every field that is not None.
 
-        Args:
-            points: (N, 3+) points of pc0, metres.
-
-        Raises:
-            CFlowError: Open3D is not installed, or the number of points differs.
+        If Open3D is not installed, or the number of points differs, that is a `CFlowError`.
 
         Example:
             >>> cloud = result.to_open3d(points)
@@ -296,11 +288,7 @@ class FlowResult:
 
     @classmethod
     def load(cls, path: str | Path) -> FlowResult:
-        """Read a file of `save`. Nothing in the file is executed.
-
-        Raises:
-            CFlowError: the file is missing, damaged, or not a result.
-        """
+        """Read a file of `save`; a missing or another file is a `CFlowError`. Nothing in the file is executed."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 return cls.of({name: torch.from_numpy(file[name]) for name in file.files})

@@ -88,16 +88,10 @@ class ProtocolScores:
 
 
 def errors_by_range(results: Mapping[str, Any]) -> dict[str, float]:
-    """Return the dynamic bucket-normalised error of each range, a mean over classes.
+    """Return the dynamic bucket-normalised error of each range ("0-35", ...), a mean over classes.
 
-    Args:
-        results: from `SceneFlowMetrics.compute`, or results.json, with the metric "bucketed_by_range".
-
-    Returns:
-        Range ("0-35", ...) -> error; NaN where the range has no dynamic points.
-
-    Raises:
-        CFlowError: the metric is not among the results.
+    It is NaN where the range has no dynamic points. The results are of `SceneFlowMetrics.compute` or of results.json; a
+    `CFlowError` if they lack the metric "bucketed_by_range".
     """
     if "bucketed_by_range" not in results:
         raise CFlowError("the results have no 'bucketed_by_range': use definition='challenge_2026'")

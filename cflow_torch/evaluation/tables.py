@@ -9,13 +9,9 @@ Table = Tuple[List[str], List[List[Any]]]
 
 
 def format_table(results: dict[str, Any]) -> str:
-    """Format scores as one Markdown table per metric.
+    """Format the result of `SceneFlowMetrics.compute` as Markdown, one table per metric.
 
-    Args:
-        results: from `SceneFlowMetrics.compute`. Metrics that the definition lacks have no table.
-
-    Returns:
-        Markdown; "-" where there are no points.
+    Metrics that the definition lacks have no table. A "-" means that there are no points.
     """
     frames, points, num_nan = (results[key] for key in ("num_frames", "num_points", "num_nan"))
     scored = f"{frames} frames, {points} points scored, {num_nan} ignored because of NaN"

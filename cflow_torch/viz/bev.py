@@ -127,18 +127,10 @@ def plot_map(points: Array, title: str | None = None) -> Figure:
 
 
 def save_picture(figure: Figure, path: str | Path) -> Path:
-    """Save a figure as PNG. The file appears complete or not at all; an older one is replaced.
+    """Save a figure of a `plot_...` function as .png, and return the path.
 
-    Args:
-        figure: from a `plot_...` function.
-        path: ends in .png; its folder is created if it does not exist.
-
-    Returns:
-        The path.
-
-    Raises:
-        CFlowError: the path does not end in .png.
-        OSError: the file cannot be written.
+    The file appears complete or not at all; an older one is replaced, and missing folders are created. Another ending
+    is a `CFlowError`, a file that cannot be written an `OSError`.
     """
     path = style.checked_path(path, ".png")
     with atomic_name(path) as temporary:

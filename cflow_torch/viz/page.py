@@ -37,12 +37,7 @@ class Page:
         self.html, self.num_pairs = html, num_pairs
 
     def save(self, path: str | Path) -> Path:
-        """Write the page. The file appears complete or not at all; an older one is replaced.
-
-        Raises:
-            CFlowError: the path does not end in .html.
-            OSError: the file cannot be written.
-        """
+        """Write the page to a path that ends in .html. It appears complete or not at all; an older one is replaced."""
         path = checked_path(path, ".html")
         write_text(path, self.html)
         return path
