@@ -161,11 +161,9 @@ class CleanLog(Log):
 
 
 def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
-    """Accumulate the points of a log in the world, one per voxel.
+    """Accumulate the points of a log in the world, one per voxel of `voxel_size` metres.
 
-    Args:
-        log: has poses. For a map of the static world, pass a `CleanLog`, or the files written from one.
-        voxel_size: metres.
+    For a map of the static world, pass a `CleanLog`, or the files written from one.
 
     Returns:
         (M, 3) float64, metres in the world: the first point of each voxel, in the order of the sweeps.

@@ -15,8 +15,9 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
     """Move the points of sweep t to where they were at the time stamp of that sweep.
 
     A spinning LiDAR may meet a car twice, or its front later than its rear; the car is then torn or stretched. We move
-    each point back by the part of its flow between the time stamp and its own measurement. The motion of the recording
-    vehicle must have been compensated already, as our readers do.
+    each point back by the part of its flow between the time stamp and its own measurement, as if objects moved at
+    constant velocity within the sweep. The motion of the recording vehicle must have been compensated already, as our
+    readers do.
 
     Args:
         window: the sweeps of the flow; `pc0.point_times` and the poses and time stamps of pc0 and pc1 are used.
@@ -26,8 +27,6 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
     Returns:
         (N, 3) float64, metres, ego frame of sweep t, on the device of the result. Points that are static or have no
         flow keep their positions.
-
-    Convention: objects move at constant velocity within the sweep.
 
     Raises:
         CFlowError: the sweep has no point times, the times are not in order, or the result has another number of points

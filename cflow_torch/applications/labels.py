@@ -43,16 +43,13 @@ class DynamicPoints(NamedTuple):
 
 
 def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", overwrite: bool = False) -> int:
-    """Estimate the flow of a scene, and write labels into its file.
+    """Estimate the flow of a scene, write labels of all sweeps into its file, and return the number of sweeps.
 
     Args:
         file: `<scene>.h5` in OpenSceneFlow's layout.
         model: a `VerifiedFlow`; the preset `offline` is the most accurate.
         find_ground: "grid" or "patchwork", how to find the ground of sweeps without a mask.
         overwrite: replace labels that the scene already has.
-
-    Returns:
-        Number of labelled sweeps: all sweeps of the scene.
 
     Raises:
         CFlowError: the scene cannot be read or written, it already has labels, or the model gives no confidence. The

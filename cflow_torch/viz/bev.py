@@ -88,15 +88,9 @@ def plot_flow(
 def plot_map(points: Array, title: str | None = None) -> Figure:
     """Draw the points of a map from above, coloured by height; higher points are darker and cover lower ones.
 
-    Args:
-        points: (N, 3+), metres, in the world, for example of `static_map`.
-        title: one line above the picture.
-
-    Returns:
-        Figure for `save_picture`, at most 1000 pixels wide.
-
-    Convention:
-        x points right, y up, with equal scales. The view leaves out the outermost 0.2 % of the points on each side.
+    The points are (N, 3+) metres in the world, for example of `static_map`. The figure, for `save_picture`, is at most
+    1000 pixels wide; x points right, y up, with equal scales. The title is one line above the picture. The view leaves
+    out the outermost 0.2 % of the points on each side.
 
     Raises:
         CFlowError: matplotlib is not installed, or the points have another shape.

@@ -31,8 +31,7 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
         of t+1; the scores of all shifts as an image and as a surface, in pixels, with the chosen shift marked in both.
 
     Raises:
-        CFlowError: matplotlib is not installed, there is no such cluster, or the method has no such map (key points,
-            HDBSCAN, verified presets).
+        CFlowError: matplotlib is not installed, there is no such cluster, or the method has no such map.
 
     Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
     """

@@ -15,19 +15,14 @@ _POSITION = np.cumsum((0, *TRANSITIONS))  # of each primary on the wheel
 
 
 def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
-    """Convert flow to colours: direction to hue, length to saturation; zero flow is white.
+    """Convert flow (..., 2+), metres, to (..., 3) uint8 RGB: direction to hue, length to saturation.
 
-    Args:
-        flow: (..., 2+) float, metres; columns after x and y are ignored.
-        max_flow: length in metres with full saturation; None = the longest flow.
-
-    Returns:
-        (..., 3) uint8 RGB.
+    Flow of `max_flow` metres gets the full hue, None = the longest flow; longer flow is darker. Zero, NaN and infinite
+    flow is white. Columns after x and y are ignored.
 
     Convention:
         +x is red, then counter-clockwise yellow, green, cyan, blue, magenta. The angle in [0, 2 pi) is spread over 54
-        of the 55 steps, as in the viewers, so +y is (255, 230, 0), -x (0, 209, 255), -y (88, 0, 255). Flow longer than
-        `max_flow` is darker. NaN and infinite flow is white.
+        of the 55 steps, as in the viewers, so +y is (255, 230, 0), -x (0, 209, 255), -y (88, 0, 255).
 
     Raises:
         CFlowError: `max_flow` is not positive.
