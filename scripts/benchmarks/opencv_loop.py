@@ -13,12 +13,9 @@ from typing import Any, NamedTuple, Sequence
 import numpy as np
 import torch
 
-from cflow_torch.config import Config
-from cflow_torch.dense.coarse_to_fine import CoarseToFine, ProjectedSweeps
-from cflow_torch.dense.correlation import Estimates
-from cflow_torch.dense.history import pool
-from cflow_torch.errors import CFlowError
-from cflow_torch.model import Motion
+from cflow_torch.config import Config, DenseConfig
+from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.types import FlowResult, Sweep, Window, as_numpy
 
 _SQUARE = np.ones((3, 3), np.uint8)
 # Smallest score that is an overlap. One common pixel scores 1 / sqrt(E_m E_w), above 1e-4 up to 10,000 pixels each;
