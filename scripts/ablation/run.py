@@ -39,7 +39,7 @@ from sets import NEAR, ScoredSet, make_sets
 from cflow_torch import make_model
 from cflow_torch.config import Config, make_config
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.json_file import write_json
+from cflow_torch.data.files import write_json
 from cflow_torch.evaluation.bucketed import mean_of_present
 from cflow_torch.evaluation.definitions import Definition
 from cflow_torch.evaluation.frame import EvalFrame
