@@ -21,6 +21,7 @@ from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Nodes
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, Pixels, count_slices
 
+_TWICE = 1 + (1 << NUM_SLICES)  # copies the slices of a pixel to the upper bits
 # Comparisons (pixel x sweep x candidate) at once; each needs about 64 bytes of temporaries.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
 _FAR = 2  # pixels, in y or in x
@@ -178,26 +179,25 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
     for to, pixel in zip(*(of_all.split(size) for of_all in comparisons(members.step, num_steps))):
         of, start, which, near_border = take_columns(table, pixel)
-        own = members.slices.index_select(0, pixel)
         start.add_(to, alpha=area)
         which -= to
-        in_place = sweeps.image.index_select(0, start)
-        in_both, near = own & in_place, own & (in_place >> NUM_SLICES)
         index = take_columns(moves.offset, which).add_(start)
         leaves = flat_nonzero(near_border < moves.longest.index_select(0, which))
         shift = moves.shift.index_select(2, which.index_select(0, leaves))
         shift += take_columns(at, pixel.index_select(0, leaves))[:, None]
         index.index_copy_(1, leaves, sweeps.or_outside(take_columns(index, leaves), shift))
+
+        # The slices of the pixel that are in place or at the target: in the pixel, then where motions must leave.
+        own = members.slices.index_select(0, pixel)
+        in_place = sweeps.image.index_select(0, start).bitwise_and_(own * _TWICE)
         at_target = sweeps.image.index_select(0, index.view(-1)).view_as(index)
-        bits = take_columns(moves.bits, which)
-        near_static, near_target = own & (in_place >> bits), own & (at_target >> bits)
-        not_static, not_target = ~near_static, ~near_target
+        exact = torch.stack((in_place.expand_as(at_target), at_target))
+        near = (exact >> take_columns(moves.bits, which)).bitwise_and_(own)
+        found, absent = torch.stack((exact, near)), own ^ near
+        lost, won = found[:, 0] & absent[1], found[:, 1] & absent[0]
         given = own * moves.is_given.index_select(0, which)
-        found = torch.cat((in_both & not_target, near_static & not_target, given[None], in_both[None]))
-        won = torch.cat((own & at_target & not_static, near_target & not_static))
-        found[: len(won)] |= won << NUM_SLICES
-        found[-1] |= near << NUM_SLICES
-        sums.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(len(sums), -1), count_slices(found))
+        counted = torch.cat(((won << NUM_SLICES | lost).flatten(0, 1), given[None], in_place[None]))
+        sums.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(len(sums), -1), count_slices(counted))
     sums = sums.view(len(sums), count, 2)
     of_motion = sums[:-2].sum(2).view(2, num_candidates, count).transpose(1, 2)
     return Wins(of_motion >> 32, of_motion & 0xFFFFFFFF, sums[-2:])
