@@ -16,25 +16,23 @@ from __future__ import annotations
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, gather, renumber, scatter_count, take_columns
+from cflow_torch.ops.indices import constant, flat_nonzero, renumber, scatter_count, take_columns
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
 # A line: largest standard deviation across and smallest along, metres.
 _THIN, _LONG = 0.3, 1.0
-# Squared sine of the largest angle between a line and a motion along it.
-_ALONG = 0.04
-# Metres; shorter displacements over the window are ignored.
-_LEAST_TRAVEL = 1.2
-# The displacements of two ends that move together differ by at most this share of their sum.
-_ALIKE = 0.1
-# Metres; no road vehicle is longer. The ends of a longer noise barrier are the borders of what is visible.
-_LONGEST = 60.0
+_ALONG = 0.04  # squared sine of the largest angle between a line and a motion along it
+_LEAST_TRAVEL = 1.2  # metres; shorter displacements over the window are ignored
+_ALIKE = 0.1  # the displacements of two ends that move together differ by at most this share of their sum
+_LONGEST = 60.0  # metres; no road vehicle is longer. The ends of longer noise barriers border what is visible
 # A guard rail has fewer height slices per pixel at t+1, on average, and a larger standard deviation along the line, in
 # metres. No vehicle is as low and as long. Where a rail crosses the border of a slice, its pixels have two slices.
 _TALL, _RAIL = 2, 2.0
+_DIRECTIONS = ((1, 0), (0, 1), (1, 1), (1, -1))  # rows and columns: y, x and the diagonals
 
 
 def slides_along_itself(
@@ -63,16 +61,16 @@ def slides_along_itself(
     """
     count, pixel_size = len(candidates), sweeps.grid.pixel_size
     newest = flat_nonzero(members.step == 0)
-    component, row, col, window = gather(newest, component, members.row, members.col, members.window)
-    is_line, variance, (var_y, cov, var_x) = principal_axes(component, row, col, count, pixel_size)
+    members, component = members.take(newest), component.index_select(0, newest)
+    is_line, variance, (var_y, cov, var_x) = principal_axes(component, members.row_col, count, pixel_size)
     # Of the two forms of the eigenvector, we take the one that does not vanish.
     is_wide = var_y < var_x
     axis_y, axis_x = torch.where(is_wide, cov, variance - var_x), torch.where(is_wide, variance - var_y, cov)
-    num_slices = count_slices(members.slices.index_select(0, newest)) - _TALL
-    is_rail = (scatter_count(component, count, num_slices) < 0) & (variance >= (_RAIL / pixel_size) ** 2)
+    num_more = scatter_count(component, count, count_slices(members.slices) - _TALL)
+    is_rail = (num_more < 0) & (variance >= (_RAIL / pixel_size) ** 2)
 
     # The window of each component; components without pixels at t+1 are not lines.
-    window = torch.zeros_like(is_line, dtype=torch.int64).scatter_(0, component, window)
+    window = torch.zeros_like(num_more).scatter_(0, component, members.window)
     intervals = (sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)).index_select(0, window)[:, None]
     y, x = candidates.unbind(2)
     across = axis_y[:, None] * x - axis_x[:, None] * y
@@ -83,17 +81,18 @@ def slides_along_itself(
 
 
 def principal_axes(
-    component: Tensor, row: Tensor, col: Tensor, num_components: int, pixel_size: float
+    component: Tensor, row_col: Tensor, num_components: int, pixel_size: float
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Return whether each component is a line, (A,) bool, the largest variance in any direction, (A,) float64, square
     pixels, and the variance in y, the covariance and the variance in x, likewise.
 
     Args:
-        component, row, col: (Q,) int64, of each pixel at t+1.
+        component: (Q,) int64, of each pixel at t+1.
+        row_col: (2, Q) int64, of each pixel at t+1.
         num_components: A.
         pixel_size: s, metres.
     """
-    one_y_x = torch.stack((torch.ones_like(row), row, col))
+    one_y_x = F.pad(row_col, (0, 0, 1, 0), value=1)
     moments = scatter_count(component, num_components, (one_y_x[:, None] * one_y_x).view(9, -1)).view(3, 3, -1)
     n, sums = moments[0, 0], moments[0, 1:]
     # Differences of large products are exact in integers.
@@ -130,26 +129,24 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     name = flat_nonzero(is_long)
     if name.numel() == 0:
         return torch.zeros_like(is_long)
-    count = name.numel()
-    step, farthest = sweeps.pixels.step, sweeps.elapsed.abs().argmax(1)
-    is_compared = (step == 0) | (step == farthest.index_select(0, sweeps.pixels.window))
-    compared = flat_nonzero(is_compared)
+    count, step = name.numel(), sweeps.pixels.step
+    farthest = sweeps.elapsed.abs().argmax(1).index_select(0, sweeps.pixels.window)
+    compared = flat_nonzero((step == 0) | (step == farthest))
     number = renumber(name, is_long.numel()).index_select(0, take_columns(roots, compared).flatten())
     some = flat_nonzero(number < count)
     pixels = sweeps.pixels.take(compared.index_select(0, some % len(compared)))
-    is_new, component = pixels.step == 0, number.index_select(0, some)
-    num_slices = torch.where(is_new, count_slices(pixels.slices) - _TALL, 0)
-    is_tall = scatter_count(component, count, num_slices) >= 0
+    # Of t+1, then of the farthest sweep.
+    group = torch.add(number.index_select(0, some), pixels.step != 0, alpha=count)
+    is_tall = scatter_count(group, 2 * count, count_slices(pixels.slices) - _TALL)[:count] >= 0
 
-    # Ends in four directions, at t+1 and in the farthest sweep.
-    of_sweep = torch.where(is_new, component, component + count)
-    along = torch.stack((pixels.row, pixels.col, pixels.row + pixels.col, pixels.row - pixels.col)).double()
-    ends = segment_amin(torch.cat((along, -along)), of_sweep, 2 * count, math.inf)
-    low, high = ends.view(2, 4, 2, count)  # the high ends are negative
+    # The first pixel in each direction and in each opposite direction.
+    directions = (*_DIRECTIONS, *((-y, -x) for y, x in _DIRECTIONS))
+    along = constant(directions, torch.float64, name.device) @ pixels.row_col.double()
+    ends = segment_amin(along, group, 2 * count, math.inf).view(2, 4, 2, count)
     metres = tuple(scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))
-    unit = constant(metres, torch.float64, along.device)[:, None]
-    length, direction = (-(high[:, 0] + low[:, 0]) * unit).max(0)
-    low, high = (((ends[:, 0] - ends[:, 1]) * unit).gather(0, direction[None])[0] for ends in (low, high))
-    both = (low - high).abs()  # infinite or NaN if the component is not visible
-    moves = is_tall & (length <= _LONGEST) & (both >= 2 * _LEAST_TRAVEL) & ((low + high).abs() <= _ALIKE * both)
+    unit = constant(metres, torch.float64, name.device)[:, None]
+    length, direction = (ends[:, :, 0].sum(0) * -unit).max(0)
+    first, last = ((ends[:, :, 0] - ends[:, :, 1]) * unit).gather(1, direction.expand(2, 1, -1))[:, 0]
+    both = (first - last).abs()  # infinite or NaN if the component is not visible
+    moves = is_tall & (length <= _LONGEST) & (both >= 2 * _LEAST_TRAVEL) & ((first + last).abs() <= _ALIKE * both)
     return torch.zeros_like(is_long).index_copy_(0, name, moves)

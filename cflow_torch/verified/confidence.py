@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lookup, scatter_count
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, lookup, scatter_count, take_columns
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, Pixels, count_slices
@@ -68,14 +68,14 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     group, motion = _groups_of_one_motion(sweeps, members, which, rigid)
     wins = count_wins(sweeps, members, group, motion[:, None] + displaced)
     counts = torch.cat((wins.won[0] - wins.lost[0], wins.in_place[:, None]), 1)
-    object_of_group = torch.zeros_like(wins.in_place).scatter_(0, group, which)
-    counts = torch.zeros(objects.count, 6, dtype=torch.int64, device=device).index_add_(0, object_of_group, counts)
+    object_of_group = group.new_zeros(len(counts)).scatter_(0, group, which)
+    counts = counts.new_zeros(objects.count, 6).index_add_(0, object_of_group, counts)
     surplus, in_place = counts[:, :5], counts[:, 5]
     gain, matched = (surplus[:, 0] - surplus[:, 1:].amax(1)).clamp(min=0), surplus[:, 0] + in_place
     z = gain / matched.clamp(min=1).double().sqrt()
     newest = flat_nonzero(members.step == 0)
-    component, row, col = gather(newest, which, members.row, members.col)
-    is_line, *_ = principal_axes(component, row, col, objects.count, size)
+    row_col = take_columns(members.row_col, newest)
+    is_line, *_ = principal_axes(which.index_select(0, newest), row_col, objects.count, size)
     is_fast = rigid.flow.square().sum(1) >= (2 * _DISPLACEMENT) ** 2
     return MotionMargin(z, (z >= _Z) | ((gain > 0) | is_fast) & (surplus[:, 0] > in_place) & ~is_line)
 
@@ -99,9 +99,8 @@ def _groups_of_one_motion(
     size, motion = sweeps.grid.pixel_size, rigid.pixels_per_interval(sweeps.grid.pixel_size)
     elapsed = sweeps.elapsed.index_select(0, pixels.window)
     since_t = elapsed[:, 1] - elapsed.gather(1, pixels.step[:, None])[:, 0]
-    (y, x), (flow_x, flow_y) = sweeps.grid.centre(pixels.row_col), rigid.flow.index_select(0, which).unbind(1)
-    flow_x, flow_y = rigid.flow_at(which, x - flow_x * since_t, y - flow_y * since_t)  # the position is that at t
-    flow = torch.stack((flow_y, flow_x), 1) / size
+    at_t = sweeps.grid.centre(pixels.row_col).flip(0) - rigid.flow.index_select(0, which).t() * since_t
+    flow = rigid.flow_at(which, at_t).flip(1) / size
     rotates = flat_nonzero(((flow - motion.index_select(0, which)).abs() >= 1).any(1))
     group = which.index_copy(0, rotates, torch.arange(len(rotates), device=which.device) + len(motion))
     return group, torch.cat((motion, flow.index_select(0, rotates)))

@@ -34,15 +34,15 @@ class RigidMotion:
 
     def only(self, is_moving: Tensor) -> RigidMotion:
         """Keep the motion of some objects, (G,) bool, and make the others static."""
-        flow, rotation = self.flow.masked_fill(~is_moving[:, None], 0.0), self.rotation.masked_fill(~is_moving, 0.0)
+        static = ~is_moving
+        flow, rotation = self.flow.masked_fill(static[:, None], 0.0), self.rotation.masked_fill(static, 0.0)
         return RigidMotion(flow, rotation, self.centre)
 
-    def flow_at(self, index: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return x and y of the flow of points of t, metres per interval, by their object and position, (K,) each."""
-        (c_x, c_y), (v_x, v_y) = (values.index_select(0, index).unbind(1) for values in (self.centre, self.flow))
-        arm = torch.complex(x - c_x, y - c_y)
-        shift = rotate(self.rotation.index_select(0, index), arm) - arm
-        return shift.real + v_x, shift.imag + v_y
+    def flow_at(self, index: Tensor, position: Tensor) -> Tensor:
+        """Return the flow of points of t, (K, 2), metres per interval, by their object, (K,), and position, (2, K)."""
+        centre, flow = (torch.view_as_complex(of.index_select(0, index)) for of in (self.centre, self.flow))
+        arm = torch.complex(*position) - centre
+        return torch.view_as_real(rotate(self.rotation.index_select(0, index), arm) - arm + flow)
 
 
 def rotate(rotation: Tensor, arm: Tensor) -> Tensor:
@@ -70,13 +70,10 @@ class RotatingMotion(Motion):
         cluster = self.cluster(points)
         flow = self.flow.index_select(0, cluster)
         rotating = flat_nonzero((self.rotation != 0).index_select(0, cluster))
-        rigid, of_rotating = (
-            RigidMotion(self.flow[:, :2], self.rotation, self.centre),
-            cluster.index_select(0, rotating),
-        )
-        x, y = rigid.flow_at(of_rotating, *take_columns(positions[:2], rotating))
-        slope_x, slope_y = self.slope.index_select(0, of_rotating).unbind(1)
-        flow.index_copy_(0, rotating, torch.stack((x, y, slope_x * x + slope_y * y), 1))
+        rigid, cluster = RigidMotion(self.flow[:, :2], self.rotation, self.centre), cluster.index_select(0, rotating)
+        along = rigid.flow_at(cluster, take_columns(positions[:2], rotating))
+        rise = self.slope.index_select(0, cluster) * along
+        flow.index_copy_(0, rotating, torch.cat((along, rise[:, :1] + rise[:, 1:]), 1))
         return flow.float()
 
 
