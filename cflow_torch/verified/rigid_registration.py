@@ -71,11 +71,12 @@ class VoxelPairs:
         self._layers = (layer + constant(((-1,), (0,), (1,)), torch.int64, device)) & (NUM_LAYERS - 1)
         self._elapsed = sweeps.elapsed_of_pixel.index_select(0, pixel)
         self._k = (self._elapsed * 16).round_() / 16
-        self._end = sweeps.elapsed[:, 1].index_select(0, window)
-        self._since_t = self._end - self._elapsed
+        end = sweeps.elapsed[:, 1].index_select(0, window)
         x, y, self._height = take_columns(voxels.position, self._voxel)
-        self._centre = self._centre_of_object.index_select(0, self._object)
-        self._arm = torch.complex(x, y) - self._centre
+        centre = self._centre_of_object.index_select(0, self._object)
+        # The flow moves the arm of a voxel from its own sweep to t, and the centre of the object from t to t+1.
+        self._arm_and_centre = torch.stack((torch.complex(x, y) - centre, centre))
+        self._intervals = torch.stack((self._elapsed - end, end))
         variance = (NOISE * UNITS) ** 2
         noise = constant(tuple(variance if i % 4 == 0 else 0.0 for i in range(9)), torch.float64, device)
         self._own_spread = take_columns(spread, self._voxel) + noise[:, None]
@@ -168,15 +169,15 @@ class VoxelPairs:
             error: (3, K) float64, units, from the moved voxel to the other one.
             arm: (K,) complex128, from the centre at t+1 to the moved voxel.
         """
-        voxels, index, end, height = self._voxels, self._object[some], self._end[some], self._height[some]
+        index = self._object[some]
         v_x, v_y, rotation = take_columns(motion, index)
-        velocity = torch.complex(v_x, v_y)
-        arm = rotate(rotation * self._elapsed[some], self._arm[some] - velocity * self._since_t[some])
-        at = torch.view_as_real(self._centre[some] + velocity * end + arm).round()
-        target = torch.cat((at.t(), height[None]))
-        other, square = voxels.nearest(self._sweep[some], self._layers[:, some], target)
+        arm, centre = self._arm_and_centre[:, some] + torch.complex(v_x, v_y) * self._intervals[:, some]
+        arm = rotate(rotation * self._elapsed[some], arm)
+        at = torch.view_as_real(centre + arm).round()
+        target = torch.cat((at.t(), self._height[None, some]))
+        other, is_near = self._voxels.nearest(self._sweep[some], self._layers[:, some], target, _FARTHEST)
         of_other = take_columns(self._table, other)
-        is_pair = (square <= round((_FARTHEST * UNITS) ** 2)) & (of_other[0] == index)
+        is_pair = is_near & (of_other[0] == index)
         error, spread = of_other[10:] - target, self._own_spread[:, some] + of_other[1:10]
         inverse, scale = adjugate(spread.view(3, 3, -1))
         square = ((inverse * error).sum(1) * error).sum(0)

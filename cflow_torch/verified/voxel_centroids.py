@@ -118,17 +118,18 @@ class Voxels:
         if points.time is not None:
             self.time = scatter_count(voxel, len(key), points.time.double()) / count
 
-    def nearest(self, sweep: Tensor, layers: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+    def nearest(self, sweep: Tensor, layers: Tensor, position: Tensor, farthest: float) -> tuple[Tensor, Tensor]:
         """Find the nearest voxel of a sweep in the 3 x 3 pixels around a position.
 
         Args:
             sweep: (K,) int64, window * S + step.
             layers: (L, K) int64, the slices to search in.
-            position: (3, K) float64, units, anywhere.
+            position: (3, K) float64, whole units, anywhere.
+            farthest: metres.
 
         Returns:
             voxel: (K,) int64, V = not found. Ties: the first slice of the first pixel in raster order.
-            square: (K,) int64, its squared distance, square units.
+            is_near: (K,) bool, it is found and at most `farthest` away; the square of that is rounded to square units.
 
         Cost: 9 L lookups for each position.
         """
@@ -137,8 +138,9 @@ class Voxels:
         # Square and slot share one number, because taking the minimum is several times faster than argmin. It is many
         # times faster in float64, which holds these numbers exactly, than in int64.
         slot = constant(tuple(range(len(voxel))), torch.float64, position.device)[:, None]
-        key = torch.add(slot, apart.square_().sum(0), alpha=32).amin(0).long()
-        return voxel.gather(0, (key & 31)[None])[0], key >> 5
+        key = torch.add(slot, apart.square_().sum(0), alpha=32).amin(0)
+        is_near = key < 32 * (round((farthest * UNITS) ** 2) + 1)
+        return voxel.gather(0, (key.long() & 31)[None])[0], is_near
 
     def around(self, sweep: Tensor, layers: Tensor, position: Tensor, reach: int) -> Tensor:
         """Return the voxels of a sweep in the pixels around a position, `reach` pixels each way.
