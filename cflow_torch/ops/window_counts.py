@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import concat_ranges, take_columns
+from cflow_torch.ops.indices import concat_ranges, scatter_count, take_columns
 
 
 class WindowCounts:
@@ -25,11 +25,11 @@ class WindowCounts:
         area = size[:, 0] * edges[1]
         numbers = np.concatenate((size.T, first_edge, area.cumsum()[None] - area, edges[1:]))
         self._numbers = torch.from_numpy(numbers).to(image.device)
-        *edge, start, stride = take_columns(self._numbers[2:], image)
+        numbers_of_pixel = take_columns(self._numbers[2:], image)
+        edge, (start, stride) = numbers_of_pixel[:2], numbers_of_pixel[2:]
         # Number of pixels above every row, and to the left of every column. The pixels of earlier images cancel.
-        line, one = torch.cat((edge[0] + row, edge[1] + col)).add_(1), torch.ones_like(image)
-        zeros = torch.zeros(int(edges.sum()), dtype=torch.int64, device=image.device)
-        self._before = zeros.index_add_(0, line, one.repeat(2)).cumsum(0)
+        line = torch.stack((row, col)).add_(edge).add_(1)
+        self._before = scatter_count(line.flatten(), int(edges.sum())).cumsum(0)
         # Running sum over rows of W + 1 samples, of which the first is empty.
         table = torch.zeros(int(area.sum()), dtype=torch.int32, device=image.device)
         self._table = table.index_fill_(0, stride.mul_(row).add_(start).add_(col).add_(1), 1).cumsum(0)

@@ -97,7 +97,7 @@ class RangeImages:
     def __init__(self, sweeps: HeightSlicedSweeps) -> None:
         batch, device = sweeps.batch, sweeps.image.device
         origin = batch.origin.clone()
-        origin[:, :, 2] += self._sensor_height(sweeps)[:, None]
+        origin[:, :, 2].add_(self._sensor_height(sweeps)[:, None])
         self._origin = origin.view(-1, 3).t().contiguous()
         size = origin[:, :, 0].numel() * _ELEVATIONS * _AZIMUTHS
         farthest = torch.full((size,), -math.inf, dtype=torch.float32, device=device)

@@ -35,7 +35,6 @@ _COUNTS = tuple(bin(byte & OWN).count("1") + (bin(byte >> NUM_SLICES).count("1")
 _HIGHEST_SLICE = 2.0**56
 # A low pixel belongs to the object of a tall one at most so many rows and columns away.
 _RESIDUE_REACH = 2
-_BESIDE = (-1, 0, 1)  # rows or columns
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ class HeightSlicedSweeps:
         num_points, num_indices = batch.image.numel(), num_images * grid.height * grid.width
         image = lazy_zeros(2 * num_indices + 1, torch.uint8, device)
         index = torch.empty(num_points, dtype=torch.int64, device=device)
-        height_slice, is_tall = (torch.empty(num_points, dtype=of, device=device) for of in (torch.uint8, torch.bool))
+        height_slice, is_low = (torch.empty(num_points, dtype=of, device=device) for of in (torch.uint8, torch.bool))
         ground = None if min_height is None or batch.ground is None else batch.ground.mean()
         for points in chunks(0, num_points, device):
             positions = batch.positions[:, points]
@@ -142,10 +141,10 @@ class HeightSlicedSweeps:
             if ground is not None and batch.ground is not None and min_height is not None:
                 window = floor_divide(batch.image[points].long(), batch.num_steps)
                 height = batch.ground.at(positions, window, ground)
-                is_tall[points] = positions[2] * 100 >= height + round(100 * min_height)
+                is_low[points] = positions[2] * 100 < height + round(100 * min_height)
         if ground is not None:  # after all points are drawn, because one tall point makes its pixel tall
-            image.index_fill_(0, torch.where(is_tall, index, num_indices), 2)
-        image[num_indices] = 0  # that of points that are inactive
+            image.index_fill_(0, index.masked_fill(is_low, num_indices), 2)
+        image[num_indices].zero_()  # that of points that are inactive
         pixel = occupied(image[:num_indices])
         rank = lazy_zeros(len(image), torch.int32, device)
         if ground is not None:
@@ -237,9 +236,8 @@ class HeightSlicedSweeps:
         Returns:
             (...) int64; for pixels outside, the index of the last entry of `image`.
         """
-        ends = constant(((0, 0), (self.grid.height - 1, self.grid.width - 1)), torch.int64, at.device)
-        is_outside = at.clamp(*ends.view(2, 2, *(1,) * index.dim())) != at
-        return index.masked_fill(is_outside[0] | is_outside[1], self.image.numel() - 1)
+        is_above_or_below, is_beside = _is_outside(at, self.grid)
+        return index.masked_fill(is_above_or_below | is_beside, self.image.numel() - 1)
 
     def around(self, pixel: Tensor, reach: int) -> Tensor:
         """Return the occupied pixels around some pixels, in the same sweep.
@@ -307,20 +305,27 @@ def _pixels(pixel: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels
 
 def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:
     """Write the slices of each pixel into its own entry, and into the upper bits of the 3 x 3 entries around it."""
-    above, outside, line = pixels.slices << NUM_SLICES, image.numel() - 1, constant(_BESIDE, torch.int64, image.device)
+    above, outside = pixels.slices << NUM_SLICES, image.numel() - 1
     image.index_copy_(0, pixels.index, pixels.slices | above)
-    row, col = pixels.row + line[:, None], pixels.col + line[:, None]
-    inside = (row.clamp(0, grid.height - 1) == row)[:, None] & (col.clamp(0, grid.width - 1) == col)
+    line = constant((-1, 0, 1), torch.int64, image.device)
     around = pixels.index + torch.add(line, line[:, None], alpha=grid.width)[..., None]
+    is_above_or_below, is_beside = _is_outside(pixels.row_col[:, None] + line[:, None], grid)
+    around.masked_fill_(is_above_or_below[:, None] | is_beside, outside)
     # Within a round, all indices differ, except those outside, where the value does not matter.
-    upper, middle, lower = around.masked_fill_(~inside, outside).flatten(1)
+    upper, middle, lower = around.flatten(1)
     left, _, right = middle.view(3, -1)
     for index in (left, right):
         image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(above))
     of_row = image.index_select(0, middle).bitwise_and_(OWN << NUM_SLICES)
     for index in (upper, lower):
         image.index_copy_(0, index, image.index_select(0, index).bitwise_or_(of_row))
-    image[outside] = 0
+    image[outside].zero_()
+
+
+def _is_outside(at: Tensor, grid: Grid) -> Tensor:
+    """Return whether rows and columns, (2, ...) int64, lie outside the images, (2, ...) bool."""
+    ends = constant(((0, 0), (grid.height - 1, grid.width - 1)), torch.int64, at.device)
+    return at.clamp(*ends.view(2, 2, *(1,) * (at.dim() - 1))) != at
 
 
 def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:

@@ -125,10 +125,10 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     component = union_find(count, floor_divide(links, near.shape[1]), targets)
 
     column, height = split_index(cells, _NUM_SLICES)
-    is_above = (height[1:] - height[:-1] >= _GAP) & (component[1:] != component[:-1]) & (column[1:] == column[:-1])
+    is_same = (height[1:] - height[:-1] < _GAP) | (component[1:] == component[:-1]) | (column[1:] != column[:-1])
     is_under = torch.zeros(count + 1, dtype=torch.bool, device=rows.device)
-    is_under.index_fill_(0, torch.where(is_above, component[:-1], count), True)
-    is_under.index_fill_(0, torch.where(is_above, component[1:], count), False)  # it is above another one
+    is_under.index_fill_(0, component[:-1].masked_fill(is_same, count), True)
+    is_under.index_fill_(0, component[1:].masked_fill(is_same, count), False)  # it is above another one
     foot, top = segment_minmax(height, component, count)
     rise = segment_amin(
         height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, _NUM_SLICES
