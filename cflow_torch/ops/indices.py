@@ -94,6 +94,22 @@ def renumber(index: Tensor, size: int) -> Tensor:
     return position.scatter_(0, index, torch.arange(index.numel(), device=index.device))
 
 
+def members_of(groups: Tensor, group: Tensor, num_groups: int) -> tuple[Tensor, Tensor]:
+    """Select the members of some groups.
+
+    Args:
+        groups: (K,) int64, distinct, below G.
+        group: (N,) int64, group of each member, 0 ... G; G stands for "none".
+        num_groups: G.
+
+    Returns:
+        The positions of the selected members, (M,) int64, ascending, and the position of the group of each in `groups`.
+    """
+    number = renumber(groups, num_groups).index_select(0, group)
+    kept = flat_nonzero(number < groups.numel())
+    return kept, number.index_select(0, kept)
+
+
 def index_in_group(group: Tensor) -> Tensor:
     """(N,) int64, index of each element among the elements of its group, from groups (N,) in ascending order."""
     return torch.arange(group.numel(), device=group.device) - torch.searchsorted(group, group)

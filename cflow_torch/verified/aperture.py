@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, renumber, scatter_count, take_columns
+from cflow_torch.ops.indices import constant, flat_nonzero, members_of, scatter_count, take_columns
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
@@ -57,7 +57,6 @@ def slides_along_itself(
         with at least 2 m along it and fewer than two slices per pixel on average. Zero motion never slides.
 
     Cost: some passes over the pixels.
-    Source: the aperture problem; not in the paper.
     """
     count, pixel_size = len(candidates), sweeps.grid.pixel_size
     newest = flat_nonzero(members.step == 0)
@@ -124,7 +123,6 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
         equally far in time. A component without pixels in that sweep does not move.
 
     Cost: some passes over the pixels of long components.
-    Source: not in the paper.
     """
     name = flat_nonzero(is_long)
     if name.numel() == 0:
@@ -132,11 +130,10 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     count, step = name.numel(), sweeps.pixels.step
     farthest = sweeps.elapsed.abs().argmax(1).index_select(0, sweeps.pixels.window)
     compared = flat_nonzero((step == 0) | (step == farthest))
-    number = renumber(name, is_long.numel()).index_select(0, take_columns(roots, compared).flatten())
-    some = flat_nonzero(number < count)
+    some, component = members_of(name, take_columns(roots, compared).flatten(), is_long.numel())
     pixels = sweeps.pixels.take(compared.index_select(0, some % len(compared)))
     # Of t+1, then of the farthest sweep.
-    group = torch.add(number.index_select(0, some), pixels.step != 0, alpha=count)
+    group = torch.add(component, pixels.step != 0, alpha=count)
     is_tall = scatter_count(group, 2 * count, count_slices(pixels.slices) - _TALL)[:count] >= 0
 
     # The first pixel in each direction and in each opposite direction.

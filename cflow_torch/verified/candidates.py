@@ -33,15 +33,10 @@ _LARGEST_BOX = 1 << 12
 
 
 class Candidates(NamedTuple):
-    """Motion candidates of N nodes.
+    """Motion candidates of N nodes."""
 
-    Args:
-        motion: (N, C, 2) float64, (y, x), finest pixels per sweep interval; 0 = unknown. Earlier candidates win ties.
-        score: (N,) float32, NCC with the nearest sweep in which the node has pixels.
-    """
-
-    motion: Tensor
-    score: Tensor
+    motion: Tensor  # (N, C, 2) float64, (y, x), finest pixels per sweep interval; 0 = unknown. Ties: the first one
+    score: Tensor  # (N,) float32, NCC with the nearest sweep in which the node has pixels
 
 
 def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig) -> Candidates:
@@ -90,10 +85,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
 def _find_peaks(
     nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the sub-pixel displacement m -> t+1 of each node for every other sweep m.
-
-    Args:
-        nodes, components, sweeps, config: as for `propose`.
+    """Return the sub-pixel displacement m -> t+1 of each node for every other sweep m. Args as for `propose`.
 
     Returns:
         estimates: (N, S - 1, 2) float64, (y, x), finest pixels m -> t+1, nearest sweep first.
@@ -117,25 +109,15 @@ def _find_peaks(
 
 
 class _NodeImages(NamedTuple):
-    """A small image of each of N nodes for each of S sweeps, at the scale at which the node is correlated.
+    """A small image of each of N nodes for each of S sweeps, at the scale at which the node is correlated."""
 
-    Args:
-        block: (N,) int64, side of a pixel in finest pixels.
-        first: (N, 2) int64, top-left (row, col) of the box over all sweeps, in pixels of the scale.
-        size: (N, 2) int64, its height and width.
-        start: (N,) int64, where the images of each node begin in `image`.
-        image: (I,) uint8, slices of the pixels of all images, one image after the other.
-        pixels: the occupied pixels.
-        occupied: (Q,) int64, index of each of them into `image`.
-    """
-
-    block: Tensor
-    first: Tensor
-    size: Tensor
-    start: Tensor
-    image: Tensor
-    pixels: ClusterPixels
-    occupied: Tensor
+    block: Tensor  # (N,) int64, side of a pixel in finest pixels
+    first: Tensor  # (N, 2) int64, top-left (row, col) of the box over all sweeps, in pixels of the scale
+    size: Tensor  # (N, 2) int64, its height and width
+    start: Tensor  # (N,) int64, where the images of each node begin in `image`
+    image: Tensor  # (I,) uint8, slices of the pixels of all images, one image after the other
+    pixels: ClusterPixels  # the occupied pixels
+    occupied: Tensor  # (Q,) int64, index of each of them into `image`
 
     @classmethod
     def of(cls, nodes: Nodes, blocks: Sequence[int], sweeps: HeightSlicedSweeps) -> _NodeImages:
@@ -177,13 +159,10 @@ class _NodeImages(NamedTuple):
 
 
 def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tensor:
-    """Return the sub-pixel offset of each peak, (J, 2) float64, (y, x), pixels of its scale: vertices of the parabolas
-    through the counts of common slices at the peak and at its four neighbours; 0 for pairs whose peak is at shift 0.
+    """Return the sub-pixel offset of each peak, (J, 2) float64, (y, x), pixels of its scale, from the shifts, (J, 2).
 
-    Args:
-        images: of all nodes.
-        pairs: J of them.
-        shift: (J, 2) int64, (dy, dx), of each peak.
+    It is the vertex of the parabolas through the counts of common slices at the peak and at its four neighbours; 0 for
+    pairs whose peak is at shift 0.
     """
     is_moved = shift.any(1)
     template = pairs.template

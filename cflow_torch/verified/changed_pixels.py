@@ -25,15 +25,10 @@ _PER_METRE, _HIGHEST = 256, 8192  # steps of height per metre; their largest num
 
 
 class ChangedPixels(NamedTuple):
-    """The change of P pixels. Windows without history have none, because only one other sweep would decide there.
+    """The change of P pixels; all False in windows without history, because a single other sweep would decide there."""
 
-    Args:
-        is_missing: (P,) bool, a slice is missing in another sweep and not occluded there.
-        has_changed: (P,) bool, a slice is missing in another sweep that saw its position.
-    """
-
-    is_missing: Tensor
-    has_changed: Tensor
+    is_missing: Tensor  # (P,) bool, a slice is missing in another sweep and not occluded there
+    has_changed: Tensor  # (P,) bool, a slice is missing in another sweep that saw its position
 
 
 def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:

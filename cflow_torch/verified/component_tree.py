@@ -41,31 +41,18 @@ _PRICE = 16 * 4
 
 @dataclass(frozen=True)
 class Components:
-    """All components of all windows. Each has a name, a number below V, level by level; some numbers are unused.
+    """All components of all windows. Each has a name, a number below V, level by level; some numbers are unused."""
 
-    Args:
-        roots: (L, P) int64, component of each pixel at each level, coarse to fine; the last level is not dilated.
-        changed: (Q,) int64, pixels that changed, positions in the list.
-        changed_root: (Q,) int64, component of each of them, labelled among the changed pixels alone.
-        firsts: first name of each level, then of the components of changed pixels.
-        parent: (V + 1,) int64, component of the next coarser level; V = none.
-        size: (V,) int64, number of pixels; 0 = an unused name.
-        length: (V,) float64, metres, longer side of the bounding box of its pixels at t+1.
-        is_linked: (V,) bool, it has pixels at t+1 and before.
-        may_move: (V,) bool, it is linked, and the static test does not exclude a motion.
-        blocks: side of a pixel at each scale, in finest pixels.
-    """
-
-    roots: Tensor
-    changed: Tensor
-    changed_root: Tensor
-    firsts: tuple[int, ...]
-    parent: Tensor
-    size: Tensor
-    length: Tensor
-    is_linked: Tensor
-    may_move: Tensor
-    blocks: tuple[int, ...]
+    roots: Tensor  # (L, P) int64, component of each pixel at each level, coarse to fine; the last is not dilated
+    changed: Tensor  # (Q,) int64, pixels that changed, positions in the list
+    changed_root: Tensor  # (Q,) int64, component of each of them, labelled among the changed pixels alone
+    firsts: tuple[int, ...]  # first name of each level, then of the components of changed pixels
+    parent: Tensor  # (V + 1,) int64, component of the next coarser level; V = none
+    size: Tensor  # (V,) int64, number of pixels; 0 = an unused name
+    length: Tensor  # (V,) float64, metres, longer side of the bounding box of its pixels at t+1
+    is_linked: Tensor  # (V,) bool, it has pixels at t+1 and before
+    may_move: Tensor  # (V,) bool, it is linked, and the static test does not exclude a motion
+    blocks: tuple[int, ...]  # side of a pixel at each scale, in finest pixels
 
     @property
     def count(self) -> int:
@@ -80,25 +67,15 @@ class Components:
 
 @dataclass(frozen=True)
 class Nodes:
-    """N components that may move: coarse to fine, then those of changed pixels, then those under overhangs.
+    """N components that may move: coarse to fine, then those of changed pixels, then those under overhangs."""
 
-    Args:
-        component: (N,) int64, its name; names of those under overhangs begin at V.
-        level: (N,) int64, 0 ... L - 1; L = changed pixels, L + 1 = under an overhang.
-        parent: (N,) int64, the next coarser node around it; N = none.
-        window: (N,) int64.
-        travels: (N,) bool, it is longer than other objects, and both of its ends move.
-        pixel: (A,) int64, pixels of all nodes, positions in the list; a pixel of several nodes is repeated.
-        node: (A,) int64, node of each of them.
-    """
-
-    component: Tensor
-    level: Tensor
-    parent: Tensor
-    window: Tensor
-    travels: Tensor
-    pixel: Tensor
-    node: Tensor
+    component: Tensor  # (N,) int64, its name; names of those under overhangs begin at V
+    level: Tensor  # (N,) int64, 0 ... L - 1; L = changed pixels, L + 1 = under an overhang
+    parent: Tensor  # (N,) int64, the next coarser node around it; N = none
+    window: Tensor  # (N,) int64
+    travels: Tensor  # (N,) bool, it is longer than other objects, and both of its ends move
+    pixel: Tensor  # (A,) int64, pixels of all nodes, positions in the list; a pixel of several nodes is repeated
+    node: Tensor  # (A,) int64, node of each of them
 
     @property
     def count(self) -> int:
@@ -108,17 +85,11 @@ class Nodes:
 
 @dataclass(frozen=True)
 class Objects:
-    """The components that were selected as objects. They are numbered by window, then by their first pixel.
+    """The components that were selected as objects. They are numbered by window, then by their first pixel."""
 
-    Args:
-        of_pixel: (P,) int64, object of each occupied pixel, G = none.
-        component: (G,) int64, name of the component.
-        first: (G,) int64, position of its first pixel in the list.
-    """
-
-    of_pixel: Tensor
-    component: Tensor
-    first: Tensor
+    of_pixel: Tensor  # (P,) int64, object of each occupied pixel, G = none
+    component: Tensor  # (G,) int64, name of the component
+    first: Tensor  # (G,) int64, position of its first pixel in the list
 
     @property
     def count(self) -> int:
@@ -206,12 +177,12 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
     travels = both_ends_move(sweeps, roots, is_long)
     may_move = may_move & (travels | ~is_long)
     if len(components.firsts) > components.num_levels:
-        may_move[components.firsts[-1] :] &= length[components.firsts[-1] :] <= _LOCAL
+        may_move[components.firsts[-1] :].logical_and_(length[components.firsts[-1] :] <= _LOCAL)
     # A plain component with as many pixels as its parent is the same component.
     size, parent = F.pad(components.size, (0, 1)), components.parent
     is_node = F.pad(may_move, (0, 1))
     plain = slice(components.firsts[components.num_levels - 1], (*components.firsts, count)[components.num_levels])
-    is_node[plain] &= size[plain] != size.index_select(0, parent[plain])
+    is_node[plain].logical_and_(size[plain] != size.index_select(0, parent[plain]))
     name = flat_nonzero(is_node)
     number, around = renumber(name, count), parent.index_select(0, name)
     nearest = torch.where(is_node, torch.arange(count + 1, device=parent.device), parent)
@@ -266,12 +237,9 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
 
     # Of all nodes of a pixel, the largest number is that of one of changed pixels or under an overhang, or the finest.
     is_other = nodes.level >= num_levels
-    last, finest = (
-        torch.full((num_pixels,), -1, dtype=torch.int64, device=own.device)
-        .scatter_reduce_(0, nodes.pixel, node, "amax")
-        .remainder_(count + 1)  # -1 becomes "none"
-        for node in (nodes.node, nodes.node.masked_fill(is_other.index_select(0, nodes.node), -1))
-    )
+    both = torch.stack((nodes.node, nodes.node.masked_fill(is_other.index_select(0, nodes.node), -1)))
+    largest = both.new_full((2, num_pixels), -1).scatter_reduce_(1, nodes.pixel.expand_as(both), both, "amax")
+    last, finest = largest.remainder_(count + 1)  # -1 becomes "none"
     moving = winner.index_select(0, finest)
     other = torch.where(lookup(is_other & (evidence > 0), last), last, count)
     moving = torch.minimum(moving, other)

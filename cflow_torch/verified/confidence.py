@@ -35,18 +35,15 @@ _Z = 1.0  # standard deviations of noise by which a motion must exceed its displ
 
 
 class MotionMargin(NamedTuple):
-    """The margins of G objects.
+    """The margins of G objects."""
 
-    Args:
-        z: (G,) float64, slices matched by the motion minus those matched by its best displaced copy, in standard
-            deviations of noise; 0 = the motion is not better, or the object is static.
-        is_dynamic: (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line, the motion
-            matches more of it than zero motion does, and it is better than its displaced copies or at least twice as
-            long as the displacement. If it is so long, the displaced copies are motions as well. A line needs z,
-            because beams hit a rail at positions that move with the vehicle.
-    """
-
+    # (G,) float64, slices matched by the motion minus those matched by its best displaced copy, in standard deviations
+    # of noise; 0 = the motion is not better, or the object is static.
     z: Tensor
+    # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line, the motion matches more of
+    # it than zero motion does, and it is better than its displaced copies or at least twice as long as the
+    # displacement. If it is so long, the displaced copies are motions as well. A line needs z, because beams hit a rail
+    # at positions that move with the vehicle.
     is_dynamic: Tensor
 
 
@@ -86,15 +83,8 @@ def _groups_of_one_motion(
     """Group pixels that share a motion: the pixels of an object, except those that its rotation displaces by a
     pixel or more. Each of these is a group of its own.
 
-    Args:
-        sweeps: finest images.
-        pixels: K pixels of objects.
-        which: (K,) int64, object of each pixel.
-        rigid: motion of the G objects.
-
-    Returns:
-        group: (K,) int64, of each pixel.
-        motion: (G + groups, 2) float64, (y, x), pixels per interval.
+    `which` is the object of each pixel, (K,) int64. Return the group of each pixel, (K,) int64, and the motion of the
+    groups, (G + groups, 2) float64, (y, x), pixels per interval.
     """
     size, motion = sweeps.grid.pixel_size, rigid.pixels_per_interval(sweeps.grid.pixel_size)
     elapsed = sweeps.elapsed.index_select(0, pixels.window)
@@ -152,16 +142,8 @@ def _bin(values: Tensor, bounds: list[float]) -> Tensor:
 
 
 def _neighbourhood(sweeps: HeightSlicedSweeps, pixels: Pixels, motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Count the slices of t in the block around each pixel, and those of them that t+1 has at their target.
-
-    Args:
-        sweeps: finest images.
-        pixels: all K pixels of t.
-        motion: (K, 2) float64, (y, x) finest pixels per interval.
-
-    Returns:
-        (K,) int64 each.
-    """
+    """Count the slices of t in the block around each of its K pixels, and those of them that t+1 has at their target,
+    (K,) int64 each. The motion is (K, 2) float64, (y, x), finest pixels per interval."""
     side = max(1, round(_BLOCK / sweeps.grid.pixel_size))
     height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
     row, col = floor_divide(pixels.row_col, side)

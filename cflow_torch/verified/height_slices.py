@@ -39,16 +39,17 @@ _RESIDUE_REACH = 2
 
 @dataclass(frozen=True)
 class Pixels:
-    """Occupied pixels of sweeps.
+    """Occupied pixels of sweeps. Step 0 is sweep t+1, 1 is t, 2 is t-1, ..."""
 
-    Args:
-        table: (5, K) int64: flat index into the images, window, step, row and column of each pixel. Step 0 is sweep
-            t+1, 1 is t, 2 is t-1, ...
-        slices: (K,) uint8, height slices of each pixel, a bit each.
-    """
+    table: Tensor  # (5, K) int64: flat index into the images, window, step, row and column of each pixel
+    slices: Tensor  # (K,) uint8, height slices of each pixel, a bit each
 
-    table: Tensor
-    slices: Tensor
+    @classmethod
+    def of(cls, index: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels:
+        """Make pixels from their flat indices and their slices, (K,) each."""
+        of_image, within = split_index(index, grid.height * grid.width)
+        columns = (index, *split_index(of_image, num_steps), *split_index(within, grid.width))
+        return cls(torch.stack(columns), slices)
 
     @property
     def index(self) -> Tensor:
@@ -87,28 +88,20 @@ class Pixels:
 
 @dataclass(frozen=True)
 class HeightSlicedSweeps:
-    """All sweeps of all windows, as height-sliced images.
+    """All sweeps of all windows, as height-sliced images."""
 
-    Args:
-        batch: the points.
-        grid: the finest BEV.
-        image: (I,) uint8 with I - 1 = 2 B S H W. Bits 0 ... 3: a point of this height slice is in the pixel; bits 4 ...
-            7: one is in the 3 x 3 pixels around. The second half is empty until `with_copies` draws there. The last
-            entry, always 0, is for positions outside the images.
-        rank: (I,) int32, 1 + position of each occupied pixel in the list; 0 for empty pixels.
-        pixels: the P occupied pixels, ascending.
-        pixel_of_point: (N + K,) int64, position in the list of the pixel of each point, then of each copy; P for points
-            that are inactive or in a pixel that was left out.
-        copied: (K,) int64, the points that have copies; empty before `with_copies`.
-    """
-
-    batch: Batch
-    grid: Grid
+    batch: Batch  # the points
+    grid: Grid  # the finest BEV
+    # (I,) uint8 with I - 1 = 2 B S H W. Bits 0 ... 3: a point of this height slice is in the pixel. Bits 4 ... 7: one
+    # is in the 3 x 3 pixels around. The second half is empty until `with_copies` draws there. The last entry, always 0,
+    # is for positions outside the images.
     image: Tensor
-    rank: Tensor
-    pixels: Pixels
+    rank: Tensor  # (I,) int32, 1 + position of each occupied pixel in the list; 0 for empty pixels
+    pixels: Pixels  # the P occupied pixels, ascending
+    # (N + K,) int64, position in the list of the pixel of each point, then of each copy; P for points that are inactive
+    # or in a pixel that was left out.
     pixel_of_point: Tensor
-    copied: Tensor
+    copied: Tensor  # (K,) int64, the points that have copies; empty before `with_copies`
 
     @classmethod
     def of(cls, batch: Batch, grid: Grid, min_height: float | None = None) -> HeightSlicedSweeps:
@@ -153,7 +146,8 @@ class HeightSlicedSweeps:
             pixel = pixel.index_select(0, flat_nonzero(is_kept))
         rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=device))
         pixel_of_point = (rank.index_select(0, index).long() - 1).remainder_(len(pixel) + 1)
-        pixels = _pixels(pixel, _slices(pixel_of_point, height_slice, len(pixel)), grid, batch.num_steps)
+        slices = _slices(pixel_of_point, height_slice, len(pixel))
+        pixels = Pixels.of(pixel, slices, grid, batch.num_steps)
         _draw_neighbourhoods(image, pixels, grid)
         return cls(batch, grid, image, rank, pixels, pixel_of_point, pixel[:0])
 
@@ -294,13 +288,6 @@ def _slices(of_point: Tensor, height_slice: Tensor, num_pixels: int) -> Tensor:
     # The product moves them to bits 24 ... 27; other terms are below or overflow, and no two of them meet.
     word = lanes.view(torch.int32)[:num_pixels] * 0x01020408
     return (word >> 24).bitwise_and_(OWN).to(torch.uint8)
-
-
-def _pixels(pixel: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels:
-    """Make pixels from their flat indices."""
-    of_image, within = split_index(pixel, grid.height * grid.width)
-    columns = (pixel, *split_index(of_image, num_steps), *split_index(within, grid.width))
-    return Pixels(torch.stack(columns), slices)
 
 
 def _draw_neighbourhoods(image: Tensor, pixels: Pixels, grid: Grid) -> None:

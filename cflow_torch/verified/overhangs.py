@@ -21,7 +21,7 @@ from cflow_torch.ops.indices import (
     lazy_empty,
     lazy_zeros,
     lookup,
-    renumber,
+    members_of,
     split_index,
     take_columns,
 )
@@ -69,9 +69,8 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     seen = torch.zeros(2 * num_names, dtype=torch.bool, device=rows.device)
     seen.index_fill_(0, component + num_names * (sweeps.pixels.step[num_own:] > 0), True)
     name = flat_nonzero(seen[:num_names] & seen[num_names:])  # at t+1 and before
-    node = renumber(name, num_names).index_select(0, component)
-    kept = flat_nonzero(node < len(name))
-    node, pixel = node.index_select(0, kept), kept + num_own
+    kept, node = members_of(name, component, num_names)
+    pixel = kept + num_own
     window = torch.zeros_like(name).scatter_(0, node, sweeps.pixels.window.index_select(0, pixel))
     count = nodes.count + len(name)
     none = torch.full_like(name, count)

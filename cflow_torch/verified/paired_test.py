@@ -12,7 +12,7 @@ from cflow_torch.ops.indices import (
     constant,
     flat_nonzero,
     gather,
-    renumber,
+    members_of,
     scatter_count,
     split_index,
     take_columns,
@@ -50,9 +50,8 @@ def verify(
         evidence: (N,) int64, of that motion, sixteenths of a slice.
     """
     tested = flat_nonzero(candidates.flatten(1).any(1))  # other nodes are static and cost nothing
-    node = renumber(tested, nodes.count).index_select(0, nodes.node)
-    some = flat_nonzero(node < len(tested))
-    members, node = sweeps.pixels.take(nodes.pixel.index_select(0, some)), node.index_select(0, some)
+    some, node = members_of(tested, nodes.node, nodes.count)
+    members = sweeps.pixels.take(nodes.pixel.index_select(0, some))
     level, travels, window, candidates_of = gather(tested, nodes.level, nodes.travels, nodes.window, candidates)
     wins = count_wins(sweeps, members, node, candidates_of)
     z = constant((_CHANGED_Z, significance), torch.float64, level.device)
@@ -110,18 +109,14 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
 
 
 class Wins(NamedTuple):
-    """Paired counts of M components with C candidate motions each.
+    """Paired counts of M components with C candidate motions each."""
 
-    Args:
-        won, lost: (2, M, C) int64, the counts of slices, then the near counts. For these, a slice also counts as found
-            in the 3 x 3 pixels around a position, if the motion is at least two pixels.
-        of_static: (2, M, 2) int64. The first row counts all slices that are compared. The second row counts those that
-            the other sweep has in place, plus 2^32 times those that it has in the 3 x 3 pixels around. Column 0 is for
-            slices of other sweeps, compared with t+1; column 1 is for slices of t+1.
-    """
-
+    # (2, M, C) int64, slices; then the near counts: a slice also counts as found in the 3 x 3 pixels around a position,
+    # if the motion is at least two pixels.
     won: Tensor
     lost: Tensor
+    # (2, M, 2) int64, slices of other sweeps, then of t+1: first all of them, then those in place in the sweep compared
+    # and, times 2^32, those that it has in the 3 x 3 pixels around.
     of_static: Tensor
 
     @property
@@ -167,7 +162,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     count, num_candidates, num_steps = len(candidates), candidates.shape[1], sweeps.num_steps
     area, device = sweeps.grid.height * sweeps.grid.width, component.device
     window = torch.zeros(count, dtype=torch.int64, device=device).scatter_(0, component, members.window)
-    moves = Moves.of(sweeps, window, candidates)
+    moves = _Moves.of(sweeps, window, candidates)
     first = torch.sub(members.index, members.step, alpha=area)
     move = torch.add(members.step + (num_steps - 1), component, alpha=2 * num_steps - 1)
     at = members.table[3:]
@@ -177,7 +172,10 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     # For each candidate, slices lost and, times 2^32, won; then the near counts; then `Wins.of_static`.
     sums = torch.zeros((2 * num_candidates + 2, 2 * count), dtype=torch.int64, device=device)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
-    for to, pixel in zip(*(of_all.split(size) for of_all in comparisons(members.step, num_steps))):
+    # Every other sweep is compared with t+1, and t+1 with every other sweep.
+    is_newest = constant(tuple(to == 0 for to in range(num_steps)), torch.bool, device)[:, None]
+    comparisons = split_index(flat_nonzero((members.step == 0) != is_newest), len(component))
+    for to, pixel in zip(*(of_all.split(size) for of_all in comparisons)):
         of, start, which, near_border = take_columns(table, pixel)
         start.add_(to, alpha=area)
         which -= to
@@ -203,52 +201,27 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     return Wins(of_motion >> 32, of_motion & 0xFFFFFFFF, sums[-2:])
 
 
-class Moves(NamedTuple):
+class _Moves(NamedTuple):
     """Displacements by C motions of T components between t+1 and each of S sweeps, in both directions. Each has a row
-    for every difference of steps from 1 - S to S - 1, so there are R = (2 S - 1) T rows.
+    for every difference of steps from 1 - S to S - 1, so there are R = (2 S - 1) T rows."""
 
-    Args:
-        shift: (2, C, R) int64, whole pixels down and to the right.
-        offset: (C, R) int64, the shift as an offset of flat indices.
-        longest: (R,) float64, largest shift in y or x by any of the C motions, pixels.
-        bits: (C, R) uint8, the first bit of an image that tells whether a slice is absent: if the shift in y or in x is
-            at least two pixels, that of the 3 x 3 pixels around, otherwise that of the pixel.
-        is_given: (R,) bool, the window has both sweeps.
-    """
-
-    shift: Tensor
-    offset: Tensor
-    longest: Tensor
+    shift: Tensor  # (2, C, R) int64, whole pixels down and to the right
+    offset: Tensor  # (C, R) int64, the shift as an offset of flat indices
+    longest: Tensor  # (R,) float64, largest shift in y or x by any of the C motions, pixels
+    # (C, R) uint8, the first bit of an image that tells whether a slice is absent: if the shift in y or in x is at
+    # least two pixels, that of the 3 x 3 pixels around, otherwise that of the pixel.
     bits: Tensor
-    is_given: Tensor
+    is_given: Tensor  # (R,) bool, the window has both sweeps
 
     @classmethod
-    def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> Moves:
+    def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> _Moves:
         """Compute them from the window, (T,) int64, and the motions, (T, C, 2) float64 per sweep interval."""
         k = sweeps.intervals.index_select(0, window)
         shift = (motion.permute(2, 1, 0)[..., None] * k + 0.5).floor_().flatten(2)
         side, shift = torch.maximum(*shift.abs()), shift.long()
-        return cls(
-            shift,
-            torch.add(shift[1], shift[0], alpha=sweeps.grid.width),
-            side.amax(0),
-            (side >= _FAR).view(torch.uint8) * NUM_SLICES,
-            (k != 0).flatten(),
-        )
-
-
-def comparisons(step: Tensor, num_steps: int) -> tuple[Tensor, Tensor]:
-    """List the comparisons of pixels with other sweeps: of every other sweep with t+1, and of t+1 with every other.
-
-    Args:
-        step: (K,) int64, sweep of each pixel; 0 = t+1.
-        num_steps: S.
-
-    Returns:
-        The step of the sweep that a pixel is compared with, and the position of the pixel, (L,) int64 each.
-    """
-    is_newest = constant(tuple(to == 0 for to in range(num_steps)), torch.bool, step.device)
-    return split_index(flat_nonzero((step == 0) != is_newest[:, None]), len(step))
+        offset = torch.add(shift[1], shift[0], alpha=sweeps.grid.width)
+        bits = (side >= _FAR).view(torch.uint8) * NUM_SLICES
+        return cls(shift, offset, side.amax(0), bits, (k != 0).flatten())
 
 
 def evidence_of(won: Tensor, lost: Tensor, z: float | Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, lazy_zeros, lookup, split_index, take_columns
+from cflow_torch.ops.indices import flat_nonzero, lazy_zeros, lookup, take_columns
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.component_tree import Components, Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
@@ -114,10 +114,8 @@ def deskew(
     pixel, number = torch.unique(index, return_inverse=True)
     moved = replace(points.at(inside), position=position, pixel=number)
     first = segment_amin(moved.object_id, number, pixel.numel(), len(rigid.rotation)).index_select(0, number)
-    of_image, within = split_index(pixel, grid.height * grid.width)
-    window, step = split_index(of_image, num_steps)
-    table = torch.stack((pixel, window, step, *split_index(within, grid.width)))
-    pixels = Pixels(table, torch.zeros_like(pixel, dtype=torch.uint8))  # slices are unused downstream
+    slices = torch.zeros_like(pixel, dtype=torch.uint8)  # unused by registration
+    pixels = Pixels.of(pixel, slices, grid, num_steps)
     rank = lazy_zeros(len(sweeps.rank), torch.int32, pixel.device)
     rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=pixel.device))
     drawn = replace(sweeps, pixels=pixels, rank=rank)

@@ -16,17 +16,11 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Motion of G objects per sweep interval.
+    """Motion of G objects per sweep interval."""
 
-    Args:
-        flow: (G, 2) float64, x and y at the centre, metres, axes of ego1.
-        rotation: (G,) float64, tangent of half the angle, counter-clockwise.
-        centre: (G, 2) float64, x and y, metres, frame of t+1.
-    """
-
-    flow: Tensor
-    rotation: Tensor
-    centre: Tensor
+    flow: Tensor  # (G, 2) float64, x and y at the centre, metres, axes of ego1
+    rotation: Tensor  # (G,) float64, tangent of half the angle, counter-clockwise
+    centre: Tensor  # (G, 2) float64, x and y, metres, frame of t+1
 
     def pixels_per_interval(self, pixel_size: float) -> Tensor:
         """Return the flow at the centre, (G, 2) float64, (y, x), in pixels of a size in metres."""
@@ -53,17 +47,11 @@ def rotate(rotation: Tensor, arm: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class RotatingMotion(Motion):
-    """Motion of clusters that may rotate, along the ground.
+    """Motion of clusters that may rotate, along the ground."""
 
-    Args:
-        rotation: (M + 1,) float64, as in `RigidMotion`.
-        centre: (M + 1, 2) float64, likewise.
-        slope: (M + 1, 2) float64, height of the ground per metre in x and in y.
-    """
-
-    rotation: Tensor = torch.empty(0)
-    centre: Tensor = torch.empty(0)
-    slope: Tensor = torch.empty(0)
+    rotation: Tensor = torch.empty(0)  # (M + 1,) float64, as in `RigidMotion`
+    centre: Tensor = torch.empty(0)  # (M + 1, 2) float64, likewise
+    slope: Tensor = torch.empty(0)  # (M + 1, 2) float64, height of the ground per metre in x and in y
 
     def residual_flow(self, points: slice, positions: Tensor) -> Tensor:
         """Return the flow of some points, (K, 3) float32, which depends on their positions if their object rotates."""

@@ -21,21 +21,13 @@ _BEYOND = 2.0**27  # units; a position far beyond all others
 
 @dataclass(frozen=True)
 class ObjectPoints:
-    """N points of G objects, of all sweeps; all points of a pixel belong to one object.
+    """N points of G objects, of all sweeps; all points of a pixel belong to one object."""
 
-    Args:
-        object_id: (N,) int64, object of each point.
-        pixel: (N,) int64, number of its occupied pixel, 0 ... P - 1.
-        layer: (N,) int64, height slice, from 0 on.
-        position: (3, N) float64, metres, frame of t+1; inside the region.
-        time: (N,) float32, sweep intervals, `Batch.point_times`; None = no times are given.
-    """
-
-    object_id: Tensor
-    pixel: Tensor
-    layer: Tensor
-    position: Tensor
-    time: Tensor | None = None
+    object_id: Tensor  # (N,) int64, object of each point
+    pixel: Tensor  # (N,) int64, number of its occupied pixel, 0 ... P - 1
+    layer: Tensor  # (N,) int64, height slice, from 0 on
+    position: Tensor  # (3, N) float64, metres, frame of t+1; inside the region
+    time: Tensor | None = None  # (N,) float32, sweep intervals, `Batch.point_times`; None = no times are given
 
     def take(self, wanted: Tensor) -> ObjectPoints:
         """Select points by a mask, (N,) bool."""
