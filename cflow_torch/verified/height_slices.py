@@ -221,27 +221,20 @@ class HeightSlicedSweeps:
         return self.num_more > 0
 
     def or_outside(self, index: Tensor, at: Tensor) -> Tensor:
-        """Return the flat index into `image` of pixels that may lie outside it.
+        """Return flat indices into `image`, (...) int64, with the index of its last entry for pixels outside.
 
         Args:
-            index: (...) int64, flat index, correct for pixels inside.
+            index: (...) int64, flat indices, right for pixels inside.
             at: (2, ...) int64, rows and columns, any value.
-
-        Returns:
-            (...) int64; for pixels outside, the index of the last entry of `image`.
         """
         is_above_or_below, is_beside = _is_outside(at, self.grid)
         return index.masked_fill(is_above_or_below | is_beside, self.image.numel() - 1)
 
     def around(self, pixel: Tensor, reach: int) -> Tensor:
-        """Return the occupied pixels around some pixels, in the same sweep.
+        """Return the occupied pixels of the same sweep around some pixels, `reach` pixels each way.
 
-        Args:
-            pixel: (K,) int64, positions in the list.
-            reach: r, pixels each way.
-
-        Returns:
-            (K, (2 r + 1)^2) int64, in raster order; P where a pixel is empty or lies outside the image.
+        Both are positions in the list: (K,) int64, and (K, (2 reach + 1)^2) int64, in raster order; P where a pixel is
+        empty or lies outside the image.
         """
         line, table = range(-reach, reach + 1), take_columns(self.pixels.table, pixel)[..., None]
         shifts = tuple(zip(*((down, right) for down in line for right in line)))

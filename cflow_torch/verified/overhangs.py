@@ -6,8 +6,7 @@ another one and above none is drawn again, by itself, in a further window of the
 
 from __future__ import annotations
 
-import itertools
-from functools import lru_cache
+from itertools import product
 
 import torch
 import torch.nn.functional as F
@@ -37,6 +36,8 @@ _GAP = 3  # slices from a cell to the next one above it, at least; the body and 
 # A vehicle or a person, in slices: it begins at most this far above the ground, and it is neither flat nor taller than
 # a bus.
 _HIGHEST_FOOT, _SMALLEST, _LARGEST = 2, 1, 10
+# Rows, columns and slices to 13 of the 26 neighbours of a cell. The others are the same links, seen from the other end.
+_HALF_OF_NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
 
 
 def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> tuple[HeightSlicedSweeps, Nodes]:
@@ -118,7 +119,8 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     count = cells.numel()
     number = lazy_empty(shape, torch.int32, rows.device)
     number.scatter_(0, cells, torch.arange(count, dtype=torch.int32, device=rows.device))
-    near = cells[:, None] + _half_neighbours(num_cols, rows.device)
+    offsets = tuple((down * num_cols + right) * _NUM_SLICES + up for down, right, up in _HALF_OF_NEIGHBOURS)
+    near = cells[:, None] + constant(offsets, torch.int64, rows.device)
     links = flat_nonzero(is_occupied.index_select(0, near.view(-1)))
     targets = number.index_select(0, near.view(-1).index_select(0, links)).long()
     component = union_find(count, floor_divide(links, near.shape[1]), targets)
@@ -138,17 +140,6 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     under = flat_nonzero(is_wanted.index_select(0, index))
     cell = number.index_select(0, index.index_select(0, under)).long()
     return rows.index_select(0, under), component.index_select(0, cell), count
-
-
-@lru_cache(maxsize=64)
-def _half_neighbours(num_cols: int, device: torch.device) -> Tensor:
-    """Return the offsets of half of the 26 neighbours of a cell, (13,) int64. The other half are the same links, seen
-    from their other ends."""
-    steps = itertools.product((0, 1), (-1, 0, 1), (-1, 0, 1))
-    offsets = [
-        (down * num_cols + right) * _NUM_SLICES + up for down, right, up in steps if (down, right, up) > (0, 0, 0)
-    ]
-    return torch.tensor(offsets, device=device)
 
 
 def _ground(column: Tensor, height: Tensor, num_windows: int, num_rows: int, num_cols: int) -> Tensor:

@@ -1,4 +1,10 @@
-"""Refinement: from motions in pixels to rigid motions in centimetres, with rotation and times of points."""
+"""Refinement: from motions in pixels to rigid motions in centimetres, with rotation and times of points.
+
+Registration takes a few Gauss-Newton steps on the voxels of objects, surface to surface, all objects at once. Beams hit
+a surface at positions that are fixed in the frame of the vehicle, so pairs of nearest points shift a moving surface
+along itself. Therefore a pair counts only across the surface. The farther the voxels around it extend in a direction,
+the lower is its weight in that direction (generalised ICP).
+"""
 
 from __future__ import annotations
 
@@ -6,16 +12,35 @@ import math
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import flat_nonzero, lazy_zeros, lookup, take_columns
+from cflow_torch.ops.chunks import chunks
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, lookup, scatter_count, take_columns
+from cflow_torch.ops.linear import adjugate
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.component_tree import Components, Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
-from cflow_torch.verified.rigid_registration import LAYER_HEIGHT, MOST_TIME, NUM_LAYERS, VoxelPairs
 from cflow_torch.verified.subpixel_motion import subpixel_motion
-from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
+from cflow_torch.verified.voxel_centroids import NOISE, UNITS, ObjectPoints, Voxels, points_of_objects, spread_of
+
+# We chose these values on real pairs and windows with history (docs/benchmarks.md).
+LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels, metres
+_FARTHEST = 0.2  # metres, between the voxels of a pair
+_FAR = 3.0  # squared distance of a pair, in variances of both surfaces, at which its weight is a quarter
+MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
+_NUM_STEPS = 4
+_STEP_LENGTH = 1.4  # in Gauss-Newton steps; above 1, because nearest partners change with each step
+# Largest change of the flow in x and y, units per interval, and largest rotation, tangent of half the angle.
+_LARGEST_CHANGE = (0.15 * UNITS, 0.15 * UNITS, 0.1)
+_WEIGHT, _ARM = 256, 16  # weights are multiples of 1/256, arms of 16 units, so sums are exact in any order
+# Weights that keep the motion near the given translation, as two pairs of points without a surface would, and near zero
+# rotation, as five pairs at a distance of 1 m would. The angle is nearly twice the tangent of its half.
+_HELD = (2.0 * _WEIGHT, 2.0 * _WEIGHT, 5.0 * _WEIGHT * (2 * UNITS) ** 2)
+# An object that passes a quarter of the rotation of the sensor in an interval would be nearer than its own length. If
+# times differ by more, the direction was measured at the end of one sweep and at the start of the next.
+_LEAST_STRETCH = 0.75
 
 
 def refine(
@@ -66,8 +91,8 @@ def register_deskewed(
         return apparent, apparent
     stretch = pairs.stretch(apparent)[:, None]
     divided = RigidMotion(apparent.flow / stretch, apparent.rotation, apparent.centre)
-    is_pair = ~sweeps.has_history
-    points = points.take(~is_pair.index_select(0, sweeps.pixels.window.index_select(0, points.pixel)))
+    has_history = sweeps.has_history.index_select(0, sweeps.pixels.window.index_select(0, points.pixel))
+    points = points.at(flat_nonzero(has_history))
     again = VoxelPairs(*deskew(points, sweeps, divided), len(start)).register(start / stretch)
     is_again = torch.bincount(points.object_id, minlength=len(start)) > 0
     deskewed = RigidMotion(
@@ -76,6 +101,149 @@ def register_deskewed(
         torch.where(is_again[:, None], again.centre, divided.centre),
     )
     return deskewed, apparent
+
+
+class VoxelPairs:
+    """Voxels of G objects, in the sweeps that are paired with t+1. Lengths are in units, vectors in the plane complex.
+
+    Args:
+        points: of the objects that move, of sweeps at most `MOST_TIME` from t+1.
+        sweeps: finest images.
+        num_objects: G.
+
+    Cost: that of `spread_of`.
+    """
+
+    def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> None:
+        self._voxels = voxels = Voxels(points, sweeps, NUM_LAYERS)
+        device = points.position.device
+        at_t = flat_nonzero(voxels.step == 1)
+        x, y = take_columns(voxels.position[:2], at_t)
+        summed = torch.stack((x, y, torch.ones_like(x)))
+        sums = scatter_count(voxels.object_id.index_select(0, at_t), num_objects, summed)
+        self._centre_of_object = torch.complex(*torch.floor(sums[:2] / sums[2].clamp(min=1)))
+        # Object, spread and position of each voxel; the last entry, for "no voxel", is far from all others.
+        spread = spread_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT).view(9, -1)
+        self._table = torch.cat((F.pad(torch.cat((voxels.object_id[None], spread)), (0, 1)), voxels.position))
+        self._corner = constant(sweeps.grid.lower[:2], torch.float64, device)
+
+        # The voxels that we pair with those of t+1.
+        self._voxel = flat_nonzero((voxels.step != 0) & (sums[2] > 0).index_select(0, voxels.object_id))
+        of_voxel = (voxels.window, voxels.pixel, voxels.layer, voxels.object_id)
+        window, pixel, layer, self._object = gather(self._voxel, *of_voxel)
+        self._chunks = list(chunks(0, len(self._voxel), device, 27))
+        self._sweep = window * sweeps.num_steps  # t+1
+        self._layers = (layer + constant(((-1,), (0,), (1,)), torch.int64, device)) & (NUM_LAYERS - 1)
+        self._elapsed = sweeps.elapsed_of_pixel.index_select(0, pixel)
+        self._k = (self._elapsed * 16).round_() / 16
+        end = sweeps.elapsed[:, 1].index_select(0, window)
+        x, y, self._height = take_columns(voxels.position, self._voxel)
+        centre = self._centre_of_object.index_select(0, self._object)
+        # The flow moves the arm of a voxel from its own sweep to t, and the centre of the object from t to t+1.
+        self._arm_and_centre = torch.stack((torch.complex(x, y) - centre, centre))
+        self._intervals = torch.stack((self._elapsed - end, end))
+        variance = (NOISE * UNITS) ** 2
+        noise = constant(tuple(variance if i % 4 == 0 else 0.0 for i in range(9)), torch.float64, device)
+        self._own_spread = take_columns(spread, self._voxel) + noise[:, None]
+        # Derivatives of x, y and z at t+1 by x and y per interval: k and 0. That by the tangent is twice the arm times
+        # k, rotated by a right angle.
+        axes = constant(((1.0, 0.0), (0.0, 1.0), (0.0, 0.0)), torch.float64, device)
+        self._by_flow, self._by_tangent = axes[..., None] * self._k, self._k * (2 * _ARM)
+
+    def register(self, flow: Tensor) -> RigidMotion:
+        """Refine the motion of every object, and estimate its rotation.
+
+        We pair every voxel of another sweep with the nearest one of its object at t+1. Each step minimises the errors
+        of the pairs over translation and angle. Two more terms keep the motion near the given translation and near zero
+        rotation.
+
+        Args:
+            flow: (G, 2) float64, x and y, metres per sweep interval, to start from.
+
+        Returns:
+            The motion. An object without points at t keeps the given flow.
+
+        Cost: 27 lookups a step for each voxel and sweep.
+        """
+        given = motion = F.pad(flow * UNITS, (0, 1)).t()  # x, y and the tangent of half the angle, (3, G)
+        held, largest = (constant(of, torch.float64, flow.device)[:, None] for of in (_HELD, _LARGEST_CHANGE))
+        lower, upper = given - largest, given + largest
+        hold = torch.diag(held[:, 0])[..., None].expand(-1, -1, len(flow))
+        for _ in range(_NUM_STEPS):
+            equations = torch.cat((hold, (held * (given - motion))[:, None]), 1)
+            for some in self._chunks:
+                self._add_equations(equations, motion, some)
+            inverse, scale = adjugate(equations[:, :3])
+            change = (inverse * equations[:, 3]).sum(1) / scale
+            motion = torch.clamp(torch.add(motion, change, alpha=_STEP_LENGTH), lower, upper)
+        centre = torch.view_as_real(self._centre_of_object) / UNITS + self._corner
+        return RigidMotion((motion[:2] / UNITS).t(), motion[2], centre)
+
+    def stretch(self, rigid: RigidMotion) -> Tensor:
+        """Return the ratio of the time between two measurements of an object to the time between their sweeps.
+
+        Args:
+            rigid: apparent motion of the objects, whose points have times: the result of `register`.
+
+        Returns:
+            (G,) float64: the sum of w k (k + b - a) divided by the sum of w k^2, over all pairs of voxels. Here w is
+            the weight of a pair in x plus that in y, k the intervals between its sweeps, and a and b are the mean times
+            of its voxels in intervals. The motion divided by this ratio explains the pairs best. The ratio is 1 for
+            objects without pairs, and if it would be below 0.75.
+
+        Convention: k is rounded to a 16th and b - a to a 1024th.
+        """
+        assert self._voxels.time is not None
+        motion = torch.cat((rigid.flow.t() * UNITS, rigid.rotation[None]))
+        time, sums = F.pad(self._voxels.time, (0, 1)), motion.new_zeros(2, len(rigid.rotation))
+        for some in self._chunks:
+            other, weight, _, _ = self._pairs(motion, some)
+            late = time.index_select(0, other) - time.index_select(0, self._voxel[some])
+            times = torch.stack((self._k[some], (late * UNITS).round_() / UNITS))
+            terms = times * ((weight[0, 0] + weight[1, 1]) * self._k[some])
+            sums.scatter_add_(1, self._object[some].expand(2, -1), terms)
+        squares, late = sums
+        stretch = torch.where(squares > 0, 1 + late / squares, 1.0)
+        return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
+
+    def _add_equations(self, equations: Tensor, motion: Tensor, some: slice) -> None:
+        """Pair some voxels under a motion, and add the pairs to the equations of their objects.
+
+        The motion is (3, G) float64, x and y per interval and the tangent of half the angle. The equations are
+        (3, 4, G) float64, normal matrices and, in column 3, right-hand sides, times 256.
+        """
+        _, weight, error, arm = self._pairs(motion, some)
+        lever = torch.view_as_real(arm * (1j / _ARM)).round().t() * self._by_tangent[some]
+        columns = torch.cat((self._by_flow[..., some], F.pad(lever, (0, 0, 0, 1))[:, None], error[:, None]), 1)
+        weighted = (weight[:, :, None] * columns).sum(1)
+        terms = (columns[:2, :3, None] * weighted[:, None]).sum(0).view(12, -1)
+        equations.view(12, -1).scatter_add_(1, self._object[some].expand(12, -1), terms)
+
+    def _pairs(self, motion: Tensor, some: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Pair some voxels with those of t+1 under a motion.
+
+        Returns:
+            other: (K,) int64, the voxel of t+1.
+            weight: (2, 3, K) float64, of the errors in x and y, times 256, rounded; 0 = not paired.
+            error: (3, K) float64, units, from the moved voxel to the other one.
+            arm: (K,) complex128, from the centre at t+1 to the moved voxel.
+        """
+        index = self._object[some]
+        v_x, v_y, rotation = take_columns(motion, index)
+        arm, centre = self._arm_and_centre[:, some] + torch.complex(v_x, v_y) * self._intervals[:, some]
+        arm = rotate(rotation * self._elapsed[some], arm)
+        at = torch.view_as_real(centre + arm).round()
+        target = torch.cat((at.t(), self._height[None, some]))
+        other, is_near = self._voxels.nearest(self._sweep[some], self._layers[:, some], target, _FARTHEST)
+        of_other = take_columns(self._table, other)
+        is_pair = is_near & (of_other[0] == index)
+        error, spread = of_other[10:] - target, self._own_spread[:, some] + of_other[1:10]
+        inverse, scale = adjugate(spread.view(3, 3, -1))
+        square = ((inverse * error).sum(1) * error).sum(0)
+        # (f / (f + d^2))^2 / s^2 of the squared distance d^2 = square / scale in standard deviations.
+        weight = scale / torch.add(square, scale, alpha=_FAR).square_() * is_pair
+        factor = _WEIGHT * (_FAR * NOISE * UNITS) ** 2
+        return other, (inverse[:2] * (weight * factor)).round_(), error, arm
 
 
 def deskew(
@@ -119,4 +287,4 @@ def deskew(
     rank = lazy_zeros(len(sweeps.rank), torch.int32, pixel.device)
     rank.scatter_(0, pixel, torch.arange(1, len(pixel) + 1, dtype=torch.int32, device=pixel.device))
     drawn = replace(sweeps, pixels=pixels, rank=rank)
-    return moved.take(moved.object_id == first), drawn
+    return moved.at(flat_nonzero(moved.object_id == first)), drawn

@@ -57,17 +57,11 @@ def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor
 
 
 def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> Tensor:
-    """Find objects that match the other sweep better one pixel to one side than one pixel to the opposite side.
+    """Find objects of pairs that match the other sweep better one pixel to one side than one to the opposite side.
 
-    Args:
-        sweeps: pairs; steps other than t and t+1 are ignored.
-        objects: G of them.
-        wanted: (G,) bool, the objects to test.
-
-    Returns:
-        (G,) bool. Of the slices of both sweeps, a are matched only ahead and b only behind. True if, in one of four
-        directions, (a - b)^2 >= z^2 (a + b), and |a - b| is at least a tenth of the slices of the object. For t+1,
-        "ahead" is the opposite side. False for objects that are not tested.
+    `wanted` and the result are (G,) bool. Of the slices of both sweeps, a are matched only ahead and b only behind. An
+    object is biased if, in one of four directions, (a - b)^2 >= z^2 (a + b), and |a - b| is at least a tenth of its
+    slices. For t+1, "ahead" is the opposite side. The result is False for objects that are not wanted.
     """
     pixels = sweeps.pixels
     some = flat_nonzero(lookup(wanted, objects.of_pixel) & (pixels.step < 2))
@@ -102,7 +96,7 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     ahead = take_columns(voxels.position[:2], near.view(-1)).view(2, *near.shape) - position[:, None]
     ahead = ahead.clamp_(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # for t+1, all signs change
 
-    weights, shift = _meeting_weights(_SIGMA, step.device), position.new_zeros((2, num_objects))
+    weights, shift = _meeting_weights(step.device), position.new_zeros((2, num_objects))
     weight, error = _meet(ahead, weights)
     unshifted = weight
     for _ in range(_NUM_STEPS):
@@ -125,14 +119,8 @@ def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     return weight, ahead.gather(1, (key & 31).expand(2, 1, -1))[:, 0]
 
 
-def _meeting_weights(sigma: float, device: torch.device) -> Tensor:
-    """Return the weights exp(-d^2 / 2 sigma^2) of centroids at distance d, (2049,) float64, multiples of 1/256.
-
-    Args:
-        sigma: metres.
-        device: device of the result.
-
-    Convention: entry i is for d^2 from 64 i to 64 (i + 1) square units; the last entry, 0, is for larger distances.
-    """
+def _meeting_weights(device: torch.device) -> Tensor:
+    """Return the weights exp(-d^2 / 2 sigma^2) of centroids at distance d, (2049,) float64, multiples of 1/256. Entry i
+    is for d^2 from 64 i to 64 (i + 1) square units; the last entry, 0, is for larger distances."""
     square = 64 * torch.arange(2048, dtype=torch.float64) + 32
-    return F.pad((256 * torch.exp(square / (-2 * (sigma * UNITS) ** 2))).round_() / 256, (0, 1)).to(device)
+    return F.pad((256 * torch.exp(square / (-2 * (_SIGMA * UNITS) ** 2))).round_() / 256, (0, 1)).to(device)

@@ -1,4 +1,7 @@
-"""Voxels (a pixel and a height slice of a sweep), the centroids of their points, and the search for the nearest one."""
+"""Voxels of objects: the centroids of their points, the search for the nearest one, the spread of surfaces around them.
+
+A voxel is a pixel and a height slice of a sweep.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,19 @@ UNITS = 1024
 _HIGHEST = 2.0**24  # units; coordinates are clamped to this, far beyond a region, so that no square overflows
 _BEYOND = 2.0**27  # units; a position far beyond all others
 
+NOISE = 0.05  # metres, standard deviation of a centroid, besides the spread of its surface
+# Sides of the blocks in voxels. With the blocks around, they cover 0.6 m and 1.2 m. A ring of beams on a surface forms
+# a line, so if the voxels of the smaller blocks form a line, we take the larger blocks.
+_SIDES = (2, 4)
+_FEWEST = 3  # voxels; an isolated voxel may belong to a surface of any direction
+_UNKNOWN = 0.2  # metres, standard deviation of such a surface
+_LINE = 5 / 3  # squared trace of a covariance over the sum of its squared entries; below this, voxels form a line
+_STEP = 4  # units; coordinates are multiples of 1/256 m, so that sums are exact
+_ROW, _LAYER = 1 << 15, 1 << 12  # more than the blocks in a row or column; more than the blocks in a stack
+# The moments are products of two of 1, x, y and z. Then: which moments are the entries of the 3 x 3 matrix of squares.
+_FACTORS = ((0, 0, 0, 0, 1, 1, 1, 2, 2, 3), (0, 1, 2, 3, 1, 2, 3, 2, 3, 3))
+_SQUARES = (4, 5, 6, 5, 7, 8, 6, 8, 9)
+
 
 @dataclass(frozen=True)
 class ObjectPoints:
@@ -28,10 +44,6 @@ class ObjectPoints:
     layer: Tensor  # (N,) int64, height slice, from 0 on
     position: Tensor  # (3, N) float64, metres, frame of t+1; inside the region
     time: Tensor | None = None  # (N,) float32, sweep intervals, `Batch.point_times`; None = no times are given
-
-    def take(self, wanted: Tensor) -> ObjectPoints:
-        """Select points by a mask, (N,) bool."""
-        return self.at(flat_nonzero(wanted))
 
     def at(self, index: Tensor) -> ObjectPoints:
         """Select points by their positions in the list, (K,) int64."""
@@ -78,13 +90,6 @@ class Voxels:
         sweeps: finest images.
         num_slices: number of slices of the points.
 
-    Attributes:
-        object_id, pixel, layer: (V,) int64, as for `ObjectPoints`.
-        window, step: (V,) int64, of the pixel.
-        position: (3, V + 1) float64, x and y of the centroid from the lower corner of the region and z from 0, whole
-            units of 1/1024 m; the last entry, for "no voxel", is far away.
-        time: (V,) float64, mean of `ObjectPoints.time`; None = no times are given.
-
     Convention: coordinates are rounded to the nearest unit, and their mean is rounded down.
 
     Cost: a sort of the points.
@@ -95,6 +100,7 @@ class Voxels:
         key, voxel, count = torch.unique(
             points.pixel * num_slices + points.layer, return_inverse=True, return_counts=True
         )
+        # (V,) int64 each, of the voxels.
         self.pixel, self.layer = split_index(key, num_slices)
         self.window, self.step = take_columns(sweeps.pixels.table[1:3], self.pixel)
         # All points of a voxel belong to one object, so it does not matter which of them is written last.
@@ -102,11 +108,13 @@ class Voxels:
         corner = constant((*sweeps.grid.lower[:2], 0.0), torch.float64, key.device)[:, None]
         position = ((points.position - corner) * UNITS).round_().clamp_(-_HIGHEST, _HIGHEST)
         centroid = torch.floor(scatter_count(voxel, len(key), position) / count)
+        # (3, V + 1) float64, x and y from the lower corner of the region and z from 0, units; the last entry, for "no
+        # voxel", is far away.
         self.position = F.pad(centroid, (0, 1), value=_BEYOND)
         # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), len(key), device=key.device)
         self._of_key.scatter_(0, key + num_slices, torch.arange(len(key), device=key.device))
-        self.time: Tensor | None = None
+        self.time: Tensor | None = None  # (V,) float64, mean of the times of the points
         if points.time is not None:
             self.time = scatter_count(voxel, len(key), points.time.double()) / count
 
@@ -158,3 +166,56 @@ class Voxels:
         rank = self._sweeps.rank.index_select(0, pixel.view(-1)).view(len(pixel), 1, -1)
         key = torch.add(layers, rank, alpha=self.num_slices).view(-1)
         return self._of_key.index_select(0, key).view(len(pixel) * len(layers), -1)
+
+
+def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
+    """Return the covariance of the centroids around each voxel, of its object and sweep.
+
+    Args:
+        voxels: V of them.
+        pixel_size, layer_height: metres, sides of a voxel.
+
+    Returns:
+        (3, 3, V) float64, square units.
+
+    Cost: 18 searches for each block of either size.
+    """
+    position, device = voxels.position[:, :-1], voxels.position.device
+    one_xyz = F.pad(torch.floor(position / _STEP).long(), (0, 0, 1, 0), value=1)
+    first, second = (one_xyz.index_select(0, constant(of, torch.int64, device)) for of in _FACTORS)
+    size = (pixel_size * UNITS, pixel_size * UNITS, layer_height * UNITS)
+    sizes = constant(tuple(tuple(side * of for side in _SIDES) for of in size), torch.float64, device)
+    block = torch.floor(position[:, None] / sizes[..., None]).long()
+    sums = _sums_around(block, voxels.object_id * voxels.num_steps + voxels.step, first * second).double()
+
+    both, total = sums[0], sums[1:4]  # number of voxels around, for blocks of both sizes
+    squares = sums.index_select(0, constant(_SQUARES, torch.int64, device)).view(3, 3, *both.shape)
+    (n, n_of_large), (spread, spread_of_large) = both, (both * squares - total[:, None] * total).unbind(2)  # times n^2
+    trace = spread.diagonal(dim1=0, dim2=1).sum(-1)
+    is_known = (n >= _FEWEST) & (trace * trace >= _LINE * spread.square().sum((0, 1)))
+    n, spread = torch.where(is_known, n, n_of_large), torch.where(is_known, spread, spread_of_large)
+    unknown = tuple((_UNKNOWN * UNITS) ** 2 * (i == j) for i in range(3) for j in range(3))
+    return spread * _STEP**2 / (n * n) + constant(unknown, torch.float64, device).view(3, 3, 1) * (n < _FEWEST)
+
+
+def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
+    """Return the sums of values, (R, 2, V) int64, over the 27 blocks around the block of each voxel.
+
+    Args:
+        block: (3, 2, V) int64, column, row and layer, for blocks of two sizes; layers beyond +-2046 are merged.
+        image: (V,) int64; only voxels of the same image are added.
+        values: (R, V) int64.
+    """
+    image = torch.add(torch.arange(2, device=image.device)[:, None], image, alpha=2)
+    column = torch.add(block[0], torch.add(block[1], image, alpha=_ROW), alpha=_ROW)
+    layer = block[2].clamp(2 - _LAYER // 2, _LAYER // 2 - 2)
+    key, of_voxel = torch.unique(torch.add(layer, column, alpha=_LAYER).flatten(), return_inverse=True)
+    # The layers of a column are adjacent, so we subtract the sum of all blocks below three layers from the sum of all
+    # blocks up to them. Running sums may overflow, but their differences are right.
+    below = scatter_count(of_voxel, len(key), values.repeat(1, 2)).cumsum(1)
+    below = F.pad(below, (1, 0)).t().contiguous()
+    columns = [(down * _ROW + right) * _LAYER for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    ends = constant(tuple(column + end for end in (-1, 2) for column in columns), torch.int64, key.device)
+    at = torch.searchsorted(key, key + ends[:, None])
+    first, last = below.index_select(0, at.view(-1)).view(2, 9, len(key), len(values))
+    return take_columns((last - first).sum(0).t(), of_voxel).view(len(values), *image.shape)

@@ -15,9 +15,8 @@ from scenes import assert_same_bits, pose
 from turning_car import MODEL, turning_car
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window
-from cflow_torch.verified.refinement import deskew, register_deskewed
+from cflow_torch.verified.refinement import VoxelPairs, deskew, register_deskewed
 from cflow_torch.verified.rigid_motion import RigidMotion
-from cflow_torch.verified.rigid_registration import VoxelPairs
 
 HISTORY = MODEL.replace(num_history=3)
 
