@@ -14,6 +14,7 @@ from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, scatter_count, split_index, take_columns
+from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps
 
 # Range images: bins of about half a degree of azimuth and one degree of elevation; half of them are below level.
@@ -72,7 +73,8 @@ def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
 
 def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, bit: Tensor) -> Tensor:
     """Return the centres of slices, (3, K) float64, metres, by their pixels and bits, (K,) int64 each."""
-    first = torch.floor(sweeps.lowest.index_select(0, pixel) / SLICE_HEIGHT)
+    lowest = segment_amin(sweeps.batch.positions[2], sweeps.pixel_of_point, sweeps.num_pixels + 1, math.inf)
+    first = torch.floor(lowest.index_select(0, pixel) / SLICE_HEIGHT)
     height = first + torch.remainder(bit - first, NUM_SLICES) + 0.5
     y, x = sweeps.grid.centre(take_columns(sweeps.pixels.row_col, pixel))
     return torch.stack((x, y, height * SLICE_HEIGHT))
@@ -103,13 +105,8 @@ class RangeImages:
         self._farthest = farthest
 
     def farther(self, sweep: Tensor, positions: Tensor) -> Tensor:
-        """Return (K,) float32, metres: the distance of the farthest return in the direction of each position, minus
-        that of the position; -infinity = no return.
-
-        Args:
-            sweep: (K,) int64, window * S + step.
-            positions: (3, K) float64, metres, frame of t+1.
-        """
+        """Return the distance of the farthest return in the direction of each position, minus that of the position,
+        (K,) float32, metres; -infinity = no return. Sweeps are window * S + step, (K,) int64; positions are (3, K)."""
         direction, distance = self._direction(sweep, positions)
         return self._farthest.index_select(0, direction).sub_(distance)
 

@@ -46,7 +46,7 @@ class Components:
     roots: Tensor  # (L, P) int64, component of each pixel at each level, coarse to fine; the last is not dilated
     changed: Tensor  # (Q,) int64, pixels that changed, positions in the list
     changed_root: Tensor  # (Q,) int64, component of each of them, labelled among the changed pixels alone
-    firsts: tuple[int, ...]  # first name of each level, then of the components of changed pixels
+    firsts: tuple[int, ...]  # first name of each level, then of the components of changed pixels; V if there are none
     parent: Tensor  # (V + 1,) int64, component of the next coarser level; V = none
     size: Tensor  # (V,) int64, number of pixels; 0 = an unused name
     length: Tensor  # (V,) float64, metres, longer side of the bounding box of its pixels at t+1
@@ -131,7 +131,7 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
     for coarse, fine in zip(roots, roots[1:]):
         parent.scatter_(0, fine, coarse)
 
-    firsts = tuple(blocks_of.first for blocks_of in found)
+    firsts = (*(blocks_of.first for blocks_of in found), count)[: len(roots) + 1]
     root = torch.cat((roots[-1], changed_root))
     # The first sum counts all pixels and, times 2^32, those at t+1; the second counts those that are missing or may be.
     is_missing = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
@@ -139,7 +139,7 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
     sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
     # The sums of a component are those of its children added up.
     for level in range(len(roots) - 1, 0, -1):
-        names = slice(firsts[level], (*firsts, count)[level + 1])
+        names = slice(*firsts[level : level + 2])
         sums += scatter_count(parent[names], count + 1, sums[:, names])
     (size, num_missing), num_newest = sums[:, :-1] & 0xFFFFFFFF, sums[0, :-1] >> 32
     is_linked = (num_newest > 0) & (num_newest < size)
@@ -176,12 +176,11 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
     is_long = may_move & (length > (math.inf if longest is None else longest))
     travels = both_ends_move(sweeps, roots, is_long)
     may_move = may_move & (travels | ~is_long)
-    if len(components.firsts) > components.num_levels:
-        may_move[components.firsts[-1] :].logical_and_(length[components.firsts[-1] :] <= _LOCAL)
+    first_plain, first_changed = components.firsts[-2:]
+    may_move[first_changed:].logical_and_(length[first_changed:] <= _LOCAL)
     # A plain component with as many pixels as its parent is the same component.
-    size, parent = F.pad(components.size, (0, 1)), components.parent
-    is_node = F.pad(may_move, (0, 1))
-    plain = slice(components.firsts[components.num_levels - 1], (*components.firsts, count)[components.num_levels])
+    plain, parent = slice(first_plain, first_changed), components.parent
+    size, is_node = F.pad(components.size, (0, 1)), F.pad(may_move, (0, 1))
     is_node[plain].logical_and_(size[plain] != size.index_select(0, parent[plain]))
     name = flat_nonzero(is_node)
     number, around = renumber(name, count), parent.index_select(0, name)

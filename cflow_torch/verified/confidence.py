@@ -48,12 +48,7 @@ class MotionMargin(NamedTuple):
 
 
 def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> MotionMargin:
-    """Return the margin of each object.
-
-    Args:
-        sweeps: finest images.
-        objects: G of them.
-        rigid: their motion.
+    """Return the margins of objects from their motion.
 
     Cost: five lookups for each pixel of the moving objects and each sweep.
     """

@@ -6,8 +6,7 @@ image holds the slices of its pixel and those of the 3 x 3 pixels around it.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -23,7 +22,6 @@ from cflow_torch.ops.indices import (
     split_index,
     take_columns,
 )
-from cflow_torch.ops.segments import segment_amin
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
@@ -174,14 +172,13 @@ class HeightSlicedSweeps:
         rank = torch.arange(count + 1, count + 1 + len(pixel), dtype=torch.int32, device=rows.device)
         none = self.pixel_of_point == count
         of_point = self.pixel_of_point.masked_fill(none, count + len(pixel))  # "none" is now a larger number
-        return HeightSlicedSweeps(
-            self.batch.with_empty_windows(),
-            self.grid,
-            self.image,
-            self.rank.scatter_(0, pixels.index, rank),
-            Pixels(torch.cat((self.pixels.table, table), 1), torch.cat((self.pixels.slices, pixels.slices))),
-            torch.cat((of_point, of_copy + count)),
-            rows,
+        return replace(
+            self,
+            batch=self.batch.with_empty_windows(),
+            rank=self.rank.scatter_(0, pixels.index, rank),
+            pixels=Pixels(torch.cat((self.pixels.table, table), 1), torch.cat((self.pixels.slices, pixels.slices))),
+            pixel_of_point=torch.cat((of_point, of_copy + count)),
+            copied=rows,
         )
 
     @property
@@ -248,11 +245,6 @@ class HeightSlicedSweeps:
     def row_of_point(self) -> Tensor:
         """(N + K,) int64, row in the batch of each point, then of each copy."""
         return torch.cat((torch.arange(self.batch.image.numel(), device=self.copied.device), self.copied))
-
-    @cached_property
-    def lowest(self) -> Tensor:
-        """Height of the lowest point of each occupied pixel, (P,) float64, metres."""
-        return segment_amin(self.batch.positions[2], self.pixel_of_point, self.num_pixels + 1, math.inf)[:-1]
 
 
 def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Tensor:

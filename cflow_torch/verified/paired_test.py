@@ -21,9 +21,9 @@ from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Nodes
 from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, Pixels, count_slices
 
-_TWICE = 1 + (1 << NUM_SLICES)  # copies the slices of a pixel to the upper bits
 # Comparisons (pixel x sweep x candidate) at once; each needs about 64 bytes of temporaries.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
+_TWICE = 1 + (1 << NUM_SLICES)  # a factor that copies the slices of a pixel to the upper bits
 _FAR = 2  # pixels, in y or in x
 _NEAR_Z = 2.0  # for near counts, z is so many times larger: one slice matches several neighbours, so counts correlate
 _COVERED = 65  # per cent
@@ -185,7 +185,8 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         shift += take_columns(at, pixel.index_select(0, leaves))[:, None]
         index.index_copy_(1, leaves, sweeps.or_outside(take_columns(index, leaves), shift))
 
-        # The slices of the pixel that are in place or at the target: in the pixel, then where motions must leave.
+        # Which slices of the pixel are in place, then which are at the target, (2, C, comparisons): in the pixel
+        # itself, and where they must be absent, which is the pixel or, for far motions, the 3 x 3 pixels around.
         own = members.slices.index_select(0, pixel)
         in_place = sweeps.image.index_select(0, start).bitwise_and_(own * _TWICE)
         at_target = sweeps.image.index_select(0, index.view(-1)).view_as(index)

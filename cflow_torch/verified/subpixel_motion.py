@@ -82,7 +82,7 @@ def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> 
 
 def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     """Return the shift from t to t+1 under which the cubes of each object match best, (G, 2) float64, x and y, whole
-    units; 0 = the shift is not significant.
+    units; 0 = it is not significant.
 
     Convention: a cube of t, moved by the shift, matches the nearest cube of t+1 among those in the 5 x 5 pixels around
         it. A cube of t+1, moved back, likewise matches one of t. Ties: the first in raster order. Each step changes the

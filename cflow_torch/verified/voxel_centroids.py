@@ -20,7 +20,6 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 UNITS = 1024
 _HIGHEST = 2.0**24  # units; coordinates are clamped to this, far beyond a region, so that no square overflows
 _BEYOND = 2.0**27  # units; a position far beyond all others
-
 NOISE = 0.05  # metres, standard deviation of a centroid, besides the spread of its surface
 # Sides of the blocks in voxels. With the blocks around, they cover 0.6 m and 1.2 m. A ring of beams on a surface forms
 # a line, so if the voxels of the smaller blocks form a line, we take the larger blocks.
