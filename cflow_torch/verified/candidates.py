@@ -174,7 +174,8 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     beside = constant(((0, -1, 1, 0, 0), (0, 0, 0, -1, 1)), torch.int64, shift.device)
     peak = torch.stack((row, col)) + shift.index_select(0, pair).t()
     at = peak[:, None] + beside[..., None]  # (2, 5, pixels)
-    inside = ((at >= 0) & (at < size[:, None])).all(0)
+    is_row, is_col = (at >= 0) & (at < size[:, None])
+    inside = is_row & is_col
     index = (at[0] * size[1]).add_(at[1]).add_(start).mul_(inside)
     own = images.image.index_select(0, images.occupied.index_select(0, pixel))
     target = images.image.index_select(0, index.view(-1)).view_as(index)
