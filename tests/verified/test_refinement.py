@@ -13,9 +13,8 @@ from oracle import registration as oracle
 from cflow_torch.verified import subpixel_motion as fast
 from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.component_tree import find_components, number_objects
-from cflow_torch.verified.refinement import refine
+from cflow_torch.verified.refinement import VoxelPairs, refine
 from cflow_torch.verified.rigid_motion import RigidMotion
-from cflow_torch.verified.rigid_registration import VoxelPairs
 from cflow_torch.verified.voxel_centroids import Voxels, points_of_objects
 
 
