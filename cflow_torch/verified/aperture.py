@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant, flat_nonzero, members_of, scatter_count, take_columns
@@ -91,7 +90,7 @@ def principal_axes(
         num_components: A.
         pixel_size: s, metres.
     """
-    one_y_x = F.pad(row_col, (0, 0, 1, 0), value=1)
+    one_y_x = torch.cat((torch.ones_like(row_col[:1]), row_col))  # `F.pad` of torch 2.0 fails without pixels
     moments = scatter_count(component, num_components, (one_y_x[:, None] * one_y_x).view(9, -1)).view(3, 3, -1)
     n, sums = moments[0, 0], moments[0, 1:]
     # Differences of large products are exact in integers.

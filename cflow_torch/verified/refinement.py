@@ -214,7 +214,8 @@ class VoxelPairs:
         """
         _, weight, error, arm = self._pairs(motion, some)
         lever = torch.view_as_real(arm * (1j / _ARM)).round().t() * self._by_tangent[some]
-        columns = torch.cat((self._by_flow[..., some], F.pad(lever, (0, 0, 0, 1))[:, None], error[:, None]), 1)
+        lever = torch.cat((lever, torch.zeros_like(lever[:1])))  # `F.pad` of torch 2.0 fails without voxels
+        columns = torch.cat((self._by_flow[..., some], lever[:, None], error[:, None]), 1)
         weighted = (weight[:, :, None] * columns).sum(1)
         terms = (columns[:2, :3, None] * weighted[:, None]).sum(0).view(12, -1)
         equations.view(12, -1).scatter_add_(1, self._object[some].expand(12, -1), terms)

@@ -180,7 +180,8 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
     Cost: 18 searches for each block of either size.
     """
     position, device = voxels.position[:, :-1], voxels.position.device
-    one_xyz = F.pad(torch.floor(position / _STEP).long(), (0, 0, 1, 0), value=1)
+    xyz = torch.floor(position / _STEP).long()
+    one_xyz = torch.cat((torch.ones_like(xyz[:1]), xyz))  # `F.pad` of torch 2.0 fails without voxels
     first, second = (one_xyz.index_select(0, constant(of, torch.int64, device)) for of in _FACTORS)
     size = (pixel_size * UNITS, pixel_size * UNITS, layer_height * UNITS)
     sizes = constant(tuple(tuple(side * of for side in _SIDES) for of in size), torch.float64, device)
