@@ -165,9 +165,6 @@ def test_a_reader_that_leaves_ends_a_command_quietly(arguments: str) -> None:
     assert (done.stdout, done.stderr) == ("141 0\n", "")
 
 
-# ---------------------------------------------------------------- information
-
-
 def test_info_lists_every_required_package(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
     texts = []
     for arguments in ((), ("--full",)):

@@ -20,9 +20,6 @@ from cflow_torch.simulator import make_drive
 ENGINES = [{"correlation": "conv"}, pytest.param({"labeling": "kornia"}, marks=needs_kornia_labelling)]
 
 
-# ------------------------------------------------------------------------------------------- equal to the oracle
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_equals_the_oracle_on_random_scenes(seed):
     settings = config(
@@ -69,8 +66,6 @@ def test_drives_equal_the_oracle(kitti_file, data_root, settings):
             assert (result.residual_flow.norm(dim=1) >= 0.05).sum() > 500
 
 
-# ------------------------------------------------------------------------------------------------- known motions
-
 WIDE = (-8, -8, -1, 8, 8, 3)
 PAPER = {"preset": "paper", "pixel_size": 0.25, "point_cloud_range": WIDE}
 
@@ -111,8 +106,6 @@ def test_flow_has_the_axes_of_t1():
     result = estimate_flow(car, (car + [0.5, 0, 0]) @ T_ego1_ego0[:3, :3].T, T_ego1_ego0=T_ego1_ego0, **PAPER)
     np.testing.assert_allclose(result.residual_flow, [[0, -0.5, 0]] * 400, atol=1e-6)
 
-
-# ---------------------------------------------------------------------------------- history and scales, by hand
 
 METRE = config(pixel_size=1.0, point_cloud_range=(0.0, 0.0, -math.inf, 40.0, 40.0, math.inf), max_extent=1000.0)
 # (row, column) pixels of a long L: half of its bounding box holds the whole displacement since t-2.
@@ -202,8 +195,6 @@ def test_older_sweeps_are_warped_by_their_steps():
     assert result.residual_flow[:, 0].tolist() == [7.0] * 6 and result.score.tolist() == [1.0] * 6
 
 
-# ------------------------------------------------------------------------------- vertical motion, sectional view
-
 SECTIONAL = METRE.replace(sectional_view=True)
 
 
@@ -237,9 +228,6 @@ def test_a_point_far_above_is_refused_with_a_hint():
     car[7, 2] = 1e5
     with pytest.raises(CFlowError, match="finite z bounds"):
         CorrelationFlow(SECTIONAL)([Window(Sweep(car), Sweep(car + [2.0, 0.0, 0.0]))])
-
-
-# ------------------------------------------------------------------------------------------------------ HDBSCAN
 
 
 def test_hdbscan_equals_the_oracle_in_a_batch():

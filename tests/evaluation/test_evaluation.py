@@ -84,9 +84,6 @@ def random_frames(count: int, size: int = 200) -> list[EvalFrame]:
     return made
 
 
-# ---------------------------------------------------------------------------------------------- buckets
-
-
 def test_buckets_contain_their_lower_edge() -> None:
     below_one, below_two = (np.nextafter(np.float32(edge), np.float32(0)) for edge in (1, 2))
     speeds = [0.0, below_one, 1.0, below_two, 2.0, 7.5]
@@ -113,9 +110,6 @@ def test_moving_background_is_static_or_bucketed() -> None:
     assert counts(scores(OSF, moving), "BACKGROUND") == {0: 1}
     assert counts(scores(BSFE, moving), "BACKGROUND") == {12: 1}
     assert scores(OSF, moving)["bucketed"]["classes"]["BACKGROUND"]["static_epe"] == 0.5
-
-
-# ---------------------------------------------------------------------------------------------- masks and regions
 
 
 def test_edges_of_regions() -> None:
@@ -182,9 +176,6 @@ def test_nan_predictions_are_ignored_or_an_error() -> None:
         assert scores(definition, unseen)["num_points"] == 1
 
 
-# ---------------------------------------------------------------------------------------------- three-way
-
-
 def test_three_way_by_hand() -> None:
     item = frame(
         [[1, 0, 0], [0.5, 0, 0], [0.01, 0, 0], [0, 0, 0], [0.6, 0, 0]],
@@ -237,9 +228,6 @@ def test_ranges_and_their_speed_threshold() -> None:
     assert ranges["mean"]["dynamic_epe"] == pytest.approx((0.15 + 1 + 1) / 3, abs=1e-6)
 
 
-# ---------------------------------------------------------------------------------------------- axes and input
-
-
 @pytest.mark.parametrize("definition", NAMES)
 def test_residual_total_and_axes_agree(definition: str) -> None:
     rng = np.random.default_rng(1)
@@ -281,9 +269,6 @@ def test_contradictory_frames_are_an_error() -> None:
         scores(BSFE, only_pose_flow)
 
 
-# ---------------------------------------------------------------------------------------------- streaming
-
-
 @pytest.mark.parametrize("definition", NAMES)
 @settings(max_examples=8, deadline=None)
 @given(order=st.permutations(range(5)), cut=st.integers(0, 5))
@@ -303,9 +288,6 @@ def test_only_scores_of_one_definition_can_be_merged() -> None:
             SceneFlowMetrics(OSF).merge(SceneFlowMetrics(other))
 
 
-# ---------------------------------------------------------------------------------------------- tables
-
-
 def cells(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
 
@@ -319,9 +301,6 @@ def test_tables() -> None:
     item = frame([[1, 0, 0]] * 2, [[0, 0, 0], [0.5, 0, 0]], points=[[10, 0, 0], [50, 0, 0]])
     table = cells(format_table(scores("challenge_2026", item)))
     assert ["35-70", "0.5000", "-", "-", "-", "0.5000"] in table and ["**mean**", "", "", "", "", "0.7500"] in table
-
-
-# ---------------------------------------------------------------------------------------------- several data sets
 
 
 def test_figures_of_the_paper() -> None:

@@ -131,8 +131,6 @@ def is_long(flow: np.ndarray) -> np.ndarray:
     return np.linalg.norm(flow, axis=1) >= np.float32(0.05)
 
 
-# ---------------------------------------------------------------------------------------------- av2
-
 METRIC_KEYS = {
     "EPE": "epe",
     "Accuracy Strict": "accuracy_strict",
@@ -182,8 +180,6 @@ def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray
         "flow": labels.flow[mask],
     }
 
-
-# ---------------------------------------------------------------------------------------------- made-up frames
 
 KINDS = ("edges", "random", "nothing valid", "all ground", "only static", "moving background", "no points", "random")
 
@@ -238,9 +234,6 @@ def test_av2_on_made_up_frames(av2_tools: ModuleType, seed: int) -> None:
         frames.append(EvalFrame(made.points, labels, flow=total, T_ego1_ego0=made.T, is_ground=made.is_ground))
     numbers = compare_av2(score("av2", frames)["three_way"], *run_av2(av2_tools, truths, predicted))
     check(f"av2, made up {seed}", numbers)
-
-
-# ---------------------------------------------------------------------------------------------- BucketedSceneFlowEval
 
 
 def run_bsfe(data_set: Any, predictions: Sequence[np.ndarray]) -> Any:

@@ -68,9 +68,6 @@ def flow_of(columns: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([columns[name] for name in FLOW], 1)
 
 
-# ---- what is written
-
-
 def test_version_1_is_total_flow_of_the_mask(log: AV2Log, estimated: dict[int, Any], archives: dict[int, Any]) -> None:
     for index, (sweeps, flow) in estimated.items():
         columns = read(archives[1][0] / log.log_id / f"{log.timestamps[index]}.feather")
@@ -197,9 +194,6 @@ def test_damaged_zips_are_one_problem(archives: dict[int, Any], tmp_path: Path) 
     assert problem.startswith(min(expected)) and "cannot be read" in problem
 
 
-# ---- which frames, which points
-
-
 def test_frames_go_by_the_masks_of_the_scene(tmp_path: Path) -> None:
     with HDF5Log(write_scene(tmp_path / "scene.h5", range(8), 1, [2, 3, 7])) as log:
         plan = plan_log(log)
@@ -254,9 +248,6 @@ def test_official_masks_take_precedence(log: AV2Log, tmp_path: Path) -> None:
         MaskArchive(__file__)
 
 
-# ---- the command
-
-
 def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     data = ("data=av2", f"data.root={log.folder}", "data.check=false")
     call = ["submit", *data, f"output={tmp_path}", "version=3", "model=paper", "model.pixel_sizes=[0.4]"]
@@ -283,9 +274,6 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
     assert cflow(*call) == 1, "an unknown file is reported"
     assert "notes.txt" in capsys.readouterr().err
     assert cflow(*call, "overwrite=true", "model.connectivity=4") == 0
-
-
-# ---- the real pair
 
 
 def test_av2_accepts_the_real_pair_with_its_masks(av2_tools: Any, av2_folder: Path, tmp_path: Path) -> None:

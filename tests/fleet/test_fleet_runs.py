@@ -32,9 +32,6 @@ def out(single_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(single_run, tmp_path / "out"))
 
 
-# Content of the files
-
-
 def test_files_contain_the_results_and_their_origin(fleet: Path, single_run: Path) -> None:
     model = make_model(CONFIG)
     for folder in sorted(fleet.iterdir()):
@@ -67,9 +64,6 @@ def test_a_file_has_only_the_contents_asked_for(fleet: Path, single_run: Path, t
     assert small.equals(whole.select(small.column_names))
     with pytest.raises(CFlowError, match="contents was"):
         run(fleet, tmp_path)
-
-
-# Resuming
 
 
 def test_a_second_run_computes_only_missing_frames(fleet: Path, single: dict[str, bytes], out: Path) -> None:
@@ -155,9 +149,6 @@ def test_data_and_results_may_be_in_an_object_store(fleet: Path, single_run: Pat
     memory.rm("/fleet-data", recursive=True)
 
 
-# Shards
-
-
 def test_shards_together_are_the_single_run(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
     for index in (2, 0, 1):
         shard = find_shard("auto", "auto", {"RANK": str(index), "WORLD_SIZE": "3"})  # as torchrun says
@@ -170,9 +161,6 @@ def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single_run: Path, tm
     reports = [json.loads(file.read_text()) for file in sorted((tmp_path / "reports").iterdir())]
     assert [report["exit_status"] for report in reports] == [0, 0]
     assert flow_files(tmp_path) == flow_files(single_run)
-
-
-# Errors and signals
 
 
 def test_a_broken_sweep_fails_only_its_frames(
@@ -232,9 +220,6 @@ def test_a_signal_lets_frames_in_hand_be_finished(
     assert tree(tmp_path).items() <= single.items()
     assert run(fleet, tmp_path)["frames"]["complete_before"] == report["frames"]["computed"]
     assert tree(tmp_path) == single
-
-
-# The command
 
 
 def test_a_dry_run_counts_the_frames_that_the_command_then_computes(

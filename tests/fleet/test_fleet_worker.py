@@ -50,9 +50,6 @@ class FailingModel:
         return self.model(windows)
 
 
-# One worker
-
-
 @pytest.mark.parametrize("error", [CFlowError("too odd"), MemoryError(), RuntimeError("CUDA: no memory"), KeyError(3)])
 def test_a_bad_frame_does_not_spoil_its_batch(
     source: Path, single: dict[str, bytes], tmp_path: Path, error: Exception
@@ -280,9 +277,6 @@ def test_a_child_process_passes_answers_and_errors() -> None:
         process.stop()
     finally:
         process.close()
-
-
-# Counters and the report
 
 
 def test_the_report_lists_what_is_missing() -> None:

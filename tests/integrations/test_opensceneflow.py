@@ -113,9 +113,6 @@ def drive() -> list[Sweep]:
     return small_drive()
 
 
-# ------------------------------------------------------------------------------------------------ layouts of batches
-
-
 @pytest.mark.parametrize(
     ("variant", "num_frames"), [("dense", 2), ("dense", 4), ("dense", 6), ("verified", 6), ("keypoints", 2)]
 )
@@ -218,9 +215,6 @@ def test_the_error_names_the_bad_key_of_a_batch(what: str, key: str, drive: list
         estimate(CFlow(**VARIANTS["dense"]), batch)
 
 
-# ------------------------------------------------------------------------------------------------ settings, checkpoint
-
-
 def test_settings_of_the_method_and_others() -> None:
     assert CFlow().config == make_config() and CFlow(preset="paper").config == make_config("paper")
     assert CFlow(method="dense", num_frames=4).config == make_config("paper", num_history=2)
@@ -283,9 +277,6 @@ def test_configuration_has_every_setting_of_the_preset(name: str) -> None:
     model = instantiate(changed.target)
     assert model.config == expected.replace(pixel_size=0.3, sweep_interval=0.2, max_speed=None)
     assert model.output == "valid" and model.ego_T_lidar is None
-
-
-# ------------------------------------------------------------------------------------------------ ego_T_lidar
 
 
 def test_extrinsics_correct_the_pose_flow_of_the_harness(drive: list[Sweep]) -> None:
