@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from command_line import cflow
-from scenes import pose
+from scenes import pose, rows_of
 from staged_cars import Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
-from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
+from cflow_torch.applications.association import VOXELS, link
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.data.catalog import find_sources, open_log
@@ -167,14 +167,7 @@ def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then
 
 def test_ids_survive_empty_sweeps_and_missing_frames() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
-    empty = FlowResult.of(
-        {
-            "residual_flow": torch.zeros(0, 3),
-            "cluster_id": torch.zeros(0, dtype=torch.int64),
-            "is_valid": torch.zeros(0, dtype=torch.bool),
-        }
-    )
-    tracker, ids = Tracker(), []
+    empty, tracker, ids = rows_of(log.result(0), np.zeros(0, int)), Tracker(), []
     for index in range(11):
         no_points = Sweep(np.zeros((0, 3), np.float32), None, None, log.timestamps[index])
         is_empty = index in (0, 6)
@@ -226,19 +219,6 @@ def test_matches_equal_those_of_plain_loops() -> None:
         assert dict(zip(earlier.tolist(), later.tolist())) == expected
 
 
-def test_boxes_are_tight_around_their_points() -> None:
-    generator = np.random.default_rng(1)
-    points, group = torch.from_numpy(generator.normal(size=(80, 3))), torch.arange(80) % 4
-    heading = torch.tensor([0.0, 0.5, 2.0, -3.0], dtype=torch.float64)
-    centre, size = boxes(points, group, heading)
-    for number in range(4):
-        own = slice(number, number + 1)
-        inside = box_of_point(points, centre[own], size[own] + 1e-9, heading[own])
-        assert (inside[group == number] == 0).all()
-        inside = box_of_point(points, centre[own], size[own] * 0.99, heading[own])
-        assert (inside[group == number] == -1).sum() >= 4, "points on the faces"
-
-
 def test_the_filter_equals_the_textbook_equations() -> None:
     one = torch.ones(1, 3, dtype=torch.float64)
     covariance = torch.tensor([[[0.2, 0.05], [0.05, 0.1]]], dtype=torch.float64)
@@ -270,9 +250,8 @@ def test_tracks_are_written_as_text(tmp_path: Path) -> None:
     write_mot(tmp_path / "mot.txt", table, log)
     mot = np.loadtxt(tmp_path / "mot.txt", delimiter=",", ndmin=2)
     assert np.array_equal(mot[:, :6], [[frame, 1, -1, -1, -1, -1] for frame in range(1, 12)])
-    assert np.allclose(mot[:, 6], 0.9) and np.allclose(
-        mot[:, 7:], np.stack([table[axis] for axis in "xyz"], 1), atol=1e-3
-    )
+    assert np.allclose(mot[:, 6], 0.9)
+    assert np.allclose(mot[:, 7:], np.stack([table[axis] for axis in "xyz"], 1), atol=1e-3)
 
     write_kitti(tmp_path / "kitti.txt", table, log)
     lines = [line.split() for line in (tmp_path / "kitti.txt").read_text().splitlines()]

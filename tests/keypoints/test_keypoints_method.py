@@ -148,11 +148,6 @@ def test_a_match_at_the_radius_is_allowed():
     assert shifts(hand_made([[0, 0]], [9]), hand_made([[32_700, 32_700]], [9]), 1e9) == {0: (32_700, 32_700)}
 
 
-def test_without_key_points_there_are_no_matches():
-    none, one = hand_made([], []), hand_made([[5, 5]], [9])
-    assert all(shifts(*pair) == {} for pair in ((none, one), (one, none), (none, none)))
-
-
 def test_all_within_the_radius_are_candidates():
     rng = np.random.default_rng(4)
     images = torch.from_numpy(rng.random((2, 50, 90)) < 0.05)

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from cflow_torch.ops import morphology
 from cflow_torch.ops.cross_correlation import cross_correlate
-from cflow_torch.ops.indices import floor_divide, lazy_empty, lazy_zeros, scatter_count, split_index
+from cflow_torch.ops.indices import floor_divide, scatter_count, split_index
 from cflow_torch.ops.kornia_engine import close_3x3_kornia
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.linear import adjugate
@@ -113,9 +113,6 @@ def test_erosion_with_a_cross_is_scipys_with_background_outside(shape):
         assert np.array_equal(morphology.erode_cross(torch.from_numpy(image)).numpy(), expected)
 
 
-CPU = torch.device("cpu")
-
-
 def test_indices_are_divided_like_integers():
     index = torch.tensor([0, 1, 6, 7, 8, 2**40, 2**62 + 5])
     for width in (1, 2, 7, 701, 2**31 + 1):
@@ -137,16 +134,6 @@ def test_counts_are_those_of_bincount():
         halves = scatter_count(given, size, torch.from_numpy(weights / 2))
         assert halves.shape == (3, size) and halves.dtype == torch.float64
         assert halves.tolist() == [[total / 2 for total in row] for row in expected]
-
-
-@pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int32, torch.int64, torch.float32])
-def test_lazy_tensors_have_their_size_and_type_and_can_be_written(dtype):
-    for size in (0, 5, 10**6):
-        zeros, empty = lazy_zeros(size, dtype, CPU), lazy_empty(size, dtype, CPU)
-        assert {values.dtype for values in (zeros, empty)} == {dtype}
-        assert zeros.shape == empty.shape == (size,) and not zeros.any()
-        for values in (zeros, empty):
-            assert values.fill_(1).bool().all()
 
 
 @pytest.mark.parametrize("shape", [(100, 100), (317, 401), (4, 3000)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import pytest
@@ -46,15 +45,3 @@ def test_later_sweeps_fix_an_appearing_car(failures: Any) -> None:
     for seed in range(3):  # with the second seed, the car is part of the coarse component of a parked van
         online, offline = (attempt.error for attempt in failures.make_case("appearing", seed).attempts)
         assert online > 0.4 and offline < 0.09 and offline < online / 6
-
-
-def test_a_wrong_frame_is_found_by_the_static_check(failures: Any) -> None:
-    from cflow_torch.data.log_check import check_static_world
-    from cflow_torch.types import CFlowWarning
-
-    good = failures.drives.turn(0).drive
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", CFlowWarning)
-        check_static_world(good)
-    with pytest.warns(CFlowWarning, match="ego_T_lidar"):
-        check_static_world(failures.MisplacedPoses(good))
