@@ -14,8 +14,8 @@ from cflow_torch import Sweep, Window, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
-from cflow_torch.keypoints import match_candidates, matching
-from cflow_torch.keypoints.match_candidates import KeyPoints, describe
+from cflow_torch.keypoints import matching
+from cflow_torch.keypoints.match_candidates import KeyPoints
 from cflow_torch.keypoints.matching import match
 
 DENSIFIERS = ("components", "clusters", "nearest")
@@ -146,22 +146,6 @@ def test_a_match_at_the_radius_is_allowed():
         for (dy, dx), reach, inside in (((3, 4), 5.0, True), ((3, 4), 4.999, False), ((0, 0), 0.5, True)):
             assert bool(shifts(pc0, hand_made([[corner + dy, corner + dx]], [9]), reach)) == inside
     assert shifts(hand_made([[0, 0]], [9]), hand_made([[32_700, 32_700]], [9]), 1e9) == {0: (32_700, 32_700)}
-
-
-def test_all_within_the_radius_are_candidates():
-    rng = np.random.default_rng(4)
-    images = torch.from_numpy(rng.random((2, 50, 90)) < 0.05)
-    pc0, pc1 = describe(images, 3), describe(images.flip(2), 3)
-    reach = torch.tensor([4.5, 30.0], dtype=torch.float64)
-    pairing = match_candidates.pair(pc0, pc1, reach)
-    found = set()
-    for member, first, count in zip(pairing.member.tolist(), pairing.first.tolist(), pairing.count.tolist()):
-        found |= {(p, q) for p in member for q in pairing.candidate[first : first + count].tolist()}
-    for p in range(len(pc0.row)):
-        square = (pc1.row - pc0.row[p]) ** 2 + (pc1.col - pc0.col[p]) ** 2
-        near = (pc1.window == pc0.window[p]) & (square <= reach[pc0.window[p]] ** 2)
-        assert {(p, q) for q in near.nonzero()[:, 0].tolist()} <= found
-    assert len(found) < 0.8 * len(pc0.row) * len(pc1.row)
 
 
 @pytest.mark.parametrize("precision", ["highest", "medium"])
