@@ -102,7 +102,7 @@ def residual_at_t(pair: Pair) -> np.ndarray:
     return ((start + pair.labels.flow - T[:3, 3]) @ T[:3, :3] - start).astype(np.float32)
 
 
-def write_table(file: Path, **columns: np.ndarray) -> None:
+def write_table(file: Path, **columns: Any) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     feather.write_feather(pa.table(columns), str(file))
 
@@ -165,11 +165,9 @@ def bucket_numbers(ours: dict[str, Any], evaluator: Any, output: Path, distance:
                 numbers[f"{name} {number} EPE"] = buckets["epe"][number], error
                 numbers[f"{name} {number} speed"] = buckets["speed"][number], speed
     mean = json.loads((output / f"mean_average_results_{distance}.json").read_text())
-    return {
-        **numbers,
-        "static": (ours["mean"]["static_epe"], mean[0]),
-        "dynamic": (ours["mean"]["dynamic_error"], mean[1]),
-    }
+    numbers["static"] = ours["mean"]["static_epe"], mean[0]
+    numbers["dynamic"] = ours["mean"]["dynamic_error"], mean[1]
+    return numbers
 
 
 def three_way_numbers(ours: dict[str, Any], classes: dict[str, Any]) -> Comparison:

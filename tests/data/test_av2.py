@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Sequence
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.feather as feather
 import pytest
+from public_evaluators import write_table
 from scenes import pose
 
 from cflow_torch.data.av2 import AV2Log, GroundRaster, read_ground_raster
@@ -24,15 +24,6 @@ POINTS = np.array([[1, 2, 3], [10, 0, 0.5], [-4, 0, 0]], dtype=np.float16)
 YAW = math.radians(90)
 
 
-def write(file: Path, columns: dict[str, Any]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    feather.write_feather(pa.table(columns), str(file))
-
-
-def write_sweep(folder: Path, time: int, points: np.ndarray = POINTS) -> None:
-    write(folder / "sensors" / "lidar" / f"{time}.feather", {name: points[:, i] for i, name in enumerate("xyz")})
-
-
 def pose_columns(times: Sequence[int] = TIMES) -> dict[str, Any]:
     """Sweep k is at x = 1000 + k, rotated to the left by 90 degrees."""
     n = len(times)
@@ -41,9 +32,7 @@ def pose_columns(times: Sequence[int] = TIMES) -> dict[str, Any]:
     return {"timestamp_ns": np.array(times, dtype=np.int64), **columns}
 
 
-def box_columns(
-    time: int, x: float, track: str = "a", category: str = "REGULAR_VEHICLE", inside: int = 1
-) -> dict[str, Any]:
+def box_columns(time: int, x: float, track: str = "a", category: str = "REGULAR_VEHICLE", inside: int = 1) -> dict:
     row: dict[str, Any] = dict.fromkeys(("qx", "qy", "qz", "ty_m"), 0.0)
     row.update(timestamp_ns=time, track_uuid=track, category=category, num_interior_pts=inside)
     row.update(length_m=4.0, width_m=2.0, height_m=1.5, qw=1.0, tx_m=x, tz_m=0.5)
@@ -51,7 +40,7 @@ def box_columns(
 
 
 def annotate(folder: Path, *rows: dict[str, Any]) -> None:
-    write(folder / "annotations.feather", {key: [row[key] for row in rows] for key in rows[0]})
+    write_table(folder / "annotations.feather", **{key: [row[key] for row in rows] for key in rows[0]})
 
 
 def label_columns(rows: int = 3, **changes: Any) -> dict[str, Any]:
@@ -65,8 +54,8 @@ def folder(tmp_path: Path) -> Path:
     """A log of three sweeps, without map and labels."""
     log = tmp_path / "val" / "some-log"
     for time in TIMES:
-        write_sweep(log, time)
-    write(log / "city_SE3_egovehicle.feather", pose_columns())
+        write_table(log / "sensors" / "lidar" / f"{time}.feather", **dict(zip("xyz", POINTS.T)))
+    write_table(log / "city_SE3_egovehicle.feather", **pose_columns())
     return log
 
 
@@ -101,12 +90,12 @@ def test_the_real_log_is_read(av2_folder: Path, data_root: Path, tmp_path: Path)
 
 def test_stored_labels_take_precedence_over_boxes(folder: Path) -> None:
     annotate(folder, box_columns(100, 10.0), box_columns(200, 10.0), box_columns(300, 13.0))
-    write(folder / "flow_labels.feather", label_columns(flow_tx_m=np.zeros(3, dtype=np.float32)))
+    write_table(folder / "flow_labels.feather", **label_columns(flow_tx_m=np.zeros(3, dtype=np.float32)))
     first, second = (AV2Log(folder).labels(index) for index in (0, 1))
     assert not first.flow[:, 0].any() and first.flow[2, 2] == 2 and first.is_valid.all()
     np.testing.assert_allclose(second.flow[1], [3, 0, 0], atol=1e-6)  # the one file is of the first pair
     valid = np.array([True, False, True])
-    write(folder / "flow_labels" / "100.feather", label_columns(is_valid=valid))
+    write_table(folder / "flow_labels" / "100.feather", **label_columns(is_valid=valid))
     log = AV2Log(folder)
     labels = log.labels(0)
     np.testing.assert_array_equal(labels.flow[:, 0], [0, 1, 2])
@@ -162,7 +151,7 @@ SWEEP, POSES, LABELS = "sensors/lidar/100.feather", "city_SE3_egovehicle.feather
     ],
 )
 def test_bad_columns_are_refused(folder: Path, file: str, columns: dict[str, Any], message: str) -> None:
-    write(folder / file, columns)
+    write_table(folder / file, **columns)
     with pytest.raises(CFlowError, match=message) as error:
         log = AV2Log(folder)
         log.sweep(0), log.labels(0)
@@ -185,13 +174,9 @@ def test_boxes_have_a_margin_and_the_last_one_wins() -> None:
     np.testing.assert_allclose(labels.flow[[0, 3], 0], 0.5, atol=1e-6)
 
 
-def raster(heights: Sequence[Sequence[float]]) -> GroundRaster:
-    return GroundRaster(np.array(heights, dtype=np.float64), np.eye(2), np.array([-100.0, -50.0]), 2.0)
-
-
 def test_ground_rules_differ_in_threshold_and_rounding() -> None:
-    flat = raster([[0.0, np.nan], [0.0, 30.0]])
     # half a metre per cell: cell (0, 0) holds x 100 ... 100.5, y 50 ... 50.5
+    flat = GroundRaster(np.array([[0.0, np.nan], [0.0, 30.0]]), np.eye(2), np.array([-100.0, -50.0]), 2.0)
     z = np.array([0.3, 0.3 + 1e-9, 0.0, -0.3, -20.0, 0.4])
     points = np.column_stack([np.full(6, 100.2), np.full(6, 50.2), z])
     np.testing.assert_array_equal(flat.is_ground(points), [True, False, True, True, True, False])

@@ -17,14 +17,8 @@ from scenes import pose
 
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.evaluation import (
-    DEFINITIONS,
-    EvalFrame,
-    SceneFlowMetrics,
-    errors_by_range,
-    format_table,
-    score_data_sets,
-)
+from cflow_torch.evaluation import EvalFrame, SceneFlowMetrics, errors_by_range, format_table, score_data_sets
+from cflow_torch.evaluation.definitions import DEFINITIONS
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.evaluation.metrics import CHALLENGE_DATA_SETS, CHALLENGE_RANGES
 from cflow_torch.types import CFlowError

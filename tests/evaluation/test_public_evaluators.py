@@ -17,30 +17,12 @@ from types import ModuleType
 from typing import Any, Sequence
 
 import numpy as np
+import public_evaluators as public
 import pytest
-from public_evaluators import (
-    EDGES,
-    LOG,
-    TIME,
-    TOLERANCE,
-    Comparison,
-    MadeUp,
-    Pair,
-    bsfe_data_set,
-    bucket_numbers,
-    check,
-    official_mask,
-    read_pair,
-    score,
-    three_way_numbers,
-    total_flow,
-    write_bsfe_truth,
-    write_log,
-)
+from public_evaluators import LOG, Comparison, check, score
 from scenes import pose
 
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.log import FlowLabels
 from cflow_torch.evaluation import DEFINITIONS, EvalFrame
 from cflow_torch.evaluation.frame import ego_motion_flow
 
@@ -50,17 +32,17 @@ STATIC = [NAN, 1.0, 1.0, NAN, NAN, 1.0]  # dynamic errors of a residual of 0; no
 
 
 @pytest.fixture(scope="module")
-def pair(av2_folder: Path) -> Pair:
-    return read_pair(av2_folder)
+def pair(av2_folder: Path) -> public.Pair:
+    return public.read_pair(av2_folder)
 
 
-def scores(pair: Pair, definition: Any, **parts: Any) -> dict[str, Any]:
+def scores(pair: public.Pair, definition: Any, **parts: Any) -> dict[str, Any]:
     """Scores of a residual flow of 0, unless `parts` has another prediction."""
     defaults: dict[str, Any] = {
         "labels": pair.labels,
         "T_ego1_ego0": pair.T_float32,
         "is_ground": pair.is_ground,
-        "eval_mask": official_mask(pair),
+        "eval_mask": public.official_mask(pair),
         "residual_flow": np.zeros_like(pair.points),
     }
     return score(definition, [EvalFrame(pair.points, **{**defaults, **parts})])
@@ -68,7 +50,7 @@ def scores(pair: Pair, definition: Any, **parts: Any) -> dict[str, Any]:
 
 def check_three_way(results: dict[str, Any], **expected: float) -> None:
     measured = {key: results["three_way"][key] for key in expected}
-    assert measured == pytest.approx(expected, abs=TOLERANCE, rel=0)
+    assert measured == pytest.approx(expected, abs=public.TOLERANCE, rel=0)
 
 
 def check_classes(results: dict[str, Any], static: Sequence[float], dynamic: Sequence[float]) -> None:
@@ -76,7 +58,7 @@ def check_classes(results: dict[str, Any], static: Sequence[float], dynamic: Seq
     rows = {**results["bucketed"]["classes"], "mean": results["bucketed"]["mean"]}
     for key, expected in (("static_epe", static), ("dynamic_error", dynamic)):
         found = [rows[name][key] for name in CLASSES]
-        assert found == pytest.approx(expected, abs=TOLERANCE, rel=0, nan_ok=True), key
+        assert found == pytest.approx(expected, abs=public.TOLERANCE, rel=0, nan_ok=True), key
 
 
 def filled(results: dict[str, Any], name: str, key: str) -> dict[int, Any]:
@@ -85,7 +67,7 @@ def filled(results: dict[str, Any], name: str, key: str) -> dict[int, Any]:
     return {i: value for i, (value, count) in enumerate(zip(buckets[key], buckets["count"])) if count}
 
 
-def test_av2_three_way(pair: Pair) -> None:
+def test_av2_three_way(pair: public.Pair) -> None:
     # The official prediction is, bit for bit, the flow by ego motion that the labels store for the background.
     background = (pair.labels.category == 0)[:, None]
     pose_flow = np.where(background, pair.labels.flow, ego_motion_flow(pair.points, pair.T_float32))
@@ -93,7 +75,7 @@ def test_av2_three_way(pair: Pair) -> None:
     check_three_way(scores(pair, "av2", pose_flow=pose_flow), **expected, dynamic_iou=0.0)
 
 
-def test_opensceneflow_npz(pair: Pair) -> None:
+def test_opensceneflow_npz(pair: public.Pair) -> None:
     results = scores(pair, "opensceneflow")
     check_three_way(
         results, epe_fd=0.6737206772, epe_fs=0.0062896596, epe_bs=6.2128e-07, epe_3way=0.2266703194, dynamic_iou=0.0
@@ -101,14 +83,14 @@ def test_opensceneflow_npz(pair: Pair) -> None:
     check_classes(results, [6.21e-07, 0.00620734, 0.00582801, 0.00385737, NAN, 0.00397334], STATIC)
     assert filled(results, "CAR", "count") == {0: 6051, 1: 24, 3: 208, 11: 239, 20: 1117, 26: 161}
     speeds = {0: 0.0062073, 1: 0.0491397, 3: 0.1400945, 11: 0.4419174, 20: 0.8175343, 26: 1.0444958}
-    assert filled(results, "CAR", "speed") == pytest.approx(speeds, abs=TOLERANCE, rel=0)
+    assert filled(results, "CAR", "speed") == pytest.approx(speeds, abs=public.TOLERANCE, rel=0)
     assert filled(results, "PEDESTRIAN", "count") == {0: 156, 2: 94}
-    assert filled(results, "PEDESTRIAN", "speed")[2] == pytest.approx(0.0998975, abs=TOLERANCE, rel=0)
+    assert filled(results, "PEDESTRIAN", "speed")[2] == pytest.approx(0.0998975, abs=public.TOLERANCE, rel=0)
     assert filled(results, "WHEELED_VRU", "count") == {0: 166}
     assert results["three_way"]["breakdown"]["foreground"]["dynamic"]["all"]["count"] == 1_819
 
 
-def test_opensceneflow_range_wise(pair: Pair) -> None:
+def test_opensceneflow_range_wise(pair: public.Pair) -> None:
     ranges = scores(pair, "opensceneflow")["range_wise"]
     counts = {name: (row["num_static"], row["num_dynamic"]) for name, row in ranges.items() if name != "mean"}
     near = {"0-35": (71_046, 1_612), "35-50": (5_502, 0), "50-75": (346, 0)}
@@ -116,10 +98,10 @@ def test_opensceneflow_range_wise(pair: Pair) -> None:
     measured = [ranges[name]["static_epe"] for name in ("0-35", "35-50", "50-75", "mean")]
     expected = [0.00091971, 0.00036213, 1.825e-06, 0.00042789]
     assert measured == pytest.approx(expected, abs=1e-8, rel=0)  # every digit that was printed
-    assert ranges["0-35"]["dynamic_epe"] == pytest.approx(0.74473900, abs=TOLERANCE, rel=0)
+    assert ranges["0-35"]["dynamic_epe"] == pytest.approx(0.74473900, abs=public.TOLERANCE, rel=0)
 
 
-def test_noise(pair: Pair) -> None:
+def test_noise(pair: public.Pair) -> None:
     noise = np.random.default_rng(0).normal(0, 0.05, pair.points.shape).astype(np.float32)
     results = scores(pair, "opensceneflow", residual_flow=noise)
     check_three_way(results, epe_fd=0.6799331272, epe_fs=0.0798506559, epe_bs=0.0799001127, dynamic_iou=0.0247696440)
@@ -164,27 +146,17 @@ def run_av2(av2: Any, truths: Sequence[dict[str, Any]], predictions: Sequence[di
         for folder in folders:
             folder.mkdir()
         for number, (truth, prediction) in enumerate(zip(truths, predictions)):
-            sweep = {"sweep_uuid": (LOG, TIME + number)}
+            sweep = {"sweep_uuid": (LOG, public.TIME + number)}
             av2.make_annotation_files.write_annotation(**truth, **sweep, output_dir=folders[0])
             av2.utils.write_output_file(**prediction, **sweep, output_dir=folders[1])
         table = av2.eval.evaluate_directories(*folders)
     return table, av2.eval.results_to_dict(table)
 
 
-def truth_for_av2(points: np.ndarray, labels: FlowLabels, is_dynamic: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
-    return {
-        "category_indices": labels.category[mask],
-        "is_close": (np.abs(points[mask, :2]) <= 35).all(axis=1),
-        "is_dynamic": is_dynamic[mask],
-        "is_valid": labels.is_valid[mask],
-        "flow": labels.flow[mask],
-    }
-
-
 KINDS = ("edges", "random", "nothing valid", "all ground", "only static", "moving background", "no points", "random")
 
 
-def made_up(kind: str, seed: int) -> MadeUp:
+def made_up(kind: str, seed: int) -> public.MadeUp:
     """Make a frame of one kind of corner case.
 
     "edges" has no ego motion, so that values lie exactly on limits. It is the first frame of a log, where both poses
@@ -199,7 +171,7 @@ def made_up(kind: str, seed: int) -> MadeUp:
     T = np.eye(4)
     if kind == "edges":
         directions = np.array([[1, 0, 0], [0, -1, 0], [0.6, 0.8, 0], [0.48, 0.64, -0.6]])
-        true = rng.choice([*EDGES, 0.05, 2.5], (n, 1)) * directions[rng.integers(0, 4, n)]
+        true = rng.choice([*public.EDGES, 0.05, 2.5], (n, 1)) * directions[rng.integers(0, 4, n)]
         points[:, :2] = rng.choice([-48, -35, -34.99999, 0, 34.99999, 35, 35.00001, 47.9999, 48, 50, 51], (n, 2))
         points[:, 2] = rng.choice([-2.5, -2.49, 0, 2.49, 2.5], n)
     else:
@@ -208,9 +180,9 @@ def made_up(kind: str, seed: int) -> MadeUp:
         T = pose(x, 0.1, angle, 0.01)
         # Total flow in float32 has errors of 1e-7 m, so speeds keep a distance from the limits.
         speed = np.linalg.norm(true, axis=1, keepdims=True)
-        near = np.abs(speed - np.append(EDGES[1:], 0.05)).min(axis=1, keepdims=True) < 1e-5
+        near = np.abs(speed - np.append(public.EDGES[1:], 0.05)).min(axis=1, keepdims=True) < 1e-5
         true = np.where(near, true * 1.001, true)
-    return MadeUp(
+    return public.MadeUp(
         points=points,
         true=true.astype(np.float32),
         predicted=(true * rng.choice([0, 0.5, 1], (n, 1)) + rng.normal(0, 0.03, (n, 3))).astype(np.float32),
@@ -228,8 +200,11 @@ def test_av2_on_made_up_frames(av2_tools: ModuleType, seed: int) -> None:
         made = made_up(kind, 100 * seed + number)
         mask = ~made.is_ground & (np.abs(made.points[:, :2]) <= 50).all(axis=1)
         pose_flow, labels = ego_motion_flow(made.points, made.T), made.labels
-        total = total_flow(made.points, made.predicted, made.T)
-        truths.append(truth_for_av2(made.points, labels, is_long(labels.flow - pose_flow), mask))
+        total = public.total_flow(made.points, made.predicted, made.T)
+        columns = {"category_indices": labels.category, "is_valid": labels.is_valid, "flow": labels.flow}
+        columns["is_close"] = (np.abs(made.points[:, :2]) <= 35).all(axis=1)
+        columns["is_dynamic"] = is_long(labels.flow - pose_flow)
+        truths.append({name: values[mask] for name, values in columns.items()})
         predicted.append({"flow": total[mask], "is_dynamic": is_long(total - pose_flow)[mask]})
         frames.append(EvalFrame(made.points, labels, flow=total, T_ego1_ego0=made.T, is_ground=made.is_ground))
     numbers = compare_av2(score("av2", frames)["three_way"], *run_av2(av2_tools, truths, predicted))
@@ -237,7 +212,6 @@ def test_av2_on_made_up_frames(av2_tools: ModuleType, seed: int) -> None:
 
 
 def run_bsfe(data_set: Any, predictions: Sequence[np.ndarray]) -> Any:
-    """Score the predictions of a log with its evaluator."""
     from bucketed_scene_flow_eval.datastructures import EgoLidarFlow
 
     assert len(data_set) == len(predictions)
@@ -254,22 +228,23 @@ def check_bsfe(
     for ground in (False, True):
         output = Path(tempfile.mkdtemp(dir=truth.parent))
         kinds = ("bucketed_epe", "threeway_epe")
-        run = [run_bsfe(bsfe_data_set(bsfe, raw, truth, kind, output, ground), predictions) for kind in kinds]
+        run = [run_bsfe(public.bsfe_data_set(bsfe, raw, truth, kind, output, ground), predictions) for kind in kinds]
         for distance, region in ((35, "box"), (math.inf, "all")):
             definition = DEFINITIONS["bucketed_scene_flow_eval"]
             ours = score(replace(definition, region=region, exclude_ground=not ground), frames)
             where = f"{label}, {distance} m" + (", with ground" if ground else "")
-            check(f"bsfe buckets, {where}", bucket_numbers(ours["bucketed"], run[0], output, distance))
+            check(f"bsfe buckets, {where}", public.bucket_numbers(ours["bucketed"], run[0], output, distance))
             found = run[1].compute_results(return_distance_threshold=distance)
-            check(f"bsfe three-way, {where}", three_way_numbers(ours["three_way"], found))
+            check(f"bsfe three-way, {where}", public.three_way_numbers(ours["three_way"], found))
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_bsfe_on_made_up_frames(bsfe: ModuleType, tmp_path: Path, seed: int) -> None:
     kinds = [kind for kind in KINDS if kind not in ("no points", "all ground")]
     made = [made_up(kind, 100 * seed + number) for number, kind in enumerate(kinds)]
-    raw = write_log(tmp_path / "raw", made)
-    truth = write_bsfe_truth(tmp_path / "truth", [(frame.true, frame.category, frame.is_valid) for frame in made])
+    raw = public.write_log(tmp_path / "raw", made)
+    labels = [(frame.true, frame.category, frame.is_valid) for frame in made]
+    truth = public.write_bsfe_truth(tmp_path / "truth", labels)
     log, frames = AV2Log(raw / LOG, ground="bsfe"), []
     for number, frame in enumerate(made):
         sweep = log.sweep(number)

@@ -9,17 +9,8 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, List, Sequence
 
 import numpy as np
+import public_evaluators as public
 import pytest
-from public_evaluators import (
-    LOG,
-    bsfe_data_set,
-    bucket_numbers,
-    check,
-    read_pair,
-    residual_at_t,
-    score,
-    write_bsfe_truth,
-)
 from scenes import pose
 from turning_drive import SETTINGS, drive, expected, relative_to, speeds
 
@@ -172,11 +163,11 @@ def test_the_error_names_the_bad_field_of_a_frame(bsfe: ModuleType, path: str, v
 @pytest.mark.parametrize("preset", ["paper", "default"])
 def test_real_pair_through_their_evaluator(bsfe: ModuleType, av2_folder: Path, tmp_path: Path, preset: str) -> None:
     """Our evaluation gets the flow of the same points as their data set's items, in our own axes."""
-    pair, raw, stored = read_pair(av2_folder), av2_folder.parent, window(AV2Log(av2_folder, ground="bsfe"), 0)
+    pair, raw, stored = public.read_pair(av2_folder), av2_folder.parent, window(AV2Log(av2_folder, ground="bsfe"), 0)
     sweeps = Window(*(replace(sweep, point_times=None) for sweep in (stored.pc0, stored.pc1)))  # frames have no times
     T, labels = pair.T_float64, pair.labels
-    truth = write_bsfe_truth(tmp_path, [(residual_at_t(pair), labels.category, labels.is_valid)])
-    data_set = bsfe_data_set(bsfe, raw, truth, "bucketed_epe", truth)
+    truth = public.write_bsfe_truth(tmp_path, [(public.residual_at_t(pair), labels.category, labels.is_valid)])
+    data_set = public.bsfe_data_set(bsfe, raw, truth, "bucketed_epe", truth)
     (item,) = data_set
     cropped = [replace(sweep, is_ground=~frame.pc.mask) for sweep, frame in zip((sweeps.pc0, sweeps.pc1), item)]
     estimate = CorrelationFlowEstimator(preset)
@@ -189,11 +180,11 @@ def test_real_pair_through_their_evaluator(bsfe: ModuleType, av2_folder: Path, t
     np.testing.assert_array_equal(item[0].pc.full_pc.points.astype(np.float32), pair.points)
     assert not (item[0].pc.mask & pair.bsfe_ground).any() and (flow.mask == item[0].pc.mask).all()
     parts = {"residual_flow": result.residual_flow, "T_ego1_ego0": T, "is_ground": pair.bsfe_ground}
-    ours = score("bucketed_scene_flow_eval", [EvalFrame(pair.points, labels, **parts)])
+    ours = public.score("bucketed_scene_flow_eval", [EvalFrame(pair.points, labels, **parts)])
     evaluator = estimate.evaluate(data_set)
-    check("estimator, buckets", bucket_numbers(ours["bucketed"], evaluator, truth))
+    public.check("estimator, buckets", public.bucket_numbers(ours["bucketed"], evaluator, truth))
     # In `load_frame_list` the ground is known and nothing is cropped, so the flow is that of the method on our window.
-    pairs = data_set.sequence_loader.load_sequence(LOG).load_frame_list(relative_to_idx=0)
+    pairs = data_set.sequence_loader.load_sequence(public.LOG).load_frame_list(relative_to_idx=0)
     (whole,), (result,) = estimate(pairs), estimate.sequence_flow.model([sweeps])
     check_flow(whole, result.residual_flow.double().numpy() @ T[:3, :3])
     assert whole.mask.all()
