@@ -11,20 +11,11 @@ import torch
 from preset_windows import changed
 from scenes import assert_same_bits, assert_zeros, config, scene
 
-from cflow_torch import (
-    CFlowError,
-    CorrelationFlow,
-    CorrelationFlowKeypoints,
-    Sweep,
-    VerifiedFlow,
-    Window,
-    estimate_flow,
-    make_config,
-    make_model,
-)
-from cflow_torch.errors import CFlowWarning, NoActivePoints
+from cflow_torch import CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow, estimate_flow, make_config, make_model
+from cflow_torch.errors import CFlowError, CFlowWarning, NoActivePoints
 from cflow_torch.simulator import make_drive
 from cflow_torch.stages import TimedModel
+from cflow_torch.types import Sweep, Window
 from cflow_torch.windows.ground import find_ground_batch
 
 RNG = np.random.default_rng(0)

@@ -32,12 +32,7 @@ class TinyRecording:
     """Ego and one car move at constant velocity, the ego yaws at a constant rate; a second car is parked.
 
     Every shot has its own time, up to 99 ms after the sweep's time stamp, and is not compensated for any motion.
-
-    Args:
-        names: LiDARs.
-        num_sweeps: of them.
-        interval_ns: between time stamps.
-        origin: world translation of the ego at the start.
+    `names` are those of the LiDARs, and `origin` is the world translation of the ego at the start, metres.
     """
 
     def __init__(

@@ -49,6 +49,5 @@ def result_of(speed: float = 1.0) -> FlowResult:
     pose_flow = torch.tensor([-STEP, 0.0, 0.0]).repeat(51, 1)
     cluster = torch.full((51,), -1)
     cluster[CAR], cluster[WALL] = 3, 5
-    return FlowResult(
-        residual, pose_flow, residual + pose_flow, cluster, torch.ones(51), torch.ones(51, dtype=torch.bool)
-    )
+    ones = torch.ones(51)
+    return FlowResult(residual, pose_flow, residual + pose_flow, cluster, ones, ones > 0)

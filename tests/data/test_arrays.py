@@ -9,19 +9,12 @@ import pyarrow as pa
 import pytest
 import scenes
 from pyarrow import feather, parquet
+from scipy.spatial.transform import Rotation
 
 from cflow_torch import CFlowError, Sweep
+from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, read_columns, write_cloud
 from cflow_torch.data.arrays.ply import ply_fields, write_ply
-from cflow_torch.data.arrays.poses_text import (
-    Trajectory,
-    covered_poses,
-    read_poses,
-    read_times,
-    write_kitti_poses,
-    write_times,
-    write_tum_poses,
-)
 from cflow_torch.data.arrays.reader import ArraysLog, find_array_logs, natural_key
 from cflow_torch.data.arrays.writer import write_array_log
 from cflow_torch.data.log import Log
@@ -37,26 +30,16 @@ class SmallLog(Log):
     def __init__(self, poses=True, times=True, ground=True) -> None:
         rng = np.random.default_rng(3)
         self.timestamps = [STAMP + k * 100_000_000 for k in range(3)]
-        self.poses = np.stack([scenes.pose(3.0 * k, -k, 0.3 * k) @ tilt(0.1, 0.2 * k) for k in range(3)])
-        self.sweeps = [
-            Sweep(
-                rng.normal(0, 30, (40, 3)).astype(np.float32),
-                rng.random(40) < 0.4 if ground else None,
-                pose if poses else None,
-                time if times else None,
-            )
-            for pose, time in zip(self.poses, self.timestamps)
-        ]
+        self.poses = np.stack([scenes.pose(3.0 * k, -k, 0.0) for k in range(3)])
+        self.poses[:, :3, :3] = Rotation.from_euler("ZXY", [(0.3 * k, 0.1, 0.2 * k) for k in range(3)]).as_matrix()
+        self.sweeps = []
+        for pose, time in zip(self.poses, self.timestamps):
+            points, is_ground = rng.normal(0, 30, (40, 3)).astype(np.float32), rng.random(40) < 0.4
+            given = (is_ground if ground else None, pose if poses else None, time if times else None)
+            self.sweeps.append(Sweep(points, *given))
 
     def sweep(self, index: int) -> Sweep:
         return self.sweeps[index]
-
-
-def tilt(roll: float, pitch: float) -> np.ndarray:
-    a, b = np.eye(4), np.eye(4)
-    a[1:3, 1:3] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
-    b[0:3:2, 0:3:2] = [[np.cos(pitch), np.sin(pitch)], [-np.sin(pitch), np.cos(pitch)]]
-    return a @ b
 
 
 @pytest.fixture
@@ -111,11 +94,8 @@ def test_other_columns_come_back_from_every_suffix(tmp_path, suffix):
     assert list(found) == list(columns)
     for name, values in columns.items():
         assert np.array_equal(found[name], values), name
-    exact = set(columns) - {".ply": {"half", "stamp", "is_strongest"}, ".pcd": {"half", "is_strongest"}}.get(
-        suffix, set()
-    )
-    exact -= {"half"} if suffix == ".parquet" else set()
-    assert all(found[name].dtype == columns[name].dtype for name in exact)
+    wider = {".ply": {"half", "stamp", "is_strongest"}, ".pcd": {"half", "is_strongest"}, ".parquet": {"half"}}
+    assert all(found[name].dtype == columns[name].dtype for name in set(columns) - wider.get(suffix, set()))
     with pytest.raises(CFlowError, match="column time has shape"):
         write_cloud(file, points, {"time": np.zeros(19)})
 
@@ -246,10 +226,10 @@ def test_names_are_sorted_naturally_and_read_as_times(tmp_path):
         log = ArraysLog(tmp_path / place)
         assert log.sweep(1).timestamp_ns == log.timestamps[1] == 1_700_000_000_100_000_000
     stamps = [-1_500_000_001, 0, 5, STAMP]
-    write_times(tmp_path / "t.txt", stamps)
-    assert read_times(tmp_path / "t.txt").tolist() == stamps
+    poses_text.write_times(tmp_path / "t.txt", stamps)
+    assert poses_text.read_times(tmp_path / "t.txt").tolist() == stamps
     (tmp_path / "m.txt").write_text("# 16 numbers, commas\n\n1, 0, 0, 5, 0,1,0,6, 0,0,1,7, 0,0,0,1\n")
-    assert read_poses(tmp_path / "m.txt").poses[0, :3, 3].tolist() == [5, 6, 7]
+    assert poses_text.read_poses(tmp_path / "m.txt").poses[0, :3, 3].tolist() == [5, 6, 7]
 
 
 def test_poses_of_another_rate_are_interpolated(tmp_path):
@@ -257,24 +237,24 @@ def test_poses_of_another_rate_are_interpolated(tmp_path):
     folder = write_array_log(SmallLog(), tmp_path, poses=None)
     seconds = np.arange(-1, 14) * 0.02
     truth = np.stack([scenes.pose(10 * s, 0, 0.5 * s) for s in seconds])
-    write_tum_poses(folder / "poses.txt", [STAMP + 7_000_000 + round(s * 1e9) for s in seconds], truth)
+    poses_text.write_tum_poses(folder / "poses.txt", [STAMP + 7_000_000 + round(s * 1e9) for s in seconds], truth)
     for k, pose in enumerate(ArraysLog(folder).poses):
         at = 0.1 * k - 0.007
         assert np.abs(pose - scenes.pose(10 * at, 0, 0.5 * at)).max() < 1e-12
-    write_times(folder / "times.txt", [time + 10**12 for time in SmallLog().timestamps])
+    poses_text.write_times(folder / "times.txt", [time + 10**12 for time in SmallLog().timestamps])
     with pytest.raises(CFlowError, match="same time"):
         ArraysLog(folder)
-    gap = Trajectory(truth[:2], np.array([0, 10**9]), "tum")
-    assert np.array_equal(covered_poses(gap, [0, 10**9], "x"), gap.poses), "a pose at its time stays as it is"
+    gap = poses_text.Trajectory(truth[:2], np.array([0, 10**9]), "tum")
+    assert np.array_equal(poses_text.covered_poses(gap, [0, 10**9], "x"), gap.poses), "a pose at its time is kept"
     with pytest.raises(CFlowError, match="no pose near"):
-        covered_poses(gap, [5 * 10**8], "x")
+        poses_text.covered_poses(gap, [5 * 10**8], "x")
 
 
 def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):
     """Camera poses and Tr give the LiDAR's motion: inv(Tr) P Tr."""
     camera_T_lidar = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1.0]])
     lidar = np.stack([scenes.pose(k, 0.1 * k, 0.05 * k) for k in range(3)])
-    write_kitti_poses(folder / "poses.txt", camera_T_lidar @ lidar @ np.linalg.inv(camera_T_lidar))
+    poses_text.write_kitti_poses(folder / "poses.txt", camera_T_lidar @ lidar @ np.linalg.inv(camera_T_lidar))
     row = " ".join(f"{v:.12e}" for v in camera_T_lidar[:3].ravel())
     (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {row}\n")
     assert np.abs(ArraysLog(folder).poses - lidar).max() < 1e-12

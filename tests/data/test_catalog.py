@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import cflow
 
-from cflow_torch.cli.main import main
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import GroundSegmentedLog, find_sources, open_log
 from cflow_torch.simulator import Drive, make_drive
@@ -35,12 +35,8 @@ def arrays(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("profile", FORMATS)
 @pytest.mark.slow
 def test_a_simulated_drive_of_every_sensor_is_scored_from_its_own_format(profile: str, tmp_path: Path) -> None:
-    main(
-        [
-            *("eval", "data=benchmark_sensors", f"data.profile={profile}", f"data.cache={tmp_path}", "model=paper"),
-            *("data.num_drives=1", "data.num_sweeps=4", "data.first=1", f"output={tmp_path / 'out'}"),
-        ]
-    )
+    data = ("data=benchmark_sensors", f"data.profile={profile}", f"data.cache={tmp_path}", "data.num_drives=1")
+    assert cflow("eval", *data, "data.num_sweeps=4", "data.first=1", "model=paper", f"output={tmp_path / 'out'}") == 0
     record = json.loads((tmp_path / "out" / "results.json").read_text())
     assert record["num_pairs"] >= 2 and not record["failures"]
     dynamic, static = record["results"]["three_way"]["epe_fd"], record["results"]["three_way"]["epe_bs"]

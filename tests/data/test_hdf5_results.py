@@ -29,7 +29,6 @@ def flow_of(index: int, value: float = 1.0) -> np.ndarray:
 
 
 def contents(file: Path) -> dict[str, Any]:
-    """Every value of a scene."""
     with h5py.File(file, "r") as scene:
         return {f"{stamp}/{key}": scene[stamp][key][()] for stamp in scene for key in scene[stamp]}
 

@@ -93,9 +93,8 @@ def test_loaders_of_kiss_icp_are_logs(drive, tmp_path):
     assert len(log.timestamps) == 3 and log.log_id == f"{tmp_path.name}-03" and log.labels(0) is None
     assert np.allclose(log.sweep(2).pose, drive.poses[2], atol=1e-6)
     given, read = drive.sweep(1).points, log.sweep(1).points
-    assert (
-        read.dtype == np.float32 and (np.linalg.norm(read - given, axis=1) < 0.01 * np.linalg.norm(given, axis=1)).all()
-    )
+    assert read.dtype == np.float32
+    assert (np.linalg.norm(read - given, axis=1) < 0.01 * np.linalg.norm(given, axis=1)).all()
     for settings, message in (
         ({"loader": "mcap"}, "choose one of apollo.*or use data=bags"),
         ({"loader": "kitti"}, "loader kitti fails: .*sequence"),

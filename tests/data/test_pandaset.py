@@ -128,12 +128,8 @@ def test_classes_of_points_are_ground_and_categories(sequence: Path) -> None:
 
 def test_data_frames_of_old_pandas_are_read() -> None:
     columns = load_columns(io.BytesIO(gzip.decompress(base64.b64decode(OLD_FRAME))))
-    assert {name: values.tolist() for name, values in columns.items()} == {
-        "x": [1.0, 3.0],
-        "y": [2.0, 4.0],
-        "d": [0, 1],
-        "label": ["Car", "Bus"],
-    }
+    expected = {"x": [1.0, 3.0], "y": [2.0, 4.0], "d": [0, 1], "label": ["Car", "Bus"]}
+    assert {name: values.tolist() for name, values in columns.items()} == expected
 
 
 @pytest.mark.parametrize(

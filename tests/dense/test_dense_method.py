@@ -204,9 +204,8 @@ def vertical(pc0: np.ndarray, pc1: np.ndarray, settings=SECTIONAL) -> FlowResult
 
 @pytest.mark.parametrize("move", [(3, 4, 1), (-4, 3, -2), (0, 2, 1), (0, 0, 2), (3, 0, 0)])
 def test_a_vertical_move_is_found(move):
-    ell = np.array(
-        [(c + 0.5, r + 0.5, 0.5) for r, c in [(r, 10) for r in range(10, 22)] + [(21, c) for c in range(11, 22)]]
-    )
+    pixels = [(r, 10) for r in range(10, 22)] + [(21, c) for c in range(11, 22)]
+    ell = np.array([(c + 0.5, r + 0.5, 0.5) for r, c in pixels])
     points = np.concatenate([ell + [0, 0, z] for z in range(6)])
     result, flat = vertical(points, points + move), vertical(points, points + move, METRE)
     np.testing.assert_allclose(result.residual_flow, np.tile(move, (len(points), 1)), atol=1e-6)

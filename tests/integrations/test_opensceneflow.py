@@ -117,9 +117,7 @@ def drive() -> list[Sweep]:
     ("variant", "num_frames"), [("dense", 2), ("dense", 4), ("dense", 6), ("verified", 6), ("keypoints", 2)]
 )
 @pytest.mark.parametrize("index", [5, 2, 0])  # 2 and 0: the harness repeats the first sweep
-def test_every_layout_gives_the_flow_of_the_method(
-    variant: str, num_frames: int, index: int, drive: list[Sweep]
-) -> None:
+def test_every_layout_gives_the_flow_of_the_method(variant, num_frames, index, drive):
     expected = residual_of_method(drive, variant, index, num_frames)
     if (variant, index) != ("verified", 0):  # two sweeps with so few points are not enough evidence of motion
         assert (expected.norm(dim=1) > 0.05).sum() > 50, "there is motion to find"

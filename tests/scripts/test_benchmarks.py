@@ -12,6 +12,7 @@ import pytest
 import torch
 from preset_windows import small
 from scenes import RANGE, assert_same
+from scipy.spatial.transform import Rotation
 
 from cflow_torch import CorrelationFlow, Sweep, Window, make_config
 from cflow_torch.data.av2 import AV2Log
@@ -130,13 +131,8 @@ def test_nearest_neighbours_of_padded_clouds(cpu: Any) -> None:
 
 def test_angles_of_a_rotation(cpu: Any) -> None:
     angles = np.array([0.7, -0.4, 0.2])
-    (cz, cy, cx), (sz, sy, sx) = np.cos(angles), np.sin(angles)
-    about_z, about_y = (
-        np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]),
-        np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]),
-    )
-    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-    found = cpu.euler_angles(torch.from_numpy(about_z @ about_y @ about_x)[None], "ZYX")
+    matrix = Rotation.from_euler("ZYX", angles).as_matrix()
+    found = cpu.euler_angles(torch.from_numpy(matrix)[None], "ZYX")
     np.testing.assert_allclose(found[0].numpy(), angles, atol=1e-12)
 
 

@@ -55,10 +55,7 @@ CALLS: dict[str, list[tuple[Callable[[Path], Any], str]]] = {
         (lambda folder: save_animation([ONE, OTHER], folder / "a.gif"), "picture 1 has .110, 50. pixels, the first"),
         (lambda folder: save_animation(failing(ONE), folder / "a.gif"), "a bad sweep"),
         (lambda folder: save_animation([ONE], folder / "a.avi"), "does not end in .gif or .mp4"),
-        (
-            lambda folder: save_animation([ONE], folder / "a.gif", frames_per_second=float("nan")),
-            "frames_per_second=nan",
-        ),
+        (lambda folder: save_animation([ONE], folder / "a.gif", frames_per_second=np.nan), "frames_per_second=nan"),
         (lambda folder: save_animation([], folder / "a.gif"), "at least one"),
         (lambda folder: save_picture(ONE, folder / "a.pdf"), r"does not end in \.png"),
         (lambda folder: plot(points=np.zeros((5, 2))), "points has shape"),

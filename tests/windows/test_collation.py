@@ -189,7 +189,6 @@ def test_results_share_no_memory_with_the_input():
 
 
 def highest_resident_kb() -> int:
-    """Largest resident memory of this process."""
     status = Path("/proc/self/status")
     if not status.exists():
         pytest.skip("no /proc/self/status: resident memory cannot be read")

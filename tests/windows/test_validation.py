@@ -111,9 +111,8 @@ def test_a_longer_history_is_cut_to_the_nearest_sweeps(caplog):
     ],
 )
 def test_too_coarse_types_of_points_are_refused(points, far, is_refused):
-    model = CorrelationFlow.from_preset(
-        "paper", pixel_size=0.25, point_cloud_range=(far - 8, far - 8, -8, far + 8, far + 8, 8)
-    )
+    region = (far - 8, far - 8, -8, far + 8, far + 8, 8)
+    model = CorrelationFlow.from_preset("paper", pixel_size=0.25, point_cloud_range=region)
     window = Window(Sweep(points(RNG.uniform(-1, 1, (50, 3)) + [far, far, 0.0])), Sweep(np.zeros((4, 3)) + far))
     if not is_refused:
         assert model([window])[0].is_valid.all()
