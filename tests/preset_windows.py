@@ -25,24 +25,15 @@ def small(preset: str, **overrides: Any) -> Config:
 def windows_for(config: Config, number: int = 1) -> list[Window]:
     """Windows in which every preset finds motion. The last of several is a pair."""
     seeds = (12, 11, 3, 8)[:number]
-    return [
-        scene(
-            seed,
-            num_history=0 if number > 1 and seed == seeds[-1] else config.num_history,
-            num_future=config.num_future,
-            num_points=90,
-        )
-        for seed in seeds
-    ]
+    history = [config.num_history] * max(number - 1, 1) + [0]
+    return [scene(s, num_history=h, num_future=config.num_future, num_points=90) for s, h in zip(seeds, history)]
 
 
 def changed(window: Window, change: Callable[[Sweep], Sweep]) -> Window:
-    """Change every sweep of a window."""
     return Window(*map(change, (window.pc0, window.pc1)), *(tuple(map(change, s)) for s in (window.pch, window.pcf)))
 
 
 def untimed(window: Window) -> Window:
-    """Drop the times of points."""
     return changed(window, lambda sweep: replace(sweep, point_times=None))
 
 

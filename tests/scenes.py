@@ -123,7 +123,6 @@ def reordered(window: Window, seed: int = 0) -> tuple[Window, np.ndarray]:
 
 
 def rows_of(result: FlowResult, rows: np.ndarray) -> FlowResult:
-    """Some rows of a result."""
     values = {f.name: getattr(result, f.name) for f in fields(FlowResult)}
     return FlowResult(**{name: None if v is None else v[torch.from_numpy(rows)] for name, v in values.items()})
 

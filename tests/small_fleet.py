@@ -1,4 +1,4 @@
-"""A few small logs, runs on them in this process, and the files of a run."""
+"""Runs on the logs of the fixture `fleet` in this process, and the files of a run."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from cflow_torch.fleet.job import Job, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import claim_folder, make_identity
 from cflow_torch.fleet.run import run_fleet
-from cflow_torch.simulator import make_drive
-from cflow_torch.simulator.writers.av2 import write_av2_log
 
 SWEEPS = (4, 6, 3)  # of the logs
 PAIRS = sum(SWEEPS) - len(SWEEPS)
@@ -23,13 +21,6 @@ CONFIG = make_config("paper", pixel_size=0.4, num_history=1)
 COMMAND = ["flow", "data=av2", "model=paper", "model.pixel_sizes=[0.4]", "model.num_history=1", "data.check=false"]
 ONE = Layout(("cpu",), 2)
 TWO = Layout(("cpu", "cpu"), 2)
-
-
-def write_fleet(root: Path) -> Path:
-    """Three logs, of 3, 5 and 2 pairs."""
-    for seed, sweeps in enumerate(SWEEPS):
-        write_av2_log(make_drive(seed=seed, num_sweeps=sweeps, profile="demo"), root)
-    return root
 
 
 def make_job(output: Path, **settings: Any) -> Job:
@@ -69,7 +60,6 @@ def tree(output: Path) -> dict[str, bytes]:
 
 
 def flow_files(output: Path) -> dict[str, bytes]:
-    """The flow files of `tree`."""
     return {name: content for name, content in tree(output).items() if name.endswith(".feather")}
 
 

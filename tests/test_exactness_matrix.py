@@ -20,11 +20,6 @@ Call = Callable[[Config, List[Window]], Results]
 EMPTY = Sweep(np.zeros((0, 3), dtype=np.float32))
 
 
-def plainly(config: Config, windows: list[Window]) -> Results:
-    """Window by window, the reference for all others."""
-    return [make_model(config, "cpu")([window])[0] for window in windows]
-
-
 def together(config: Config, windows: list[Window]) -> Results:
     return make_model(config, "cpu")(windows)
 
@@ -97,7 +92,7 @@ CALLS: dict[str, Call] = {
 def expected(preset: str) -> tuple[Config, list[Window], Results]:
     config = small(preset)
     windows = windows_for(config, 2)
-    return config, windows, plainly(config, windows)
+    return config, windows, [make_model(config, "cpu")([window])[0] for window in windows]
 
 
 @pytest.mark.parametrize("call", CALLS)

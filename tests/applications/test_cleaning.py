@@ -30,15 +30,12 @@ def test_moving_cars_are_removed_from_every_sweep_and_the_wall_stays() -> None:
         assert clean[index].timestamp_ns == log.timestamps[index]
 
 
-def waiting() -> Staged:
+def test_waiting_cars_are_removed_by_their_tracks_and_parked_cars_stay() -> None:
     """A car that waits for eight sweeps and starts, a car that stops, and a parked car that never moves."""
     start = np.cumsum([0.0] * 8 + [0.1, 0.2, 0.4, 0.7, 1.0, 1.0, 1.0, 1.0])
     stop = np.cumsum([1.0, 1.0, 1.0, 1.0, 0.7, 0.4, 0.2, 0.1] + [0.0] * 8)
-    return Staged([np.stack([start, 0 * start], 1), np.stack([stop, 0 * stop + 5], 1), straight((25, 0), (0, 0), 16)])
-
-
-def test_waiting_cars_are_removed_by_their_tracks_and_parked_cars_stay() -> None:
-    log = waiting()
+    moving = [np.stack([start, 0 * start], 1), np.stack([stop, 0 * stop + 5], 1)]
+    log = Staged([*moving, straight((25, 0), (0, 0), 16)])
     by_flow, by_tracks = cleaned(log), cleaned(log, remove_stopped=True)
     for index in range(len(log) - 1):
         car = log.world(index)[2]
@@ -65,25 +62,20 @@ def test_a_piece_of_a_waiting_car_that_seems_to_move_does_not_take_its_track() -
         assert np.array_equal(clean.moving(index), log.world(index)[2] == 0), index
 
 
-def test_ground_and_point_times_stay_with_their_rows() -> None:
-    class Whole(Staged):
+@pytest.mark.parametrize("suffix", [".npy", ".ply", ".bin"])
+def test_ground_times_and_other_columns_stay_with_their_rows(tmp_path: Path, suffix: str) -> None:
+    class WithRows(Staged):
         def sweep(self, index: int) -> Sweep:
             points = super().sweep(index).points
             rows = np.arange(len(points))
             return Sweep(points, rows % 7 == 0, None, self.timestamps[index], rows * 1e-6)
 
-    log = Whole([straight((0, 0), (0.9, 0.0))])
-    sweep, stays = cleaned(log)[3], np.flatnonzero(~cleaned(log).moving(3))
-    assert np.array_equal(sweep.is_ground, stays % 7 == 0) and np.allclose(sweep.point_times, stays * 1e-6)
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".ply", ".bin"])
-def test_other_columns_stay_with_their_rows(tmp_path: Path, suffix: str) -> None:
-    class WithRows(Staged):
         def columns(self, index: int) -> dict[str, np.ndarray]:
             return {"column_3": np.arange(len(self.sweep(index).points), dtype=np.float32)}
 
     log = WithRows([straight((0, 0), (0.9, 0.0))])
+    sweep, stays = cleaned(log)[3], np.flatnonzero(~cleaned(log).moving(3))
+    assert np.array_equal(sweep.is_ground, stays % 7 == 0) and np.allclose(sweep.point_times, stays * 1e-6)
     source = ArraysLog(write_array_log(log, tmp_path / "all", suffix, poses=None))
     clean = CleanLog(source, flow=log.result)
     back = ArraysLog(write_array_log(clean, tmp_path / "clean", suffix, poses=None))

@@ -43,7 +43,6 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def scenes(drives: Path, tmp_path: Path) -> Path:
-    """A copy of them."""
     return Path(shutil.copytree(drives, tmp_path / "scenes"))
 
 
@@ -63,7 +62,6 @@ def stored(file: Path) -> list[dict[str, Any]]:
 
 
 def label(*arguments: Any) -> int:
-    """Exit status of `cflow label`."""
     return cflow(*CALL, *arguments)
 
 
@@ -203,9 +201,8 @@ def test_a_killed_run_leaves_whole_scenes_and_resumes(scenes: Path, tmp_path: Pa
     assert label(scenes, output) == 0
     assert first.stat().st_ino == inode, "a labelled scene is not written again"
     assert frames == {f: f.stat().st_mtime_ns for f in tmp_path.glob("out/*/*.feather")}, "flow is not computed again"
-    assert all("nnd" in sweep for sweep in stored(second)) and sorted(
-        name for name in os.listdir(scenes) if not name.endswith(".json")
-    ) == sorted(before)
+    assert all("nnd" in sweep for sweep in stored(second))
+    assert sorted(name for name in os.listdir(scenes) if not name.endswith(".json")) == sorted(before)
 
 
 def test_shards_label_every_scene_once(scenes: Path, tmp_path: Path, capsys: Any) -> None:

@@ -7,7 +7,6 @@ import json
 import weakref
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,14 +34,12 @@ def push(stream: FlowStream, sweep: Sweep, **changes: Any) -> FlowResult | None:
 def expected(sweeps: list[Sweep], index: int, settings: Any) -> FlowResult:
     """Flow of sweep `index` with all available history."""
     oldest = max(index - settings.num_history, 0)
-    (result,) = make_model(settings, "cpu")(
-        [Window(sweeps[index], sweeps[index + 1], tuple(sweeps[oldest:index][::-1]))]
-    )
-    return result
+    window = Window(sweeps[index], sweeps[index + 1], tuple(sweeps[oldest:index][::-1]))
+    return make_model(settings, "cpu")([window])[0]
 
 
 @pytest.mark.parametrize("preset", ["default", "paper", "keypoints"])
-def test_results_equal_those_of_windows(preset: str, sweeps: list[Sweep]) -> None:
+def test_results_equal_those_of_windows(preset, sweeps):
     settings = small(preset)
     timed = [replace(s, point_times=np.linspace(0, 0.09, len(s.points))) for s in sweeps]
     stream = FlowStream(config=settings, device="cpu")
@@ -54,7 +51,7 @@ def test_results_equal_those_of_windows(preset: str, sweeps: list[Sweep]) -> Non
         assert np.array_equal(stream.window.pc0.points, timed[index].points, equal_nan=True)
 
 
-def test_few_sweeps_are_kept_and_buffers_may_be_reused(sweeps: list[Sweep]) -> None:
+def test_few_sweeps_are_kept_and_buffers_may_be_reused(sweeps):
     settings, buffer = small("paper", num_history=1), np.empty((2000, 3), np.float32)
     stream, seen = FlowStream(config=settings), []
     for index, sweep in enumerate(sweeps):
@@ -69,9 +66,7 @@ def test_few_sweeps_are_kept_and_buffers_may_be_reused(sweeps: list[Sweep]) -> N
     assert [reference() is not None for reference in seen] == [False] * 4 + [True, True]
 
 
-def test_late_and_repeated_sweeps_are_skipped_and_gaps_start_again(
-    sweeps: list[Sweep], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_late_and_repeated_sweeps_are_skipped_and_gaps_start_again(sweeps, caplog):
     settings = small("default", num_history=2)
     stream = FlowStream(config=settings, max_gap=0.5)
     for sweep in sweeps[:3]:
@@ -89,7 +84,7 @@ def test_late_and_repeated_sweeps_are_skipped_and_gaps_start_again(
     assert push(stream, sweeps[5]) is None
 
 
-def test_times_in_seconds_and_missing_times_give_the_same_flow(sweeps: list[Sweep]) -> None:
+def test_times_in_seconds_and_missing_times_give_the_same_flow(sweeps):
     settings = small("default", num_history=2, max_speed=8.0)
     regular = [replace(sweep, timestamp_ns=None) for sweep in sweeps]
     stream, by_second = FlowStream(config=settings), FlowStream(config=settings)
@@ -111,9 +106,7 @@ BAD = [
 
 
 @pytest.mark.parametrize("bad, message, first", [*BAD, *(case[:2] + (False,) for case in BAD[:3])])
-def test_a_bad_sweep_is_refused_and_the_stream_goes_on(
-    bad: dict, message: str, first: bool, sweeps: list[Sweep]
-) -> None:
+def test_a_bad_sweep_is_refused_and_the_stream_goes_on(bad, message, first, sweeps):
     settings = small("default", num_history=2)
     stream = FlowStream(config=settings)
     good = sweeps[:3]
@@ -126,7 +119,7 @@ def test_a_bad_sweep_is_refused_and_the_stream_goes_on(
     assert_same_bits(result, expected(good, 1, settings))
 
 
-def test_settings_that_a_stream_cannot_have_are_refused(sweeps: list[Sweep]) -> None:
+def test_settings_that_a_stream_cannot_have_are_refused(sweeps):
     for settings, message in (
         ({"preset": "offline"}, "does not know later sweeps"),
         ({"ground": "grass"}, "ground="),
@@ -138,7 +131,7 @@ def test_settings_that_a_stream_cannot_have_are_refused(sweeps: list[Sweep]) -> 
         FlowStream("default").push(sweeps[0], sweeps[0].pose)
 
 
-def test_missing_ground_and_poses_are_estimated() -> None:
+def test_missing_ground_and_poses_are_estimated():
     drive = make_drive(seed=2, num_sweeps=4, profile="demo")
     stream = FlowStream("default", num_history=0, ground="auto")
     if find_spec("kiss_icp") is None:
@@ -154,7 +147,7 @@ def test_missing_ground_and_poses_are_estimated() -> None:
     assert np.abs(moved - true).max() < 0.2 and result.residual_flow.any()
 
 
-def test_the_command_reports_latency(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_command_reports_latency(tmp_path, capsys):
     data = ("data.num_sweeps=4", f"data.cache={tmp_path / 'cache'}")
     assert cflow("stream", *data, "model.num_history=0", "pace=null", f"output={tmp_path / 'out'}") == 0
     report = json.loads((tmp_path / "out" / "stream.json").read_text())

@@ -66,7 +66,6 @@ def run(kind: str, part: Any, names: dict[str, Any]) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return an empty working folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", list(sys.argv))
     return tmp_path
@@ -159,9 +158,8 @@ def test_the_reference_has_every_public_name() -> None:
     public = {f"cflow_torch.{name}" for name in cflow_torch.__all__ if name != "__version__"}
     readers = {f"cflow_torch.data.{name}.{one.log}" for name, one in DATA_SETS.items()}
     scores = {f"cflow_torch.evaluation.{name}" for name in evaluation.__all__ if name != "DEFINITIONS"}
-    pictures = {
-        f"cflow_torch.viz.{name}" for name in viz.__all__ if name.startswith(("plot", "save", "record", "show"))
-    }
+    drawn = [name for name in viz.__all__ if name.startswith(("plot", "save", "record", "show"))]
+    pictures = {f"cflow_torch.viz.{name}" for name in drawn}
     assert not (public | readers | scores | pictures) - named
 
 

@@ -5,15 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from small_fleet import run, tree, write_fleet
+from small_fleet import SWEEPS, run, tree
 
 from cflow_torch.fleet.machine import Layout
+from cflow_torch.simulator import make_drive
+from cflow_torch.simulator.writers.av2 import write_av2_log
 
 
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of three logs, of 3, 5 and 2 pairs."""
-    return write_fleet(tmp_path_factory.mktemp("fleet"))
+    root = tmp_path_factory.mktemp("fleet")
+    for seed, sweeps in enumerate(SWEEPS):
+        write_av2_log(make_drive(seed=seed, num_sweeps=sweeps, profile="demo"), root)
+    return root
 
 
 @pytest.fixture(scope="session")

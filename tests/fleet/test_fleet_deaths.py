@@ -13,7 +13,7 @@ from typing import Any, Callable
 
 import numpy as np
 import pytest
-from small_fleet import COMMAND, PAIRS, TWO, command, frames, run, tree
+from small_fleet import COMMAND, PAIRS, TWO, command, flow_files, frames, run, tree
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet import run as running
@@ -52,14 +52,7 @@ def make_deadly_worker(*arguments: Any) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("once, always", [(("SIGKILL", "hang"), "SIGSEGV"), (("SystemExit",), "memory")])
-def test_dying_workers_lose_only_the_frame_that_always_kills(
-    once: tuple[str, ...],
-    always: str,
-    fleet: Path,
-    single: dict[str, bytes],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_dying_workers_lose_only_the_frame_that_always_kills(once, always, fleet, single, tmp_path, monkeypatch):
     monkeypatch.setenv(DEADLY, str(tmp_path))
     monkeypatch.setattr(running, "make_worker", make_deadly_worker)
     logs = [AV2Log(folder) for folder in sorted(fleet.iterdir())]
@@ -79,7 +72,6 @@ COPIES = 20  # of a log of five pairs: a run of some seconds
 
 @pytest.fixture(scope="module")
 def many(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One log under many names."""
     root = tmp_path_factory.mktemp("many")
     for number in range(COPIES):
         shutil.copytree(sorted(fleet.iterdir())[1], root / f"log-{number:02}", copy_function=os.link)
@@ -102,24 +94,16 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def workers(process: subprocess.Popen) -> list[int]:
-    """Worker processes of a run."""
     threads = Path(f"/proc/{process.pid}/task").iterdir()
     children = [child for thread in threads for child in (thread / "children").read_text().split()]
     return [int(child) for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
-
-
-def flow_of(output: Path) -> dict[str, bytes]:
-    """All files but manifests and hidden ones."""
-    return {n: content for n, content in tree(output).items() if not n.endswith("manifest.json") and "/." not in n}
 
 
 @pytest.mark.parametrize(
     ("send", "name", "status"),
     [(os.kill, "SIGKILL", -9), pytest.param(os.killpg, "SIGTERM", 143, marks=pytest.mark.slow)],
 )
-def test_a_killed_run_is_resumed_and_its_workers_end(
-    many: Path, expected: dict[str, bytes], tmp_path: Path, send: Callable[[int, int], None], name: str, status: int
-) -> None:
+def test_a_killed_run_is_resumed_and_its_workers_end(many, expected, tmp_path, send, name, status):
     settings = [f"data.root={many}", f"output={tmp_path}", "engine.batch=2", "engine.workers=2"]
     process = subprocess.Popen(
         [sys.executable, "-m", "cflow_torch.cli.main", *COMMAND, *settings],
@@ -132,9 +116,9 @@ def test_a_killed_run_is_resumed_and_its_workers_end(
     assert process.wait(timeout=60) == status and len(children) == 2
     wait_for(lambda: not any(Path(f"/proc/{child}").exists() for child in children))
     assert not any(Path(f"/proc/{child}").exists() for child in children)
-    assert 3 < len(frames(tmp_path)) < len(expected) and flow_of(tmp_path).items() <= expected.items()
+    assert 3 < len(frames(tmp_path)) < len(expected) and flow_files(tmp_path).items() <= expected.items()
     assert command(f"data.root={many}", f"output={tmp_path}") == 0
-    assert flow_of(tmp_path) == expected, "nothing is lost"
+    assert flow_files(tmp_path) == expected, "nothing is lost"
     left = list(tmp_path.rglob(".*"))
     assert all(file.name.endswith(".tmp") for file in left)
     for file in left:

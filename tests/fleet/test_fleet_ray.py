@@ -21,7 +21,7 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 
 
 @pytest.mark.slow
-def test_equals_the_local_engine_byte_for_byte(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
+def test_equals_the_local_engine_byte_for_byte(fleet, single, tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     report = run(fleet, tmp_path, TWO, engine="ray")
     assert (report["exit_status"], report["frames"]["computed"]) == (0, PAIRS)
@@ -43,9 +43,7 @@ class LethalActor(ray_engine._Actor):
 
 
 @pytest.mark.slow
-def test_a_killed_worker_is_replaced_and_a_unit_that_always_kills_is_reported(
-    fleet: Path, single: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_worker_is_replaced_and_a_unit_that_always_kills_is_reported(fleet, single, tmp_path, monkeypatch):
     from ray import cloudpickle
 
     monkeypatch.setattr(ray_engine, "_Actor", LethalActor)
@@ -74,13 +72,13 @@ def start(layout: Layout, **settings: Any) -> None:
         (Layout(("cuda:1",), 1), {}, "CUDA_VISIBLE_DEVICES"),
     ],
 )
-def test_bad_settings_are_errors(layout: Layout, settings: dict[str, Any], message: str) -> None:
+def test_bad_settings_are_errors(layout, settings, message):
     with pytest.raises(CFlowError, match=message):
         start(layout, **settings)
 
 
 @pytest.mark.slow
-def test_a_cluster_without_room_and_a_node_that_does_not_see_the_output() -> None:
+def test_a_cluster_without_room_and_a_node_that_does_not_see_the_output():
     with pytest.raises(CFlowError, match="no node of the Ray cluster has room for a worker of 0 CPU, 3 GPU"):
         start(Layout(("cuda:0",), 1), num_gpus=3)
     with pytest.raises(CFlowError, match="does not see .*nowhere: all nodes must reach the output"):

@@ -8,7 +8,7 @@ import re
 import shutil
 import signal
 from pathlib import Path
-from typing import Any, Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def out(single_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(single_run, tmp_path / "out"))
 
 
-def test_files_contain_the_results_and_their_origin(fleet: Path, single_run: Path) -> None:
+def test_files_contain_the_results_and_their_origin(fleet, single_run):
     model = make_model(CONFIG)
     for folder in sorted(fleet.iterdir()):
         log = AV2Log(folder)
@@ -46,7 +46,7 @@ def test_files_contain_the_results_and_their_origin(fleet: Path, single_run: Pat
     assert len(frames(single_run)) == PAIRS
 
 
-def test_a_batch_changes_no_byte(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_batch_changes_no_byte(fleet, single, tmp_path):
     report = run(fleet, tmp_path, Layout(("cpu",), batch=4))
     assert tree(tmp_path) == single
     assert (report["status"], report["exit_status"]) == ("complete", 0)
@@ -56,7 +56,7 @@ def test_a_batch_changes_no_byte(fleet: Path, single: dict[str, bytes], tmp_path
     assert json.loads((tmp_path / "reports" / "shard-0-of-1.json").read_text())["frames"] == report["frames"]
 
 
-def test_a_file_has_only_the_contents_asked_for(fleet: Path, single_run: Path, tmp_path: Path) -> None:
+def test_a_file_has_only_the_contents_asked_for(fleet, single_run, tmp_path):
     run(fleet, tmp_path, settings={"contents": ("residual", "is_valid")})
     file = frames(tmp_path)[0]
     small, whole = feather.read_table(file), feather.read_table(single_run / file.relative_to(tmp_path))
@@ -66,7 +66,7 @@ def test_a_file_has_only_the_contents_asked_for(fleet: Path, single_run: Path, t
         run(fleet, tmp_path)
 
 
-def test_a_second_run_computes_only_missing_frames(fleet: Path, single: dict[str, bytes], out: Path) -> None:
+def test_a_second_run_computes_only_missing_frames(fleet, single, out):
     gone = frames(out)[2::3]
     for file in gone:
         file.unlink()
@@ -77,7 +77,7 @@ def test_a_second_run_computes_only_missing_frames(fleet: Path, single: dict[str
     assert all(file.stat().st_mtime_ns == time for file, time in times.items()), "complete files are kept"
 
 
-def test_incomplete_files_are_computed_again(fleet: Path, single: dict[str, bytes], out: Path) -> None:
+def test_incomplete_files_are_computed_again(fleet, single, out):
     for number, file in enumerate(frames(out)[::2]):
         whole = file.read_bytes()
         file.write_bytes(b"" if number == 0 else whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2))
@@ -85,7 +85,7 @@ def test_incomplete_files_are_computed_again(fleet: Path, single: dict[str, byte
     assert tree(out) == single
 
 
-def test_other_settings_are_rejected_by_name(fleet: Path, single: dict[str, bytes], out: Path) -> None:
+def test_other_settings_are_rejected_by_name(fleet, single, out):
     with pytest.raises(CFlowError, match=re.escape("method.pixel_sizes was [0.4], is [0.8]") + ".*overwrite=true"):
         run(fleet, out, settings=OTHER)
     with pytest.raises(CFlowError, match="find_ground was None, is grid"):
@@ -102,7 +102,7 @@ def test_other_settings_are_rejected_by_name(fleet: Path, single: dict[str, byte
     assert tree(out) == single, "nothing was touched"
 
 
-def test_overwrite_removes_the_other_run(fleet: Path, out: Path, tmp_path: Path) -> None:
+def test_overwrite_removes_the_other_run(fleet, out, tmp_path):
     shutil.copytree(out / frames(out)[0].parent.name, out / "a-log-of-the-other-run")
     (out / "mine.txt").write_text("not of a run")
     (out / "manifest.json").unlink()  # an earlier attempt was killed in the middle
@@ -113,15 +113,13 @@ def test_overwrite_removes_the_other_run(fleet: Path, out: Path, tmp_path: Path)
     assert run(fleet, out, overwrite=True, settings=OTHER)["frames"]["computed"] == PAIRS, "its own frames, too"
 
 
-def test_memory_limit_and_paths_may_change(fleet: Path, out: Path, tmp_path: Path) -> None:
+def test_memory_limit_and_paths_may_change(fleet, out, tmp_path):
     moved = Path(shutil.copytree(fleet, tmp_path / "Straße 東京"))
     report = run(moved, out, settings={"config": CONFIG.replace(max_memory=5e7)})
     assert report["frames"]["computed"] == 0
 
 
-def test_a_changed_log_is_rejected_and_the_others_are_done(
-    fleet: Path, single: dict[str, bytes], out: Path, tmp_path: Path
-) -> None:
+def test_a_changed_log_is_rejected_and_the_others_are_done(fleet, single, out, tmp_path):
     root = Path(shutil.copytree(fleet, tmp_path / "root"))
     first, second, _ = sorted(folder.name for folder in root.iterdir())
     shutil.rmtree(out / second)
@@ -132,7 +130,7 @@ def test_a_changed_log_is_rejected_and_the_others_are_done(
     assert tree(out) == single
 
 
-def test_data_and_results_may_be_in_an_object_store(fleet: Path, single_run: Path, tmp_path: Path) -> None:
+def test_data_and_results_may_be_in_an_object_store(fleet, single_run, tmp_path):
     fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
     pytest.importorskip("upath", reason="needs the extra remote")
     memory = fsspec.filesystem("memory")
@@ -149,23 +147,21 @@ def test_data_and_results_may_be_in_an_object_store(fleet: Path, single_run: Pat
     memory.rm("/fleet-data", recursive=True)
 
 
-def test_shards_together_are_the_single_run(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
+def test_shards_together_are_the_single_run(fleet, single, tmp_path):
     for index in (2, 0, 1):
         shard = find_shard("auto", "auto", {"RANK": str(index), "WORLD_SIZE": "3"})  # as torchrun says
         assert run(fleet, tmp_path, shard=shard)["shard"] == {"index": index, "count": 3}
     assert tree(tmp_path) == single
 
 
-def test_a_sweep_over_shards_shares_one_folder(fleet: Path, single_run: Path, tmp_path: Path) -> None:
+def test_a_sweep_over_shards_shares_one_folder(fleet, single_run, tmp_path):
     assert command("-m", f"data.root={fleet}", f"output={tmp_path}", "shard.count=2", "shard.index=0,1") == 0
     reports = [json.loads(file.read_text()) for file in sorted((tmp_path / "reports").iterdir())]
     assert [report["exit_status"] for report in reports] == [0, 0]
     assert flow_files(tmp_path) == flow_files(single_run)
 
 
-def test_a_broken_sweep_fails_only_its_frames(
-    fleet: Path, single: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_broken_sweep_fails_only_its_frames(fleet, single, tmp_path, capsys):
     root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
     log = sorted(root.iterdir())[1]
     sweeps = sorted((log / "sensors" / "lidar").iterdir())
@@ -181,7 +177,7 @@ def test_a_broken_sweep_fails_only_its_frames(
     assert tree(out).keys() == single.keys()
 
 
-def test_a_log_that_cannot_be_opened_is_skipped(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_opened_is_skipped(fleet, single, tmp_path):
     root, out = Path(shutil.copytree(fleet, tmp_path / "root")), tmp_path / "out"
     first = sorted(root.iterdir())[0]
     poses = first / "city_SE3_egovehicle.feather"
@@ -197,23 +193,16 @@ def test_a_log_that_cannot_be_opened_is_skipped(fleet: Path, single: dict[str, b
     assert tree(out) == single
 
 
-def during(patch: pytest.MonkeyPatch, number: int, act: Callable[[], Any]) -> None:
-    """Call `act` when a run begins to write frame `number`, from 1."""
+def test_a_signal_lets_frames_in_hand_be_finished(fleet, single, tmp_path, monkeypatch):
     calls, write = [], work.write_flow
 
-    def write_after(*arguments: Any) -> None:
+    def stop_at_the_second(*arguments: Any) -> None:
         calls.append(0)
-        if len(calls) == number:
-            act()
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
         write(*arguments)
 
-    patch.setattr(work, "write_flow", write_after)
-
-
-def test_a_signal_lets_frames_in_hand_be_finished(
-    fleet: Path, single: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    during(monkeypatch, 2, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    monkeypatch.setattr(work, "write_flow", stop_at_the_second)
     report = run(fleet, tmp_path, Layout(("cpu",), 1))
     assert (report["status"], report["stopped_by"], report["exit_status"]) == ("interrupted", "SIGTERM", 143)
     assert report["frames"]["computed"] == len(frames(tmp_path)) < PAIRS and report["frames"]["unopened_units"]
@@ -222,9 +211,7 @@ def test_a_signal_lets_frames_in_hand_be_finished(
     assert tree(tmp_path) == single
 
 
-def test_a_dry_run_counts_the_frames_that_the_command_then_computes(
-    fleet: Path, single_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_dry_run_counts_the_frames_that_the_command_then_computes(fleet, single_run, tmp_path, capsys):
     out = tmp_path / "out"
     assert command(f"data.root={fleet}", f"output={out}", "dry_run=true") == 0
     printed = capsys.readouterr().out
@@ -240,9 +227,7 @@ def test_a_dry_run_counts_the_frames_that_the_command_then_computes(
     assert re.search(rf"^ +{PAIRS} +1  in total", capsys.readouterr().out, re.M)
 
 
-def test_an_unknown_engine_and_an_output_that_cannot_be_written_are_one_line(
-    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_an_unknown_engine_and_an_output_that_cannot_be_written_are_one_line(fleet, tmp_path, capsys):
     assert command(f"data.root={fleet}", f"output={tmp_path / 'out'}", "engine.name=cloud") == 2
     assert "local, ray" in capsys.readouterr().err
     (tmp_path / "file").write_text("mine")

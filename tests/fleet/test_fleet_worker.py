@@ -33,12 +33,7 @@ def source(fleet: Path) -> Path:
 
 
 class FailingModel:
-    """A method that raises an error for some frames and for every batch that contains one of them.
-
-    Args:
-        bad: time stamps of the frames.
-        error: what it raises.
-    """
+    """A method that raises `error()` for every batch that contains a frame with a time stamp of `bad`."""
 
     def __init__(self, bad: Sequence[int], error: Callable[[], Exception]) -> None:
         self.model = make_model(CONFIG, "cpu")
@@ -51,9 +46,7 @@ class FailingModel:
 
 
 @pytest.mark.parametrize("error", [CFlowError("too odd"), MemoryError(), RuntimeError("CUDA: no memory"), KeyError(3)])
-def test_a_bad_frame_does_not_spoil_its_batch(
-    source: Path, single: dict[str, bytes], tmp_path: Path, error: Exception
-) -> None:
+def test_a_bad_frame_does_not_spoil_its_batch(source, single, tmp_path, error):
     stamps = AV2Log(source).timestamps
     model = FailingModel([stamps[1], stamps[3]], lambda: error)
     events = list(Worker(make_job(tmp_path, batch=3), "cpu", model=model).run(Unit(0, source)))
@@ -64,7 +57,7 @@ def test_a_bad_frame_does_not_spoil_its_batch(
     assert len(flow_files(tmp_path)) == 3 and flow_files(tmp_path).items() <= single.items()
 
 
-def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_path: Path) -> None:
+def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_path):
     drive = make_drive(seed=1, num_sweeps=5, profile="demo")
 
     class Odd(LogWrapper):
@@ -89,7 +82,7 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
     assert any("static world moves" in text for _, text in notes), "the log is checked by the unit of its first frame"
 
 
-def test_a_lost_gpu_ends_its_worker(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_gpu_ends_its_worker(source, tmp_path, monkeypatch):
     model = FailingModel(AV2Log(source).timestamps, lambda: RuntimeError("assert"))
     worker = Worker(make_job(tmp_path, batch=1), "cpu", model=model)
 
@@ -109,13 +102,8 @@ class Death(BaseException):
 
 
 class ThreadProcess:
-    """A worker that lives in the thread of its caller and dies when it reads a deadly frame.
-
-    Args:
-        job: the run.
-        deadly: "log/time stamp" -> how many more workers die on it.
-        failed_starts: how often it dies at its start.
-    """
+    """A worker that lives in the thread of its caller. It dies `failed_starts` times at its start, and when it reads a
+    deadly frame: `deadly` maps "log/time stamp" to how many more workers die on it."""
 
     def __init__(self, job: Job, deadly: dict[str, int] | None = None, failed_starts: int = 0) -> None:
         self.job, self.deadly, self.failed_starts = job, {} if deadly is None else deadly, failed_starts
@@ -161,9 +149,7 @@ def count(events: Iterator[Event], units: Sequence[Unit]) -> Counters:
     return counters
 
 
-def test_after_a_death_the_unit_is_repeated_then_each_frame_by_itself(
-    fleet: Path, single: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_after_a_death_the_unit_is_repeated_then_each_frame_by_itself(fleet, single, tmp_path):
     sources = sorted(fleet.iterdir())
     names = [f"{sources[1].name}/{stamp}" for stamp in AV2Log(sources[1]).timestamps]
     units, deadly = units_of(sources), {names[3]: 1000, names[1]: 1}
@@ -178,7 +164,7 @@ def test_after_a_death_the_unit_is_repeated_then_each_frame_by_itself(
     assert all(process.is_closed.is_set() for process in processes)
 
 
-def test_a_unit_that_kills_ten_workers_is_left(fleet: Path, single: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_unit_that_kills_ten_workers_is_left(fleet, single, tmp_path):
     sources = sorted(fleet.iterdir())[:2]
     units = units_of(sources)
     deadly = {f"{sources[1].name}/{stamp}": 1000 for stamp in AV2Log(sources[1]).timestamps}
@@ -191,7 +177,7 @@ def test_a_unit_that_kills_ten_workers_is_left(fleet: Path, single: dict[str, by
     assert len(found) == 3 and not counters.is_complete and found.items() <= single.items()
 
 
-def test_a_log_that_cannot_be_opened_alive_is_left(source: Path, tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_opened_alive_is_left(source, tmp_path):
     class Deadly(ThreadProcess):
         def call(self, unit: Unit) -> Any:
             raise WorkerDied("by SIGABRT")
@@ -202,14 +188,14 @@ def test_a_log_that_cannot_be_opened_alive_is_left(source: Path, tmp_path: Path)
     assert failed == Failed(0, source.name, "2 workers died on it, the last one by SIGABRT")
 
 
-def test_workers_that_die_at_their_start_are_started_three_times(source: Path, tmp_path: Path) -> None:
+def test_workers_that_die_at_their_start_are_started_three_times(source, tmp_path):
     units, job = units_of([source]), make_job(tmp_path)
     with pytest.raises(CFlowError, match="3 workers in a row died at their start, the last one by SIGKILL"):
         list(dispatch([ThreadProcess(job, failed_starts=3)], units, lambda: False, 1))
     assert count(dispatch([ThreadProcess(job, failed_starts=2)], units, lambda: False, 1), units).is_complete
 
 
-def test_a_worker_that_cannot_start_leaves_its_work_to_the_others(fleet: Path, tmp_path: Path, capsys: Any) -> None:
+def test_a_worker_that_cannot_start_leaves_its_work_to_the_others(fleet, tmp_path, capsys):
     class Gone(ThreadProcess):
         def start(self) -> None:
             Worker(self.job, "nowhere")
@@ -222,9 +208,7 @@ def test_a_worker_that_cannot_start_leaves_its_work_to_the_others(fleet: Path, t
         list(dispatch(processes[:1], units, lambda: False, 1))
 
 
-def test_an_error_outside_of_frames_fails_only_its_unit(
-    fleet: Path, single: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_outside_of_frames_fails_only_its_unit(fleet, single, tmp_path, monkeypatch):
     """For example if there is no memory for another thread."""
     first, *others = sorted(fleet.iterdir())
     real = Worker._pass
@@ -235,15 +219,14 @@ def test_an_error_outside_of_frames_fails_only_its_unit(
         return real(self, log, *rest)
 
     monkeypatch.setattr(Worker, "_pass", pass_)
-    events = dispatch(
-        [ThreadProcess(make_job(tmp_path)) for _ in range(2)], units_of([first, *others]), lambda: False, 1
-    )
+    processes = [ThreadProcess(make_job(tmp_path)) for _ in range(2)]
+    events = dispatch(processes, units_of([first, *others]), lambda: False, 1)
     failed = [(e.name, e.message) for e in events if isinstance(e, Failed)]
     assert failed == [(first.name, "RuntimeError: can't start new thread")]
     assert len(flow_files(tmp_path)) == PAIRS - 3 and flow_files(tmp_path).items() <= single.items()
 
 
-def test_a_stop_does_not_wait_for_a_worker_that_hangs(source: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_stop_does_not_wait_for_a_worker_that_hangs(source, tmp_path, monkeypatch):
     class Hanging(ThreadProcess):
         def call(self, unit: Unit) -> Any:
             self.is_closed.wait()
@@ -264,7 +247,7 @@ def make_countdown(count: int) -> Callable[..., Iterator[Any]]:
     return countdown
 
 
-def test_a_child_process_passes_answers_and_errors() -> None:
+def test_a_child_process_passes_answers_and_errors():
     process = ChildProcess(make_countdown, 3, timeout=60)
     try:
         assert list(process.call(6)) == [2.0, 3.0, 6.0, False]
@@ -279,7 +262,7 @@ def test_a_child_process_passes_answers_and_errors() -> None:
         process.close()
 
 
-def test_the_report_lists_what_is_missing() -> None:
+def test_the_report_lists_what_is_missing():
     units = units_of(["a", "b", "c"])
     counters = Counters(units)
     stamps = tuple(range(40))
@@ -299,13 +282,13 @@ def test_the_report_lists_what_is_missing() -> None:
     assert "  read" in format_report(report, verbose=True)
 
 
-def test_settings_of_the_engine_are_checked(source: Path, tmp_path: Path) -> None:
+def test_settings_of_the_engine_are_checked(source, tmp_path):
     for settings in ({"timeout": 0}, {"timeout": "long"}, {"memory": -1}, {"memory": True}):
         with pytest.raises(CFlowError, match=f"engine.{next(iter(settings))}=.*above 0"):
             list(run_local(make_job(tmp_path), units_of([source]), Layout(("cpu",), 1), lambda: False, **settings))
 
 
-def test_a_stop_lets_started_frames_finish(fleet: Path, tmp_path: Path) -> None:
+def test_a_stop_lets_started_frames_finish(fleet, tmp_path):
     units, job = units_of(sorted(fleet.iterdir())), make_job(tmp_path, batch=1)
     processes = [ThreadProcess(job), ThreadProcess(job)]
     counters = count(dispatch(processes, units, lambda: any(tmp_path.rglob("*.feather")), 1), units)

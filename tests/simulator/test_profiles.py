@@ -19,12 +19,10 @@ KIND = {"nuscenes": "crossing", "truckscenes": "highway", "aevascenes": "highway
 
 @pytest.fixture(scope="module")
 def drives():
-    """Two sweeps of each profile."""
     return {name: make_drive(seed=3, num_sweeps=2, profile=name, scene=KIND.get(name, "street")) for name in PROFILES}
 
 
 def exact(drive):
-    """The drive without noise."""
     profile = replace(drive._profile, range_noise=0.0, velocity_noise=0.0)
     return Drive(drive.scene, profile, 0, len(drive.timestamps), "exact")
 

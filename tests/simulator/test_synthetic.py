@@ -147,7 +147,6 @@ def test_ground_rays_end_on_the_first_surface_they_meet():
 
 
 def test_a_wall_occludes_a_box_behind_it():
-    """A wall at x = 10 occludes the box behind it, but not the box to its left."""
     pose = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     pose[:, :3, 3] = torch.tensor([[10.0, 0, 1], [20.0, 0, 1], [20.0, 30, 1]])
     half = torch.tensor([[0.1, 8, 3], [1, 1, 1], [1, 1, 1]], dtype=torch.float64)

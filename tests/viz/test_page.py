@@ -29,7 +29,6 @@ STATIC, GROUND, UNKNOWN, FIRST = range(4)
 
 
 def content_of(html: str) -> dict[str, Any]:
-    """The data of a page."""
     return json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', html, re.DOTALL)[1])
 
 
@@ -121,9 +120,8 @@ def test_only_static_points_are_thinned_and_the_page_says_so() -> None:
     data = content_of(show(window(log, 0), result, voxel=3.0).html)
     position, entries = points_of(data, 0)
     given = log.sweep(0).points[:50] - np.array([STEP, 0, 0], np.float32)
-    voxels = {(*np.floor(point / 3), 0) for point in given[WALL]} | {
-        (*np.floor(point / 6), 1) for point in given[FLOOR]
-    }
+    voxels = {(*np.floor(point / 3), 0) for point in given[WALL]}
+    voxels |= {(*np.floor(point / 6), 1) for point in given[FLOOR]}
     assert (entries["flow"] >= FIRST).sum() == 20 and len(position) == 20 + len(voxels) < 50
     assert f"{len(position)} of 50 points" in data["thinned"] and "3 m (6 m on the ground)" in data["thinned"]
 

@@ -130,12 +130,6 @@ def test_windows_are_grouped_by_memory(monkeypatch):
     assert sizes() == [1] * 5 and split_windows([], grid, CPU, 160, None) == []
 
 
-def locked(array: np.ndarray) -> np.ndarray:
-    array = array.copy()
-    array.flags.writeable = False
-    return array
-
-
 FORMS: dict[str, Callable[[np.ndarray], Any]] = {
     "float16": lambda p: p.astype(np.float16),
     "float64": lambda p: p.astype(np.float64),
@@ -143,7 +137,7 @@ FORMS: dict[str, Callable[[np.ndarray], Any]] = {
     "columns first": np.asfortranarray,
     "both backwards": lambda p: p[::-1, ::-1].copy()[::-1, ::-1],
     "not aligned": lambda p: np.frombuffer(b"x" + p.tobytes(), np.uint8)[1:].view(p.dtype).reshape(p.shape),
-    "read-only": locked,
+    "read-only": lambda p: np.frombuffer(p.tobytes(), p.dtype).reshape(p.shape),
     "more columns": lambda p: np.pad(p, [(0, 0), (0, 2)], constant_values=np.nan),
     "tensor of bfloat16": lambda p: torch.from_numpy(p).bfloat16(),
     "tensor, transposed": lambda p: torch.from_numpy(np.ascontiguousarray(p.T)).t(),
