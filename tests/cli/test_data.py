@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +15,9 @@ from cflow_torch.data.catalog import DATA_SETS, recognise
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.types import CFlowError
 
-Cflow = Callable[..., int]
-
 
 @pytest.mark.parametrize("name", SMALL_LOGS)
-def test_a_path_is_enough(name: str, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+def test_a_path_is_enough(name, tmp_path, cflow, capsys):
     root = write_small_log(name, tmp_path / "data")
     call = ("flow", root, f"output={tmp_path / 'out'}", "model=paper", "engine.workers=1", "data.check=false")
     assert cflow(*call) == 0
@@ -31,12 +29,9 @@ def test_a_path_is_enough(name: str, tmp_path: Path, cflow: Cflow, capsys: pytes
         assert f"complete before  {len(files)}" in capsys.readouterr().out.replace("  complete", "complete")
 
 
-def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path: Path) -> None:
-    for place, message in (
-        ("absent", "no such file or folder"),
-        ("empty", "no format fits its contents"),
-    ):
-        (tmp_path / "empty").mkdir(exist_ok=True)
+def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path):
+    (tmp_path / "empty").mkdir()
+    for place, message in (("absent", "no such file or folder"), ("empty", "no format fits its contents")):
         with pytest.raises(CFlowError, match=message):
             recognise(tmp_path / place)
     (tmp_path / "both" / "a" / "sensors" / "lidar").mkdir(parents=True)
@@ -50,7 +45,7 @@ def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path: Path) -> None:
     assert {name for name, one in DATA_SETS.items() if not one.marks} <= {"arrays", "kiss_icp"}
 
 
-def test_a_path_by_itself_is_the_data_root() -> None:
+def test_a_path_by_itself_is_the_data_root():
     call = ["-m", "/a b/c", "model=paper,default", "--config-dir", "conf", "-p", "model"]
     assert split(call) == (['data.root="/a b/c"', "model=paper,default"], ["-m", "--config-dir", "conf", "-p", "model"])
 
@@ -93,9 +88,7 @@ def mine(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
-def test_your_own_reader_by_configuration_only(
-    workers: int, mine: Path, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_your_own_reader_by_configuration_only(workers, mine, cflow, capsys):
     pytest.importorskip("matplotlib")
     own = ("--config-dir", mine / "my", "data=mine", "data.speed=5", "model=paper")
     assert cflow("flow", *own, f"output={mine / 'flow'}", f"engine.workers={workers}") == 0
@@ -126,9 +119,7 @@ def test_your_own_reader_by_configuration_only(
         ("_target_: builtins.list\n", "builtins.list returned no log"),
     ],
 )
-def test_a_broken_reader_is_one_line(
-    text: str, message: str, mine: Path, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_broken_reader_is_one_line(text, message, mine, cflow, capsys):
     (mine / "my" / "data" / "mine.yaml").write_text(text)
     assert cflow("eval", "--config-dir", mine / "my", "data=mine", f"output={mine / 'out'}") == 2
     error = capsys.readouterr().err

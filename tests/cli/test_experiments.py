@@ -7,7 +7,6 @@ import itertools
 import json
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any, Callable
 
 import pytest
@@ -19,8 +18,6 @@ from cflow_torch.cli.comparison import compare
 from cflow_torch.cli.record import objective
 from cflow_torch.cli.run import make_model
 
-Cflow = Callable[..., int]
-Compose = Callable[..., Any]
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 # Number of jobs of an experiment, and settings of the first and the last one.
 JOBS: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
@@ -35,8 +32,7 @@ JOBS: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
 JOBS["range_split"] = JOBS["datasets"]
 
 
-def jobs_of(compose: Compose, experiment: str) -> list[tuple[str, ...]]:
-    """Overrides of every job of an experiment."""
+def jobs_of(compose: Callable[..., Any], experiment: str) -> list[tuple[str, ...]]:
     whole = compose("eval", f"experiment={experiment}")
     assert str(whole.hydra.mode) == "RunMode.MULTIRUN"
     params = [f"{key}={value}" for key, value in whole.hydra.sweeper.params.items()]
@@ -46,7 +42,7 @@ def jobs_of(compose: Compose, experiment: str) -> list[tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("experiment", [file.stem for file in CONFIGS.glob("experiment/*.yaml")])
-def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment: str, compose: Compose) -> None:
+def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment, compose):
     far, jobs = experiment in ("datasets", "range_split"), jobs_of(compose, experiment)
     count, *ends = JOBS[experiment]
     assert len(jobs) == count
@@ -60,9 +56,7 @@ def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment: str, co
         assert cfg.data.label == "benchmark" and cfg.experiment_name == experiment
 
 
-def test_a_sweep_keeps_every_result_and_resumes(
-    log_folder: Path, tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_sweep_keeps_every_result_and_resumes(log_folder, tmp_path, cflow, capsys):
     data = ("data=av2", log_folder, "data.check=false", "data.step=2", "model.point_cloud_range=[-20,-20,-9,20,20,9]")
     call = ("eval", "-m", "experiment=history", *data, f"output={tmp_path}", "model.num_history=0,2")
     assert cflow(*call) == 0
@@ -77,9 +71,8 @@ def test_a_sweep_keeps_every_result_and_resumes(
     header, *rows = csv.reader((tmp_path / "comparison.csv").read_text().splitlines())
     assert header[:3] == ["experiment", "model.num_history", "mean dynamic error"]
     assert [float(row[2]) for row in rows] == [objective(record["results"]) for record in records]
-    assert (
-        capsys.readouterr().out.splitlines()[-4].startswith("| experiment | model.num_history | mean dynamic error |")
-    )
+    titles = "| experiment | model.num_history | mean dynamic error |"
+    assert capsys.readouterr().out.splitlines()[-4].startswith(titles)
 
     before = {file: file.stat().st_mtime_ns for file in files}
     files[1].unlink()  # as if it had been stopped there
@@ -90,7 +83,7 @@ def test_a_sweep_keeps_every_result_and_resumes(
     assert files[0].stat().st_mtime_ns > before[files[0]]
 
 
-def test_the_comparison_sorts_jobs_by_their_settings_and_names_other_data(tmp_path: Path, capsys: Any) -> None:
+def test_the_comparison_sorts_jobs_by_their_settings_and_names_other_data(tmp_path, capsys):
     def write(job: str, digest: str, text: str | None = None) -> None:
         results = {"bucketed": {"mean": {"dynamic_error": 0.5}}, "three_way": {"epe_fd": 0.25, "epe_bs": None}}
         record = {"results": results, "seconds_per_pair": {"median": 2.0}, "data": {"digest": digest}}
@@ -111,30 +104,23 @@ def test_the_comparison_sorts_jobs_by_their_settings_and_names_other_data(tmp_pa
 
 
 PLUGINS = {
-    "joblib": (
-        "hydra_plugins.hydra_joblib_launcher",
-        ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "model.connectivity=4,8"],
-    ),
-    "submitit": ("hydra_plugins.hydra_submitit_launcher", ["hydra/launcher=submitit_local", "model.connectivity=4,8"]),
-    "optuna": (
-        "hydra_plugins.hydra_optuna_sweeper",
-        ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "model.max_extent=interval(5,30)"],
-    ),
+    "joblib_launcher": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "model.connectivity=4,8"],
+    "submitit_launcher": ["hydra/launcher=submitit_local", "model.connectivity=4,8"],
+    "optuna_sweeper": ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "model.max_extent=interval(5,30)"],
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plugin", sorted(PLUGINS))
-def test_sweeps_with_plugins(plugin: str, log_folder: Path, tmp_path: Path) -> None:
-    module, settings = PLUGINS[plugin]
-    pytest.importorskip(module)
-    command = [sys.executable, "-m", "cflow_torch.cli.main", "eval", "-m", *settings, "model=paper", "data=av2"]
+def test_sweeps_with_plugins(plugin, log_folder, tmp_path):
+    pytest.importorskip(f"hydra_plugins.hydra_{plugin}")
+    command = [sys.executable, "-m", "cflow_torch.cli.main", "eval", "-m", *PLUGINS[plugin], "model=paper", "data=av2"]
     call = [*command, f"data.root={log_folder}", f"output={tmp_path}"]
     done = subprocess.run(call, capture_output=True, text=True, cwd=str(tmp_path))
     assert done.returncode == 0, done.stderr
     records = [json.loads(file.read_text()) for file in tmp_path.rglob("results.json")]
     assert len(records) == 2
-    if plugin == "optuna":
+    if plugin == "optuna_sweeper":
         best = OmegaConf.load(tmp_path / "optimization_results.yaml")
         assert best.best_value == pytest.approx(min(objective(r["results"]) for r in records))
     else:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Callable
+from typing import Any
 
 import hydra
 import pytest
@@ -19,15 +19,12 @@ from cflow_torch.cli.choices import CONFIGS
 from cflow_torch.cli.main import COMMANDS
 from cflow_torch.config import REMOVED
 
-Cflow = Callable[..., int]
 MAIN = [sys.executable, "-m", "cflow_torch.cli.main"]
 needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_explains_a_command_with_examples_and_settings(
-    command: str, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_help_explains_a_command_with_examples_and_settings(command, cflow, capsys):
     assert cflow(command, "--help") == 0
     text = capsys.readouterr().out
     assert text.startswith(f"cflow {command}: {COMMANDS[command]}") and f"\nexamples:\n  cflow {command}" in text
@@ -75,9 +72,7 @@ OTHERS = (
 
 
 @pytest.mark.parametrize(("call", "message"), OTHERS)
-def test_a_wrong_call_is_one_line_with_a_hint(
-    call: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: Any
-) -> None:
+def test_a_wrong_call_is_one_line_with_a_hint(call, message, tmp_path, monkeypatch, cflow, capsys):
     monkeypatch.chdir(tmp_path)
     assert cflow(*shlex.split(call)) == 2
     error = capsys.readouterr().err
@@ -92,9 +87,7 @@ def assert_nothing_was_computed(folder: Path) -> None:
 HELPFUL = ("--version", "--help", "eval --help", "help clean", "settings", "settings data", "info")
 
 
-def test_help_comes_without_torch_and_hydra_and_wrong_calls_without_torch(
-    tmp_path: Path, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_help_comes_without_torch_and_hydra_and_wrong_calls_without_torch(tmp_path, cflow, capsys):
     code = f"""
 import sys
 from cflow_torch.cli.main import main
@@ -131,9 +124,7 @@ def bench_that_raises(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize("error", [KeyError("ours"), OSError("ours")])
-def test_a_bug_asks_for_a_report(
-    error: Exception, monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_bug_asks_for_a_report(error, monkeypatch, cflow, capsys):
     bench_that_raises(error, monkeypatch)
     assert cflow("bench") == 1
     error_text = capsys.readouterr().err
@@ -141,9 +132,7 @@ def test_a_bug_asks_for_a_report(
     assert os.path.dirname(hydra.__file__) not in error_text, "no frames of Hydra"
 
 
-def test_ctrl_c_and_a_refused_file_are_one_line(
-    monkeypatch: pytest.MonkeyPatch, cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_ctrl_c_and_a_refused_file_are_one_line(monkeypatch, cflow, capsys):
     bench_that_raises(KeyboardInterrupt(), monkeypatch)
     assert cflow("bench") == 130 and capsys.readouterr().err == "stopped by Ctrl-C\n"
     bench_that_raises(PermissionError(13, "Permission denied", "there"), monkeypatch)
@@ -156,16 +145,15 @@ def test_ctrl_c_and_a_refused_file_are_one_line(
 
 
 @needs_posix
-@pytest.mark.parametrize(
-    "arguments", ["--help", pytest.param("eval --cfg job", marks=pytest.mark.slow)]
-)  # Hydra prints
-def test_a_reader_that_leaves_ends_a_command_quietly(arguments: str) -> None:
+# What the first call prints is ours, and what the second one prints is Hydra's.
+@pytest.mark.parametrize("arguments", ["--help", pytest.param("eval --cfg job", marks=pytest.mark.slow)])
+def test_a_reader_that_leaves_ends_a_command_quietly(arguments):
     command = f"{shlex.join(MAIN)} {arguments} | true; echo ${{PIPESTATUS[*]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
     assert (done.stdout, done.stderr) == ("141 0\n", "")
 
 
-def test_info_lists_every_required_package(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+def test_info_lists_every_required_package(cflow, capsys):
     texts = []
     for arguments in ((), ("--full",)):
         assert cflow("info", *arguments) == 0

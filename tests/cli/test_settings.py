@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Callable
+from typing import Callable
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -20,17 +20,15 @@ from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, REMOVED, WINDOW
 from cflow_torch.setting import describe
 
-Cflow = Callable[..., int]
-Compose = Callable[..., Any]
 WITH_SETTINGS = [command for command in COMMANDS if (CONFIGS / f"{command}.yaml").exists()]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_preset_is_the_same_as_in_python(preset: str, compose: Compose) -> None:
+def test_a_preset_is_the_same_as_in_python(preset, compose):
     assert make_model(compose("eval", f"model={preset}")).config == make_config(preset)
 
 
-def test_every_choice_of_every_group_composes(compose: Compose) -> None:
+def test_every_choice_of_every_group_composes(compose):
     """All choices with the first command that has their group, and the first one with the others."""
     tested: set[str] = {"row", "experiment"}  # see test_experiments.py
     for command in WITH_SETTINGS:
@@ -45,7 +43,7 @@ def test_every_choice_of_every_group_composes(compose: Compose) -> None:
             make_model(cfg)
 
 
-def test_examples_use_existing_settings_and_choices(compose: Compose) -> None:
+def test_examples_use_existing_settings_and_choices(compose):
     texts = [HELP, *((Path(settings.__file__).parent / f"{command}.py").read_text() for command in WITH_SETTINGS)]
     lines = [line for text in texts for line in text.splitlines() if line.startswith("  cflow ")]
     assert len(lines) > 30
@@ -72,9 +70,7 @@ def mine(tmp_path: Path) -> Callable[[str], Path]:
     return write
 
 
-def test_your_own_preset_contains_only_its_changes(
-    mine: Callable[[str], Path], cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_your_own_preset_contains_only_its_changes(mine, cflow, capsys):
     folder = mine("defaults: [base_verified, _self_]\nnum_history: 3\n")
     call = ("eval", "--config-dir", folder, "model=mine", "model.max_speed=20", "--cfg", "job", "-p", "model")
     assert cflow(*call) == 0
@@ -92,9 +88,7 @@ def test_your_own_preset_contains_only_its_changes(
         ("num_history: 3\n", "method=None: give one of"),
     ],
 )
-def test_a_wrong_preset_is_one_line(
-    text: str, message: str, mine: Callable[[str], Path], cflow: Cflow, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_wrong_preset_is_one_line(text, message, mine, cflow, capsys):
     assert cflow("eval", "--config-dir", mine(text), "model=mine", "data.num_sweeps=2") == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error and error.count("\n") == 1
@@ -105,19 +99,19 @@ def test_a_wrong_preset_is_one_line(
     ["10203656353524179475_7625_000_7645_000", "1e5", "2024_11_22", "-1.5", "true", "a_1", "Ausgänge/東京", 'it\'s "ü"']
     + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "50%", "a#b"],
 )
-def test_names_are_text_even_if_they_look_like_numbers(name: str) -> None:
+def test_names_are_text_even_if_they_look_like_numbers(name):
     read = OverridesParser.create().parse_overrides(split([f"log={name}", f"+data.root={name}", "pair=1"])[0])
     assert [override.value() for override in read] == [name, name, 1]
 
 
-def test_hydra_syntax_in_names_keeps_its_meaning(compose: Compose) -> None:
+def test_hydra_syntax_in_names_keeps_its_meaning(compose):
     cfg = compose("plot", *split(["log=null", "output=${device}"])[0])
     assert cfg.log is None and cfg.output == "auto"
     assert split(["-m", "log=1_0,b,2_0", "pair=1,2"]) == (['log="1_0",b,"2_0"', "pair=1,2"], ["-m"])
     assert split(["log=choice(a,b)", "log='1_0'"])[0] == ["log=choice(a,b)", "log='1_0'"]
 
 
-def test_the_page_lists_every_setting(cflow: Cflow, capsys: pytest.CaptureFixture) -> None:
+def test_the_page_lists_every_setting(cflow, capsys):
     assert cflow("settings") == 0
     page = capsys.readouterr().out
     rows = [line[2:-2].split(" | ") for line in page.splitlines() if line.startswith("| `model.")]
@@ -142,7 +136,7 @@ def test_the_page_lists_every_setting(cflow: Cflow, capsys: pytest.CaptureFixtur
         ("flow", ["## cflow flow", "contents: ", "cflow clean:\n  flow: null  # output folder of `cflow flow`"]),
     ],
 )
-def test_settings_explains_one_name(name: str, expected: list[str], cflow: Cflow, capsys: Any) -> None:
+def test_settings_explains_one_name(name, expected, cflow, capsys):
     assert cflow("settings", name) == 0
     text = capsys.readouterr().out
     assert all(part in text for part in expected) and len(text) < 4500
@@ -151,7 +145,7 @@ def test_settings_explains_one_name(name: str, expected: list[str], cflow: Cflow
 
 
 @pytest.mark.parametrize("preset", sorted({*PRESETS} - {"offline"}))  # the harness has no sweeps after t+1
-def test_a_model_of_the_harness_has_every_setting_of_its_preset(preset: str, tmp_path: Path, cflow: Cflow) -> None:
+def test_a_model_of_the_harness_has_every_setting_of_its_preset(preset, tmp_path, cflow):
     assert cflow("settings", "--opensceneflow", tmp_path) == 0
     text = (tmp_path / f"cflow_{preset}.yaml".replace("_default", "")).read_text(encoding="utf-8")
     config, target = make_config(preset), OmegaConf.create(text).target

@@ -65,11 +65,7 @@ class Harness:
     work: Path
 
     def run(self, name: str, script: str, *overrides: Any) -> str:
-        """Run a script and return what it printed.
-
-        Raises:
-            AssertionError: the exit status is not 0, or an exception was swallowed.
-        """
+        """Run a script and return what it printed. Its exit status must be 0, and no exception swallowed."""
         # The scripts replace the last folder but one by the name of the model; what they write stays in `work`.
         settings = [SEARCHPATH, f"hydra.run.dir={self.work}/runs-{name}/job", *map(str, overrides)]
         python = os.environ.get("OPENSCENEFLOW_PYTHON", sys.executable)
@@ -108,7 +104,6 @@ def evaluated(scenes: Path, output: Path, *settings: str) -> Any:
 
 @pytest.fixture(scope="module")
 def harness(tmp_path_factory: pytest.TempPathFactory) -> Harness:
-    """The checkout."""
     root = Path(os.environ.get("OPENSCENEFLOW") or ROOT.parent / "shared" / "opensceneflow")
     if not (root / "eval.py").is_file():
         pytest.skip(f"no checkout of OpenSceneFlow at {root}; set OPENSCENEFLOW to its folder")
@@ -182,9 +177,7 @@ def columns_of(archive: Path) -> dict[str, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("version", [1, 3])
-def test_its_leaderboard_archive_is_that_of_cflow_submit(
-    version: int, harness: Harness, checkpoint: Path, data: Path, tmp_path: Path
-) -> None:
+def test_its_leaderboard_archive_is_that_of_cflow_submit(version, harness, checkpoint, data, tmp_path):
     overrides = ["data_mode=test", "save_res=True", f"leaderboard_version={version}"]
     harness.run(f"test-{version}", "eval.py", *inputs(checkpoint, data), *overrides)
     theirs = data.parent / "results" / f"cflow-e0-test-v{version}.zip"

@@ -43,7 +43,7 @@ def cflow(monkeypatch: pytest.MonkeyPatch, drive: Path, tmp_path: Path) -> Calla
 
 
 @pytest.mark.parametrize("picture", ["flow", "clusters", "keypoints", "correlation", "scales"])
-def test_every_picture(picture: str, cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_every_picture(picture, cflow, tmp_path, capsys):
     model = ("model=paper",) if picture in ("flow", "clusters") else ()  # the others choose their own
     assert cflow("plot", f"picture={picture}", "pair=1", f"log={NAME}", *model, SMALL) == 0
     (file,) = (tmp_path / "out").iterdir()
@@ -52,9 +52,7 @@ def test_every_picture(picture: str, cflow: Callable, tmp_path: Path, capsys: py
     assert f"log {NAME}, pair 1" in printed and f"picture: {file}" in printed
 
 
-def test_truth_is_residual_and_only_where_it_is_known(
-    cflow: Callable, drive: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_truth_is_residual_and_only_where_it_is_known(cflow, drive, monkeypatch, capsys):
     seen = []
 
     def spy(*arguments: object, **settings: object) -> None:
@@ -76,9 +74,7 @@ def test_truth_is_residual_and_only_where_it_is_known(
     assert cflow("plot", "pair=1", "model=paper", SMALL, "truth=true") == 2 and "truth=true" in capsys.readouterr().err
 
 
-def test_an_animation_has_a_picture_for_every_pair(
-    cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_an_animation_has_a_picture_for_every_pair(cflow, tmp_path, capsys):
     assert cflow("plot", "picture=animation", "model=paper", "width=300", "first=1", SMALL) == 0
     assert "2 pairs from 1 to 2" in capsys.readouterr().out
     with Image.open(tmp_path / "out" / "animation.gif") as gif:
@@ -96,18 +92,14 @@ def test_an_animation_has_a_picture_for_every_pair(
         (["picture=animation", "legend=middle", "count=1", "model=paper"], "legend"),
     ],
 )
-def test_a_picture_that_cannot_be_drawn_is_reported(
-    arguments: list, message: str, cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_picture_that_cannot_be_drawn_is_reported(arguments, message, cflow, tmp_path, capsys):
     assert cflow("plot", "pair=0", SMALL, *arguments) == 2
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
     assert not [file for file in tmp_path.rglob("*") if file.is_file()]
 
 
-def test_missing_matplotlib_is_reported_before_the_work(
-    cflow: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_missing_matplotlib_is_reported_before_the_work(cflow, monkeypatch, capsys):
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr(plot_command, "find_log", lambda cfg: pytest.fail("work"))
@@ -115,9 +107,7 @@ def test_missing_matplotlib_is_reported_before_the_work(
 
 
 @pytest.mark.parametrize(("form", "package", "ending"), [("html", "k3d", "html"), ("rerun", "rerun", "rrd")])
-def test_a_view_of_estimated_and_of_stored_flow(
-    form: str, package: str, ending: str, cflow: Callable, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_view_of_estimated_and_of_stored_flow(form, package, ending, cflow, tmp_path, capsys):
     pytest.importorskip(package)
     view = ("view", f"format={form}")
     assert cflow(*view, "model=paper", "data.step=2", "count=5", SMALL) == 0
@@ -132,9 +122,7 @@ def test_a_view_of_estimated_and_of_stored_flow(
     assert cflow(*view, "flow=nowhere") == 2 and "flow=nowhere is not a folder" in capsys.readouterr().err
 
 
-def test_a_view_that_cannot_be_made_is_reported_before_the_work(
-    cflow: Callable, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_a_view_that_cannot_be_made_is_reported_before_the_work(cflow, monkeypatch, capsys):
     monkeypatch.setattr(run, "open_logs", lambda cfg: pytest.fail("work"))
     assert cflow("view", "format=pdf") == 2 and "format=pdf: give one of html, rerun" in capsys.readouterr().err
     if find_spec("k3d"):
