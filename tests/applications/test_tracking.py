@@ -13,7 +13,7 @@ from scenes import pose, rows_of
 from staged_cars import Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
-from cflow_torch.applications.association import VOXELS, link
+from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.data.catalog import find_sources, open_log
@@ -217,6 +217,19 @@ def test_matches_equal_those_of_plain_loops() -> None:
         given = [torch.from_numpy(value) for value in (clouds[0], groups[0], clouds[1], groups[1])]
         earlier, later = link(*given, 0.05)
         assert dict(zip(earlier.tolist(), later.tolist())) == expected
+
+
+def test_boxes_are_tight_around_their_points() -> None:
+    generator = np.random.default_rng(1)
+    points, group = torch.from_numpy(generator.normal(size=(80, 3))), torch.arange(80) % 4
+    heading = torch.tensor([0.0, 0.5, 2.0, -3.0], dtype=torch.float64)
+    centre, size = boxes(points, group, heading)
+    for number in range(4):
+        own = slice(number, number + 1)
+        inside = box_of_point(points, centre[own], size[own] + 1e-9, heading[own])
+        assert (inside[group == number] == 0).all()
+        inside = box_of_point(points, centre[own], size[own] * 0.99, heading[own])
+        assert (inside[group == number] == -1).sum() >= 4, "points on the faces"
 
 
 def test_the_filter_equals_the_textbook_equations() -> None:
