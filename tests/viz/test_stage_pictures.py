@@ -122,6 +122,12 @@ def test_scales_show_the_longest_mover_or_the_chosen_cluster() -> None:
         plot_scales(sweeps, settings, cluster_id=100000)
 
 
+def test_the_cluster_with_the_largest_product_of_points_and_flow_is_chosen() -> None:
+    of_point = np.repeat([-1, 0, 1, 2], [200, 10, 3, 100])
+    flow = np.array([9.0, 1.0, 2.0, 0.05])[of_point + 1, None] * [0.6, -0.8, 0.0]
+    assert stages.choose_cluster(of_point, flow) == 0 and stages.choose_cluster(of_point[:200], flow[:200]) is None
+
+
 def test_matches_are_drawn_and_the_wheel_covers_none(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
     monkeypatch.setattr("cflow_torch.viz.style.draw_wheel", lambda axes, *given: seen.append(given))
