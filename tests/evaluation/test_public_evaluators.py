@@ -221,25 +221,9 @@ def run_bsfe(data_set: Any, predictions: Sequence[np.ndarray]) -> Any:
     return evaluator
 
 
-def check_bsfe(
-    bsfe: ModuleType, label: str, raw: Path, truth: Path, predictions: Sequence[np.ndarray], frames: Sequence[EvalFrame]
-) -> None:
-    """Compare both metrics, inside 35 m and in the whole crop, without and with ground."""
-    for ground in (False, True):
-        output = Path(tempfile.mkdtemp(dir=truth.parent))
-        kinds = ("bucketed_epe", "threeway_epe")
-        run = [run_bsfe(public.bsfe_data_set(bsfe, raw, truth, kind, output, ground), predictions) for kind in kinds]
-        for distance, region in ((35, "box"), (math.inf, "all")):
-            definition = DEFINITIONS["bucketed_scene_flow_eval"]
-            ours = score(replace(definition, region=region, exclude_ground=not ground), frames)
-            where = f"{label}, {distance} m" + (", with ground" if ground else "")
-            check(f"bsfe buckets, {where}", public.bucket_numbers(ours["bucketed"], run[0], output, distance))
-            found = run[1].compute_results(return_distance_threshold=distance)
-            check(f"bsfe three-way, {where}", public.three_way_numbers(ours["three_way"], found))
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_bsfe_on_made_up_frames(bsfe: ModuleType, tmp_path: Path, seed: int) -> None:
+    """Both metrics, inside 35 m and in the whole crop, without and with ground."""
     kinds = [kind for kind in KINDS if kind not in ("no points", "all ground")]
     made = [made_up(kind, 100 * seed + number) for number, kind in enumerate(kinds)]
     raw = public.write_log(tmp_path / "raw", made)
@@ -252,4 +236,16 @@ def test_bsfe_on_made_up_frames(bsfe: ModuleType, tmp_path: Path, seed: int) -> 
         assert 0 < sweep.is_ground.sum() < len(sweep.is_ground)
         parts = {"residual_flow": frame.predicted, "residual_axes": "t", "T_ego1_ego0": frame.T}
         frames.append(EvalFrame(sweep.points, frame.labels, is_ground=sweep.is_ground, **parts))
-    check_bsfe(bsfe, f"made up {seed}", raw, truth, [frame.predicted for frame in made], frames)
+    predictions, definition = [frame.predicted for frame in made], DEFINITIONS["bucketed_scene_flow_eval"]
+    for ground in (False, True):
+        output = tmp_path / f"ground {ground}"
+        output.mkdir()
+        kinds = ("bucketed_epe", "threeway_epe")
+        data_sets = [public.bsfe_data_set(bsfe, raw, truth, kind, output, ground) for kind in kinds]
+        buckets, three_way = (run_bsfe(data_set, predictions) for data_set in data_sets)
+        for distance, region in ((35, "box"), (math.inf, "all")):
+            ours = score(replace(definition, region=region, exclude_ground=not ground), frames)
+            where = f"made up {seed}, {distance} m, ground {ground}"
+            check(f"bsfe buckets, {where}", public.bucket_numbers(ours["bucketed"], buckets, output, distance))
+            found = three_way.compute_results(return_distance_threshold=distance)
+            check(f"bsfe three-way, {where}", public.three_way_numbers(ours["three_way"], found))
