@@ -56,7 +56,6 @@ def labelled(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stored(file: Path) -> list[dict[str, Any]]:
-    """Every value of every sweep."""
     with h5py.File(file, "r") as scene:
         return [{key: scene[stamp][key][()] for key in scene[stamp]} for stamp in sorted(scene, key=int)]
 

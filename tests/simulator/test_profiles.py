@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_synthetic import transform
 
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.drive import SCENES, Drive
 from cflow_torch.simulator.profiles import PROFILES
@@ -33,7 +33,7 @@ def at_shot(drive, index, unit):
     spec = next(u for u in drive._profile.units if u.name == unit.name)
     if spec.is_virtual or not (drive._profile.is_rolling and drive._profile.is_deskewed):
         return points
-    world = transform(drive.poses[index] @ unit.T_ego_sensor, points)
+    world = transform_points(points, drive.poses[index] @ unit.T_ego_sensor)
     T = np.linalg.inv(drive.poses_at(index, unit.offset_ns) @ unit.T_ego_sensor)
     return np.einsum("nij,nj->ni", T[:, :3, :3], world) + T[:, :3, 3]
 
@@ -42,7 +42,7 @@ def world_at_shot(drive, index, returns):
     """(n, 3) float64 world points of a sweep at the time of their shots."""
     points = returns.points.numpy().astype(float)
     if drive._profile.is_deskewed:
-        return transform(drive.poses[index], points)
+        return transform_points(points, drive.poses[index])
     T = drive.poses_at(index, returns.offset_ns.numpy())
     return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
 
@@ -67,7 +67,7 @@ def on_boxes(drive, index, is_chosen):
 def test_every_shot_is_on_its_ring_its_column_and_its_time(name, drives):
     drive = drives[name]
     units, sweep = drive.units(1), drive.sweep(1)
-    together = np.concatenate([transform(unit.T_ego_sensor, unit.points.astype(float)) for unit in units])
+    together = np.concatenate([transform_points(unit.points, unit.T_ego_sensor) for unit in units])
     assert np.abs(together - sweep.points).max() < 1e-4 and len(drive.labels(0).flow) == len(drive.sweep(0).points)
     assert np.array_equal(np.concatenate([unit.offset_ns for unit in units]), drive.channels(1)["offset_ns"])
     near = sweep.is_ground & (np.hypot(*sweep.points[:, :2].T) < 14)
@@ -98,7 +98,7 @@ def test_static_boxes_are_undistorted_after_deskewing_and_distorted_without(name
     drive = exact(drives[name])
     rows, world, _, distance = on_boxes(drive, 1, lambda body: body.is_static)
     assert len(rows) > 500 and np.quantile(distance(world), 0.999) < 1e-3
-    given = distance(transform(drive.poses[1], drive.returns(1).points.numpy().astype(float))[rows])
+    given = distance(transform_points(drive.returns(1).points.numpy(), drive.poses[1])[rows])
     # The points of the truck, which drives at 80 km/h or more, are not compensated.
     assert np.quantile(given, 0.9) > 0.3 if name == "truckscenes" else np.quantile(given, 0.999) < 1e-3
 
@@ -117,10 +117,10 @@ def test_moving_objects_stay_distorted_and_boxes_hold_their_points(drives):
     assert np.quantile(distance(world - pose[:, :3, 0] * along[:, None]), 0.99) < 5e-3, "speed times time"
     for drive in drives.values():
         boxes, body = drive.boxes(1), drive._body_of(drive.returns(1))
-        points = transform(np.linalg.inv(drive.poses[1]), world_at_shot(drive, 1, drive.returns(1)))
+        points = transform_points(world_at_shot(drive, 1, drive.returns(1)), np.linalg.inv(drive.poses[1]))
         number_of = {track: b for b, track in enumerate(drive.track_ids)}
         for track, pose, size, number in zip(boxes.track_id, boxes.pose, boxes.size, boxes.num_points):
-            local = transform(np.linalg.inv(pose), points[body == number_of[track]])
+            local = transform_points(points[body == number_of[track]], np.linalg.inv(pose))
             assert len(local) == number and (np.abs(local) <= size / 2 + 0.06).all()
         assert boxes.num_points.sum() > 1000
 
@@ -173,7 +173,7 @@ SPEEDS = {"street": (15, 21), "highway": (28, 35.5), "crossing": (8, 15), "narro
 def test_scenes_have_their_traffic(scene):
     drive = make_drive(seed=2, num_sweeps=2, profile="av2", scene=scene)
     labels, points = drive.labels(0), drive.sweep(0).points.astype(float)
-    static = transform(np.linalg.inv(drive.poses[1]) @ drive.poses[0], points) - points
+    static = transform_points(points, np.linalg.inv(drive.poses[1]) @ drive.poses[0]) - points
     speed, present = 10 * np.linalg.norm(labels.flow - static, axis=1), set(np.unique(labels.category))
     low, high = SPEEDS[scene]
     assert low < speed.max() < high and ((speed > 0.5) & (labels.category == 19)).sum() > 100

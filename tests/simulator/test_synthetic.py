@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator import make_drive, raycast
 from cflow_torch.simulator.drive import SCENES, Drive
 from cflow_torch.simulator.ground import Ground
@@ -25,10 +26,6 @@ from cflow_torch.types import CFlowError
 @pytest.fixture(scope="module")
 def drive():
     return make_drive(seed=3, num_sweeps=5, profile="av2")
-
-
-def transform(T, points):
-    return points @ T[:3, :3].T + T[:3, 3]
 
 
 def brute_force(solids, origin, directions):
@@ -178,9 +175,9 @@ def test_static_flow_is_ego_motion_and_the_ground_mask_is_exact(drive):
         static, points = labels.category == 0, sweep.points.astype(float)
         T = np.linalg.inv(drive.poses[i + 1]) @ drive.poses[i]
         assert static.sum() > 40_000 and static[sweep.is_ground].all() and labels.is_valid[static].all()
-        assert np.abs(transform(T, points) - points - labels.flow)[static].max() < 2e-6
+        assert np.abs(transform_points(points, T) - points - labels.flow)[static].max() < 2e-6
     assert drive.labels(4) is None
-    world = transform(sweep.pose, points[sweep.is_ground])
+    world = transform_points(points[sweep.is_ground], sweep.pose)
     off = np.abs(world[:, 2] - drive.scene.ground.height(world[:, 0].copy(), world[:, 1].copy()))
     depth = drive.scene.ground.pavement_depth(*torch.from_numpy(world[:, :2].copy()).T).numpy()
     at_kerb = np.abs(depth) < 0.1  # a few centimetres of range noise change the level there
@@ -190,7 +187,7 @@ def test_static_flow_is_ego_motion_and_the_ground_mask_is_exact(drive):
 def test_flow_moves_points_onto_the_same_object_in_the_next_sweep(drive):
     """Objects of boxes with enough returns: their points must land on them, and would not by ego motion alone."""
     body, points = zip(*((drive._body_of(drive.returns(i)), drive.sweep(i).points.astype(float)) for i in (1, 2)))
-    static = transform(np.linalg.inv(drive.poses[2]) @ drive.poses[1], points[0])
+    static = transform_points(points[0], np.linalg.inv(drive.poses[2]) @ drive.poses[1])
     landed_at, checked, missed_without = points[0] + drive.labels(1).flow, [], 0
     for b, category in enumerate(each.category for each in drive.scene.bodies):
         rows, target = body[0] == b, body[1] == b

@@ -57,14 +57,6 @@ def colors_at(figure: Figure, *positions: tuple[float, float], axes: int = 0) ->
     return image[len(image) - 1 - row, column].astype(int)
 
 
-def arrows_of(figure: Figure) -> np.ndarray:
-    """(K, 4) start and vector of the arrows, by x."""
-    (arrows,) = [item for item in figure.axes[0].collections if type(item).__name__ == "Quiver"]
-    assert arrows.scale == 1 / panel.ARROW_STEPS
-    columns = np.column_stack([arrows.X, arrows.Y, arrows.U, arrows.V])
-    return columns[np.argsort(columns[:, 0])]
-
-
 def test_colours_lie_where_the_points_are(scene: Scene) -> None:
     points, flow, cluster = scene
     figure = plot_flow(points, result_of(flow, cluster), max_flow=0.6)
@@ -80,7 +72,10 @@ def test_one_arrow_per_moving_cluster(scene: Scene) -> None:
     points, flow, cluster = scene
     expected = [[-20, -8, *VAN_FLOW[:2]], [15, 20, *CAR_FLOW[:2]]]
     for given in (result_of(flow, cluster), flow):  # with clusters, and with groups found from the points
-        assert np.allclose(arrows_of(plot_flow(points, given)), expected, atol=0.1)
+        (arrows,) = [each for each in plot_flow(points, given).axes[0].collections if type(each).__name__ == "Quiver"]
+        found = np.column_stack([arrows.X, arrows.Y, arrows.U, arrows.V])
+        assert np.allclose(found[np.argsort(found[:, 0])], expected, atol=0.1)
+        assert arrows.scale == 1 / panel.ARROW_STEPS
 
 
 def test_truth_adds_truth_and_error(scene: Scene) -> None:
