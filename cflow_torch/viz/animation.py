@@ -124,8 +124,10 @@ def _write_gif(path: Path, figures: Iterator[Figure], frames_per_second: float) 
 
     pictures = map(draw, figures)
     first = next(pictures)
-    sample, wheel = first.copy(), Image.fromarray(wheel_image(min(first.size) // 2))
-    sample.paste(wheel, (0, 0), wheel)
+    wheel = Image.fromarray(wheel_image(min(first.size)))
+    sample = Image.new("RGB", (first.width, first.height + wheel.height), "white")
+    sample.paste(first)
+    sample.paste(wheel, (0, first.height), wheel)
     # Median cut, Pillow's default, drops the colours of small moving objects.
     palette = sample.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=1)
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in chain([first], pictures)]
