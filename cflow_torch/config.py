@@ -275,7 +275,7 @@ def removed_preset(name: str) -> str:
 
 
 def config_from(settings: dict[str, Any]) -> Config:
-    """Make settings from `Config.as_dict`; missing fields have defaults, and wrong ones are a `CFlowError`."""
+    """Make settings from `Config.as_dict`. Missing fields get their defaults. A wrong field is a `CFlowError`."""
     return _class_of(settings.get("method"))().replace(**settings)
 
 

@@ -27,7 +27,10 @@ class NoActivePoints(CFlowWarning):
 
 
 def import_optional(module: str, need: str, name: str | None = None) -> Any:
-    """Import a module that may be missing, or a name from it; `need` is the error then, and says how to install it."""
+    """Import a module that may be missing, or a name from it.
+
+    If it is missing, that is a `CFlowError` with the message `need`, which says how to install it.
+    """
     try:
         return getattr(import_module(module), name) if name else import_module(module)
     except (ImportError, AttributeError) as error:

@@ -121,9 +121,9 @@ def estimate_flow(
 
 
 def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
-    """Make the method of some settings: `CorrelationFlow`, `CorrelationFlowKeypoints` or `VerifiedFlow`.
+    """Make the method for some settings: `CorrelationFlow`, `CorrelationFlowKeypoints` or `VerifiedFlow`.
 
-    The settings are the result of `make_config`, and the device is as in `estimate_flow`.
+    `make_config` returns the settings. `device` is as for `estimate_flow`.
     """
     methods = {method.method: method for method in (CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow)}
     if not isinstance(config, Config):

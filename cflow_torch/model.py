@@ -43,7 +43,10 @@ class Motion:
         return out
 
     def residual_flow(self, points: slice, positions: Tensor) -> Tensor:
-        """(K, 3) float32 flow of some points at (A, K) float64 metres, which clusters that rotate need."""
+        """Return the flow of some points, (K, 3) float32.
+
+        `positions`, (A, K) float64 in metres, matter only to clusters that rotate.
+        """
         cluster = self.cluster(points)
         if self.before is None:
             return self.flow.float().index_select(0, cluster)
@@ -91,8 +94,8 @@ class SceneFlowModel(nn.Module):
     def from_preset(cls: type[Any], preset: str | None = None, device: Any = "auto", **overrides: Any) -> Any:
         """Make the method with the settings of a preset, with some fields replaced.
 
-        The preset is one of the method; None = its first. `overrides` are any of its settings. An unknown preset or
-        field, a preset of another method, or an invalid value is a `CFlowError`.
+        `preset` is a preset of this method; None = its first one. `overrides` are settings of the method. A preset or
+        field that is unknown, a preset of another method, or an invalid value is a `CFlowError`.
         """
         return cls(make_config(preset, cls.method, **overrides), device)
 

@@ -27,11 +27,11 @@ def setting(
     high: float = math.inf,
     choices: tuple[Any, ...] = (),
 ) -> Any:
-    """A field of a `Config` with its default value, its meaning and unit, and its bounds.
+    """Make a field of a `Config` with its default value, its meaning and unit, and its bounds.
 
-    The `kind` is int, float, bool, str or tuple (of floats); None = the type of the default. With `optional`, None is a
-    value as well. `low` and `high` are the smallest and the largest value, both allowed; `above` is the largest value
-    that is not. `choices` are all values, if they can be listed.
+    `kind` is int, float, bool, str or tuple (of floats); None = the type of the default. If `optional`, the value None
+    is allowed. `low` and `high` are the smallest and the largest value, both allowed. `above` is a lower bound that is
+    not allowed itself. `choices` are all allowed values, if these can be listed.
     """
     limits = {"kind": kind or type(default), "optional": optional, "low": low, "above": above, "high": high}
     return field(default=default, metadata={"help": help, "choices": choices, **limits})

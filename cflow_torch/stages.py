@@ -50,8 +50,8 @@ class FlowModel(Protocol):
 class TimedModel:
     """Wrap a method and time every call.
 
-    The time of a pair starts with the window in memory and ends with the result on the device. The first pair is a
-    warm-up and does not count, unless it is the only one.
+    The time of a pair starts when its window is in memory, and ends when its result is on the device. The first pair is
+    a warm-up and does not count, unless it is the only one.
     """
 
     def __init__(self, model: FlowModel) -> None:

@@ -33,7 +33,7 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
 
 
 def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray:
-    """Check an array of one row per point and return (N, 3) float64; N is the count, or any number."""
+    """Check an array with a row per point, and return it as (N, 3) float64. None as `count` allows any N."""
     array = as_numpy(values)
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
         wanted = "(N, 3)" if count is None else f"({count}, 3)"
@@ -44,8 +44,8 @@ def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray
 def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str, wanted: str) -> None:
     """Check the type, shape (None = any length) and dtype of a dense array or tensor.
 
-    The allowed `kinds` of dtypes are some of "b" bool, "iu" integers, "f" floats. The message has the name and what is
-    `wanted`.
+    `kinds` are the allowed kinds of dtypes: "b" for bool, "iu" for integers, "f" for floats, or several of these. The
+    message names the array and says what is `wanted`.
     """
     if not isinstance(array, (np.ndarray, Tensor)):
         raise CFlowError(f"{name} is {type(array).__name__}: give {wanted}, a NumPy array or a torch tensor")
@@ -196,9 +196,10 @@ class FlowResult:
         return columns
 
     def to_pandas(self, points: Array | None = None) -> Any:
-        """A `pandas.DataFrame` with a row per point: x, y, z, if you pass the (N, 3+) points of pc0, then `columns`.
+        """Return a `pandas.DataFrame` with a row per point and the columns of `columns`.
 
-        If pandas is not installed, or the number of points differs, that is a `CFlowError`.
+        If you pass the points of pc0, (N, 3+), the columns x, y and z come first. If pandas is not installed, or the
+        number of points differs, that is a `CFlowError`.
         """
         need = "to_pandas needs pandas: pip install pandas; columns() returns the same as arrays"
         pandas = import_optional("pandas", need)
@@ -206,9 +207,10 @@ class FlowResult:
         return pandas.DataFrame({**positions, **self.columns()})
 
     def to_open3d(self, points: Array) -> Any:
-        """An `open3d.t.geometry.PointCloud` of pc0, (N, 3+), with an attribute for every field that is not None.
+        """Return an `open3d.t.geometry.PointCloud` with an attribute for every field that is not None.
 
-        If Open3D is not installed, or the number of points differs, that is a `CFlowError`.
+        `points` are those of pc0, (N, 3+), in metres. If Open3D is not installed, or the number of points differs, that
+        is a `CFlowError`.
 
         Example:
             >>> cloud = result.to_open3d(points)
@@ -288,7 +290,7 @@ class FlowResult:
 
     @classmethod
     def load(cls, path: str | Path) -> FlowResult:
-        """Read a file of `save`; a missing or another file is a `CFlowError`. Nothing in the file is executed."""
+        """Read a file that `save` wrote. A missing or different file is a `CFlowError`. Nothing in it is executed."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 return cls.of({name: torch.from_numpy(file[name]) for name in file.files})

@@ -53,8 +53,9 @@ def divide(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
 def settle(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
     """Take a moving group as static if it is a small piece of a confirmed object that has stopped.
 
-    While the vehicle passes a stopped object, its outline changes, and a piece of it seems to move; the track would
-    follow the piece. It is such a piece if the object's box holds most of its points, and more static points.
+    While the vehicle passes a stopped object, the visible outline of the object changes. A piece of it then seems to
+    move, and the track would follow the piece. A group is such a piece if the box of the object holds most of its
+    points, and more static points than the group has points.
     """
     known = tracks.is_confirmed.nonzero()[:, 0]
     box = box_of_point(groups.point, tracks.box[known], tracks.size[known] + _MARGIN, tracks.heading[known])
@@ -83,7 +84,7 @@ def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: Moving
 
 
 def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
-    """Match groups of two sweeps as `link_in_voxels` does: in small voxels, and what remains in larger ones."""
+    """Match groups of two sweeps in small voxels, then the remaining groups in larger voxels, see `link_in_voxels`."""
     earlier, current = (torch.zeros(0, dtype=torch.int64, device=points0.device) for _ in range(2))
     for side in VOXELS:
         rest0, rest1 = ~torch.isin(group0, earlier), ~torch.isin(group1, current)
@@ -97,9 +98,10 @@ def link_in_voxels(
 ) -> tuple[Tensor, Tensor]:
     """Match groups of two sweeps that share voxels, one to one.
 
-    Each group (N,) int64, from 0, has points (N, 3) float64 in metres; those of the earlier sweep are where they should
-    be now. `min_share` is the least overlap of a match: common voxels over the voxels of either group (intersection
-    over union). The side of a voxel is in metres. Returns (K,) int64 earlier groups and (K,) int64 current ones.
+    Points are (N, 3) float64 in metres; those of the earlier sweep are already moved to where they should be now. The
+    group of each point is (N,) int64, counted from 0. `min_share` is the smallest overlap of a match: the number of
+    common voxels over the number of voxels of either group (intersection over union). `side` is that of a voxel, in
+    metres. Returns the matched groups of the earlier sweep, (K,) int64, and those of the current sweep, (K,) int64.
 
     Convention: greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
     Cost: three sorts of the points, and as many rounds as it takes to match all groups, mostly two or three.
@@ -146,7 +148,10 @@ def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) 
 
 
 def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
-    """(K, 3) float64 centres and sizes of upright boxes along `heading` (K,) around groups (N,); none may be empty."""
+    """Return the centres and the sizes, (K, 3) float64 each, of upright boxes around K groups.
+
+    `group` is the group of each point, (N,), and `heading` the direction of each box, (K,). No group may be empty.
+    """
     along, across = rotate(points[:, 0], points[:, 1], -heading[group])
     local = torch.stack([along, across, points[:, 2]], 1)
     index, extremes = group[:, None].expand(-1, 3), local.new_zeros(len(heading), 3)

@@ -172,7 +172,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
         CFlowError: a sweep has no pose, the voxel size is not positive, or a point is more than a million voxels from
             the first sweep.
 
-    Cost: memory for the map and one sweep; a pass over the map's voxels per sweep.
+    Cost: memory for the map and one sweep. Each sweep takes a pass over the voxels of the map.
     """
     if not voxel_size > 0:
         raise CFlowError(f"voxel_size={voxel_size}: give a positive length in metres")

@@ -62,7 +62,7 @@ class MovingGroups:
         return replace(self, group=group, cluster=self.cluster[origin], count=count, confidence=confidence)
 
     def without(self, group: Tensor) -> MovingGroups:
-        """Return the groups without those of the (K,) indices, whose points become static."""
+        """Return the groups without some of them, (K,) indices. The points of those become static."""
         is_kept = torch.ones_like(self.count, dtype=torch.bool)
         is_kept[group] = False
         index = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)

@@ -29,7 +29,7 @@ def files(group: str) -> list[Path]:
 
 
 def settings(command: str) -> list[str]:
-    """Names of all settings of a command in dotted form, with every choice of its groups."""
+    """Return the names of all settings of a command in dotted form, those of every choice of its groups included."""
     found = [*own_settings(CONFIGS / f"{command}.yaml")]
     found += [f"model.{name}" for preset in PRESETS for name in make_config(preset).as_dict()]
     for group in groups(command):

@@ -137,8 +137,8 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
 def split(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Split the arguments of a command into settings, with quoted names, and options with their values.
 
-    Hydra accepts them in this order only: no `-m` between two settings. A path by itself means data.root. Without
-    quotes, Hydra would read the Waymo segment log=10203656353524179475_7625_000_7645_000 as a whole number, and reject
+    Hydra accepts no option, such as `-m`, between two settings. A path by itself means data.root. Without quotes, Hydra
+    would read the Waymo segment log=10203656353524179475_7625_000_7645_000 as a whole number, and it would reject
     output=Ausgänge.
     """
     overrides, options = [], []
@@ -153,7 +153,7 @@ def split(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def fixed_settings(overrides: list[str]) -> list[str]:
-    """Return the names of the settings that have one value, so that all jobs of a sweep share it."""
+    """Return the names of the settings that have a single value. All jobs of a sweep share these."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import OverrideParseException
 

@@ -32,10 +32,10 @@ Answer = Callable[[], Tuple[Window, FlowResult]]
 def for_each_pair(
     pairs: Sequence[Pair], model: TimedModel, use: Callable[[Log, int, Window, FlowResult], None]
 ) -> Failures:
-    """Estimate the flow of pairs, and call `use` with log, index, window and result of each, in order.
+    """Estimate the flow of pairs, and call `use` with the log, index, window and result of each pair, in order.
 
-    A bad pair is reported and skipped. The pairs of a log lie next to each other. The model receives the times of all
-    pairs. Results do not depend on the number of processes.
+    The pairs of a log must follow one another. A bad pair is reported and skipped. The times of all pairs are added to
+    the model. Results do not depend on the number of processes.
     """
     failures: Failures = []
     for (log, index), answer in _answers(pairs, model):
