@@ -13,10 +13,10 @@ from cflow_torch.types import CFlowError
 
 
 class FeatherFile:
-    """A feather file in memory, with the `names` of its columns and `num_rows`; a damaged one is a `CFlowError`.
+    """A feather file in memory, with the `names` of its columns and `num_rows`. A damaged file is a `CFlowError`.
 
-    If you pass its contents as `data`, `file` is only its name in messages. Otherwise they are read all at once, so
-    that a file that shrinks meanwhile does no harm.
+    If you pass the contents as `data`, `file` is only the name in messages. Otherwise the whole file is read at once,
+    so it does no harm if the file shrinks later.
     """
 
     def __init__(self, file: Any, data: bytes | None = None) -> None:

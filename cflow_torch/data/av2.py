@@ -18,8 +18,8 @@ from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_error
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
-# Rule -> largest distance of a ground point from the surface, metres; rounding of grid positions to cells (towards
-# zero, or half to even).
+# Each rule has the largest distance of a ground point from the surface, metres, and the function that rounds grid
+# positions to cells (towards zero, or half to even).
 GROUND_RULES: dict[str, tuple[float, Callable[[np.ndarray], Any]]] = {
     "av2-api": (0.3, np.trunc),
     "bsfe": (0.4, np.round),
@@ -44,9 +44,10 @@ class GroundRaster(NamedTuple):
     scale: float  # cells per metre. The grid position of a city point is scale * (rotation @ xy + translation).
 
     def is_ground(self, points: np.ndarray, rule: str = "av2-api") -> np.ndarray:
-        """Return (N,) bool: which of (N, 3) points, metres in the CITY frame, are on or below the ground by a rule.
+        """Return whether each point is ground by one of the `GROUND_RULES`, (N,) bool.
 
-        False outside the raster and where its height is NaN.
+        `points` are (N, 3), metres, in the CITY frame. Points below the surface are ground, too. The result is False
+        outside the raster and where its height is NaN.
         """
         threshold, to_cell = GROUND_RULES[rule]
         xyz: np.ndarray = np.asarray(points, dtype=np.float64)
@@ -62,7 +63,7 @@ class GroundRaster(NamedTuple):
 
 
 def read_ground_raster(map_folder: Path) -> GroundRaster | None:
-    """Read the raster of a log from its folder `map`; None if there is none, a `CFlowError` if there are several."""
+    """Read the ground raster in the folder `map` of a log; None = it has none. Several are a `CFlowError`."""
     rasters = sorted(map_folder.glob("*_ground_height_surface____*.npy"))
     if not rasters:
         return None

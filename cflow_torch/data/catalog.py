@@ -94,10 +94,10 @@ def _has_logs(name: str, root: Any) -> bool:
 
 
 def find_user_sources(target: str, settings: Mapping[str, Any]) -> list[UserSource]:
-    """Return one source, for `open_log`, per log that your own reader returns.
+    """Return a source, for `open_log`, of each log that your own reader returns.
 
-    The `target` is the name of a class or function, "package.module.name", which returns a log (`data.log.Log`), or a
-    sequence of logs that may open them lazily. The settings are its keyword arguments, and those of `open_log`.
+    `target` names the reader, "package.module.name": a class or function that returns a log (`data.log.Log`), or a
+    sequence of logs, which may open them lazily. `settings` are its keyword arguments, and those of `open_log`.
     """
     logs = _user_logs(target, {key: value for key, value in settings.items() if key not in _OF_ALL})
     if len(logs) == 0:
@@ -196,8 +196,8 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
 class GroundSegmentedLog(LogWrapper):
     """A log with a ground mask for every sweep: its own where it has one, otherwise found from the points.
 
-    `method` is the `find_ground` of `open_log`. The attribute `has_found_ground` is True once ground was found although
-    nobody asked for it, by "auto".
+    `method` is the `find_ground` of `open_log`. The attribute `has_found_ground` becomes True when the method is "auto"
+    and ground was found for a sweep.
     """
 
     def __init__(self, log: Log, method: str = "grid") -> None:

@@ -1,4 +1,4 @@
-"""Shared by the readers: one error for every file that cannot be read, .npy and JSON files, and the search for logs."""
+"""What readers share: one error for all files that cannot be read, .npy and JSON files, and the search for logs."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ def read_npy(path: Path, hint: str) -> np.ndarray:
 
 
 def read_json(file: Path, use: Callable[[dict[str, Any]], Any] | None = None) -> Any:
-    """Read a JSON file in UTF-8, with or without a byte order mark; `use` replaces each object, inner ones first.
+    """Read a JSON file in UTF-8, with or without a byte order mark.
 
-    NaN and Infinity are accepted, as Python writes them; check the numbers where they must be finite (1e999 is
-    infinite, too).
+    Each object is replaced by what `use` returns for it, inner objects first. NaN and Infinity are accepted, as Python
+    writes them, and 1e999 is read as infinity. Check numbers that must be finite.
     """
     content = read_bytes(file)
     with file_errors(f"{file} as JSON"):
@@ -78,12 +78,12 @@ def read_json(file: Path, use: Callable[[dict[str, Any]], Any] | None = None) ->
 
 
 def write_json(path: PathLike, value: Any) -> None:
-    """Write a JSON file atomically; for what JSON cannot hold see `json_ready`."""
+    """Write a JSON file atomically. `json_ready` replaces values that JSON cannot hold."""
     write_text(path, json.dumps(json_ready(value), indent=1, allow_nan=False) + "\n")
 
 
 def json_ready(value: Any) -> Any:
-    """Replace what JSON cannot hold: tuples by lists, NaN (no points) by null, infinity by text."""
+    """Replace values that JSON cannot hold: tuples by lists, NaN (no points) by null, infinity by text."""
     if isinstance(value, dict):
         return {str(key): json_ready(member) for key, member in value.items()}
     if isinstance(value, (list, tuple)):
@@ -94,7 +94,7 @@ def json_ready(value: Any) -> Any:
 
 
 def flatten(value: Any, name: str = "") -> dict[str, Any]:
-    """Flatten nested dictionaries into one, with keys joined by dots; lists are values."""
+    """Flatten nested dictionaries into one. Keys are joined by dots. Lists are not flattened."""
     if not isinstance(value, dict):
         return {name: value}
     leaves: dict[str, Any] = {}
@@ -115,10 +115,10 @@ def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:
 
 
 def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Test = lambda folder: True) -> list[Path]:
-    """Find the folders that are logs, `root` among them and at most `depth` levels below it, sorted.
+    """Find the folders that are logs, sorted: `root` itself, or folders at most `depth` levels below it.
 
-    Folders below a log, hidden ones and those that are not `is_passed` are not searched. A root that is not a folder is
-    a `CFlowError` that says `what` to pass.
+    We do not search in logs, in hidden folders, or in folders for which `is_passed` is False. If the root is not a
+    folder, that is a `CFlowError` that says `what` to pass.
     """
     if not root.is_dir():
         raise CFlowError(f"{root} is not a folder; pass {what}")

@@ -73,7 +73,7 @@ class Log(Protocol):
         return None
 
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
-        """Read the columns of sweep `index` besides the positions of its points, such as intensity, ring and time.
+        """Read the other columns of the points of sweep `index`, such as intensity, ring and time.
 
         Models ignore them; `CleanLog` and `write_array_log` keep them.
 
@@ -125,7 +125,7 @@ class Log(Protocol):
 
 
 def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> Window:
-    """Read the window whose flow is that from sweep `index` to sweep `index + 1`.
+    """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
     The window is shorter near the start of the log, where fewer than `num_history` sweeps precede it, and near its
     end, where fewer than `num_future` follow `index + 1`.

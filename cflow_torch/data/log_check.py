@@ -34,10 +34,10 @@ class StaticResidual:
 
     index: int
     later: int
-    # (2,) float64 metres, x and y of the frame of `later`, between its structure and that of `index` under the poses
+    # (2,) float64, x and y, metres, frame of `later`: from the structure of `index` under the poses to that of `later`
     shift: np.ndarray
-    rotation: float  # radians about z, between the same two
-    # 0 ... 1, how well the two coincide under the poses: 0.3 to 0.5 on a street. NaN if too little can be compared.
+    rotation: float  # radians about z, likewise
+    # 0 ... 1, how well the structures coincide under the poses: 0.3 to 0.5 on a street. NaN = too little to compare.
     agreement: float
     aligned: float  # agreement after `shift` and `rotation` are removed
     verdict: str  # the likely mistake, "" = none
@@ -49,8 +49,9 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     Without poses the sensor is assumed to be static. Without ground masks, a simple rule removes low points. Only the
     horizontal plane is compared. The points of the later sweep above ground, 2.5 to 50 m away, become Gaussian patches
     in cells of 1 m. A Gauss-Newton fit with robust weights (for moving objects) finds the shift and rotation that align
-    the older sweep with them. Along a wall without corners no shift is detected. A LiDAR at another position than the
-    poses state shows only when the vehicle turns: by its distance times the rotation, 12 cm for 1.35 m and 5 degrees.
+    the older sweep with them. Along a wall without corners no shift is detected. If the LiDAR is not where the poses
+    assume it, a shift appears only when the vehicle turns. It is the distance between the two positions times the
+    rotation: 12 cm for 1.35 m and 5 degrees.
 
     Cost: reads two sweeps and takes about 0.15 s on one core.
 
@@ -99,8 +100,9 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
 def check_static_world(log: Log) -> list[StaticResidual]:
     """Measure whether the static world moves between two sweeps of a log, and warn if it does.
 
-    We compare the two pairs over which the vehicle turns most if the log has `poses`, else first and last, and return
-    their residuals; none for a log of one sweep. There is one warning, with the verdict on the worst pair.
+    We compare two pairs and return their residuals. If the log has `poses`, they are the pairs over which the vehicle
+    turns most, otherwise the first and the last pair. A log of one sweep has none. One warning gives the verdict on the
+    worst pair.
 
     Cost: reads two sweeps per pair; 0.15 s each.
     """

@@ -1,4 +1,4 @@
-"""Local and remote paths (by fsspec), how the readers open their files, and names from data that become paths.
+"""Local and remote paths (by fsspec): open files of the readers, and check names from data that become paths.
 
 A path is a text ("/data/av2", "s3://bucket/av2"), a `pathlib.Path` or a `upath.UPath`. The readers use only pathlib's
 interface and the functions below.

@@ -13,10 +13,10 @@ QUATERNION_TOLERANCE = 1e-3  # only quaternions of length 1 are rotations; those
 
 
 def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[int], str]) -> np.ndarray:
-    """Build (K, 4, 4) float64 poses from (K, 3) translations and (K, 4) quaternions, as files store them; K may be 0.
+    """Build poses, (K, 4, 4) float64, from translations, (K, 3), and quaternions, (K, 4). K may be 0.
 
     Quaternions are scalar first (w, x, y, z), and of length 1 within `QUATERNION_TOLERANCE`. A row that is not a pose
-    is a `CFlowError`, in which `what` says where that row comes from.
+    is a `CFlowError`, which begins with what `what` returns for the row.
     """
     shift = np.asarray(translation, dtype=np.float64).reshape(-1, 3)
     rotation = np.asarray(quaternion, dtype=np.float64).reshape(-1, 4)
@@ -30,10 +30,10 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
 
 
 def poses_from_json(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
-    """Return the (K, 4, 4) float64 poses of K JSON objects.
+    """Return the poses of K JSON objects, (K, 4, 4) float64.
 
-    `translation` and `rotation` are the keys of {x, y, z} in metres and of the unit quaternion {w, x, y, z}. `what`
-    names the objects in the `CFlowError` for a pose that is not rigid.
+    `translation` is the key of {x, y, z}, metres, and `rotation` that of the unit quaternion {w, x, y, z}. A pose that
+    is not rigid is a `CFlowError`, in which `what` names the objects.
     """
     shifts = [[node[translation][axis] for axis in "xyz"] for node in nodes]
     quaternions = [[node[rotation][axis] for axis in "wxyz"] for node in nodes]

@@ -207,10 +207,11 @@ def _table_columns(read: Any, content: bytes) -> dict[str, np.ndarray]:
 
 
 def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
-    """Read a `.pcd` file of version 0.7: field -> (N,) array of the stated dtype; another file raises any exception.
+    """Read the fields of a `.pcd` file of version 0.7: name -> (N,) array of the stated dtype.
 
     Organised clouds (HEIGHT above 1) are flattened row by row. Padding and fields of several values (COUNT above 1) are
-    left out. VIEWPOINT is not applied, so points stay in their stored frame. NaN points stay.
+    left out. VIEWPOINT is not applied, so points stay in their stored frame. NaN points stay. A file that is damaged or
+    not a `.pcd` file may raise any exception, which the caller reports.
     """
     cloud = _pypcd4().PointCloud.from_fileobj(io.BytesIO(content))
     header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
@@ -223,7 +224,7 @@ def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
 
 
 def write_pcd(path: PathLike, fields: Mapping[str, np.ndarray]) -> None:
-    """Write a binary cloud, atomically; field name without spaces -> (N,) float32, float64 or integers."""
+    """Write a binary cloud, atomically. Fields are (N,) float32, float64 or integers; their names have no spaces."""
     pypcd4 = _pypcd4()
     kinds = [values.dtype for values in fields.values()]
     cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)

@@ -36,11 +36,12 @@ def is_argoverse2(timestamp: int) -> bool:
 def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndarray | None) -> np.ndarray:
     """Recognise ego_T_lidar, (4, 4) float64, which maps the points of a scene to the frame whose poses it stores.
 
-    The arguments are the time stamp of a sweep, its (N, 3+) float points in metres as stored, and its (N,) bool mask;
-    None = unknown. Argoverse 2 sweeps (by their time stamp) with ground more than 1.2 m below the origin have points in
-    the frame of up_lidar and poses of the ego frame. We return the extrinsics of one log of that set. Those of the
-    scene's own log are not in its file: take them from `calibration/egovehicle_SE3_sensor.feather`. For all other sets
-    we return the identity (nuScenes and ZOD have poses of the sensor, Waymo and TruckScenes points in the ego frame).
+    The arguments are those of one sweep: its time stamp, its points as stored, (N, 3+) float in metres, and its ground
+    mask, (N,) bool, None = unknown. A sweep is of Argoverse 2 by its time stamp. If its ground is more than 1.2 m below
+    the origin, its points are in the frame of up_lidar, and its poses are of the ego frame. We then return the
+    extrinsics of one log of that set, because those of the scene's own log are not in its file: take them from
+    `calibration/egovehicle_SE3_sensor.feather`. For all other sweeps we return the identity (nuScenes and ZOD have
+    poses of the sensor, Waymo and TruckScenes have points in the ego frame).
     """
     if not is_argoverse2(timestamp) or is_ground is None:
         return np.eye(4)
@@ -73,10 +74,10 @@ def harness_pose_flow(points: Tensor, T_ego1_ego0: np.ndarray) -> Tensor:
 def residual_for_harness(
     residual: Tensor, points: Tensor, T_ego1_ego0: np.ndarray, T_lidar1_lidar0: np.ndarray
 ) -> Tensor:
-    """Return the residual to pass to the harness so that its total is right if its poses are of another frame.
+    """Return the residual flow with which the harness gets the right total, even if its poses are of another frame.
 
-    `residual` and `points`, in the frame of the LiDAR at t, are (N, 3) float32 metres. `T_ego1_ego0` is from
-    `harness_motion`, `T_lidar1_lidar0` the (4, 4) float64 motion of the frame of the points.
+    `residual` and `points` are (N, 3) float32, metres; the points are in the frame of the LiDAR at t. `T_ego1_ego0` is
+    the result of `harness_motion`. `T_lidar1_lidar0`, (4, 4) float64, is the motion of the frame of the points.
     """
     positions = points.t().double()
     correction = compensate(positions, T_lidar1_lidar0) - compensate(positions, T_ego1_ego0.astype(np.float64))

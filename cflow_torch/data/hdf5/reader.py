@@ -112,7 +112,7 @@ class HDF5Log(Log):
         return self._column(index, "eval_mask", self._rows(index), np.bool_)
 
     def stored_motion(self, index: int) -> StoredMotion:
-        """Compute the ego motion of the pair (index, index + 1) that the harness uses, from the stored poses."""
+        """Compute the ego motion that the harness uses for the pair (index, index + 1), from the stored poses."""
         poses: Any = [self._stored_pose(k, None) for k in (index, index + 1)]
         for pose in poses:
             rigid_transform(pose, f"pose of sweep {index} or {index + 1} of {self.file}")
@@ -124,11 +124,12 @@ class HDF5Log(Log):
             return tuple(sorted(self._group(index)))
 
     def values(self, index: int, key: str) -> np.ndarray:
-        """Read what sweep `index` stores under a key; (N, 1) columns become (N,). An error lists the keys.
+        """Read the array that sweep `index` stores under a key. Columns (N, 1) become (N,).
 
-        Keys are for example `lidar` (N, 3+), `ego_motion` (4, 4) to the next sweep as stored (of the ego frame),
-        `flow_instance_id` (N,) 0 = background, `lidar_id` (N,), `lidar_dt` (N,) seconds, `lidar_center` (L, 4, 4)
-        ego_T_sensor, `dufo`, `cluster`, or the name of a result, (N, 3) total flow.
+        A key that the sweep does not have is a `CFlowError`, which lists those that it has. Keys are for example
+        `lidar` (N, 3+), `ego_motion` (4, 4) of the ego frame to the next sweep as stored, `flow_instance_id` (N,) with
+        0 = background, `lidar_id` (N,), `lidar_dt` (N,) in seconds, `lidar_center` (L, 4, 4) ego_T_sensor, `dufo`,
+        `cluster`, and the name of a result, (N, 3) total flow.
         """
         values = self._values(index, key)
         if values is None:

@@ -80,7 +80,7 @@ def write_hdf5_labels(
     made_by: str = "",
     overwrite: bool = False,
 ) -> int:
-    """Write labels for self-supervised training into a copy of a scene, which replaces it; return how many sweeps.
+    """Write labels for self-supervised training into a copy of a scene, which replaces it. Return the number of sweeps.
 
     Args:
         file: `<scene>.h5`; every other key keeps its contents.
@@ -95,7 +95,7 @@ def write_hdf5_labels(
 
 
 def labelled_by(file: str | Path) -> str | None:
-    """Return what made the labels of a scene, "" if that is unknown, None if the scene has no labels."""
+    """Return the method that made the labels of a scene; "" = unknown, None = the scene has no labels."""
     with open_scene(Path(file)) as scene, file_errors(file):
         has_labels = any(set(scene[stamp]) & set(LABELS) for stamp in scene if is_timestamp(stamp))
         made_by = scene.attrs.get(LABELLED, "" if has_labels else None)

@@ -64,7 +64,7 @@ def write_index_files(folder: str | Path) -> None:
 
 
 def _sweep(log: Log, index: int, eval_step: int, identity: dict[str, int]) -> dict[str, np.ndarray]:
-    """Return the keys and values of one group; `identity` has the object id of each track so far."""
+    """Return the keys and values of one group. `identity` holds the object ids of the tracks so far."""
     sweep, labels = log.sweep(index), log.labels(index)
     if sweep.pose is None:
         raise CFlowError(f"sweep {index} of log {log.log_id} has no pose, which the layout needs")

@@ -207,9 +207,9 @@ def _times(rows: Sequence[Row]) -> np.ndarray:
 
 
 class Tracks:
-    """The annotated boxes of a scene at any time, from its (S,) ascending sample times in microseconds.
+    """The boxes of a scene at any annotated time, interpolated between its samples.
 
-    `start` and `end` are the times of the first and of the last sample.
+    `sample_times` are (S,), microseconds, ascending. The attributes `start` and `end` are the first and the last one.
     """
 
     def __init__(self, sample_times: np.ndarray, annotations: Annotations) -> None:
@@ -220,9 +220,10 @@ class Tracks:
             self._rows[int(sample)][annotations.track[row]] = row
 
     def at(self, time: int) -> tuple[Annotations, np.ndarray] | None:
-        """Return the K boxes at a time, and (K,) bool whether each is known; None outside the annotated time.
+        """Return the K boxes at a time, and whether each is known, (K,) bool; None outside the annotated time.
 
-        A box between two samples of which only one has the object is a guess. Guesses come first.
+        A box is not known, but a guess, if only one of the two samples around the time has the object. Guesses come
+        first.
 
         Convention: at a sample, we return its own boxes. Between two samples the centre and the size change linearly,
             and the rotation at a constant rate. If only one of the two samples has an object, we continue its motion

@@ -67,10 +67,10 @@ def range_image_points(
     pixel_poses: np.ndarray | None = None,
     T_world_ego: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (N, 3) float64 points of all pixels with a return, and (N,) int64 pixels, row * W + column, ascending.
+    """Return the points of all pixels with a return, (N, 3) float64, and the index of each pixel, (N,) int64.
 
-    Points are in metres, in the vehicle frame of the frame. We compute in float64, because world coordinates are about
-    10 km, where float32 has steps of 1 mm.
+    Points are in metres, in the vehicle frame of the frame. Indices are row * W + column, ascending. We compute in
+    float64, because world coordinates are about 10 km, where float32 has steps of 1 mm.
 
     Args:
         image: (H, W, 4) float: range (metres), intensity, elongation, no-label-zone flag.
