@@ -1,6 +1,6 @@
 """Spatio-temporal clusters: connected components of all sweeps of a window together (Alg. clustering).
 
-Components of binary images are dilated, measured, and split where they are too long.
+We dilate binary images, label their components, and split components that are too long.
 """
 
 from __future__ import annotations
@@ -91,7 +91,10 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
 
 
 def _can_move(component: Tensor, num_components: int, occupied: Tensor) -> Tensor:
-    """(C,) bool: some pixels (P,) of the component are `occupied`, (S, P) bool, at t+1 (index 0), and some before."""
+    """Return whether each component has occupied pixels both at t+1 and before, (C,) bool.
+
+    `component` is that of each pixel, (P,). `occupied` is (S, P) bool; index 0 of S is sweep t+1.
+    """
     newest, *older = occupied.unbind(0)
     before = reduce(torch.bitwise_or, older, torch.zeros_like(newest))
     kind = newest.byte() + (newest & before).byte()  # 0: occupied before only, 1: at t+1 only, 2: both
@@ -114,8 +117,8 @@ class PixelIndices:
 def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: ClusteringConfig) -> Tensor:
     """Label the components of dilated images; erode and label again those that are too long (Alg. clustering).
 
-    The images are (B, H, W) bool, and `pixels` (P,) int64 are the flat indices of their set pixels, ascending. Returns
-    (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
+    `image` is (B, H, W) bool. `pixels` are the flat indices of its set pixels, (P,) int64, ascending. Return, for each
+    pixel, the position in `pixels` of the first pixel of its component in raster order, (P,) int64.
     """
     _, height, width = image.shape
     padded = pad([image])
@@ -129,10 +132,10 @@ def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: C
 def components_by_size(
     padded: Tensor, height: int, width: int, indices: PixelIndices, pixel_size: float, config: ClusteringConfig
 ) -> tuple[Tensor, int]:
-    """Component of each set pixel of padded images of height x width, and a number above the largest component.
+    """Return the component of each set pixel, and a number above the largest component.
 
-    We erode all oversized components together. Components of a dilated image do not share a 3 x 3 neighbourhood that
-    lies in their union, so none affects another.
+    `height` and `width` are those of the images without padding. We erode all oversized components together. They do
+    not affect each other, because no 3 x 3 neighbourhood within their union has pixels of two components.
     """
     component, count = _components(padded, indices, 3, config)
     top, bottom = segment_minmax(indices.row, component, count)
@@ -156,7 +159,7 @@ def components_by_size(
 
 
 def _components(padded: Tensor, indices: PixelIndices, reach: int, config: ClusteringConfig) -> tuple[Tensor, int]:
-    """Component of each pixel, dilated first if `reach` is 3, and a number above the largest component."""
+    """Return the component of each pixel, and a number above the largest one. Dilate first if `reach` is 3."""
     if config.labeling == "kornia":
         component = connected_components_kornia(padded, indices.pixel, config.connectivity, reach)
         return component, indices.pixel.numel()

@@ -20,13 +20,13 @@ class ProjectedSweeps:
 
     batch: Batch  # points of all windows
     grid: Grid  # pixels of the bird's-eye view
-    # (A, P) float64, metres per sweep interval, flow so far of every point before t+1. None = no flow yet.
+    # (A, P) float64, metres per sweep interval, the flow of every point before t+1 so far. None = no flow yet.
     flow: Tensor | None
     occupancy: Tensor  # (B, S, H, W) bool; index 0 of S is sweep t+1
     pixel: Tensor  # (P,) int64, flat index into `occupancy`; its size for ignored points
 
     def positions(self) -> Tensor:
-        """(A, P) float64, metres, frame of t+1: the warped positions of all points."""
+        """Return the warped positions of all points, (A, P) float64, metres, frame of t+1."""
         if self.flow is None:
             return self.batch.positions
         before = slice(self.batch.num_newest, None)
@@ -34,9 +34,9 @@ class ProjectedSweeps:
 
 
 def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
-    """Warp every sweep m by (t+1-m) times its flow so far and draw it (Eq. 3d_to_bev); `flow` as in `ProjectedSweeps`.
+    """Warp every sweep m by (t+1-m) times its flow so far, and draw it (Eq. 3d_to_bev).
 
-    Points that are warped out of the region are ignored at this scale.
+    `flow` is as in `ProjectedSweeps`. Points that are warped out of the region are ignored at this scale.
     """
     num_images, num_points = batch.num_windows * batch.num_steps, len(batch.image)
     pixel = torch.empty(num_points, dtype=torch.int64, device=batch.image.device)
@@ -53,7 +53,7 @@ def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
 
 
 def _warp(batch: Batch, flow: Tensor, points: slice) -> Tensor:
-    """(A, K) float64, metres: points before t+1, each moved by the flow so far times its interval to t+1."""
+    """Move points before t+1 by their flow so far times their interval to t+1: (A, K) float64, metres."""
     intervals = batch.elapsed.flatten().index_select(0, batch.image[points])
     return (flow[:, points] * intervals).add_(batch.positions[:, points])
 

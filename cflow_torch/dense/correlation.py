@@ -65,8 +65,8 @@ def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) 
 def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | None = None) -> tuple[Tensor, Tensor]:
     """Find the shift of each of J templates that maximises the normalised cross-correlation with its target.
 
-    The result is identical for the engines "fft" and "conv", and for any `max_memory`, bytes of working memory to plan
-    with; None = no limit.
+    `max_memory` is the working memory that we may use, bytes; None = no limit. The result is identical for any memory,
+    and for the engines "fft" and "conv".
 
     Returns:
         shift: (J, 2) int64, (dy, dx), pixels.
@@ -148,8 +148,8 @@ def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor
     """Find the shifts that may be the best of their pair: (4, K) int64, packed pair, dy, dx, count.
 
     The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
-    count^2 / target energy and count. A shift whose count is below the largest of these lower bounds cannot win. The
-    target energies (J,) int64 and the radius (J,) float64, None = no limit, are in pixels.
+    count^2 / target energy and count. A shift whose count is below the largest of these lower bounds cannot win.
+    `target_energy`, (J,) int64, and `radius`, (J,) float64, are in pixels; None = no limit of the radius.
     """
     low, high, stride = search.low[:, run.pairs], search.high[:, run.pairs], search.stride[run.pairs]
     searched = search.searched[run.pairs]
@@ -183,8 +183,8 @@ def _best_of_each_pair(
     """Choose the best candidate of each pair: (4, J) int64, dy, dx, count, energy, all 0 for a pair without candidates.
 
     The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels under the H x W window at
-    that shift. The pair, target, count (K,) and shift (2, K) of each candidate are int64. Those of a pair are in order
-    of dy, then of dx. Ties: as in `best_shifts`.
+    that shift. The pair, target and count of each candidate, (K,), and its shift, (2, K), are int64. The candidates of
+    a pair are in order of dy, then of dx. Ties: as in `best_shifts`.
     """
     # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
     parts = [windows.bounds(target[some], shift[:, some]) for some in chunks(0, len(pair), pair.device, 16)]

@@ -9,10 +9,10 @@ from cflow_torch.ops.segments import masked_median
 
 
 def pool(estimates: Tensor, available: Tensor) -> Tensor:
-    """Combine the median magnitude and the median orientation of several estimates: (M, 3) float64.
+    """Return the vectors of the median magnitude and the median orientation of several estimates, (M, 3) float64.
 
-    Estimates (M, K, 3) float64 are metres per sweep interval, nearest sweep first; z is pooled on its own. `available`
-    (M, K) is False where the cluster is empty in that sweep; at least one per row is True.
+    `estimates` are (M, K, 3) float64, metres per sweep interval, nearest sweep first. z is pooled by itself.
+    `available`, (M, K), is False where the cluster is empty in that sweep. At least one per row is True.
 
     Convention:
         A single estimate is returned unchanged. Even counts: mean of the middle two (for orientations: the direction

@@ -20,9 +20,9 @@ def add_sectional_view(
 ) -> Estimates:
     """Add f_z to the estimates of M clusters, and correct f_x and f_y along the heading (Alg. scene_flow_1obj).
 
-    `cluster` is the (P,) cluster of each point, M = none; the points of the sweeps have three axes. The heading is the
-    direction of (f_x, f_y), the x axis if that is zero. The X-Z images lie on one grid through the origin, cut to the
-    bounding box of the pair. Ties: smallest shift, then smallest dz, then smallest dx'.
+    `cluster` is that of each point, (P,), M = none. The points of the sweeps have three axes. The heading is the
+    direction of (f_x, f_y), or the x axis if both are zero. All X-Z images lie on one grid through the origin, and each
+    is cut to the bounding box of its pair. Ties: smallest shift, then smallest dz, then smallest dx'.
     """
     available, positions, pixel_size = estimates.available, sweeps.positions(), sweeps.grid.pixel_size
     step = sweeps.batch.image % sweeps.batch.num_steps

@@ -49,9 +49,10 @@ def bucket_scores(count: np.ndarray, error_sum: np.ndarray, speed_sum: np.ndarra
 
 
 class BucketedByRange(Accumulator):
-    """`BucketedEPE` of every range between the definition's `region_edges`, in one pass; a point is in at most one.
+    """Dynamic bucket-normalised EPE of each range between the definition's `region_edges`, see `BucketedEPE`.
 
-    `region` ("box" or "disc"), `region_axes` and `closed` define how a range is measured; `max_range` does not apply.
+    `region` ("box" or "disc"), `region_axes` and `closed` define how a range is measured; `max_range` does not apply. A
+    point is in at most one range.
     """
 
     def __init__(self, definition: Definition, num_ranges: int | None = None) -> None:
@@ -73,9 +74,10 @@ class BucketedByRange(Accumulator):
         return cell, (scored.error[keep], scored.speed[keep])
 
     def compute(self) -> dict[str, Any]:
-        """Return "ranges": "0-35", ... -> "classes" and "mean" as of `BucketedEPE`; "mean" over them; "speed_edges".
+        """Return "ranges", "mean" and "speed_edges".
 
-        The mean over the ranges, `static_epe` and `dynamic_error`, is NaN if a range has no points to score.
+        "ranges" has a dictionary for each range ("0-35", ...), with "classes" and "mean" as in `BucketedEPE`. "mean"
+        is the mean of `static_epe` and `dynamic_error` over the ranges. It is NaN if a range has no points to score.
         """
         names = range_names(self.definition.region_edges)
         ranges = {name: bucket_scores(*sums) for name, *sums in zip(names, self.count, *self.sums)}
@@ -100,10 +102,10 @@ class BucketedEPE(BucketedByRange):
         return scored.in_region.astype(np.int64) - 1
 
     def compute(self) -> dict[str, Any]:
-        """Return "classes", "mean" over them (`static_epe`, `dynamic_error`) and "speed_edges", metres per frame.
+        """Return "classes", "mean" and "speed_edges" (metres per frame).
 
-        A class has `static_epe` (metres), `dynamic_error` (ratio), `num_static`, `num_dynamic` (points) and "buckets":
-        `count`, `epe`, `speed`, `normalized` of each.
+        Each class has `static_epe` (metres), `dynamic_error` (ratio), `num_static` and `num_dynamic` (points), and
+        "buckets", each with `count`, `epe`, `speed` and `normalized`. "mean" averages the first two over classes.
         """
         return {**bucket_scores(self.count[0], *self.sums[:, 0]), "speed_edges": list(self.definition.speed_edges)}
 

@@ -90,8 +90,8 @@ class ProtocolScores:
 def errors_by_range(results: Mapping[str, Any]) -> dict[str, float]:
     """Return the dynamic bucket-normalised error of each range ("0-35", ...), a mean over classes.
 
-    It is NaN where the range has no dynamic points. The results are of `SceneFlowMetrics.compute` or of results.json; a
-    `CFlowError` if they lack the metric "bucketed_by_range".
+    It is NaN if the range has no dynamic points. `results` are those of `SceneFlowMetrics.compute` or of results.json.
+    If they lack the metric "bucketed_by_range", that is a `CFlowError`.
     """
     if "bucketed_by_range" not in results:
         raise CFlowError("the results have no 'bucketed_by_range': use definition='challenge_2026'")

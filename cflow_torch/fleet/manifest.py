@@ -59,8 +59,8 @@ def make_identity(
 def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
     """Make sure that a folder has results of this identity only, and write its manifest; others are a `CFlowError`.
 
-    `resume` continues an earlier run of the same identity, and `overwrite` removes the results of earlier runs, which
-    is allowed only if you are `alone`: no other shard works in this folder.
+    `resume` continues an earlier run of the same identity. `overwrite` removes the results of earlier runs. It is
+    allowed only if you are `alone`, that is, if no other shard works in this folder.
     """
     forget_listings(output)
     why = find_conflict(output, identity, resume or overwrite)

@@ -75,9 +75,9 @@ def run_fleet(
     The folder of the job is claimed already (`manifest.claim_folder`). `sources` are all logs, of all shards.
 
     Returns:
-        The report of `Counters.report`, with the entries of `about`, which is also in OUTPUT/reports/<shard>.json.
-        "exit_status" is 0 if every frame of the shard is on disk, 1 if not or if the report could not be written, 130,
-        143 or 129 if Ctrl-C, SIGTERM or SIGHUP came first.
+        The report of `Counters.report` with the entries of `about`. It is also written to OUTPUT/reports/<shard>.json.
+        "exit_status" is 0 if every frame of the shard is on disk, 1 if not or if the report could not be written. It is
+        130 after Ctrl-C, 143 after SIGTERM and 129 after SIGHUP.
     """
     if engine not in ENGINES:
         raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")

@@ -31,9 +31,10 @@ class DenseShift:
 def densify(
     images: Tensor, matched: Tensor, matches: Matches, pixel_size: float, config: KeypointsConfig
 ) -> DenseShift:
-    """Find the shift of every occupied pixel of sweep t, whose images are (B, H, W) bool.
+    """Find the shift of every occupied pixel of sweep t.
 
-    `matched` (M,) int64 are flat indices into the images of the key points that have `matches`, ascending.
+    `images` are those of sweep t, (B, H, W) bool. `matched` are the key points that have `matches`: flat indices into
+    the images, (M,) int64, ascending.
 
     Returns:
         With "components", a group is a connected component of the image. Its shift is the median of dy and the median

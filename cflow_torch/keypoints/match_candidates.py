@@ -48,7 +48,7 @@ class KeyPoints:
 
 
 def detect(occupancy: Tensor) -> Tensor:
-    """Key points of (..., H, W) bool images: pixels at distance 1 from the background or from the outside."""
+    """Find the key points of (..., H, W) bool images: pixels at distance 1 from the background or the outside."""
     return occupancy & ~erode_cross(occupancy)
 
 

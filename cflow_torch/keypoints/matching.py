@@ -86,8 +86,8 @@ def _contenders(
 ) -> Iterator[tuple[Tensor, ...]]:
     """Yield pairs of key points of `source` and `target`, and their counts, (N,) int64 each.
 
-    These are the pairs whose count^2 / energy is at least `share` of the best one of its `source`. All pairs of a key
-    point of `source` come at once.
+    A pair is yielded if its count^2 / energy is at least `share` times the largest one of its key point of `source`.
+    All pairs of a key point of `source` come at once.
     """
     if source.row.numel() == 0 or target.row.numel() == 0:
         return

@@ -219,7 +219,7 @@ def _blocks_near(
 
 
 class RollingRays:
-    """Map blocks and columns to rays in unit coordinates of the block's solid, as `raycast.nearest_hits` needs."""
+    """Rays of blocks and columns, in unit coordinates of the solid of each block, for `raycast.nearest_hits`."""
 
     def __init__(self, solids: MovingSolids, shots: Shots, blocks: Blocks) -> None:
         middle = blocks.first_column + blocks.num_columns // 2

@@ -38,8 +38,8 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
         ego_T_lidar: (4, 4); None = identity; "auto" = `recognized_extrinsics` of the sweep.
 
     Convention:
-        A ground mask of the length of its points is applied. If instead the number of its rows that are not ground
-        equals the number of points, the harness has already applied it (to pc0, pc1 and some or all of the history).
+        We apply a ground mask that has as many rows as its sweep has points. If instead it has as many rows that are
+        not ground, the harness has already applied it (to pc0, pc1 and some or all of the history).
         Rows with NaN are ignored: they are padding, or beams without a return. "flow" and other truth is never read. A
         `CFlowError` names the key of a value that is missing, has a wrong shape, or is not a rigid motion.
     """

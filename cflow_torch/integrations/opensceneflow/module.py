@@ -1,4 +1,4 @@
-"""The model that OpenSceneFlow's configuration names: batches in, residual flow out; its checkpoint has no weights."""
+"""The model that OpenSceneFlow's configuration names. It turns batches into residual flow, and has no weights."""
 
 from __future__ import annotations
 
@@ -144,11 +144,11 @@ def _with_history(config: Config, num_frames: Any) -> Config:
 
 
 def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
-    """Write the checkpoint without weights, for example `cflow.ckpt`, and return its path.
+    """Write a checkpoint without weights, for example `cflow.ckpt`, and return its path.
 
-    OpenSceneFlow's scripts require one. The stem of the file labels the output folder and the printed tables, and
-    save.py stores its results under this name. A file that exists, which might contain weights, is a `CFlowError`
-    unless you set `overwrite`.
+    OpenSceneFlow's scripts require one. They use the stem of the file as a label of the output folder and of printed
+    tables, and save.py stores its results under this name. A file that exists is a `CFlowError` unless you set
+    `overwrite`, because it might contain weights.
     """
     # Plain containers only, so that `torch.load(weights_only=True)` reads it. There is no `model.target`, because the
     # harness prefers the settings of a checkpoint to those of the command line, which must win.
