@@ -91,10 +91,7 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
 
 
 def _can_move(component: Tensor, num_components: int, occupied: Tensor) -> Tensor:
-    """Return whether each component has occupied pixels both at t+1 and before, (C,) bool.
-
-    `component` is that of each pixel, (P,). `occupied` is (S, P) bool; index 0 of S is sweep t+1.
-    """
+    """Return whether each component has `occupied` pixels, (S, P) bool, at t+1 (index 0) and before, (C,) bool."""
     newest, *older = occupied.unbind(0)
     before = reduce(torch.bitwise_or, older, torch.zeros_like(newest))
     kind = newest.byte() + (newest & before).byte()  # 0: occupied before only, 1: at t+1 only, 2: both

@@ -74,8 +74,9 @@ class ThreeWayEPE(Accumulator):
     def compute(self) -> dict[str, Any]:
         """Return `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou`, `num_frames` and two breakdowns.
 
-        "breakdown": "background" / "foreground" -> "static" / "dynamic" -> "all" / "close" / "far" -> `count`,
-        `num_predicted` (points predicted as dynamic) and the values of `QUANTITIES`; "by_class": the same per class.
+        The keys of "breakdown" are "background" and "foreground", then "static" and "dynamic", then "all", "close" and
+        "far". Each entry has `count`, `num_predicted` (points predicted as dynamic) and the values of `QUANTITIES`.
+        "by_class" has the same for each class.
         """
         values = _values(self.count, self.sums)
         if self.definition.average == "frames":

@@ -123,8 +123,8 @@ def plot_map(points: Array, title: str | None = None) -> Figure:
 def save_picture(figure: Figure, path: str | Path) -> Path:
     """Save a figure of a `plot_...` function as .png, and return the path.
 
-    The file appears complete or not at all; an older one is replaced, and missing folders are created. Another ending
-    is a `CFlowError`, a file that cannot be written an `OSError`.
+    The file appears complete or not at all. An older one is replaced, and missing folders are created. Another ending
+    is a `CFlowError`. A file that cannot be written is an `OSError`.
     """
     path = style.checked_path(path, ".png")
     with atomic_name(path) as temporary:

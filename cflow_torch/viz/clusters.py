@@ -72,7 +72,7 @@ def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Seq
 
     The largest cluster is coloured first. Each cluster gets the colour of `PALETTE` whose nearest cluster is farthest
     away, measured between bounding boxes in x and y. Ties: the colour that fewest clusters have. Positions (N, 2+) are
-    finite metres. Negative ids (N,) are points in no cluster, which get the colour `no_cluster`, 0 ... 255.
+    finite metres. Points in no cluster have a negative id, (N,), and get the colour `no_cluster`, 0 ... 255.
 
     Cost: quadratic in the number of clusters, about 0.1 s for a thousand.
     """

@@ -65,7 +65,7 @@ def ramp_entry(value: np.ndarray, most: float) -> np.ndarray:
 
 
 def object_entry(position: np.ndarray, cluster: np.ndarray, moving: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """(N,) uint8 entries of the palette of objects: neighbours differ; pale if less than half of a cluster moves."""
+    """Return palette entries, (N,) uint8. Neighbours differ. Clusters of which less than half moves are pale."""
     entry = np.where(ground, GROUND, STATIC).astype(np.uint8)
     has_one = cluster >= 0
     colors = cluster_colors(position[has_one], cluster[has_one], (0, 0, 0))

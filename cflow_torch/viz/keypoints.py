@@ -57,7 +57,7 @@ def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
 
 
 def _busiest_view(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of the view around the cell in which the vectors of the matches add up to most, or around the vehicle."""
+    """Return the corners of the view around the cell with the largest sum of match vectors, or around the vehicle."""
     flow = end - start
     middle = np.zeros(2)
     moves = np.linalg.norm(flow, axis=1) > MOVING

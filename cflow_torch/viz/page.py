@@ -37,7 +37,7 @@ class Page:
         self.html, self.num_pairs = html, num_pairs
 
     def save(self, path: str | Path) -> Path:
-        """Write the page to a path that ends in .html. It appears complete or not at all; an older one is replaced."""
+        """Write the page to an .html file. It appears complete or not at all, and replaces an older one."""
         path = checked_path(path, ".html")
         write_text(path, self.html)
         return path

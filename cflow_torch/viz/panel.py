@@ -35,9 +35,9 @@ def new_figure(
 ) -> tuple[Figure, list[Axes]]:
     """Create a figure with one framed panel per name, in a row, and range rings around the ego vehicle.
 
-    "" is a panel without a heading. The view is (2, 2) float64 metres, low and high corner (x, y); one that is too long
-    and thin for a panel gets empty space along its long sides. The caption is one line below the panels that explains
-    the colours; the distance of the rings is added.
+    The name "" makes a panel without a heading. The view is (2, 2) float64, metres: its low and its high corner (x, y).
+    A view that is too long and thin for a panel gets empty space along its long sides. The caption is one line below
+    the panels. It explains the colours; the distance of the rings is added.
     """
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
@@ -110,7 +110,7 @@ def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.nd
 
 
 def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.ndarray) -> None:
-    """Draw the error of every point with known truth (not NaN) on the field's scale from black (none) to white."""
+    """Draw the error of every point whose truth is known (not NaN), from black (no error) to white."""
     error = np.linalg.norm(flow - truth, axis=1)
     is_known = np.isfinite(error)
     position, error = position[is_known], error[is_known]
@@ -127,9 +127,10 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
 
 
 def group_medians(group: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Numbers (G,) of groups, medians (G, C) and rows (G,) of (N, C) values within each group (N,), negative = in none.
+    """Return the number of each group, (G,), the medians of its values, (G, C), and its count of rows, (G,).
 
-    Groups are in ascending order. The median of an even count is the upper one.
+    `group` is the number of the group of each row, (N,), negative = in no group; `values` are (N, C). Groups are in
+    ascending order. The median of an even count is the upper one of the middle two.
     """
     values, group = values[group >= 0], group[group >= 0]
     number, start, count = np.unique(np.sort(group), return_index=True, return_counts=True)

@@ -57,7 +57,7 @@ class Scene:
         )
 
     def arrows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Ids (A,), ascending, of clusters with enough moving points; median positions and flow, (A, 3) float64."""
+        """Return ids, (A,), median positions and median flows, (A, 3), of clusters with enough moving points."""
         moving = ~self.is_ground & (np.linalg.norm(self.residual, axis=1) > MOVING)
         columns = np.concatenate([self.position[moving], self.residual[moving]], axis=1)
         cluster, middle, count = group_medians(self.cluster[moving], columns)

@@ -17,8 +17,8 @@ _POSITION = np.cumsum((0, *TRANSITIONS))  # of each primary on the wheel
 def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
     """Convert flow (..., 2+), metres, to (..., 3) uint8 RGB: direction to hue, length to saturation.
 
-    Flow of `max_flow` metres gets the full hue, None = the longest flow; longer flow is darker. Zero, NaN and infinite
-    flow is white. Columns after x and y are ignored.
+    Flow of `max_flow` metres gets the full hue; None = the length of the longest flow. Longer flow is darker. Zero, NaN
+    and infinite flow is white. Columns after x and y are ignored.
 
     Convention:
         +x is red, then counter-clockwise yellow, green, cyan, blue, magenta. The angle in [0, 2 pi) is spread over 54
@@ -49,7 +49,7 @@ def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
 
 
 def wheel_image(size: int) -> np.ndarray:
-    """Draw the wheel, +x right, +y up, `max_flow` at the rim: (size, size, 4) uint8 RGBA, transparent outside of it."""
+    """Draw the wheel with +x right, +y up and `max_flow` at the rim: (size, size, 4) uint8 RGBA, clear outside."""
     axis = (np.arange(size) + 0.5) * (2 / size) - 1
     flow = np.stack(np.meshgrid(axis, -axis), axis=-1)
     distance = np.hypot(flow[..., 0], flow[..., 1])

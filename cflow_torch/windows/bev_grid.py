@@ -46,12 +46,12 @@ class Grid:
         return math.floor((self.upper[0] - self.lower[0]) / self.pixel_size) + 1
 
     def centre(self, pixel: Tensor) -> Tensor:
-        """Return y and x of the centres of pixels, (2, K) float64 metres, given their row and column, (2, K) int64."""
+        """Return y and x of the centres of pixels, (2, K) float64, metres. `pixel` has their row and column, (2, K)."""
         lower = constant(self.lower[1::-1], torch.float64, pixel.device)
         return pixel.double().add_(0.5).mul_(self.pixel_size).add_(lower[:, None])
 
     def contains(self, positions: Tensor) -> Tensor:
-        """(N,) bool: positions, (2, N) or (3, N) float64 metres, are finite and in the region, both ends included."""
+        """Test whether positions, (2, N) or (3, N) float64, metres, are finite and in the region, ends included."""
         # A value is inside if clamping keeps it; NaN and infinity fail. eq_ writes ones and zeros in place: on the CPU
         # two comparisons that write bools take almost twice as long.
         largest = torch.finfo(positions.dtype).max
@@ -84,11 +84,11 @@ class Grid:
     def pixel_of_image(
         self, positions: Tensor, image: Tensor, num_images: int, is_active: Tensor | None = None
     ) -> Tensor:
-        """(N,) int32 pixel of every point in a stack of images, int64 where int32 is too small.
+        """Return the flat index of the pixel of every point in a stack of B x H x W pixels, (N,) int32.
 
-        It is the flat index into B x H x W pixels, and B * H * W for points that `is_active` (N,) bool leaves out,
-        which must be False outside the region; None = all points are active and inside. Positions are (2, N) or (3, N)
-        float64 metres, frame of t+1, and the image of each point is (N,) int32 or int64.
+        If int32 is too small, it is int64. Points with `is_active`, (N,) bool, False get the index B * H * W. It must
+        be False outside the region; None = all points are active and inside. Positions are (2, N) or (3, N) float64,
+        metres, frame of t+1. `image` is the image of each point, (N,) int32 or int64.
         """
         num_pixels = num_images * self.height * self.width
         pixel = self.pixel(positions)

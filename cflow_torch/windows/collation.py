@@ -56,9 +56,9 @@ class Batch:
         return replace(self, num_windows=2 * self.num_windows, elapsed=elapsed, seconds=seconds, origin=origin)
 
     def split_past_and_future(self) -> tuple[Batch, Tensor]:
-        """Give the sweeps after t+1 windows of their own; also return the points that have copies, (K,) int64.
+        """Return a batch in which sweeps after t+1 have windows of their own, and the copied points, (K,) int64.
 
-        Of the 2 B windows, window w has the sweeps up to t+1, and window B + w has t+1, t and the sweeps after t+1. The
+        Of its 2 B windows, window w has the sweeps up to t+1, and window B + w has t+1, t and the sweeps after t+1. Its
         points are those of this batch, then copies of all points of t+1 and t for the windows B ... 2 B - 1.
         """
         num_future = int((self.elapsed < 0).any(0).sum())
@@ -113,7 +113,7 @@ def make_batch(
         grid: the images of any scale; they contain the region.
         device: device of the batch.
         num_axes: coordinates to keep, 2 or 3.
-        needs_ground, needs_times: keep the heights of the ground, the times of the points as well.
+        needs_ground, needs_times: also keep the heights of the ground, or the times of the points.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, tensors on several devices, poses for some

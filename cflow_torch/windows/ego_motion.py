@@ -18,9 +18,10 @@ _ORTHOGONALITY = 1e-3
 
 
 def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
-    """Check a rigid transform and convert it to (4, 4) float64; another matrix is a `CFlowError` with its name.
+    """Check a rigid transform and convert it to (4, 4) float64. Another matrix is a `CFlowError` that names it.
 
-    Its type must resolve a centimetre at its own translation and at `reach` metres, the farthest point.
+    Its dtype must resolve a centimetre at its own translation, and at `reach`, the distance of the farthest point in
+    metres.
     """
     dtype = getattr(matrix, "dtype", None)
     try:
@@ -56,10 +57,10 @@ def relative_transform(pose1: Any, pose: Any) -> np.ndarray:
 
 
 def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -> Tensor:
-    """Transform (3, N) float64 metres to the frame of t+1 (Eq. def_scene_flow): (A, N), the first A = `num_axes` axes.
+    """Transform positions to the frame of t+1 (Eq. def_scene_flow), and return their first A = `num_axes` axes, (A, N).
 
-    The transform is (4, 4) float64, array or tensor, or (3, 4, N), one per point; None = already in the frame of t+1. A
-    point that is not finite has no finite coordinate after a transform.
+    Positions are (3, N) float64, metres. The transform is (4, 4) float64, or (3, 4, N), one per point; None = positions
+    are in the frame of t+1 already. A point that is not finite has no finite coordinate after a transform.
 
     Convention: ((R0 x + R1 y) + R2 z) + t with one rounding per operation instead of a matrix product: the same bits on
     every device.

@@ -51,8 +51,8 @@ class GroundHeights:
         return both
 
     def mean(self) -> Tensor:
-        """(B, Y, X) int64, centimetres: mean over 3 x 3 blocks, rounded down; where they hold fewer than five points,
-        a height far below every point."""
+        """Return the mean height over 3 x 3 blocks, (B, Y, X) int64, centimetres, rounded down. Where they hold fewer
+        than five points, it is a height far below every point."""
         _, rows, cols = self._heights.shape
         sums = F.pad(torch.stack((self._heights, self._counts)), (1, 1, 1, 1))
         around = [sums[:, :, down : down + rows, right : right + cols] for down in range(3) for right in range(3)]
@@ -61,16 +61,19 @@ class GroundHeights:
         return mean.masked_fill_(count < _FEWEST_POINTS, _UNKNOWN)
 
     def at(self, positions: Tensor, window: Tensor, mean: Tensor) -> Tensor:
-        """(N,) float64 centimetres: ground around (3, N) metres in the region, given the result of `mean`."""
+        """Return the height of the ground around each position, (N,) float64, centimetres.
+
+        Positions are (3, N), metres, in the region. `mean` is the result of the function `mean`.
+        """
         block = torch.add(self._block(positions), window, alpha=mean.shape[1] * mean.shape[2])
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
 
     def slopes(self, centre: Tensor, window: Tensor) -> Tensor:
-        """(G, 2) float64 slopes of the ground around objects, metres of height per metre in x and in y.
+        """Return the slopes of the ground around objects, (G, 2) float64, metres of height per metre in x and in y.
 
-        A plane is fitted to the mean heights of the blocks around each centre (G, 2) float64, x and y, metres, frame of
-        t+1; anywhere. The slope is 0 where the plane is steeper than 0.3, or where fewer than five blocks are known,
-        or all of them lie nearly on a line. Window B + w is window w once more, for copies of its points.
+        `centre` is that of each object, (G, 2) float64, x and y, metres, frame of t+1, anywhere. We fit a plane to the
+        mean heights of the blocks around it. The slope is 0 if the plane is steeper than 0.3, if fewer than five blocks
+        are known, or if they lie nearly on a line. Window B + w is window w once more, for copies of its points.
 
         Convention: block heights are whole millimetres, rounded down. So all sums are exact.
         """

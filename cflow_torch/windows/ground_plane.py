@@ -39,7 +39,7 @@ class Plane:
 
 
 def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int) -> Plane:
-    """Fit the plane on which most flat spots of active points, (3, N) int64 mm, lie nearby. Ties: the lowest height."""
+    """Fit the plane on which most flat spots near the sensor lie. Ties: the lowest. Points are (3, N) int64, mm."""
     size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
     col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
     is_near = (((col | row) & -size) == 0).logical_and_(is_active)  # both in 0 ... size - 1
@@ -66,9 +66,9 @@ def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int
 
 
 def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Tenth percentile, median and number of the heights of each cell, (num_cells,) int64 each.
+    """Return the tenth percentile, the median and the number of the heights of each cell, (num_cells,) int64 each.
 
-    The first two are undefined where the number is 0. Heights (N,) int64 are in mm, |height| < 2^36; those in cell
+    The first two are undefined where the number is 0. Heights are (N,) int64, mm, |height| < 2^36. Those in cell
     `num_cells` are left out.
     """
     offset, bits = 1 << 36, 37

@@ -76,7 +76,7 @@ def control_groups() -> list[Path]:
 def split_windows(
     windows: Sequence[Window], grid: Grid, device: torch.device, bytes_per_point: int, max_memory: float | None
 ) -> list[list[Window]]:
-    """Split checked windows into groups that fit into memory, in order. Results do not depend on the grouping.
+    """Split checked windows, in order, into groups that fit into memory. Results do not depend on the grouping.
 
     The grid is that of the finest scale, whose images are the largest. `max_memory` is in bytes; None = no limit on a
     GPU, 512 MiB per group on a CPU, where large groups are slower. A window that does not fit is a `CFlowError`.

@@ -47,8 +47,9 @@ def move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
 def is_better_inverted(given: float, none: float, inverted: float) -> bool:
     """Test whether the given motion between two sweeps is inverted.
 
-    The arguments are the agreements of the sweeps under three motions, which must increase in this order. Where most
-    structure belongs to vehicles that keep pace, as on a highway, the agreement is largest without motion.
+    The arguments are the agreements of the sweeps under the given motion, no motion and the inverse motion. The motion
+    is inverted only if they increase in this order. On a highway, where most structure belongs to vehicles of the same
+    speed, no motion has the largest agreement.
     """
     return given < none < inverted and inverted > _BETTER * given
 

@@ -111,7 +111,10 @@ def _is_same(a: Sweep, b: Sweep) -> bool:
 
 
 def elapsed_times(window: Window, sources: Sequence[Source], config: Config) -> list[tuple[float, float]]:
-    """(sweep intervals, seconds) from each source to t+1, negative after it, by time stamps if all sweeps have one."""
+    """Return the time from each source to t+1 in sweep intervals and in seconds, negative for sources after t+1.
+
+    It is that of the time stamps if all sweeps have one.
+    """
     if any(sweep.timestamp_ns is None for _, sweep in named_sweeps(window)):
         return [(float(source.intervals), source.intervals * config.sweep_interval) for source in sources]
     newest = _nanoseconds(window.pc1, "pc1")

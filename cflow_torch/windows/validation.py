@@ -42,7 +42,7 @@ def keep_nearest(window: Window, num_history: int) -> Window:
 
 
 def have_same_points(a: Sweep, b: Sweep) -> bool:
-    """Compare points. Different sweeps mostly differ in their first points, so we compare those before the whole."""
+    """Test whether two sweeps have the same points. We compare the first points first, as these mostly differ."""
     if a.points.shape != b.points.shape:
         return False
     parts = (slice(_FIRST_POINTS), slice(None))
@@ -50,7 +50,7 @@ def have_same_points(a: Sweep, b: Sweep) -> bool:
 
 
 def resolution(dtype: Any, distance: float) -> float:
-    """Return the step between neighbouring numbers of a dtype at this distance from 0; 0 for integer dtypes."""
+    """Return the step between neighbouring numbers of a dtype at a distance from 0. It is 0 for integer dtypes."""
     if isinstance(dtype, torch.dtype):
         epsilon = torch.finfo(dtype).eps if dtype.is_floating_point else 0.0
     else:

@@ -84,7 +84,7 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """Path of the frame's file inside the archive."""
+        """Return the path of the file of the frame inside the archive."""
         return f"{self.log.log_id}/{self.log.timestamps[self.index]}.feather"
 
     def count_rows(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> int:
