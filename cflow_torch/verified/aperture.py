@@ -81,12 +81,14 @@ def slides_along_itself(
 def principal_axes(
     component: Tensor, row_col: Tensor, num_components: int, pixel_size: float
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """Return whether each component is a line, (A,) bool, the largest variance in any direction, (A,) float64, square
-    pixels, and the variance in y, the covariance and the variance in x, likewise.
+    """Return which components are lines, and the variances of their pixels.
+
+    The first result is (A,) bool. The second is the largest variance in any direction, and the third has the variance
+    in y, the covariance and the variance in x. Each of these is (A,) float64, square pixels.
 
     Args:
-        component: (Q,) int64, of each pixel at t+1.
-        row_col: (2, Q) int64, of each pixel at t+1.
+        component: (Q,) int64, component of each pixel at t+1.
+        row_col: (2, Q) int64, row and column of each pixel at t+1.
         num_components: A.
         pixel_size: s, metres.
     """
@@ -131,7 +133,7 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     compared = flat_nonzero((step == 0) | (step == farthest))
     some, component = members_of(name, take_columns(roots, compared).flatten(), is_long.numel())
     pixels = sweeps.pixels.take(compared.index_select(0, some % len(compared)))
-    # Of t+1, then of the farthest sweep.
+    # The components at t+1, then those in the farthest sweep.
     group = torch.add(component, pixels.step != 0, alpha=count)
     is_tall = scatter_count(group, 2 * count, count_slices(pixels.slices) - _TALL)[:count] >= 0
 

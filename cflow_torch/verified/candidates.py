@@ -85,7 +85,7 @@ def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Ten
 def _find_peaks(
     nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the sub-pixel displacement m -> t+1 of each node for every other sweep m. Args as for `propose`.
+    """Find the sub-pixel displacement m -> t+1 of each node for every other sweep m. Arguments are as for `propose`.
 
     Returns:
         estimates: (N, S - 1, 2) float64, (y, x), finest pixels m -> t+1, nearest sweep first.
@@ -159,10 +159,10 @@ class _NodeImages(NamedTuple):
 
 
 def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tensor:
-    """Return the sub-pixel offset of each peak, (J, 2) float64, (y, x), pixels of its scale, from the shifts, (J, 2).
+    """Return the sub-pixel offset of each peak, (J, 2) float64, (y, x), pixels of its scale.
 
-    It is the vertex of the parabolas through the counts of common slices at the peak and at its four neighbours; 0 for
-    pairs whose peak is at shift 0.
+    `shift` is the shift of each peak, (J, 2). The offset is the vertex of the parabolas through the counts of common
+    slices at the peak and at its four neighbours. It is 0 for pairs whose peak is at shift 0.
     """
     is_moved = shift.any(1)
     template = pairs.template

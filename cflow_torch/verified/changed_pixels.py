@@ -105,8 +105,10 @@ class RangeImages:
         self._farthest = farthest
 
     def farther(self, sweep: Tensor, positions: Tensor) -> Tensor:
-        """Return the distance of the farthest return in the direction of each position, minus that of the position,
-        (K,) float32, metres; -infinity = no return. Sweeps are window * S + step, (K,) int64; positions are (3, K)."""
+        """Return how much farther than each position the farthest return in its direction is, (K,) float32, metres.
+
+        -infinity = no return. Sweeps are window * S + step, (K,) int64. Positions are (3, K).
+        """
         direction, distance = self._direction(sweep, positions)
         return self._farthest.index_select(0, direction).sub_(distance)
 

@@ -41,7 +41,7 @@ _PRICE = 16 * 4
 
 @dataclass(frozen=True)
 class Components:
-    """All components of all windows. Each has a name, a number below V, level by level; some numbers are unused."""
+    """All components of all windows. The name of each is a number below V. Names ascend by level; some are unused."""
 
     roots: Tensor  # (L, P) int64, component of each pixel at each level, coarse to fine; the last is not dilated
     changed: Tensor  # (Q,) int64, pixels that changed, positions in the list

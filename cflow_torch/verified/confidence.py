@@ -37,8 +37,8 @@ _Z = 1.0  # standard deviations of noise by which a motion must exceed its displ
 class MotionMargin(NamedTuple):
     """The margins of G objects."""
 
-    # (G,) float64, slices matched by the motion minus those matched by its best displaced copy, in standard deviations
-    # of noise; 0 = the motion is not better, or the object is static.
+    # (G,) float64. The motion matches this many more slices than its best displaced copy, in standard deviations of
+    # noise. 0 = the motion is not better, or the object is static.
     z: Tensor
     # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line, the motion matches more of
     # it than zero motion does, and it is better than its displaced copies or at least twice as long as the
@@ -75,11 +75,11 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 def _groups_of_one_motion(
     sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion
 ) -> tuple[Tensor, Tensor]:
-    """Group pixels that share a motion: the pixels of an object, except those that its rotation displaces by a
-    pixel or more. Each of these is a group of its own.
+    """Return the group of pixels of one motion that each pixel is in, (K,) int64, and the motion of each group.
 
-    `which` is the object of each pixel, (K,) int64. Return the group of each pixel, (K,) int64, and the motion of the
-    groups, (G + groups, 2) float64, (y, x), pixels per interval.
+    The pixels of an object are a group, except those that its rotation displaces by a pixel or more. Each of these is a
+    group of its own, after the G objects. `which` is the object of each pixel, (K,) int64. The motion is
+    (number of groups, 2) float64, (y, x), pixels per interval.
     """
     size, motion = sweeps.grid.pixel_size, rigid.pixels_per_interval(sweeps.grid.pixel_size)
     elapsed = sweeps.elapsed.index_select(0, pixels.window)
@@ -137,8 +137,10 @@ def _bin(values: Tensor, bounds: list[float]) -> Tensor:
 
 
 def _neighbourhood(sweeps: HeightSlicedSweeps, pixels: Pixels, motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Count the slices of t in the block around each of its K pixels, and those of them that t+1 has at their target,
-    (K,) int64 each. The motion is (K, 2) float64, (y, x), finest pixels per interval."""
+    """Count the slices of t in the block around each of K pixels, and those that t+1 has at their target, (K,) int64.
+
+    The motion of each pixel is (K, 2) float64, (y, x), finest pixels per interval.
+    """
     side = max(1, round(_BLOCK / sweeps.grid.pixel_size))
     height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)
     row, col = floor_divide(pixels.row_col, side)

@@ -218,7 +218,7 @@ class HeightSlicedSweeps:
         return self.num_more > 0
 
     def or_outside(self, index: Tensor, at: Tensor) -> Tensor:
-        """Return flat indices into `image`, (...) int64, with the index of its last entry for pixels outside.
+        """Return flat indices into `image`, (...) int64. Those of pixels outside become the index of the last entry.
 
         Args:
             index: (...) int64, flat indices, right for pixels inside.
@@ -228,10 +228,10 @@ class HeightSlicedSweeps:
         return index.masked_fill(is_above_or_below | is_beside, self.image.numel() - 1)
 
     def around(self, pixel: Tensor, reach: int) -> Tensor:
-        """Return the occupied pixels of the same sweep around some pixels, `reach` pixels each way.
+        """Return the occupied pixels of the same sweep around each of K pixels, up to `reach` pixels each way.
 
-        Both are positions in the list: (K,) int64, and (K, (2 reach + 1)^2) int64, in raster order; P where a pixel is
-        empty or lies outside the image.
+        `pixel`, (K,) int64, and the result, (K, (2 reach + 1)^2) int64 in raster order, are positions in the list. The
+        result is P where a pixel is empty or outside the image.
         """
         line, table = range(-reach, reach + 1), take_columns(self.pixels.table, pixel)[..., None]
         shifts = tuple(zip(*((down, right) for down in line for right in line)))

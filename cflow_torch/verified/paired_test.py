@@ -111,12 +111,12 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
 class Wins(NamedTuple):
     """Paired counts of M components with C candidate motions each."""
 
-    # (2, M, C) int64, slices; then the near counts: a slice also counts as found in the 3 x 3 pixels around a position,
-    # if the motion is at least two pixels.
+    # (2, M, C) int64, numbers of slices. The second ones are the near counts: if the motion is at least two pixels, a
+    # slice also counts as found if it is in the 3 x 3 pixels around a position.
     won: Tensor
     lost: Tensor
-    # (2, M, 2) int64, slices of other sweeps, then of t+1: first all of them, then those in place in the sweep compared
-    # and, times 2^32, those that it has in the 3 x 3 pixels around.
+    # (2, M, 2) int64, numbers of slices. Last axis: slices of other sweeps, those of t+1. First axis: all of them, then
+    # those in place in the compared sweep plus, times 2^32, those that it has in the 3 x 3 pixels around.
     of_static: Tensor
 
     @property
@@ -209,8 +209,8 @@ class _Moves(NamedTuple):
     shift: Tensor  # (2, C, R) int64, whole pixels down and to the right
     offset: Tensor  # (C, R) int64, the shift as an offset of flat indices
     longest: Tensor  # (R,) float64, largest shift in y or x by any of the C motions, pixels
-    # (C, R) uint8, the first bit of an image that tells whether a slice is absent: if the shift in y or in x is at
-    # least two pixels, that of the 3 x 3 pixels around, otherwise that of the pixel.
+    # (C, R) uint8, first of the bits of an image that tell whether a slice is absent. If the shift in y or in x is at
+    # least two pixels, they are those of the 3 x 3 pixels around, otherwise those of the pixel itself.
     bits: Tensor
     is_given: Tensor  # (R,) bool, the window has both sweeps
 

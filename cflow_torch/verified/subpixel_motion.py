@@ -57,7 +57,7 @@ def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor
 
 
 def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> Tensor:
-    """Find objects of pairs that match the other sweep better one pixel to one side than one to the opposite side.
+    """Find objects of pairs that match the other sweep better one pixel ahead than one pixel behind, or vice versa.
 
     `wanted` and the result are (G,) bool. Of the slices of both sweeps, a are matched only ahead and b only behind. An
     object is biased if, in one of four directions, (a - b)^2 >= z^2 (a + b), and |a - b| is at least a tenth of its
