@@ -146,7 +146,7 @@ class Sources(NamedTuple):
 
 
 def find_logs(cfg: DictConfig) -> Sources:
-    """Find the logs of `cfg.data`, and simulate those that are not in the cache. No log is a `CFlowError`."""
+    """Find the logs of `cfg.data`; make simulated ones that are not cached. If there is none, raise a `CFlowError`."""
     data = cfg.data
     given: dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
     settings = {str(key): value for key, value in given.items() if key not in _NOT_OF_READER}

@@ -44,7 +44,7 @@ class GroundRaster(NamedTuple):
     scale: float  # cells per metre. The grid position of a city point is scale * (rotation @ xy + translation).
 
     def is_ground(self, points: np.ndarray, rule: str = "av2-api") -> np.ndarray:
-        """Return whether each point is ground by one of the `GROUND_RULES`, (N,) bool.
+        """Return whether each point is ground, (N,) bool, by a rule of `GROUND_RULES`.
 
         `points` are (N, 3), metres, in the CITY frame. Points below the surface are ground, too. The result is False
         outside the raster and where its height is NaN.

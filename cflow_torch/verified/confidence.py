@@ -75,7 +75,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 def _groups_of_one_motion(
     sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion
 ) -> tuple[Tensor, Tensor]:
-    """Return the group of pixels of one motion that each pixel is in, (K,) int64, and the motion of each group.
+    """Group pixels that share a motion: return the group of each pixel, (K,) int64, and the motion of each group.
 
     The pixels of an object are a group, except those that its rotation displaces by a pixel or more. Each of these is a
     group of its own, after the G objects. `which` is the object of each pixel, (K,) int64. The motion is

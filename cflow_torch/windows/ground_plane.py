@@ -39,7 +39,7 @@ class Plane:
 
 
 def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int) -> Plane:
-    """Fit the plane on which most flat spots near the sensor lie. Ties: the lowest. Points are (3, N) int64, mm."""
+    """Fit the plane of most flat spots of active points near the sensor; ties: the lowest. Points: (3, N) int64 mm."""
     size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
     col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
     is_near = (((col | row) & -size) == 0).logical_and_(is_active)  # both in 0 ... size - 1

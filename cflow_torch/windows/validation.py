@@ -42,7 +42,7 @@ def keep_nearest(window: Window, num_history: int) -> Window:
 
 
 def have_same_points(a: Sweep, b: Sweep) -> bool:
-    """Test whether two sweeps have the same points. We compare the first points first, as these mostly differ."""
+    """Test whether sweeps have the same points. We compare the first points first; most sweeps differ there."""
     if a.points.shape != b.points.shape:
         return False
     parts = (slice(_FIRST_POINTS), slice(None))

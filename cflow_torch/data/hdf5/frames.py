@@ -37,9 +37,9 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndar
     """Recognise ego_T_lidar, (4, 4) float64, which maps the points of a scene to the frame whose poses it stores.
 
     The arguments are those of one sweep: its time stamp, its points as stored, (N, 3+) float in metres, and its ground
-    mask, (N,) bool, None = unknown. A sweep is of Argoverse 2 by its time stamp. If its ground is more than 1.2 m below
-    the origin, its points are in the frame of up_lidar, and its poses are of the ego frame. We then return the
-    extrinsics of one log of that set, because those of the scene's own log are not in its file: take them from
+    mask, (N,) bool, None = unknown. We recognise sweeps of Argoverse 2 by the time stamp. If their ground is more than
+    1.2 m below the origin, their points are in the frame of up_lidar, and their poses are of the ego frame. We return
+    the extrinsics of one log of that set, because those of the scene's own log are not in its file: take them from
     `calibration/egovehicle_SE3_sensor.feather`. For all other sweeps we return the identity (nuScenes and ZOD have
     poses of the sensor, Waymo and TruckScenes have points in the ego frame).
     """
