@@ -119,7 +119,7 @@ class _WithHistory(Config):
 
 @dataclass(frozen=True)
 class DenseConfig(_WithHistory, ClusteringConfig):
-    """Settings of `CorrelationFlow`, the paper's dense method. The defaults are the paper's base row."""
+    """Settings of `CorrelationFlow`, the paper's dense method. The defaults are the paper's baseline."""
 
     method: str = _method("dense")
     sectional_view: bool = setting(False, "also estimate f_z in the X-Z view along the heading (Alg. scene_flow_1obj)")

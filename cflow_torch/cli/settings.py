@@ -26,7 +26,7 @@ import yaml  # type: ignore[import-untyped]
 
 from cflow_torch.cli.choices import CONFIGS, files, near, settings
 from cflow_torch.config import CONFIGS as METHODS
-from cflow_torch.config import PRESETS, make_config
+from cflow_torch.config import PRESETS, WINDOW, make_config
 from cflow_torch.errors import CFlowError
 from cflow_torch.setting import describe
 
@@ -35,7 +35,23 @@ _PAGE = """# Settings
 Settings have the same names in Python, `make_config("paper", max_speed=30.0)`, on the command line, `model=paper
 model.max_speed=30`, and in a sweep, `-m model.num_history=0,2,4`. null is None in Python. Words such as Alg. clustering
 are labels of the paper. If a name or a value is wrong, the error message lists what is allowed."""
+# The values are literals, because the harness's eval.yaml and save.yaml define nothing to refer to.
+_HARNESS = """\
+# CorrelationFlow, preset {preset}: hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow] model={name}
+# For OpenSceneFlow. Written by `cflow settings --opensceneflow FOLDER`; `cflow settings` says what each setting does.
+name: {name}
+val_monitor: val/Dynamic/Mean
+iter_only: false  # true: the runner for methods without training (needs a GPU, no checkpoint)
+target:
+  _target_: cflow_torch.integrations.opensceneflow.CFlow
+  num_frames: {num_frames}  # sweeps per window, t+1 and t included: h + 2
+  ego_T_lidar: auto  # auto | null | 4 x 4: points in the sensor frame, poses of the vehicle (Argoverse 2)
+  output: full  # full | valid (by pc0_valid_point_idxes)
+  device: auto  # auto = that of the batch
+  voxel_size: [0.1, 0.1, 2000.0]  # the harness asks for it; without effect, pixel_sizes counts
+"""
 _COMMANDS = sorted(file.stem for file in CONFIGS.glob("*.yaml") if file.stem != "hydra")
+_Z = 1000.0  # metres; the harness computes with the region, so infinite bounds of z are replaced by this one
 
 
 def task(arguments: list[str]) -> None:
@@ -46,13 +62,30 @@ def task(arguments: list[str]) -> None:
         from cflow_torch.data.atomic import ensure_writable, write_text
 
         folder = ensure_writable(Path(arguments[1]))
-        for file in sorted((CONFIGS / "opensceneflow" / "model").glob("*.yaml")):
-            write_text(folder / file.name, file.read_text(encoding="utf-8"))
-            print(folder / file.name)
+        for name, text in harness_models().items():
+            write_text(folder / f"{name}.yaml", text)
+            print(folder / f"{name}.yaml")
     elif any(word.startswith("-") for word in arguments):
         raise CFlowError(f"settings takes names or --opensceneflow FOLDER, got {' '.join(arguments)}")
     else:
         print("\n\n".join(text for name in arguments for text in _about(name)))
+
+
+def harness_models() -> dict[str, str]:
+    """Name -> YAML of each preset as a model of OpenSceneFlow, except offline: the harness has no sweeps after t+1."""
+    models = {}
+    for preset, config in ((preset, make_config(preset)) for preset in PRESETS):
+        if config.num_future > 0:
+            continue
+        name = "cflow" if preset == "default" else f"cflow_{preset}"
+        text = _HARNESS.format(preset=preset, name=name, num_frames=config.num_history + 2)
+        region = [min(max(bound, -_Z), _Z) for bound in config.point_cloud_range]
+        for f in fields(config):
+            value = region if f.name == "point_cloud_range" else getattr(config, f.name)
+            if f.name not in WINDOW:  # num_frames replaces it
+                text += f"  {f.name}: {_yaml(value)}  # {describe(f)}\n"
+        models[name] = text
+    return models
 
 
 def _sections() -> Iterator[tuple[list[str], str, list[str]]]:
