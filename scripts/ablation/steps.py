@@ -15,7 +15,8 @@ from typing import Any, Callable
 from unittest.mock import patch
 
 import torch
-from run import CACHE, Figures, make_parser, print_table, score_preset
+from run import CACHE, make_parser, print_table, score_preset
+from score import Figures
 from sets import ScoredSet, make_sets
 
 from cflow_torch.verified import (

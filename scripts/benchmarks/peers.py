@@ -45,7 +45,7 @@ from cflow_torch.data.log import window
 from cflow_torch.types import as_numpy
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "ablation"))
-from run import pooled_figures  # noqa: E402
+from score import pooled_figures  # noqa: E402
 from sets import Item, between, make_item  # noqa: E402
 
 OURS = ("default", "paper", "keypoints")
