@@ -33,7 +33,7 @@ class Motion:
     before: Tensor | None = None
 
     def cluster(self, points: slice) -> Tensor:
-        """Cluster of each of some points, M = none."""
+        """Return the cluster of each point in a slice; M = no cluster."""
         return self.cluster_of_cell.index_select(0, self.cell_of_point[points])
 
     def flow_of(self, cluster: Tensor, out: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
-"""Measures the run time of the method and of its stages, windows per second, and memory: a table and OUTPUT/bench.json.
+"""Measures the run time of the method and of its stages, windows per second, and memory.
 
-The pairs are spread evenly over the first log and run one at a time and in batches. Times start with the points in
-memory and end with the flow on the device. Other work on the machine distorts them.
+It prints a table and writes OUTPUT/bench.json. The pairs are spread evenly over the first log and run one at a time and
+in batches. Times start with the points in memory and end with the flow on the device. Other work on the machine
+distorts them.
 
 examples:
   cflow bench                                                    a simulated street

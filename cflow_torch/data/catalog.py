@@ -148,7 +148,7 @@ def open_log(
     """Open one log.
 
     Args:
-        name: a key of `DATA_SETS`, or the target of `find_user_sources`.
+        name: a key of `DATA_SETS`, or the `target` that you gave `find_user_sources`.
         source: from `find_sources` or `find_user_sources`.
         find_ground: method of `cflow_torch.windows.ground.find_ground` for sweeps without a ground mask, "grid" or
             "patchwork"; "auto" = "grid", with a line that says so; None = they have no ground.
@@ -157,8 +157,8 @@ def open_log(
         **settings: keyword arguments of the reader.
 
     Raises:
-        CFlowError: a log that cannot be read, or whose name cannot be a folder's; a setting that the reader does not
-            have (the message lists its own) or cannot use.
+        CFlowError: the log cannot be read; its name cannot be the name of a folder; the reader does not have a setting
+            (the message lists those that it has) or cannot use it.
     """
     if find_ground not in CHOICES:
         raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")

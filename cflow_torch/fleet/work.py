@@ -1,4 +1,4 @@
-"""A worker: it reads, computes and writes the frames of a unit, all three at the same time."""
+"""A worker: it reads, computes and writes the frames of a `Unit` (part of a log), all three at the same time."""
 
 from __future__ import annotations
 

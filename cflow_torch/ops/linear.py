@@ -1,4 +1,4 @@
-"""Small linear algebra on many matrices at once: they come first in the shape, so operations are elementwise."""
+"""Linear algebra on many small matrices at once. Their axes come first, (3, 3, K), so operations are elementwise."""
 
 from __future__ import annotations
 

@@ -21,10 +21,10 @@ FOLIAGE_RETURN = 0.75  # share of the shots at foliage that return, because leav
 
 @dataclass(frozen=True)
 class Returns:
-    """The N returns of a vehicle's LiDARs in one sweep, unit by unit.
+    """The N returns of a vehicle's LiDARs (its units) in one sweep, one unit after the other.
 
     Args:
-        points: (N, 3) float32, metres, ego frame, after the motion compensation of the data set.
+        points: (N, 3) float32, metres, ego frame; motion-compensated if the profile is (`is_deskewed`).
         solid: (N,) int64, index of the solid that was hit; -1 = the ground.
         intensity: (N,) uint8.
         laser_number: (N,) uint8, which continues from unit to unit (modulo 256).
@@ -34,8 +34,8 @@ class Returns:
         ring: (N,) int32, index of the beam, lowest first.
         column: (N,) int32, index of the azimuth step in the order of time.
 
-    Convention: the rows of a unit are in the order of time in rolling profiles, else in the order of azimuth; within a
-    column from the lowest beam up.
+    Convention: the columns of a unit are sorted by time in rolling profiles, and by azimuth in others. The rows of a
+    column are sorted from the lowest beam up.
     """
 
     points: Tensor

@@ -140,9 +140,10 @@ def color_bar(axes: Axes, dots: Any, label: str, position: np.ndarray, is_import
 def legend_box(
     axes: Axes, position: np.ndarray, is_important: np.ndarray, inches: tuple[float, float], corner: str | None = None
 ) -> Axes:
-    """Add an empty white box in the corner where it covers the fewest points; an important point counts twenty-fold.
+    """Add an empty white box, with the given width and height in inches, in a corner of a panel.
 
-    The size is in inches. `corner` is one of `CORNERS`; None = the one that covers the fewest.
+    `corner` is one of `CORNERS`; None = the one where the box covers the fewest points. An important point counts as
+    twenty.
     """
     panel = inches_of(axes)
     size, margin = np.minimum(np.array(inches) / panel, 0.5), 0.1 / panel

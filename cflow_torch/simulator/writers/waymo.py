@@ -93,16 +93,18 @@ def write_waymo_segment(log: Recording, root: str | Path) -> Path:
     Convention:
         - TOP: each pixel has the vehicle's pose at the time of its shot, interpolated between the poses of the sweeps.
           Where that is too inaccurate, it is the recording's own pose, if it has poses between sweeps. The pose is
-          shifted so that its point is exactly where the recording has it, except for the rounding of poses and ranges
-          to float32: 5e-5 m up to 1 km from the world's origin.
-        - Other lasers: range images of the vehicle at the pose of the frame, without poses of pixels. Returns on the
-          rays of their pixels keep float32 accuracy, 5e-6 m at 75 m; others are moved onto the ray, by up to 5 mm.
+          shifted so that the pixel's point is exactly where the recording has it, except for the rounding of poses
+          and ranges to float32: 5e-5 m up to 1 km from the world's origin.
+        - Other lasers: the images are as if the vehicle stood still at the pose of the frame, and their pixels have no
+          poses. Returns on the rays of their pixels keep float32 accuracy, 5e-6 m at 75 m; others are moved onto the
+          ray, by up to 5 mm.
         - Times are rounded to microseconds. Boxes keep their heading only, without roll and pitch.
         - There are no second returns, no elongation, no no-label zones and no speeds of boxes.
 
     Raises:
         CFlowError: the segment exists already, its name cannot be used for a file, there are more than five units, a
-            return is off its pixel's ray, two returns share a pixel, or time stamps are less than a microsecond apart.
+            return is too far from its pixel's ray, two returns share a pixel, or time stamps are less than a
+            microsecond apart.
     """
     root = Path(root)
     name = safe_name(f"{log.log_id}.parquet", "the file of log_id")
