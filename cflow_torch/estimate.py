@@ -66,7 +66,7 @@ def estimate_flow(
         preset: "default", "offline", "keypoints" or "paper"; None = the preset of the method, or "default".
         config: settings from `make_config`, instead of `method` and `preset`.
         ground: what to do with sweeps without a mask. "grid" = find their ground (`find_ground`); "auto" = the same,
-            and say so; "patchwork" = find it with Patchwork++ (`pip install pypatchworkpp`); None = they have none.
+            with a warning; "patchwork" = find it with Patchwork++ (`pip install pypatchworkpp`); None = they have none.
         device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
         **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
 
@@ -79,7 +79,7 @@ def estimate_flow(
 
     Warns:
         CFlowWarning: the ground was found (`ground="auto"`); a likely mistake in the input, see
-            `SceneFlowModel.forward`; or no point of pc0 is active.
+            `SceneFlowModel.forward`; or `is_valid` is False for all points of pc0.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.

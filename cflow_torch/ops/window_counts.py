@@ -1,4 +1,4 @@
-"""Count the set pixels of binary images of different sizes under a shifted window of the size of the image."""
+"""Count the set pixels of binary images of different sizes inside shifted windows, each as large as its image."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class WindowCounts:
         """(K,) int64, number of set pixels in rows dy ... H - 1 + dy and columns dx ... W - 1 + dx.
 
         Args:
-            image: (K,) int64.
+            image: (K,) int64, number of the image of each window.
             shift: (2, K) int64, dy and dx, |dy| <= H, |dx| <= W.
 
         Cost: linear in the height of the windows.

@@ -41,7 +41,7 @@ def cast_unit(
     T_world_ego: Tensor,
     max_range: float,
 ) -> RangeImage:
-    """Cast the rays of one unit in an instantaneous sweep.
+    """Cast the rays of one LiDAR, `unit`, in an instantaneous sweep.
 
     Args:
         phase: azimuth of the first column, radians.

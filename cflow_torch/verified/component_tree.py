@@ -207,18 +207,18 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
 
     Args:
         nodes: N of them.
-        components: V names; the names of components under overhangs follow.
+        components: those of the tree, with names below V. Components under overhangs have names from V on.
         evidence: (N,) int64, of the best motion of each node; 0 = none is significant. Sums must stay below 2^63.
-        num_pixels: P, including the pixels of copies.
+        num_pixels: P, including the pixels of copies (`HeightSlicedSweeps.with_copies`).
 
     Returns:
         The objects, and the node of each, (G,) int64, N = none. A pixel belongs to the coarsest of its nodes that won.
-        If none won, it belongs to its node of changed pixels, if that moves. Otherwise it is static and belongs to its
-        finest component, or to none if that is not linked. The pixel of a copy belongs to its node if that moves, or to
-        none.
+        If none won, it belongs to its node of changed pixels if that node has evidence. Otherwise it is static and
+        belongs to its finest component, or to no object if that component is not linked. The pixel of a copy belongs to
+        its node if that node has evidence, else to no object.
 
-    Convention: a child counts with its evidence minus `_PRICE`, at least 0. A component wins if it has more evidence
-        than its children together. Ties: the children win.
+    Convention: a child counts with its own evidence or that of its children together, whichever is more, minus
+        `_PRICE`, at least 0. Ties: the children win.
 
     Cost: a few passes over the nodes for each level, and over the pixels.
     """

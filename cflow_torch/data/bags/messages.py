@@ -33,7 +33,7 @@ def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarra
 
 
 def other_columns(message: Any) -> dict[str, np.ndarray]:
-    """Return the other fields of the points that `points_and_times` returns: name -> (N,) numbers as stored."""
+    """Return the fields besides x, y, z of the points of `points_and_times`: name -> (N,) numbers as stored."""
     single = [field.name for field in message.fields if field.count <= 1 and field.datatype in _TYPES]
     names = [name for name in single if name not in ("", "x", "y", "z")]
     table, _, kept = _returns(message, [*"xyz", *names])

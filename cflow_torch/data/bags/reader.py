@@ -125,7 +125,7 @@ class BagLog(Log):
         return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
-        """Read the other fields of the cloud, such as intensity and ring, of the points of sweep `index`."""
+        """Read the fields besides x, y, z, such as intensity and ring, of the points of sweep `index`."""
         time = self._timestamp(index)
         with file_errors(f"{self.path}, {self.topic} at {time} ns"):
             return other_columns(self._cloud(time))

@@ -109,11 +109,11 @@ class SceneWriter:
 
         Args:
             file_name: pattern with {name} of the log, {channel}, {stamp} in microseconds.
-            write_points: called with file, unit and the time stamp of its sweep in nanoseconds.
+            write_points: called with each file, the returns of its LiDAR and its time stamp in nanoseconds.
             key_frame_interval: seconds.
 
         Returns:
-            Table -> rows.
+            The rows of each table, by its name.
         """
         keys = self._key_frames(key_frame_interval)
         tables = self._fixed_tables(keys)
