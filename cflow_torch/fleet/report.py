@@ -134,7 +134,7 @@ class Counters:
 
 
 def format_report(report: dict[str, Any], verbose: bool = False) -> str:
-    """Return the report as a table, if `verbose` with the times of the stages."""
+    """Return the report as a table. With `verbose`, the table has the times of the stages, too."""
     frames, shard, devices = report["frames"], report["shard"], report["devices"]
     workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
     rows = {

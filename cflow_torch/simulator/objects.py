@@ -184,7 +184,7 @@ def wall(x: float, y: float, length: float, depth: float, height: float, albedo:
 
 
 def pole(x: float, y: float, height: float, radius: float, sign: float = 0.0) -> Body:
-    """A lamp post, or with `sign` > 0 (metres) a sign post with its plate."""
+    """A lamp post. With `sign` > 0, it is a sign post with a square plate of that side, metres, at its top."""
     solids = [Solid(CYLINDER, (0, 0, height / 2), (radius, radius, height / 2), albedo=0.4)]
     if sign:
         solids.append(box(-0.03, 0.03, -sign / 2, sign / 2, height - sign, height, 0.9))

@@ -1,4 +1,8 @@
-"""Motion candidates of nodes: correlation peaks with each sweep, their median, and the medians of surrounding nodes."""
+"""Motion candidates of the nodes of the component tree.
+
+The candidates of a node are its correlation peaks with each sweep, their median, and the medians of the coarser nodes
+around it.
+"""
 
 from __future__ import annotations
 

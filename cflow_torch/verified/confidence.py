@@ -5,8 +5,8 @@ than a displaced copy, the object is static, such as a wall that seems to slide 
 
 A table gives each point a probability from counts that need no ground truth. For a moving object, the probability
 depends on its margin. For a static point, it depends on the share of its neighbourhood that is matched, and it is lower
-next to a moving object, which may be larger than it seems. The more slices are around a point without correspondence at
-t+1, the lower is its probability.
+next to a moving object, which may be larger than it seems. For a point without correspondence at t+1, the probability
+falls with the number of occupied height slices around it.
 """
 
 from __future__ import annotations

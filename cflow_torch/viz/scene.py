@@ -77,7 +77,7 @@ class ViewerFrame:
         self.T_world_viewer: np.ndarray | None = None
 
     def move(self, pose: np.ndarray) -> np.ndarray:
-        """(4, 4) `T_viewer_ego` of a pose `T_world_ego`."""
+        """Return (4, 4) `T_viewer_ego`, given a pose `T_world_ego`. The first pose becomes the frame of the viewer."""
         if self.T_world_viewer is None:
             self.T_world_viewer = pose
         return np.linalg.solve(self.T_world_viewer, pose)
