@@ -28,7 +28,8 @@ class KissICPLog(Log):
 
     Attributes:
         log_id: name of the file or folder, and the sequence.
-        timestamps: 0, 1, 2, ..., because the loaders have no common way to return times; 0.1 s per sweep is assumed.
+        timestamps: 0, 1, 2, ..., not times, because the loaders have no common way to return them. We assume 0.1 s per
+            sweep.
 
     Convention: points and poses are those of the loader, in the frame of the LiDAR; poses are the data set's own
         (`gt_poses`), None if it has none.

@@ -72,7 +72,7 @@ def run_fleet(
 ) -> dict[str, Any]:
     """Compute the frames of a shard that are not complete, and write a report.
 
-    The folder of the job is claimed already (`manifest.claim_folder`). `sources` are all logs, of all shards.
+    Claim the folder of the job first (`manifest.claim_folder`). `sources` are all logs, of all shards.
 
     Returns:
         The report of `Counters.report` with the entries of `about`. It is also written to OUTPUT/reports/<shard>.json.

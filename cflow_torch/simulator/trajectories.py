@@ -36,7 +36,7 @@ class Route:
         return self.at(self.distance(seconds))
 
     def distance(self, seconds: np.ndarray) -> np.ndarray:
-        """(T,) metres from the beginning of the arc at `seconds` (T,)."""
+        """Return the position along the route at `seconds` (T,): (T,) metres from the beginning of the arc."""
         if self.acceleration == 0:
             return np.asarray(self.start + self.speed * seconds)
         stop = -self.speed / self.acceleration

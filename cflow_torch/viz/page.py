@@ -26,10 +26,10 @@ Tracks = Mapping[str, np.ndarray]
 
 
 class Page:
-    """A page with a drive. In a notebook it shows itself; `html` is its text.
+    """A page with a drive. A notebook shows it inline.
 
     Args:
-        html: the whole page.
+        html: text of the whole page.
         num_pairs: number of pairs in it.
     """
 

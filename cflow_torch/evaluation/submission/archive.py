@@ -1,4 +1,4 @@
-"""The two open submission formats: how a flow becomes a file, and how files are written, packed and checked.
+"""Submission formats, versions 1 and 3: how a flow becomes a file, and how files are written, packed and checked.
 
 Files are written whole or not at all, and packed into the same bytes every time.
 """
