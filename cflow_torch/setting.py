@@ -51,7 +51,7 @@ def describe(f: Any) -> str:
 
 
 def checked(f: Any, value: Any) -> Any:
-    """Return the value of a field in its plain type. A value that is not allowed raises a `CFlowError`."""
+    """Return a setting as int, float, bool, str, tuple or None. One that is not allowed raises a `CFlowError`."""
     limits = f.metadata
     kind = limits["kind"]
     if value is None and limits["optional"]:

@@ -101,10 +101,10 @@ class Tracks(NamedTuple):
         self.write(index, start=self.box[index], start_length=self.size[index, 0], travel=0.0, evidence=0.0)
 
     def have_shown_motion(self) -> Tensor:
-        """(K,) bool: the box of the track has moved about as its flow predicts, and far enough for its confidence.
+        """(K,) bool: the track moves, and its box has moved about as its flow predicts.
 
-        If the confidence suffices, both ends of the box must have moved at least a little: a piece of a wall has flow,
-        too, but its box grows, shrinks or jumps. Otherwise, the box must have moved far, and very nearly as predicted.
+        If `evidence` is high, both ends of the box must have moved at least a little: a piece of a wall has flow, too,
+        but its box grows, shrinks or jumps. Otherwise, the box must have moved far, and very nearly as predicted.
         """
         predicted, length = self.travel.norm(dim=1), self.size[:, 0]
         moved = self.box - self.start

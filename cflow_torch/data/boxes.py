@@ -96,7 +96,7 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
 
     `points` are (N, 3) float, metres, in the ego frame of t, and `T_ego1_ego0` is (4, 4) float64.
 
-    Convention: computed in float64, TOTAL flow is rounded to float32 once at the end. Points in a box whose track ends
+    Convention: TOTAL flow, computed in float64 and rounded to float32 at the end. Points in a box whose track ends
         have the category of the box, the flow of ego motion and `is_valid` False. A point in several boxes takes the
         flow and category of the last one, and is valid only if the tracks of all these boxes continue.
 

@@ -1,4 +1,4 @@
-"""Count the set pixels of binary images of different sizes inside shifted windows, each as large as its image."""
+"""Count the set pixels of binary images of different sizes inside shifted windows. Each is as large as its image."""
 
 from __future__ import annotations
 

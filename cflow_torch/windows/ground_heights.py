@@ -1,4 +1,4 @@
-"""Height and slope of the ground around a point, from the ground points of t, because harnesses give no others."""
+"""Height and slope of the ground around a point, from the ground points of t: harnesses give those of t only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _UNKNOWN = -(1 << 40)
 
 
 class GroundHeights:
-    """Sums of heights in blocks of 2 m x 2 m. They are integers, so the order of points and pieces does not matter."""
+    """Sums of the heights of ground points in blocks of 2 m x 2 m: integers, so the order of points does not matter."""
 
     def __init__(self, num_windows: int, grid: Grid, device: torch.device) -> None:
         self._lower = grid.lower

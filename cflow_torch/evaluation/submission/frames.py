@@ -88,7 +88,7 @@ class Frame:
         return f"{self.log.log_id}/{self.log.timestamps[self.index]}.feather"
 
     def count_rows(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> int:
-        """Count the rows of its file; this reads the sweep."""
+        """Count the rows that the file of the frame must have. This reads the sweep."""
         sweep = self.log.sweep(self.index)
         return int(point_mask(self.log, self.index, sweep, masks).sum()) if version.is_masked else len(sweep.points)
 

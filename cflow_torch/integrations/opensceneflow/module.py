@@ -31,14 +31,14 @@ class CFlow(nn.Module):
             for "default", 2 for the others. If the harness passes fewer sweeps, we use those.
         ego_T_lidar: (4, 4) nested list or array that maps points to the frame whose poses the scenes store. None = the
             same frame. "auto" = recognise scenes of Argoverse 2, whose points are in the frame of up_lidar.
-        output: "full" = flow of all rows of pc0, 0 where the method estimates none (both paths of the harness).
-            "valid" = flow of the valid rows only, with their indices in "pc0_valid_point_idxes". Do not combine it
-            with iter_only, which ignores the indices.
+        output: "full" = flow of all rows of pc0, 0 where the method estimates none. "valid" = flow of the valid rows
+            only, with their indices in "pc0_valid_point_idxes". Do not combine "valid" with the harness's setting
+            iter_only, which ignores the indices.
         device: "auto" = that of the batch.
         voxel_size, grid_feature_size: ignored. The harness passes them.
         preset, method: as for `make_config`; "default" if neither is given.
-        **settings: any setting of the method except `num_history` and `num_future`; the others are those of the
-            preset. A setting that the method does not have is named in a warning and ignored.
+        **settings: settings of the method, instead of the preset's. We ignore `num_history`, `num_future` and settings
+            that the method does not have, and name them in a warning.
 
     Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
