@@ -60,7 +60,7 @@ class Tracks(NamedTuple):
         return Tracks(*map(function, self))
 
     def take(self, index: Tensor) -> Tracks:
-        """The tracks of an index or mask."""
+        """Select tracks by index or mask."""
         return self.map(lambda values: values[index])
 
     def add_evidence(self, index: Tensor, confidence: Tensor) -> None:

@@ -83,7 +83,7 @@ def output_folder(cfg: DictConfig) -> Path:
 
 
 def local_folder(cfg: DictConfig) -> Path:
-    """Return the output folder of a command that writes to this machine only; a remote one is a `CFlowError`."""
+    """Return the output folder of a command that writes to this machine only. A remote one raises a `CFlowError`."""
     output = output_folder(cfg)
     if is_remote(output):
         raise CFlowError(f"output={output}: give a folder of this machine, and copy the files from there")

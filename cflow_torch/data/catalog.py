@@ -151,14 +151,14 @@ def open_log(
         name: a key of `DATA_SETS`, or the `target` that you gave `find_user_sources`.
         source: from `find_sources` or `find_user_sources`.
         find_ground: method of `cflow_torch.windows.ground.find_ground` for sweeps without a ground mask, "grid" or
-            "patchwork"; "auto" = "grid", with a line that says so; None = they have no ground.
+            "patchwork"; "auto" = "grid", and `check` warns that it is used; None = all their points are kept.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
         **settings: keyword arguments of the reader.
 
     Raises:
-        CFlowError: the log cannot be read; its name cannot be the name of a folder; the reader does not have a setting
-            (the message lists those that it has) or cannot use it.
+        CFlowError: the log cannot be read; its name cannot be the name of a folder; the reader does not know a setting
+            (the message lists those that it knows) or cannot use the value.
     """
     if find_ground not in CHOICES:
         raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")

@@ -18,7 +18,7 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
 
 
 def flat_nonzero(mask: Tensor) -> Tensor:
-    """Flat indices of the set elements, ascending: `mask.flatten().nonzero()[:, 0]`.
+    """Flat indices of the True elements, ascending: `mask.flatten().nonzero()[:, 0]`.
 
     Args:
         mask: (...) bool.
@@ -26,8 +26,8 @@ def flat_nonzero(mask: Tensor) -> Tensor:
     Returns:
         (K,) int64.
 
-    Cost: one pass and, on a GPU, one synchronisation. On the CPU NumPy is about five times faster than torch for
-    a sparse mask of half a million pixels.
+    Cost: one pass and, on a GPU, one synchronisation. On the CPU we call NumPy, which is about five times
+    faster than torch for a sparse mask of half a million pixels.
     """
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))

@@ -84,8 +84,8 @@ class Drive(Log):
         return self._motion.ego_poses(self._seconds[index] + 1e-9 * np.asarray(offset_ns, np.float64))
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose, time stamp, and point
-        times in rolling profiles."""
+        """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose and time stamp. It has
+        point times if the sensor profile has a rolling shutter, as `av2_rolling`."""
         returns = self.returns(index)
         return Sweep(
             points=returns.points.numpy().copy(),
@@ -99,9 +99,9 @@ class Drive(Log):
         """Ground truth of the pair (index, index + 1), None for the last sweep.
 
         A point belongs to the body that its ray hit. It moves with the body's track from one time stamp to the next,
-        even if it was measured before or after the time stamp; legs do not swing in the truth. Points of a body that is
-        not annotated in both sweeps (its middle is beyond the LiDAR's range) are invalid. They have category 0 if the
-            body is not annotated at `index`.
+        even if it was measured before or after the time stamp; legs do not swing in the truth. A body with a
+        category is annotated in a sweep if its middle is within the LiDAR's range. Its points are invalid unless it is
+        annotated in both sweeps of the pair. If it is not annotated at `index`, they also have category 0.
 
         Source: p' = inv(pose1) B1 inv(B0) pose0 p with the body's poses B0, B1 in the world, in float64.
         """

@@ -85,7 +85,7 @@ class Recording(Log, Protocol):
         order, are the rows of `sweep(index)` and of `labels(index)`."""
 
     def elevations(self, unit: str) -> np.ndarray:
-        """(num_rings,) float64 radians, elevation of each ring of a unit, lowest first."""
+        """(num_rings,) float64 radians, elevation of each ring of the LiDAR named `unit`, lowest first."""
 
     def boxes(self, index: int) -> Boxes:
         """Annotation boxes of sweep `index`, ego frame, category by Argoverse 2 name."""

@@ -1,9 +1,10 @@
 """VerifiedFlow: draw, find changed pixels, build a tree, propose, verify, select, refine (docs/verified.md).
 
 Connected components at several pixel sizes are hypotheses for rigid objects. Each receives motion candidates: the
-correlation peaks with every sweep, their median, and the medians of the components around it. A paired test against
-"static" at the finest pixels, over all sweeps and in both time directions, selects the best candidate. In the tree of
-components, a component wins if it explains more than its children together. Winning motions are refined to centimetres.
+correlation peaks with every sweep, their median, and the medians of the coarser components that contain it. A paired
+test against "static" at the finest pixels, over all sweeps and in both time directions, selects the best candidate. In
+the tree of components, a component wins if it explains more than its children together. Winning motions are refined to
+centimetres.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _AROUND = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
-    """Estimate flow by verified motion candidates: the presets `default` and `offline`. It has no parameters.
+    """Estimate flow by verified motion candidates: the presets `default` and `offline`. It has no weights.
 
     Args:
         config: a `VerifiedConfig`; `VerifiedFlow.from_preset` makes it from a preset.
