@@ -179,7 +179,7 @@ def open_logs(cfg: DictConfig) -> tuple[list[Log], Failures]:
 
 
 def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], FlowResult]:
-    """Function that reads the flow of a pair from the output of `cflow flow`; each file must have the needed fields."""
+    """Return a reader of the flow of pairs in the output of `cflow flow`. It rejects a file without a needed field."""
     output = as_path(folder)
     if not output.is_dir():
         raise CFlowError(f"flow={folder} is not a folder: give the output of `cflow flow`")

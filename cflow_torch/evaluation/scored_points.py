@@ -74,9 +74,9 @@ class Accumulator:
 def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     """Select the points of a frame that a definition scores, and compare prediction and truth there.
 
-    Rounding follows the evaluator that the definition is named after. Totals and residuals are float32. A predicted
-    residual is processed as the harnesses do: pose flow is added and subtracted again. Lengths are computed in
-    `norm_dtype`. Rows without a valid label are never read.
+    Rounding follows the evaluator that the definition is named after. Totals and residuals are float32. Like the
+    harnesses, we add the pose flow to a predicted residual and subtract it again. Lengths are computed in `norm_dtype`.
+    Rows without a valid label are never read.
     """
     points, true_total = as_numpy(frame.points), frame.labels.flow
     pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""A run, the share of this process, its pieces, and the events that workers report."""
+"""A run (`Job`), the `Shard` of it that this process does, its `Unit`s, and the events that workers report."""
 
 from __future__ import annotations
 
@@ -122,10 +122,10 @@ class Shard:
 
 
 def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
-    """Return the shard of this process; `index` counts from 0, and it and `count` may be "auto".
+    """Return the shard of this process. `index` counts from 0; both arguments may be "auto".
 
-    "auto" takes RANK and WORLD_SIZE of torchrun, or the task of an `srun` step, combined with the task of a SLURM array
-    if there is one, from the environment variables. Without any of them this is the only shard.
+    "auto" reads the environment variables: RANK and WORLD_SIZE of torchrun, or the task of an `srun` step. In a SLURM
+    array, we combine it with the task of the array. Without any of them this is the only shard.
     """
     if index != AUTO and count == AUTO:
         raise CFlowError(f"shard.index={index} is given without shard.count: give both")

@@ -1,7 +1,7 @@
 """Match key points by normalised correlation, all windows at once (Sec. Matching keypoints).
 
-One small matrix product counts the common pixels of a group of key points and all of its match candidates. Few
-candidates come near the best one of their key point; we compare only those exactly.
+One small matrix product counts the pixels that each key point of a group shares with each match candidate of the
+group. Few candidates score close to the best one of a key point; we compare only those exactly.
 """
 
 from __future__ import annotations

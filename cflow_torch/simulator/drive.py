@@ -175,10 +175,10 @@ class Drive(Log):
         return parts
 
     def elevations(self, unit: str) -> np.ndarray:
-        """(num_rings,) float64 radians, elevation of each ring of a unit, lowest first.
+        """(num_rings,) float64 radians, elevation of each ring of the LiDAR named `unit`, lowest first.
 
         Raises:
-            CFlowError: there is no unit of that name.
+            CFlowError: there is no LiDAR of that name.
         """
         for candidate in self._profile.units:
             if candidate.name == unit:

@@ -23,14 +23,14 @@ _FADE = 0.72  # of the pixels behind the matches
 
 
 def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
-    """Draw key points of a pair of sweeps and their matches, close up where most of them move.
+    """Draw a close-up of the key points of a pair of sweeps and their matches, where the matches move most.
 
     The config is of the key-point method; None = the preset "keypoints", without older sweeps.
 
     Returns:
-        Figure, 1600 pixels wide. Left: the pixels of both sweeps, and the key points of t as dots. Right: a line from
-        every matched key point of t to its match at t+1, in the colours of the wheel. The axes are metres, frame of
-        t+1; a key point lies in the middle of its pixel.
+        Figure, 1600 pixels wide. Left: the pixels of both sweeps, and the key points of t as dots. Right: moving
+        matches as lines from t to t+1, coloured as the wheel shows, and static ones as grey dots. The axes are metres,
+        frame of t+1; a key point lies in the middle of its pixel.
 
     Raises:
         CFlowError: matplotlib is not installed, the config is of another method, or the input is invalid.

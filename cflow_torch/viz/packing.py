@@ -21,9 +21,10 @@ _FLOOR_RADIUS = 15.0  # metres; the ground near the vehicle has the height of th
 
 
 class PackedDrive:
-    """Thinned scenes of one drive, and their colours as entries of palettes.
+    """Thinned scenes of one drive, with the colours of points as indices into palettes.
 
-    `max_flow` has full colour, metres per sweep. Of each cube of `voxel` metres, one static point is kept.
+    A flow of `max_flow`, metres per sweep, has full colour. We keep one static point in each cube of `voxel` metres, on
+    the ground of twice that side.
     """
 
     def __init__(self, max_flow: float, voxel: float) -> None:

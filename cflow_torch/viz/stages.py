@@ -2,8 +2,8 @@
 
 Occupancy images show sweep t in blue, t+1 in red, and pixels of both in a dark colour.
 
-We record a run of the model from scale to scale, and call the functions of the finest scale once more. The presets
-default and offline weigh the motions of all scales together, so they have none of these.
+`scales` records each scale of a run. We compute the correlation and the key points again, at the finest scale. The
+presets default and offline weigh the motions of all scales together, so they have no such results.
 """
 
 from __future__ import annotations
