@@ -1,4 +1,4 @@
-"""A run (`Job`), the `Shard` of it that this process does, its `Unit`s, and the events that workers report."""
+"""A run, the share of this process, the units of work, and the events that workers report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _UNITS_PER_WORKER = 2
 
 @dataclass(frozen=True)
 class Job:
-    """The description of a run that every worker gets, without its units."""
+    """What every worker gets to know about a run. The units of work are sent separately."""
 
     config: Config  # settings of the method
     identity: str  # hash of method, data settings and versions, see `cflow_torch.fleet.manifest`

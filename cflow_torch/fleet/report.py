@@ -98,13 +98,14 @@ class Counters:
         return int(event.timestamp is not None)
 
     def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
-        """Return all figures of a run that took `seconds` and was stopped by a signal, "" = none.
+        """Return all figures of a run that took `seconds`. `signal_name` is the signal that stopped it, "" = none.
 
         Returns:
-            "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": "total",
-            "complete_before", "computed", "failed", "failed_logs" (or parts of logs), "waiting" (of opened logs) and
-            "unopened_units"; "frames_per_s" of those computed; "stages": seconds per computed frame, summed over the
-            workers, although these work at the same time; "failures", "waiting"; "notes": log, message and how often.
+            "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": the counts
+            "total", "complete_before", "computed", "failed" and "waiting" (of opened logs, not done), and the counts of
+            logs or parts of logs "failed_logs" and "unopened_units"; "frames_per_s" of those computed; "stages":
+            seconds per computed frame, summed over the workers, although these work at the same time; lists of
+            "failures" and of "waiting" frames; "notes": log, message and how often.
         """
         computed = self.total - self.num_before - self.num_failed - len(self._waiting)
         return {

@@ -73,14 +73,14 @@ def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int)
 
 
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:
-    """Median of the masked rows of each matrix, column by column.
+    """Median of the selected rows of each matrix, column by column.
 
     Args:
         values: (M, K, C) float.
-        mask: (M, K) bool, False = ignored.
+        mask: (M, K) bool, True = selected.
 
     Returns:
-        (M, C) float; 0 for a matrix without masked rows.
+        (M, C) float; 0 for a matrix without selected rows.
 
     Convention:
         Even count: mean of the middle two, (a + b) / 2.

@@ -49,7 +49,7 @@ class Scene:
         return self.ground.pose(paths[..., 0], paths[..., 1], paths[..., 2])
 
     def dynamic_part(self) -> tuple[Scene, np.ndarray]:
-        """The scene reduced to its moving bodies, and (P',) int64 index in this scene of each of its solids."""
+        """A scene of the moving bodies only, and the index in `self` of each of its solids, (P',) int64."""
         is_dynamic = np.array([not body.is_static for body in self.bodies])
         chosen = tuple(body for body, moves in zip(self.bodies, is_dynamic) if moves)
         return Scene(self.ground, self.ego, chosen), np.flatnonzero(is_dynamic[self.body_of_solid])

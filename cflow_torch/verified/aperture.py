@@ -2,13 +2,14 @@
 
 A moving sensor samples walls, hedges and guard rails at positions that move with it, so they seem to slide along
 themselves. We take such a line for static if t+1 has most of it at the old position, or if the older sweeps have most
-of it at the new one, because one end may enter or leave the view. The side of a car is a line as well, but its rear
-leaves the old position and its front reaches a new one. A low line of 7 m or more is a guard rail and always static.
+of it at the new one. One of the two suffices, because one end of the line may enter or leave the view. The side of a
+car is a line as well, but its rear leaves the old position and its front reaches a new one. A low line of 7 m or more
+is a guard rail and always static.
 
-A component longer than other objects moves only if both of its ends move, as those of a tram do. One end of a wall
-stays, or each end follows the border of what is visible. The ends of a guard rail or a noise barrier may keep pace with
-the ego vehicle, because the beams hit it at positions that are fixed in the frame of the vehicle. However, no vehicle
-is as low as a guard rail, or as long as a noise barrier.
+A component longer than `max_object_length` moves only if both of its ends move, as those of a tram do. One end of a
+wall stays, or each end follows the border of what is visible. The ends of a guard rail or a noise barrier may keep pace
+with the ego vehicle, because the beams hit it at positions that are fixed in the frame of the vehicle. However, no
+vehicle is as low as a guard rail, or as long as a noise barrier.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ def slides_along_itself(
         is_covered: (A,) bool, other sweeps have most of the component in place, as defined in `Wins`.
 
     Returns:
-        (A, C) bool: the component is a line at t+1, it is covered or a rail, and the motion points along it and covers
-        at least 1.2 m over the window.
+        (A, C) bool. True if the pixels of the component at t+1 form a line, this line is covered or a rail, and the
+        motion points along it and is at least 1.2 m long over the window.
 
     Convention:
         Moments are sums of integers; all else is elementwise float64 in the written order. The positions of the pixels
