@@ -81,7 +81,7 @@ class Tracks(NamedTuple):
         return self._replace(position=self.position + seconds * self.velocity, covariance=covariance)
 
     def measure(self, index: Tensor, position: Tensor, velocity: Tensor, noise: Tensor) -> None:
-        """Update the indexed tracks by measurements (K, 3), with standard deviations (2,) of position and velocity."""
+        """Update the indexed tracks by measured position and velocity, (K, 3) each, with standard deviations (2,)."""
         before = self.covariance[index]
         residual = torch.stack([position - self.position[index], velocity - self.velocity[index]], 1)  # (K, 2, 3)
         gain = torch.linalg.solve(before + torch.diag(noise**2), before).transpose(1, 2)  # both are symmetric

@@ -108,7 +108,7 @@ def new_folder(root: PathLike, name: str) -> Iterator[Path]:
 def remove_stale(folder: PathLike) -> list[str]:
     """Remove the temporary files and folders that killed processes have left in a folder, and return their names.
 
-    They count as left if they have not changed for an hour: a shorter time could hit another process that still writes.
+    They count as left if they have not changed for an hour. Newer ones may belong to a process that is still writing.
     The folder may be remote. Its subfolders are not searched.
     """
     folder, removed = as_path(folder), []

@@ -1,4 +1,4 @@
-"""A log is an ordered sequence of sweeps that are read when asked for; every reader is one. Windows slide over it."""
+"""A log is an ordered sequence of sweeps, read when you ask for them. Every reader is a log. Windows slide over it."""
 
 from __future__ import annotations
 

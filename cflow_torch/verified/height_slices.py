@@ -1,7 +1,7 @@
 """Height-sliced occupancy: images of all sweeps at the finest pixels, with four height slices a pixel.
 
-A slice is half a metre high, and slices repeat every two metres, so that a wheel cannot match a roof. One byte of an
-image holds the slices of its pixel and those of the 3 x 3 pixels around it.
+Slices keep a wheel from matching a roof. A slice is half a metre high, and the slices repeat every two metres. One
+byte of an image holds the slices of its pixel and those of the 3 x 3 pixels around it.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def show(
         tracks: table of `cflow_torch.track`, whose column `sweep` counts the windows from 0.
         title, preset: texts of the heading.
         max_flow: residual flow with the full colour, metres per sweep. Faster flow is darker.
-        voxel: side of the cubes of which each keeps one static point, metres; twice as large for ground.
+        voxel: side of a voxel, metres, twice that for ground. Of the static points in a voxel, we keep one.
 
     Raises:
         CFlowError: k3d is not installed, lists differ in length or are empty, or a value is not allowed.

@@ -74,7 +74,7 @@ class Patches:
         return float(np.exp(-distance / 2).sum() / max(len(xy), 1))
 
     def fit(self, xy: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """Return the shift and rotation that move points onto the patches, and the agreement after them."""
+        """Return the shift and rotation that move points onto the patches, and the agreement of the moved points."""
         x, y, rotation = 0.0, 0.0, 0.0
         for _ in range(_STEPS):
             moved = _rotated(xy, rotation) + (x, y)

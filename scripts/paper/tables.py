@@ -37,12 +37,12 @@ EXPERIMENTS = ("pixel_size", "views", "history", "scales", "keypoints", "dataset
 PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets, not classes
 INTRODUCTION = """# The paper's tables next to ours
 
-The score is the dynamic bucket-normalised EPE; lower is better. The paper's rows are of Argoverse 2 val. Ours name
-their data; benchmark (av2) is simulated. You can compare whether a change helps, but not the numbers. The tables have
-the means over the classes, and the CSV files next to the pictures have each class. A table without a line on our run
-shows the run of the table before. docs/settings.md has the commands.
+The score is the dynamic bucket-normalised EPE; lower is better. The paper's rows are of Argoverse 2 val or the set
+that they name. benchmark (av2) is simulated: compare whether a change helps, not the numbers. The tables have the
+means over the classes; the CSV files next to the pictures have each class. If no line below a table describes our run,
+it is that of the table before. docs/settings.md has the commands.
 """
-ABOUT_OTHERS = "pictures across data sets also show the paper's other methods (numbers: scripts/paper/figures.yaml)"
+ABOUT_OTHERS = "this picture and the next also show the paper's other methods (numbers: scripts/paper/figures.yaml)"
 Cells = List[List[str]]
 
 

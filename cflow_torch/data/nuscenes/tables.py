@@ -71,7 +71,8 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
     """Find the scenes of all versions under a folder, sorted by folder and name. Scenes of a version share its tables.
 
     The root is a data root (it holds `v1.0-mini` or the like), the folder of one version, or a folder up to two levels
-    above data roots. A version with one of the `foreign` tables is of the related data set.
+    above data roots. We skip versions with one of the `foreign` tables, which belong to the related
+    data set. If all versions have one, a `CFlowError` names the first.
     """
     what = "the data root, which holds v1.0-mini or the like"
     versions = find_folders(
