@@ -1,5 +1,4 @@
-"""The error and warning classes of the package. This module does not import torch, so that a wrong call is answered at
-once."""
+"""The error and warning classes of the package. We do not import torch here, so `cflow` rejects wrong calls fast."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Estimates:
 
 
 def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) -> Estimates:
-    """Estimate the displacement m -> t+1, with z = 0, of every cluster and earlier sweep m (Alg. scene_flow_1view)."""
+    """Estimate the displacement (z = 0) of every cluster from each earlier sweep to t+1 (Alg. scene_flow_1view)."""
     batch, pixel_size = sweeps.batch, sweeps.grid.pixel_size
     pairs = make_pairs(clusters, batch, pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)

@@ -64,7 +64,7 @@ class BucketedByRange(Accumulator):
         return interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Cells are range, class and bucket; quantities are error and speed."""
+        """Return the cell (range, class, bucket) of each scored point, and its two quantities: error and speed."""
         meta, bucket = meta_class(scored.category), interval_of(scored.speed, self.definition.speed_edges)
         if self.definition.background == "static":
             bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)

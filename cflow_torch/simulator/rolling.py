@@ -41,14 +41,14 @@ class MovingSolids:
     dynamic: Tensor
 
     def at(self, solid: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-        """Transforms from the world to solids, and their derivatives.
+        """Return the transforms from the world to E solids, each at its own time, and their derivatives.
 
         Args:
             solid: (E,) int64.
             seconds: (E,) float64.
 
         Returns:
-            (E, 3, 4) float64 transform; (E, 3, 4) float64 its derivative, per second.
+            (E, 3, 4) float64, transforms; (E, 3, 4) float64, their derivatives, per second.
         """
         transform = self.static.index_select(0, solid)
         change = torch.zeros_like(transform)

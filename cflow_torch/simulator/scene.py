@@ -23,7 +23,7 @@ class Scene:
         ground: the ground.
         ego: route of the recording vehicle's rear axle.
         bodies: everything else.
-        num_own: number of bodies, the last ones, that are the recording vehicle itself. They occlude other bodies, but
+        num_own: how many bodies, at the end of `bodies`, form the recording vehicle. They occlude other bodies, but
             have no returns.
     """
 
