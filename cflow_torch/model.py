@@ -43,9 +43,9 @@ class Motion:
         return out
 
     def residual_flow(self, points: slice, positions: Tensor) -> Tensor:
-        """Return the flow of some points, (K, 3) float32.
+        """Return the flow of the K points of a slice, (K, 3) float32.
 
-        `positions`, (A, K) float64 in metres, matter only to clusters that rotate.
+        Only clusters that rotate need `positions`, (A, K) float64 in metres, A = `num_axes` of the method.
         """
         cluster = self.cluster(points)
         if self.before is None:

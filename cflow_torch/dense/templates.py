@@ -1,4 +1,4 @@
-"""Templates and targets: a cluster in an earlier sweep, and the same cluster at t+1 in which we search for it."""
+"""A template is a cluster in an earlier sweep. We search for it in its target, the same cluster at t+1."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class TemplatePairs:
 def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max_speed: float | None) -> TemplatePairs:
     """Make a pair for every cluster and every earlier sweep in which it has pixels.
 
-    The pixel size of the images is one for all, or (M,) float64. `max_speed` is in m/s; None = no bound.
+    `pixel_size`, in metres, is one for all M clusters, or (M,) float64. `max_speed` is in m/s; None = no bound.
     """
     num_sources, pixels = batch.num_steps - 1, clusters.pixels
     num_slots = clusters.window.numel() * num_sources

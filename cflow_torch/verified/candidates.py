@@ -48,7 +48,7 @@ def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, co
 
     Args:
         nodes: N of them.
-        components: the scales of the nodes.
+        components: gives the number of scales and their pixel sizes.
         sweeps: finest images.
         config: `max_speed`, `correlation`, `max_memory`.
     """

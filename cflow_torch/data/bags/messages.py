@@ -17,7 +17,7 @@ _SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 
 
 
 def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points of a PointCloud2, (N, 3) float64 metres in its frame, and their times as `seconds_after`.
+    """Return the points of a PointCloud2, (N, 3) float64 metres in its frame, and their times (see `seconds_after`).
 
     Points that are not finite or at the origin are left out: they mean "no return". A cloud without x, y or z, or with
     less data than it states, is a ValueError.
