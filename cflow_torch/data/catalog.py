@@ -62,7 +62,7 @@ def recognise(root: Any) -> str:
     """Return the name of the data set whose logs lie at a path, without opening a file.
 
     Args:
-        root: as for `find_sources`. The format closest to the root counts.
+        root: as for `find_sources`. The formats that fit closest to the root count.
 
     Raises:
         CFlowError: the path does not exist, or no format fits, or several do.

@@ -98,8 +98,8 @@ class EvalFrame:
             window: with the poses of both pc0 and pc1, or of neither.
             result: flow of `window.pc0`.
             labels: truth of the pair.
-            stored_motion: ego motion as OpenSceneFlow stores it (`HDF5Log.stored_motion`), removed from truth and
-                prediction with the same bits as there. None = motion of the window.
+            stored_motion: ego motion as OpenSceneFlow uses it (`HDF5Log.stored_motion`). We subtract it from truth and
+                prediction with the same rounding as there. None = motion of the window.
             **parts: further fields, for example `eval_mask`. They take precedence over those of the window.
         """
         pose0, pose1 = window.pc0.pose, window.pc1.pose

@@ -28,7 +28,7 @@ class Trajectory(NamedTuple):
 
 
 def read_poses(path: PathLike) -> Trajectory:
-    """Read the poses of a file, orthogonal up to rounding; its number of columns tells the format.
+    """Read poses, with rotations orthogonal up to rounding. The number of columns tells the format.
 
     Args:
         path: text with 12 numbers per line (KITTI: upper three rows of the matrix), 8 (TUM: time in seconds, tx ty tz,

@@ -80,7 +80,7 @@ Sample = Tuple[float, ...]  # nanoseconds (int), x, y, z, and the quaternion w, 
 
 
 class Frames:
-    """A tree of frames, from the parent of each frame, and from samples of `T_parent_frame` over time."""
+    """A tree of coordinate frames: the parent of each, and samples of its `T_parent_frame` over time."""
 
     def __init__(self, parents: dict[str, str], samples: dict[str, list[Sample]]) -> None:
         self._parents = parents

@@ -49,10 +49,10 @@ class Component:
         return self._row_of
 
     def images(self, keys: Sequence[Key], column: str, channels: int) -> dict[Key, np.ndarray | None]:
-        """Read the range images of some rows: frame time and laser -> (H, W, channels), None if the file has a null.
+        """Read range images, (H, W, channels), by frame time and laser; None if the cell is null or empty.
 
-        The name of the column has no `.values` or `.shape`. Cost: decodes every row group that holds a wanted row, a
-        few rows at a time.
+        Give `column` without `.values` or `.shape`. Cost: decodes every row group that holds a wanted row, a few rows
+        at a time.
         """
         missing = [key for key in keys if key not in self.frame_lasers()]
         if missing:
