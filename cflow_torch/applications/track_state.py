@@ -92,9 +92,10 @@ class Tracks(NamedTuple):
         self.velocity[index] += change[:, 1]
 
     def start_again(self, index: Tensor, length: Tensor) -> None:
-        """Start the evidence again for the indexed tracks whose `length` (K,) was very different in the sweep before.
+        """Restart the evidence of motion of the indexed tracks whose box is now much longer or shorter.
 
-        Another part of the object has become visible, or it was merged with another one, so its centre has jumped.
+        `length` (K,) is that of the sweep before. The centre of the box has jumped, because another part of the object
+        has become visible, or the object was merged with another one.
         """
         ratio = (self.size[index, 0] + _SMALL) / (length + _SMALL)
         index = index[(ratio > _JUMP) | (ratio < 1 / _JUMP)]

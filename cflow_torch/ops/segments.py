@@ -29,11 +29,11 @@ def segment_minmax(values: Tensor, index: Tensor, num_segments: int) -> tuple[Te
     """Smallest and largest value of each segment.
 
     Args:
-        values: (..., N) int64, at most 2^61.
+        values: (..., N) int64, from -2^61 to 2^61.
         index, num_segments: as for `segment_amin`.
 
     Returns:
-        first, last: (..., S) int64; for a segment without values the last is far below the first.
+        smallest, largest: (..., S) int64; 2^61 and -2^61 for a segment without values.
     """
     last = values.new_full((*values.shape[:-1], num_segments), -_FAR)
     last.scatter_reduce_(-1, index.expand_as(values), values, "amax")

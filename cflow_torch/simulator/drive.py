@@ -99,11 +99,11 @@ class Drive(Log):
         """Ground truth of the pair (index, index + 1), None for the last sweep.
 
         A point belongs to the body that its ray hit. It moves with the body's track from one time stamp to the next,
-        even if it was measured before or after the time stamp; legs do not swing in the truth. A body with a
+        even if it was measured before or after the time stamp. Legs do not swing in the truth. A body with a
         category is annotated in a sweep if its middle is within the LiDAR's range. Its points are invalid unless it is
         annotated in both sweeps of the pair. If it is not annotated at `index`, they also have category 0.
 
-        Source: p' = inv(pose1) B1 inv(B0) pose0 p with the body's poses B0, B1 in the world, in float64.
+        A point p moves to p' = inv(pose1) B1 inv(B0) pose0 p, with the body's poses B0, B1 in the world, in float64.
         """
         returns = self.returns(index)
         if index == len(self.timestamps) - 1:

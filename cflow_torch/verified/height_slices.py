@@ -183,7 +183,7 @@ class HeightSlicedSweeps:
 
     @property
     def num_pixels(self) -> int:
-        """P."""
+        """P, the number of occupied pixels."""
         return len(self.pixels.index)
 
     @property
