@@ -44,7 +44,10 @@ def make_boxes(track_id: Sequence[str], category: Sequence[int], size: Any, pose
 
 
 def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int]:
-    """Return the Argoverse 2 indices of K boxes, from their own categories and a map to those of Argoverse 2."""
+    """Return the index of the Argoverse 2 category of each of K boxes.
+
+    `names` are the categories of the boxes in their own data set. `known` maps these to categories of Argoverse 2.
+    """
     unknown = sorted(set(names) - set(known))
     if unknown:
         raise CFlowError(f"the categories {shortened(unknown[:_LISTED])} are unknown; known are {list(known)}")

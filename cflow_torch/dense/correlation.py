@@ -38,7 +38,7 @@ class Estimates:
     intervals: Tensor  # (M, K) float64, sweep intervals from m to t+1
 
     def per_interval(self) -> Tensor:
-        """(M, K, 3) float64, metres per sweep interval."""
+        """Displacement per sweep interval, (M, K, 3) float64, metres."""
         return self.displacement / self.intervals.clamp(min=1)[:, :, None]
 
     def newest_score(self) -> Tensor:

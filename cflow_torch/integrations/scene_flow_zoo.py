@@ -44,7 +44,7 @@ class CorrelationFlowModel(nn.Module):
             B `TorchFullFrameOutputSequence`, on the device of their input. A causal loader gets one flow, of sweep
             K - 2; a non-causal one gets K - 1 flows. The sweeps before a sweep are its history.
             ego_flows: (1 or K - 1, PadN, 3) float32, metres until the next sweep, residual (ego motion removed), in the
-                axes of the sweep's own points; 0 for inactive points, NaN in padding rows.
+                axes of the sweep's own points; 0 where `full_pc_mask` is 0, NaN in padding rows.
             valid_flow_mask: float32, `full_pc_mask` as 0 and 1, NaN in padding rows. A flow of 0 outside the method's
                 range is scored like any other.
 

@@ -218,11 +218,11 @@ class HeightSlicedSweeps:
         return self.num_more > 0
 
     def or_outside(self, index: Tensor, at: Tensor) -> Tensor:
-        """Return flat indices into `image`, (...) int64. Those of pixels outside become the index of the last entry.
+        """Replace the indices of pixels outside the images by that of the last entry of `image`; return (...) int64.
 
         Args:
-            index: (...) int64, flat indices, right for pixels inside.
-            at: (2, ...) int64, rows and columns, any value.
+            index: (...) int64, flat indices into `image`; those of pixels outside may be wrong.
+            at: (2, ...) int64, rows and columns of the same pixels, any value.
         """
         is_above_or_below, is_beside = _is_outside(at, self.grid)
         return index.masked_fill(is_above_or_below | is_beside, self.image.numel() - 1)
