@@ -208,7 +208,7 @@ def collect_failures(failures: Failures, name: str) -> Iterator[None]:
 def finish(failures: Failures) -> None:
     """Print the failures, and exit with status 1 if there are any.
 
-    A job of a sweep raises `UnfinishedJob`: Hydra runs the other jobs before it exits with status 1.
+    A job of a parameter sweep raises `UnfinishedJob`, so that Hydra runs the other jobs before it exits with status 1.
     """
     if failures:
         print(f"{len(failures)} failed:", file=sys.stderr)

@@ -54,7 +54,7 @@ class Blocks:
     component: Tensor
 
     def of_pixel(self, row: Tensor, col: Tensor) -> Tensor:
-        """(P,) int64, component of pixels at (row, col) of the padded images, rows counted through all of them."""
+        """Component of the pixels at (row, col), (P,) int64. Rows continue from one padded image to the next."""
         if self.side == 3:
             row, col = floor_divide(row, 3), floor_divide(col, 3)
         else:

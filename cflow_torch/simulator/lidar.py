@@ -104,7 +104,7 @@ def scan(
 def scan_rolling(
     profile: LidarProfile, solids: MovingSolids, ground: Ground, ego: EgoMotion, generator: torch.Generator
 ) -> Returns:
-    """Simulate a sweep of all units of a vehicle in which every shot has its own time. Args: as for `scan`."""
+    """Simulate a sweep of all units of a vehicle. Every shot has its own time. Args: as for `scan`."""
     of_units = []
     for number, unit in enumerate(profile.units):
         first, end = unit.active_columns or (0, unit.num_columns)
