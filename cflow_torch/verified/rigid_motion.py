@@ -33,7 +33,10 @@ class RigidMotion:
         return RigidMotion(flow, rotation, self.centre)
 
     def flow_at(self, index: Tensor, position: Tensor) -> Tensor:
-        """Return the flow of points of t, (K, 2), metres per interval, by their object, (K,), and position, (2, K)."""
+        """Return the flow of K points of t, (K, 2), metres per interval.
+
+        `index`, (K,), is the object of each point; `position`, (2, K), its x and y, metres, frame of t+1.
+        """
         centre, flow = (torch.view_as_complex(of.index_select(0, index)) for of in (self.centre, self.flow))
         arm = torch.complex(*position) - centre
         return torch.view_as_real(rotate(self.rotation.index_select(0, index), arm) - arm + flow)

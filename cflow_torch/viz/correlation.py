@@ -23,7 +23,7 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
 
     Args:
         window: sweeps.
-        config: of the dense method, clusters by components; None = the preset "paper", without older sweeps.
+        config: a `DenseConfig` with `clustering="components"`; None = the preset "paper", without older sweeps.
         cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
 
     Returns:

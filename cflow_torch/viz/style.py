@@ -25,7 +25,7 @@ _TITLE = 7.2  # characters of a heading per inch
 
 
 def checked_path(path: str | Path, *endings: str) -> Path:
-    """Return the path of a picture or page, which must have one of some endings."""
+    """Return the path of a picture or page. It must end in one of `endings`, such as ".png"."""
     if Path(path).suffix.lower() not in endings:
         raise CFlowError(f"{path} does not end in {' or '.join(endings)}: give a file that does")
     return Path(path)

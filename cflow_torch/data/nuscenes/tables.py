@@ -208,7 +208,7 @@ def _times(rows: Sequence[Row]) -> np.ndarray:
 
 
 class Tracks:
-    """The boxes of a scene at any annotated time, interpolated between its samples.
+    """The boxes of a scene at any time from its first to its last sample, interpolated between samples.
 
     `sample_times` are (S,), microseconds, ascending. The attributes `start` and `end` are the first and the last one.
     """
