@@ -31,11 +31,8 @@ from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps
 
 _CELL = 0.4  # metres, side of a cell; it is as high as a slice
 _NUM_SLICES = 32  # from the lowest cell of a window on; higher points are in the highest slice
-_GROUND = 4.0  # metres, side of a square; the lowest cell of the nine squares around a cell is on the ground
 _GAP = 3  # slices from a cell to the next one above it, at least; the body and the roof of a car are closer
-# A vehicle or a person, in slices: it begins at most this far above the ground, and it is neither flat nor taller than
-# a bus.
-_HIGHEST_FOOT, _SMALLEST, _LARGEST = 2, 1, 10
+_LARGEST = 10  # slices from the lowest cell of an object to its highest one, at most: a bus
 # Rows, columns and slices to 13 of the 26 neighbours of a cell. The others are the same links, seen from the other end.
 _HALF_OF_NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
 
@@ -49,12 +46,12 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
         nodes: nodes of all levels.
 
     Returns:
-        The sweeps with copies of the points under other components, and the nodes followed by the added ones.
+        The sweeps with copies of the points of objects under other components, and the nodes followed by the added ones.
 
     Convention:
         Cells of 0.4 m x 0.4 m x 0.5 m are connected to their 26 neighbours. A component is under another one if, in any
         column, the next occupied cell above one of its cells belongs to the other one, with at least two empty cells
-        between. If two components share a pixel of a sweep, it belongs to the one with the first cell.
+        between. It is an object if it is at most eleven cells high. If two components share a pixel of a sweep, it belongs to the one with the first cell.
 
     Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
     """
@@ -92,8 +89,8 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
 
 
 def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Select the points, (K,) int64, that are in an object on the ground under another component. Return them, the 3-D
-    component of each, named by its first cell, and the number of names."""
+    """Select the points, (K,) int64, that are in an object under another component. Return them, the 3-D component of
+    each, named by its first cell, and the number of names."""
     batch, grid = sweeps.batch, sweeps.grid
     # With an empty margin all around, neighbours need no bounds check.
     num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 3 for axis in (1, 0))
@@ -131,24 +128,8 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     is_under.index_fill_(0, component[:-1].masked_fill(is_same, count), True)
     is_under.index_fill_(0, component[1:].masked_fill(is_same, count), False)  # it is above another one
     foot, top = segment_minmax(height, component, count)
-    rise = segment_amin(
-        height - _ground(column, height, batch.num_windows, num_rows, num_cols), component, count, _NUM_SLICES
-    )
-    size = top - foot
-    is_object = (rise <= _HIGHEST_FOOT) & (size >= _SMALLEST) & (size <= _LARGEST)
-    is_wanted = is_occupied.index_copy_(0, cells, (is_under[:-1] & is_object).index_select(0, component))
+    is_wanted = is_under[:-1] & (top - foot <= _LARGEST)
+    is_wanted = is_occupied.index_copy_(0, cells, is_wanted.index_select(0, component))
     under = flat_nonzero(is_wanted.index_select(0, index))
     cell = number.index_select(0, index.index_select(0, under)).long()
     return rows.index_select(0, under), component.index_select(0, cell), count
-
-
-def _ground(column: Tensor, height: Tensor, num_windows: int, num_rows: int, num_cols: int) -> Tensor:
-    """Return the slice of the ground at each cell, (V,) int64: the lowest cell of the nine squares around."""
-    side = round(_GROUND / _CELL)
-    line, col = split_index(column, num_cols)
-    window, row = split_index(line, num_rows)
-    rows, cols = num_rows // side + 1, num_cols // side + 1
-    square = (window * rows + floor_divide(row, side)) * cols + floor_divide(col, side)
-    lowest = segment_amin(height, square, num_windows * rows * cols, _NUM_SLICES).view(-1, 1, rows, cols)
-    around = -F.max_pool2d(-lowest.float(), 3, 1, padding=1)
-    return around.view(-1).long().index_select(0, square)
