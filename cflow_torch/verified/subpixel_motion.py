@@ -22,8 +22,7 @@ _BIAS_Z, _LEAST_BIAS = 3, 0.1  # least difference, in standard deviations of noi
 _NUM_LAYERS = 16  # numbers of the layers of cubes repeat after so many
 # Steps to the best shift, and their length; above 1, because cubes on the sides of an object shorten them.
 _NUM_STEPS, _STEP_LENGTH = 4, 2.0
-_FARTHEST = 154  # units (1/1024 m) of a shift in x and in y
-_Z, _LEAST_GAIN, _LEAST_CUBES = 4.0, 0.05, 6  # significance; gain per cube, as a share of a perfect match; cubes
+_Z = 4.0  # standard deviations of noise
 _SIGMA = 0.07  # metres, of the weight of two centroids by their distance
 _AROUND = 2  # pixels each way in which a cube may match
 _BEYOND = 2.0**12  # units; cubes so far apart never match
@@ -86,8 +85,8 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
 
     Convention: a cube of t, moved by the shift, matches the nearest cube of t+1 among those in the 5 x 5 pixels around
         it. A cube of t+1, moved back, likewise matches one of t. Ties: the first in raster order. Each step changes the
-        shift by twice the weighted mean of the errors, within `_FARTHEST`. The gain is the weight of all matches minus
-        their weight without a shift. It must exceed `_Z` standard deviations of noise.
+        shift by twice the weighted mean of the errors. The gain is the weight of all matches minus their weight without
+        a shift. It must exceed `_Z` standard deviations of noise.
     """
     some = flat_nonzero(voxels.step < 2)
     window, step, layer, of = gather(some, voxels.window, voxels.step, voxels.layer, voxels.object_id)
@@ -102,12 +101,10 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     for _ in range(_NUM_STEPS):
         sums = scatter_count(of, num_objects, torch.cat((weight[None], weight * error)))
         shift += (_STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # no weight is smaller
-        shift.clamp_(-_FARTHEST, _FARTHEST)
         weight, error = _meet(ahead - take_columns(shift, of)[:, None], weights)
     gain = weight - unshifted
-    gain, square, count = scatter_count(of, num_objects, torch.stack((gain, gain * gain, torch.ones_like(gain))))
-    moves = (gain > _Z * square.sqrt()) & (gain >= _LEAST_GAIN * count) & (count >= _LEAST_CUBES)
-    return shift.t() * moves[:, None]
+    gain, square = scatter_count(of, num_objects, torch.stack((gain, gain * gain)))
+    return shift.t() * (gain > _Z * square.sqrt())[:, None]
 
 
 def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
