@@ -32,8 +32,6 @@ _FAR = 3.0  # squared distance of a pair, in variances of both surfaces, at whic
 MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _NUM_STEPS = 4
 _STEP_LENGTH = 1.4  # in Gauss-Newton steps; above 1, because nearest partners change with each step
-# Largest change of the flow in x and y, units per interval, and largest rotation, tangent of half the angle.
-_LARGEST_CHANGE = (0.15 * UNITS, 0.15 * UNITS, 0.1)
 _WEIGHT, _ARM = 256, 16  # weights are multiples of 1/256, arms of 16 units, so sums are exact in any order
 # Weights that keep the motion near the given translation, as two pairs of points without a surface would, and near zero
 # rotation, as five pairs at a distance of 1 m would. The angle is nearly twice the tangent of its half.
@@ -166,8 +164,7 @@ class VoxelPairs:
         Cost: 27 lookups a step for each voxel and sweep.
         """
         given = motion = F.pad(flow * UNITS, (0, 1)).t()  # x, y and the tangent of half the angle, (3, G)
-        held, largest = (constant(of, torch.float64, flow.device)[:, None] for of in (_HELD, _LARGEST_CHANGE))
-        lower, upper = given - largest, given + largest
+        held = constant(_HELD, torch.float64, flow.device)[:, None]
         hold = torch.diag(held[:, 0])[..., None].expand(-1, -1, len(flow))
         for _ in range(_NUM_STEPS):
             equations = torch.cat((hold, (held * (given - motion))[:, None]), 1)
@@ -175,7 +172,7 @@ class VoxelPairs:
                 self._add_equations(equations, motion, some)
             inverse, scale = adjugate(equations[:, :3])
             change = (inverse * equations[:, 3]).sum(1) / scale
-            motion = torch.clamp(torch.add(motion, change, alpha=_STEP_LENGTH), lower, upper)
+            motion = torch.add(motion, change, alpha=_STEP_LENGTH)
         centre = torch.view_as_real(self._centre_of_object) / UNITS + self._corner
         return RigidMotion((motion[:2] / UNITS).t(), motion[2], centre)
 

@@ -19,10 +19,8 @@ LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of voxels, metres; their number, then they
 FARTHEST = 0.2  # metres, between the voxels of a pair
 FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces, at which its weight is a quarter
 NOISE = 0.05  # metres, standard deviation of a centroid across its surface
-UNKNOWN = 0.2  # metres, standard deviation of a surface of fewer than three voxels
 MOST_TIME = 2.5  # sweep intervals: older sweeps are ignored
 NUM_STEPS, STEP_LENGTH = 4, 1.4  # steps, as long as so many of Gauss and Newton
-LARGEST_CHANGE = (0.15, 0.15, 0.1)  # metres per interval, in x and in y, from the given flow; rotation
 HELD = (2.0, 2.0, 5.0)  # pairs that the given translation is worth, and, at 1 m, no rotation
 
 
@@ -91,8 +89,7 @@ def register(sweeps: SlicedSweeps, object_of: np.ndarray, flow: Sequence[Vector]
         centre, given = at_t.sum(0) // len(at_t), np.array([*start, 0.0])
         motion = given
         for _ in range(NUM_STEPS):
-            change = gauss_newton(voxels, spread, object_id, centre, given, motion)
-            motion = np.clip(motion + STEP_LENGTH * change, given - LARGEST_CHANGE, given + LARGEST_CHANGE)
+            motion = motion + STEP_LENGTH * gauss_newton(voxels, spread, object_id, centre, given, motion)
         x, y, rotation = motion.tolist()
         result.append(RigidMotion((x, y), rotation, tuple(centre / UNITS + sweeps.lower)))
     return result
@@ -136,18 +133,13 @@ def spread_of(voxels: Voxels) -> np.ndarray:
     """(V, 3, 3) covariance, square metres, of the centroids of an object and sweep in the 3 x 3 x 3 blocks around each
     voxel.
 
-    Blocks are 2 voxels wide, or 4 if the centroids in the smaller ones lie nearly on a line. Centroids are whole 256ths
-    of a metre.
+    Blocks are 2 voxels wide. Centroids are whole 256ths of a metre.
     """
     spread, size = np.zeros((len(voxels.step), 3, 3)), np.array([voxels.sweeps.size] * 2 + [LAYER_HEIGHT]) * UNITS
     for v, (position, step, object_id) in enumerate(zip(voxels.position, voxels.step, voxels.object_id)):
         own = voxels.position[(voxels.step == step) & (voxels.object_id == object_id)]
-        for side in (2, 4):
-            apart = np.floor(own / (side * size)) - np.floor(position / (side * size))
-            near = own[(np.abs(apart) <= 1).all(1)] // 4
-            n, sums = len(near), near.sum(0)
-            scaled = n * near.T @ near - np.outer(sums, sums)
-            if n >= 3 and 3 * scaled.trace() ** 2 >= 5 * (scaled**2).sum():
-                break
-        spread[v] = scaled / (256 * n) ** 2 + (n < 3) * UNKNOWN**2 * np.eye(3)
+        apart = np.floor(own / (2 * size)) - np.floor(position / (2 * size))
+        near = own[(np.abs(apart) <= 1).all(1)] // 4
+        n, sums = len(near), near.sum(0)
+        spread[v] = (n * near.T @ near - np.outer(sums, sums)) / (256 * n) ** 2
     return spread
