@@ -46,12 +46,14 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
         nodes: nodes of all levels.
 
     Returns:
-        The sweeps with copies of the points of objects under other components, and the nodes followed by the added ones.
+        The sweeps with copies of the points of objects under other components, and the nodes followed by the added
+        ones.
 
     Convention:
         Cells of 0.4 m x 0.4 m x 0.5 m are connected to their 26 neighbours. A component is under another one if, in any
         column, the next occupied cell above one of its cells belongs to the other one, with at least two empty cells
-        between. It is an object if it is at most eleven cells high. If two components share a pixel of a sweep, it belongs to the one with the first cell.
+        between. It is an object if it is at most eleven cells high. If two components share a pixel of a sweep, it
+        belongs to the one with the first cell.
 
     Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
     """
