@@ -31,8 +31,8 @@ OWN = (1 << NUM_SLICES) - 1  # bits of the slices of the pixel itself
 _COUNTS = tuple(bin(byte & OWN).count("1") + (bin(byte >> NUM_SLICES).count("1") << 32) for byte in range(256))
 # Beyond this, float64 has only multiples of 16, so clamping heights here changes no slice.
 _HIGHEST_SLICE = 2.0**56
-# A low pixel belongs to the object of a tall one at most so many rows and columns away.
-_RESIDUE_REACH = 2
+# Rows and columns each way. Several steps search so far around a pixel.
+REACH = 2
 
 
 @dataclass(frozen=True)
@@ -301,13 +301,13 @@ def _is_outside(at: Tensor, grid: Grid) -> Tensor:
 
 
 def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
-    """Return whether a pixel of value 2 is at most `_RESIDUE_REACH` rows and columns away from each pixel, (P,) bool.
+    """Return whether a pixel of value 2 is at most `REACH` rows and columns away from each pixel, (P,) bool.
     Ground residue, the ground points that a ground mask misses, seems to move, because it differs in every sweep."""
     answer = image.index_select(0, pixel) == 2
     low = flat_nonzero(~answer)
     line, col = split_index(pixel.index_select(0, low), grid.width)
     number, row = split_index(line, grid.height)
-    reach = constant(tuple(range(-_RESIDUE_REACH, _RESIDUE_REACH + 1)), torch.int64, pixel.device)
+    reach = constant(tuple(range(-REACH, REACH + 1)), torch.int64, pixel.device)
     # Beyond the border, we look up the pixel at the border, which is within reach as well.
     rows = (row[:, None] + reach).clamp_(0, grid.height - 1).add_(number[:, None], alpha=grid.height)
     cols = (col[:, None] + reach).clamp_(0, grid.width - 1)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cflow_torch.ops.indices import flat_nonzero, lookup, split_index
 from cflow_torch.verified.component_tree import Objects
-from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.height_slices import REACH, HeightSlicedSweeps
 from cflow_torch.verified.paired_test import best_candidate, count_wins, evidence_of
 from cflow_torch.verified.rigid_motion import RotatingMotion
 from cflow_torch.windows.collation import Batch
@@ -22,8 +22,6 @@ from cflow_torch.windows.collation import Batch
 # The future must show an object in more than so many sweeps for each sweep of the past. At 1, façades that are
 # uncovered as the ego vehicle moves get more false motion (simulated drives).
 _TIMES = 2
-# Pixels each way from the given motion.
-_REACH = 2
 
 
 def choose_side(sides: Batch, copied: Tensor, motion: RotatingMotion) -> RotatingMotion:
@@ -66,7 +64,7 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
 
     Cost: 25 lookups for each pixel and sweep of the moving objects.
     """
-    line = torch.arange(-_REACH, _REACH + 1, device=motion.device)
+    line = torch.arange(-REACH, REACH + 1, device=motion.device)
     offsets = torch.cartesian_prod(line, line)
     offsets = offsets.index_select(0, (offsets * offsets).sum(1).sort(stable=True).indices)
     has_after = (sweeps.elapsed < 0).any(1).index_select(0, sweeps.pixels.window.index_select(0, objects.first))

@@ -19,7 +19,7 @@ from cflow_torch.ops.indices import (
 )
 from cflow_torch.verified.aperture import slides_along_itself
 from cflow_torch.verified.component_tree import Nodes
-from cflow_torch.verified.height_slices import NUM_SLICES, HeightSlicedSweeps, Pixels, count_slices
+from cflow_torch.verified.height_slices import NUM_SLICES, REACH, HeightSlicedSweeps, Pixels, count_slices
 
 # Comparisons (pixel x sweep x candidate) at once; each needs about 64 bytes of temporaries.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
@@ -28,7 +28,6 @@ _FAR = 2  # pixels, in y or in x
 _NEAR_Z = 2.0  # for near counts, z is so many times larger: one slice matches several neighbours, so counts correlate
 _COVERED = 65  # per cent
 _CHANGED_Z = 4.0
-_REACH = 2  # pixels from a changed pixel to an unchanged one of the same object
 # A motion must gain so many slices per sweep besides t and t+1, or one for every so many pixels, whichever is less.
 _LEAST_GAIN, _LEAST_SHARE = 3, 8
 
@@ -95,7 +94,7 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
     if len(some) == 0:
         return nodes
     pixel, node = gather(some, nodes.pixel, nodes.node)
-    near = sweeps.around(pixel, _REACH)
+    near = sweeps.around(pixel, REACH)
     nearest = torch.full((sweeps.num_pixels + 1,), nodes.count, device=near.device)
     nearest.scatter_reduce_(0, near.view(-1), node.repeat_interleave(near.shape[1]), "amin")
     nearest.index_fill_(0, pixel, nodes.count)

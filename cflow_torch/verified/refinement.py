@@ -22,7 +22,7 @@ from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.component_tree import Components, Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
-from cflow_torch.verified.subpixel_motion import subpixel_motion
+from cflow_torch.verified.subpixel_motion import NUM_STEPS, STEP_LENGTH, subpixel_motion
 from cflow_torch.verified.voxel_centroids import NOISE, UNITS, ObjectPoints, Voxels, points_of_objects, spread_of
 
 # We chose these values on real pairs and windows with history (docs/benchmarks.md).
@@ -30,8 +30,6 @@ LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels, metres
 _FARTHEST = 0.2  # metres, between the voxels of a pair
 _FAR = 3.0  # squared distance of a pair, in variances of both surfaces, at which its weight is a quarter
 MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
-_NUM_STEPS = 4
-_STEP_LENGTH = 1.4  # in Gauss-Newton steps; above 1, because nearest partners change with each step
 _WEIGHT, _ARM = 256, 16  # weights are multiples of 1/256, arms of 16 units, so sums are exact in any order
 # Weights that keep the motion near the given translation, as two pairs of points without a surface would, and near zero
 # rotation, as five pairs at a distance of 1 m would. The angle is nearly twice the tangent of its half.
@@ -166,13 +164,13 @@ class VoxelPairs:
         given = motion = F.pad(flow * UNITS, (0, 1)).t()  # x, y and the tangent of half the angle, (3, G)
         held = constant(_HELD, torch.float64, flow.device)[:, None]
         hold = torch.diag(held[:, 0])[..., None].expand(-1, -1, len(flow))
-        for _ in range(_NUM_STEPS):
+        for _ in range(NUM_STEPS):
             equations = torch.cat((hold, (held * (given - motion))[:, None]), 1)
             for some in self._chunks:
                 self._add_equations(equations, motion, some)
             inverse, scale = adjugate(equations[:, :3])
             change = (inverse * equations[:, 3]).sum(1) / scale
-            motion = torch.add(motion, change, alpha=_STEP_LENGTH)
+            motion = torch.add(motion, change, alpha=STEP_LENGTH)
         centre = torch.view_as_real(self._centre_of_object) / UNITS + self._corner
         return RigidMotion((motion[:2] / UNITS).t(), motion[2], centre)
 

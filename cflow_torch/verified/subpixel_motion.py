@@ -13,18 +13,17 @@ from torch import Tensor
 
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lookup, scatter_count, take_columns
 from cflow_torch.verified.component_tree import Objects
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.verified.height_slices import REACH, HeightSlicedSweeps, count_slices
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_objects
 
 # Rows and columns of a pixel ahead in four directions, then of a pixel behind.
 _SIDES = ((0, 1, 1, 1, 0, -1, -1, -1), (1, -1, 0, 1, -1, 1, 0, -1))
 _BIAS_Z, _LEAST_BIAS = 3, 0.1  # least difference, in standard deviations of noise and as a share of the slices
 _NUM_LAYERS = 16  # numbers of the layers of cubes repeat after so many
-# Steps to the best shift, and their length; above 1, because cubes on the sides of an object shorten them.
-_NUM_STEPS, _STEP_LENGTH = 4, 2.0
+# Steps to the best motion, and their length; above 1, because the nearest partners change with each step.
+NUM_STEPS, STEP_LENGTH = 4, 1.4
 _Z = 4.0  # standard deviations of noise
 _SIGMA = 0.07  # metres, of the weight of two centroids by their distance
-_AROUND = 2  # pixels each way in which a cube may match
 _BEYOND = 2.0**12  # units; cubes so far apart never match
 BYTES_PER_POINT = 560  # cubes and the 25 around each
 
@@ -85,22 +84,22 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
 
     Convention: a cube of t, moved by the shift, matches the nearest cube of t+1 among those in the 5 x 5 pixels around
         it. A cube of t+1, moved back, likewise matches one of t. Ties: the first in raster order. Each step changes the
-        shift by twice the weighted mean of the errors. The gain is the weight of all matches minus their weight without
-        a shift. It must exceed `_Z` standard deviations of noise.
+        shift by 1.4 times the weighted mean of the errors. The gain is the weight of all matches minus their weight
+        without a shift. It must exceed `_Z` standard deviations of noise.
     """
     some = flat_nonzero(voxels.step < 2)
     window, step, layer, of = gather(some, voxels.window, voxels.step, voxels.layer, voxels.object_id)
     position = take_columns(voxels.position[:2], some)
-    near = voxels.around(window * voxels.num_steps + 1 - step, layer[None], position, _AROUND)
+    near = voxels.around(window * voxels.num_steps + 1 - step, layer[None], position, REACH)
     ahead = take_columns(voxels.position[:2], near.view(-1)).view(2, *near.shape) - position[:, None]
     ahead = ahead.clamp_(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # for t+1, all signs change
 
     weights, shift = _meeting_weights(step.device), position.new_zeros((2, num_objects))
     weight, error = _meet(ahead, weights)
     unshifted = weight
-    for _ in range(_NUM_STEPS):
+    for _ in range(NUM_STEPS):
         sums = scatter_count(of, num_objects, torch.cat((weight[None], weight * error)))
-        shift += (_STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # no weight is smaller
+        shift += (STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # no weight is smaller
         weight, error = _meet(ahead - take_columns(shift, of)[:, None], weights)
     gain = weight - unshifted
     gain, square = scatter_count(of, num_objects, torch.stack((gain, gain * gain)))

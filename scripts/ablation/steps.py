@@ -60,7 +60,7 @@ STEPS: dict[str, list[Callable[[], Any]]] = {
     "no least gain": [lambda: patch.object(paired_test, "_LEAST_GAIN", 0)],
     "no price of an object": [lambda: patch.object(component_tree, "_PRICE", 0)],
     "no margin": [lambda: patch.object(method, "motion_margin", _without_margin)],
-    "no registration": [lambda: patch.object(refinement, "_NUM_STEPS", 0)],
+    "no registration": [lambda: patch.object(refinement, "NUM_STEPS", 0)],
     "no slow objects of pairs": [lambda: patch.object(refinement, "subpixel_motion", _nothing_is_slow)],
     "long vehicles are static": [
         lambda: patch.object(component_tree, "both_ends_move", lambda sweeps, roots, is_long: torch.zeros_like(is_long))

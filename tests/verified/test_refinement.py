@@ -175,5 +175,5 @@ def shift_of(count: int, moved: float) -> list[float]:
 @pytest.mark.parametrize("count, moved, found", [(9, 0.02, 0.02), (9, 0.04, 0.04), (8, 0.04, 0.0)])
 def test_a_shift_gains_more_than_noise(count, moved, found, monkeypatch):
     """The gain of equal cubes is 4 standard deviations of noise if there are more than 16 in both sweeps."""
-    monkeypatch.setattr(fast, "_STEP_LENGTH", 1.0)  # lone points need no longer steps
+    monkeypatch.setattr(fast, "STEP_LENGTH", 1.0)  # lone points need no longer steps
     np.testing.assert_allclose(shift_of(count, moved), (found, 0.0), atol=0.001)
