@@ -22,7 +22,7 @@ class CFlowWarning(UserWarning):
 
 
 class NoActivePoints(CFlowWarning):
-    """A window without an active point, so its result is empty."""
+    """No point of pc0 is active (finite, not ground, not of the vehicle, in the region), so no row has a result."""
 
 
 def import_optional(module: str, need: str, name: str | None = None) -> Any:

@@ -110,9 +110,9 @@ def complete_data(data: DictConfig) -> DictConfig:
 
 
 def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
-    """Function log -> indices of the pairs that the settings `first`, `step` and, if it exists, `count` choose.
+    """Return a function from a log to the indices of its pairs, by the settings `first`, `step` and `count`.
 
-    `group` is the prefix of the names of the first two: "" or "data.".
+    `group`, "" or "data.", is the prefix of `first` and `step`. `count` has no prefix and may be missing.
     """
     first, step = whole_number(cfg, f"{group}first", 0), whole_number(cfg, f"{group}step", 1)
     count = None if OmegaConf.select(cfg, "count") is None else whole_number(cfg, "count", 1)

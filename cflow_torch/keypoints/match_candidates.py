@@ -1,8 +1,8 @@
 """Key points, their descriptors, and match candidates: the key points of t+1 within a radius of a key point of t.
 
 We group the key points of t by small tiles of the image. The key points of t+1 are sorted by band of rows, then by
-column, so those within the radius of a group are a few ranges of that list. Nothing is ever as large as all key points
-times all key points.
+column, so those within the radius of a group are a few ranges of that list. No tensor ever holds all pairs of key
+points of t and t+1.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def verify(
         sweeps: images.
         nodes: N of them.
         candidates: (N, C, 2) float64, (y, x), finest pixels per sweep interval.
-        num_levels: L; for nodes of changed pixels, which have level L, z is `_CHANGED_Z`.
+        num_levels: L. Nodes of changed pixels have level L, and their z is `_CHANGED_Z`.
         significance: z of the paired test for all other nodes.
 
     Returns:

@@ -66,8 +66,8 @@ def show(
         labels: its labels, or a list of the same length; None = no labels.
         tracks: table of `cflow_torch.track`, whose column `sweep` counts the windows from 0.
         title, preset: texts of the heading.
-        max_flow: residual flow with the full colour, metres per sweep. Faster flow is darker.
-        voxel: side of a voxel, metres, twice that for ground. Of the static points in a voxel, we keep one.
+        max_flow: metres per sweep. Residual flow of this length has the full colour; longer flow is darker.
+        voxel: side of a voxel, metres; on the ground, twice that. We keep one static point in each voxel.
 
     Raises:
         CFlowError: k3d is not installed, lists differ in length or are empty, or a value is not allowed.
