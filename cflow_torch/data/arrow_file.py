@@ -48,7 +48,7 @@ class FeatherFile:
         return self._column(column, "bool", pa.types.is_boolean).to_numpy().astype(bool)
 
     def texts(self, column: str) -> np.ndarray:
-        """Return the texts of a column, also of a dictionary column, as (rows,) objects."""
+        """Return a text column, plain or dictionary-encoded, as (rows,) objects (str)."""
         return np.array([*self._column(column, "text", _is_text).to_pylist(), None], object)[:-1]
 
     def _column(self, column: str, kind: str, is_kind: Any) -> pa.ChunkedArray:

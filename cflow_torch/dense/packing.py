@@ -56,7 +56,7 @@ class SizeClass(NamedTuple):
 
     @property
     def area(self) -> int:
-        """Samples of an image."""
+        """Number of samples in an image."""
         return self.height * self.width
 
 

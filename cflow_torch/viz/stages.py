@@ -2,8 +2,8 @@
 
 Occupancy images show sweep t in blue, t+1 in red, and pixels of both in a dark colour.
 
-We record every scale of a run. For the correlation and the key points, we call the functions of the finest scale once
-more. The presets default and offline weigh the motions of all scales together, so they have no such results.
+We record every scale of a run. For the correlation and the key points, we compute the finest scale a second time. The
+presets default and offline weigh the motions of all scales together, so they have no such results.
 """
 
 from __future__ import annotations

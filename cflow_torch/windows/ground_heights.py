@@ -1,4 +1,4 @@
-"""Height and slope of the ground around a point, from the ground points of t: harnesses give those of t only."""
+"""Height and slope of the ground around a point. We use the ground points of t, because harnesses give no others."""
 
 from __future__ import annotations
 
