@@ -1,4 +1,4 @@
-"""Local and remote paths (by fsspec): open files of the readers, and check names from data that become paths.
+"""Local and remote paths (by fsspec): open files for the readers, and check the names in data that we use as paths.
 
 A path is a text ("/data/av2", "s3://bucket/av2"), a `pathlib.Path` or a `upath.UPath`. The readers use only pathlib's
 interface and the functions below.
@@ -164,10 +164,10 @@ def safe_name(name: Any, what: str) -> str:
 
 
 def path_inside(folder: Path, relative: Any, what: str) -> Path:
-    """Return the path of a file that a table names, below a folder. Links are followed: users link data sets.
+    """Return the path of a file below a folder. `relative` is the text in the data that names the file.
 
-    A text that is empty or absolute, or has a name that is not safe, such as `..`, is a `CFlowError` that begins with
-    `what`.
+    If `relative` is empty or absolute, or contains an unsafe name such as `..`, we raise a `CFlowError` that begins
+    with `what`. Symbolic links may lead out of the folder, because users link data sets.
     """
     names = relative.split("/") if isinstance(relative, str) else [""]
     named = [name for name in names if name not in ("", ".")]

@@ -116,7 +116,7 @@ class SequenceFlow(nn.Module):
 
 
 def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Tensor:
-    """Rotate (N, 3) residual flow from the axes of ego1 to those of the points of t; `now`, `following` are t, t+1.
+    """Rotate (N, 3) residual flow from the ego axes at t+1 (`following`) to the axes of the points at t (`now`).
 
     The rotation is (R_global_ego0 R_ego_sensor)^T R_global_ego1, in float64; a difference of positions is not
     translated.

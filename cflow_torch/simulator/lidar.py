@@ -69,7 +69,7 @@ class EgoMotion:
 def scan(
     profile: LidarProfile, solids: Solids, ground: Ground, T_world_ego: Tensor, generator: torch.Generator
 ) -> Returns:
-    """Simulate an instantaneous sweep of all units of a vehicle: all shots are taken at the time stamp.
+    """Simulate a sweep of all LiDARs (units) of a vehicle, in which all shots are taken at the same instant.
 
     Args:
         profile: the units and their quality.

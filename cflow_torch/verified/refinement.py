@@ -1,9 +1,9 @@
 """Refinement: from motions in pixels to rigid motions in centimetres, with rotation and times of points.
 
 Registration takes a few Gauss-Newton steps on the voxels of objects, surface to surface, all objects at once. Beams hit
-a surface at positions that are fixed in the frame of the vehicle, so pairs of nearest points shift a moving surface
-along itself. Therefore a pair counts only across the surface. The farther the voxels around it extend in a direction,
-the lower is its weight in that direction (generalised ICP).
+a surface at positions that are fixed in the frame of the vehicle. Pairs of nearest points would align these positions,
+and so give the surface a wrong motion along itself. Therefore a pair counts mainly across the surface: the farther the
+voxels around the pair extend in a direction, the lower is the weight of the pair in that direction (generalised ICP).
 """
 
 from __future__ import annotations
@@ -100,10 +100,12 @@ def register_deskewed(
 
 
 class VoxelPairs:
-    """Voxels of G objects, in the sweeps that are paired with t+1. Lengths are in units, vectors in the plane complex.
+    """The voxels of G objects, which are paired with those of the same object at t+1.
+
+    Inside, lengths are in units of 1 / `UNITS` m, and vectors in the x-y plane are complex numbers.
 
     Args:
-        points: of the objects that move, of sweeps at most `MOST_TIME` from t+1.
+        points: those of the moving objects, in sweeps at most `MOST_TIME` sweep intervals from t+1.
         sweeps: finest images.
         num_objects: G.
 
@@ -149,9 +151,9 @@ class VoxelPairs:
     def register(self, flow: Tensor) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
 
-        We pair every voxel of another sweep with the nearest one of its object at t+1. Each step minimises the errors
-        of the pairs over translation and angle. Two more terms keep the motion near the given translation and near zero
-        rotation.
+        We pair every voxel of the sweeps other than t+1 with the nearest voxel of its object at t+1. Each step
+        minimises the errors of the pairs over translation and angle. Two more terms keep the motion near the given
+        translation and near zero rotation.
 
         Args:
             flow: (G, 2) float64, x and y, metres per sweep interval, to start from.
@@ -159,7 +161,7 @@ class VoxelPairs:
         Returns:
             The motion. An object without points at t keeps the given flow.
 
-        Cost: 27 lookups a step for each voxel and sweep.
+        Cost: 27 lookups a step for each voxel of the sweeps other than t+1.
         """
         given = motion = F.pad(flow * UNITS, (0, 1)).t()  # x, y and the tangent of half the angle, (3, G)
         held = constant(_HELD, torch.float64, flow.device)[:, None]

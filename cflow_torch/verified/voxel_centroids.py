@@ -164,14 +164,16 @@ class Voxels:
 
 
 def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
-    """Return the covariance of the centroids around each voxel, of its object and sweep.
+    """Return for each voxel the covariance of the centroids around it that belong to its object and sweep.
+
+    A block has 2 x 2 x 2 voxels. The centroids around a voxel are those in its block and in the 26 adjacent blocks.
 
     Args:
         voxels: V of them.
         pixel_size, layer_height: metres, sides of a voxel.
 
     Returns:
-        (3, 3, V) float64, square units.
+        (3, 3, V) float64, squares of units of 1 / `UNITS` m.
 
     Cost: 18 searches for each block.
     """
