@@ -7,8 +7,8 @@ columns: files are much smaller, and the flow and pose follow from the poses.
 
 OUTPUT/config.yaml contains the settings and versions, OUTPUT/reports what was done. Run the command again to resume.
 After Ctrl-C, SIGTERM or SIGHUP the run finishes the frames that it has begun. The exit status is 0 if every frame is
-complete, 1 if one is missing, 2 if the call was wrong, and 128 plus its number after a signal. The report has the time
-of each stage, and verbose=true prints it.
+complete, 1 if one is missing, 2 if the call was wrong, and 128 + n after signal number n. The report has the time of
+each stage, and verbose=true prints it.
 
 result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep, where the viewers of
 OpenSceneFlow read it. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a log are complete: one

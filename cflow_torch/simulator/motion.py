@@ -87,7 +87,7 @@ class Motion:
         )
 
     def radial_velocity(self, seconds: float, returns: Returns) -> np.ndarray:
-        """(N,) float32 m/s of the surfaces that were hit, over ground, along the ray, positive = receding."""
+        """(N,) float32 m/s, speed over ground of each surface that was hit, along its ray; positive = receding."""
         row_of_hit = np.append(self._row, -1)[returns.solid.numpy()]
         velocity = np.zeros(len(row_of_hit), np.float32)
         rows = np.flatnonzero(row_of_hit >= 0)

@@ -22,8 +22,8 @@ class SpinningLidar:
         pitch: degrees about y before the yaw, positive = downwards.
         start: azimuth in the sensor frame at which a sweep begins, degrees: the outer edge of the first column.
         span: degrees of azimuth per sweep, positive = counter-clockwise about the sensor's z axis.
-        active_columns: first column that fires, and the one after the last; None = all. The image has all columns.
-            Negative columns are those at its end, but they fire before column 0.
+        active_columns: first column that fires, and the one after the last; None = all. The range image has all
+            columns. Column -1 is its last one, but fires before column 0.
         has_jitter: each sweep begins up to a column early, like a free-running motor; False = on a fixed grid.
         is_virtual: the shots are given as if the vehicle had been static at the time stamp (Waymo's small LiDARs).
         max_range, reach, dropout: values of this unit, None = those of the `LidarProfile`.

@@ -1,7 +1,8 @@
 """Objects under overhangs: a car under the crown of a tree shares its bird's-eye component with the crown.
 
-The two are separate in space. We label the points of components that may move in three dimensions. A component under
-another one and above none is drawn again, by itself, in a further window of the same batch, and becomes a node.
+The two are separate in space. We divide the points of components that may move into connected 3-D components. One that
+is under another one and above none becomes a node: we draw it again, without the other one, in a further window of the
+same batch.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
 
     Args:
         sweeps: images, and the points.
-        components: we search those that may move, dilated at the finest pixels.
+        components: we search those of the finest dilated level that may move.
         nodes: nodes of all levels.
 
     Returns:
@@ -52,8 +53,8 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     Convention:
         Cells of 0.4 m x 0.4 m x 0.5 m are connected to their 26 neighbours. A component is under another one if, in any
         column, the next occupied cell above one of its cells belongs to the other one, with at least two empty cells
-        between. It is an object if it is at most eleven cells high. If two components share a pixel of a sweep, it
-        belongs to the one with the first cell.
+        between. It is an object if it is at most eleven cells high. If two components share a pixel of a sweep, the
+        pixel belongs to the one whose first cell has the lower index.
 
     Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
     """

@@ -106,7 +106,7 @@ def covered_poses(trajectory: Trajectory, times_ns: Sequence[int], source: str) 
     """Interpolate poses at (M,) nanoseconds: positions linearly, rotations at a constant rate.
 
     A time before the first pose, after the last one, or in a gap of more than half a second is a `CFlowError` that
-    names the `source`. A pose at exactly its time is returned unchanged.
+    names the `source`. At exactly the time of a pose, the result is this pose, unchanged.
     """
     known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
     after = np.searchsorted(known, wanted).clip(0, len(known) - 1)  # the first pose that is not before
