@@ -31,6 +31,7 @@ from cflow_torch.verified.rigid_motion import RigidMotion
 TABLE = json.loads(Path(__file__).with_name("confidence.json").read_text(encoding="utf-8"))
 _BLOCK = 1.6  # metres, side of a neighbourhood
 _DISPLACEMENT = 0.4  # metres per interval, along x and along y
+_Z = 1.0  # standard deviations of noise by which a motion must exceed its displaced copies
 
 
 class MotionMargin(NamedTuple):
@@ -39,17 +40,15 @@ class MotionMargin(NamedTuple):
     # (G,) float64. The motion matches this many more slices than its best displaced copy, in standard deviations of
     # noise. 0 = the motion is not better, or the object is static.
     z: Tensor
-    # (G,) bool. True if z is at least `significance`, or if all of this holds: the object is not a line, the motion
-    # matches more of it than zero motion does, and it is better than its displaced copies or at least twice as long as
-    # the displacement. If it is so long, the displaced copies are motions as well. A line needs z, because beams hit a
-    # rail at positions that move with the vehicle.
+    # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line, the motion matches more of
+    # it than zero motion does, and it is better than its displaced copies or at least twice as long as the
+    # displacement. If it is so long, the displaced copies are motions as well. A line needs z, because beams hit a rail
+    # at positions that move with the vehicle.
     is_dynamic: Tensor
 
 
-def motion_margin(
-    sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, significance: float
-) -> MotionMargin:
-    """Return the margins of objects from their motion. `significance` is the z from which an object is dynamic.
+def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> MotionMargin:
+    """Return the margins of objects from their motion.
 
     Cost: five lookups for each pixel of the moving objects and each sweep.
     """
@@ -70,7 +69,7 @@ def motion_margin(
     row_col = take_columns(members.row_col, newest)
     is_line, *_ = principal_axes(which.index_select(0, newest), row_col, objects.count, size)
     is_fast = rigid.flow.square().sum(1) >= (2 * _DISPLACEMENT) ** 2
-    return MotionMargin(z, (z >= significance) | ((gain > 0) | is_fast) & (surplus[:, 0] > in_place) & ~is_line)
+    return MotionMargin(z, (z >= _Z) | ((gain > 0) | is_fast) & (surplus[:, 0] > in_place) & ~is_line)
 
 
 def _groups_of_one_motion(

@@ -97,7 +97,7 @@ class VerifiedFlow(SceneFlowModel):
                 motion = best_nearby(sweeps, objects, motion, config.significance)
         with stage("refine"):
             rigid, apparent = refine(sweeps, components, objects, motion, config.max_object_length)
-            margin = motion_margin(sweeps, objects, apparent, config.significance)
+            margin = motion_margin(sweeps, objects, apparent)
         with stage("confidence"):
             confidence = confidence_of(sweeps, objects, apparent, margin.z)
         score, is_changed = lookup(candidates.score, node), lookup(nodes.level == components.num_levels, node)

@@ -24,8 +24,8 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     """What an object's motion loses by being displaced by 0.4 m per interval, the best of four displacements, in
     standard deviations of what it finds; and whether it is dynamic. 0 for a static object.
 
-    An object that loses at least `significance` standard deviations is dynamic. So is one that is not a line and is
-    found less in place than where it moves to, if it loses something or moves at least twice as far as it is displaced.
+    An object that loses at least one standard deviation is dynamic. So is one that is not a line and is found less in
+    place than where it moves to, if it loses something or moves at least twice as far as it is displaced.
     """
     if not any(rigid.flow):
         return 0.0, False
@@ -36,7 +36,7 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     z = gain / math.sqrt(surplus + stays) if gain > 0 else 0.0
     is_line = principal_axis(sweeps, members[sweeps.pixels[members, 0] == 0]) is not None
     is_fast = rigid.flow[0] * rigid.flow[0] + rigid.flow[1] * rigid.flow[1] >= (2 * DISPLACEMENT) ** 2
-    return z, bool(z >= sweeps.config.significance or ((gain > 0 or is_fast) and surplus > stays and not is_line))
+    return z, bool(z >= 1 or ((gain > 0 or is_fast) and surplus > stays and not is_line))
 
 
 def motion_of_pixels(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> np.ndarray:
