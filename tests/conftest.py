@@ -6,6 +6,7 @@ again, a third of the time of the tests. So bytecode goes into the cache of pyte
 
 from __future__ import annotations
 
+import gc
 import importlib
 import importlib.util
 import os
@@ -22,6 +23,11 @@ if sys.dont_write_bytecode:
     sys.dont_write_bytecode = False
     sys.pycache_prefix = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "bytecode")
     os.environ.update(PYTHONDONTWRITEBYTECODE="", PYTHONPYCACHEPREFIX=sys.pycache_prefix)
+
+
+def pytest_collection_finish() -> None:
+    """Exempt all that is imported by now from the garbage collector, which would search it again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
