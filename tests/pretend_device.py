@@ -5,6 +5,7 @@ As on a GPU, an operation on tensors of two devices raises. We count the launche
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, Callable
 
 import torch
@@ -109,6 +110,10 @@ class PretendDevice(TorchDispatchMode):
             return x if not isinstance(x, Tensor) else known[id(x)] if id(x) in known else _Remote(_plain(x))
 
         return tree_map(wrapped, out)
+
+
+# torch wraps the method, and the wrapper imports its compiler, which takes seconds.
+PretendDevice.__torch_dispatch__ = inspect.unwrap(PretendDevice.__torch_dispatch__)  # type: ignore[method-assign]
 
 
 class _Constructors(TorchFunctionMode):

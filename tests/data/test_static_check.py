@@ -25,7 +25,7 @@ class Changed:
 
     @property
     def poses(self):
-        return self.pose and np.stack([self.pose(self.log.sweep(k).pose) for k in range(len(self.timestamps))])
+        return self.pose and np.stack([self.pose(pose) for pose in self.log.poses])
 
     def sweep(self, index):
         if self.is_broken:
@@ -59,7 +59,7 @@ def verdict(log) -> str:
 @pytest.fixture(scope="module")
 def drive():
     """A drive that begins to turn in its first second."""
-    return make_drive(seed=2, num_sweeps=8, profile="demo")
+    return CachedLog(make_drive(seed=2, num_sweeps=8, profile="demo"), 8)
 
 
 @pytest.mark.parametrize("profile", ["av2", "nuscenes", "waymo", "truckscenes"])
