@@ -43,9 +43,11 @@ def test_every_choice_of_every_group_composes(compose):
 
 
 def test_examples_use_existing_settings_and_choices(compose):
+    """Examples of a command with the same choices are composed together."""
     texts = [HELP, *((Path(settings.__file__).parent / f"{command}.py").read_text() for command in WITH_SETTINGS)]
     lines = [line for text in texts for line in text.splitlines() if line.startswith("  cflow ")]
     assert len(lines) > 30
+    calls: dict[tuple[str, ...], dict[str, None]] = {}
     for command, *words in (shlex.split(line.strip().partition("   ")[0])[1:] for line in lines):
         if command in WITH_SETTINGS:
             overrides, options = split([word for word in words if word != "..."])
@@ -53,8 +55,11 @@ def test_examples_use_existing_settings_and_choices(compose):
                 if override.is_sweep_override():  # its first value
                     value = next(override.sweep_string_iterator())
                     overrides[overrides.index(override.input_line)] = f"{override.get_key_element()}={value}"
-            compose(command, *overrides)
+            choices = [override for override in overrides if override.partition("=")[0] in groups(command)]
+            calls.setdefault((command, *choices), {}).update(dict.fromkeys(overrides))
             assert not unknown_options(options)
+    for (command, *_), merged in calls.items():
+        compose(command, *merged)
 
 
 @pytest.fixture
