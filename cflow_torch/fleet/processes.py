@@ -8,7 +8,7 @@ import traceback
 from contextlib import suppress
 from typing import Any, Callable, Iterator
 
-from cflow_torch.types import CFlowError
+from cflow_torch.errors import CFlowError
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]  # end a run
 

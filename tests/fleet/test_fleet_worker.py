@@ -10,6 +10,7 @@ from typing import Any, Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
+from countdown import make_countdown
 from small_fleet import CONFIG, PAIRS, flow_files, make_job, tree
 
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
@@ -237,14 +238,6 @@ def test_a_stop_does_not_wait_for_a_worker_that_hangs(source, tmp_path, monkeypa
     stop = lambda: time.monotonic() > start + 1  # noqa: E731
     assert not list(dispatch([Hanging(make_job(tmp_path))], units_of([source]), stop, 1))
     assert time.monotonic() - start < 20
-
-
-def make_countdown(count: int) -> Callable[..., Iterator[Any]]:
-    def countdown(number: int, stop: Callable[[], bool]) -> Iterator[Any]:
-        yield from (number / k for k in range(count, 0, -1))
-        yield 1 / number and stop()
-
-    return countdown
 
 
 def test_a_child_process_passes_answers_and_errors():
