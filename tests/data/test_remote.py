@@ -169,7 +169,7 @@ def test_large_files_are_read_in_cached_blocks(far, tmp_path, monkeypatch):
 @pytest.mark.parametrize("error", [FileNotFoundError, Unreachable, asyncio.TimeoutError])
 @pytest.mark.parametrize("name", REMOTE)
 def test_a_remote_error_costs_one_call(written, far, name, error, monkeypatch):
-    monkeypatch.setattr(paths, "_BLOCK", 1000)
+    monkeypatch.setattr(paths, "_BLOCK", 20_000)
     monkeypatch.setattr(paths, "_KEPT_BLOCKS", 1)
     root = far(written(name))
     (source,) = find_sources(name, root)
