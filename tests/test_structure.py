@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -32,7 +33,9 @@ def test_imports_point_one_way():
     assert not wrong
 
 
-def test_importing_loads_nothing_heavy_and_changes_nothing():
+def test_importing_loads_nothing_heavy_and_changes_nothing_and_the_hub_needs_no_more():
+    """One process for both, because torch takes seconds."""
+    given = set(runpy.run_path(str(PACKAGE.parent / "hubconf.py"))["dependencies"])
     code = (
         "import sys, numpy, torch\n"
         "state = lambda: (torch.get_default_dtype(), torch.get_num_threads(), torch.get_rng_state().sum().item(),\n"
@@ -43,11 +46,16 @@ def test_importing_loads_nothing_heavy_and_changes_nothing():
         "cflow_torch.estimate_flow\n"
         "assert state() == before, (state(), before)\n"
         "print(*sorted({name.split('.')[0] for name in set(sys.modules) - loaded}))\n"
+        "for name in [name for name in sys.modules if name.startswith('cflow_torch')]: del sys.modules[name]\n"
+        f"for name in {sorted({*HEAVY, 'tqdm', 'scipy', 'pandas'} - given)}: sys.modules[name] = None\n"
+        f"model = torch.hub.load({str(PACKAGE.parent)!r}, 'cflow', source='local', preset='paper')\n"
+        "print(type(model).__name__, len(list(model.parameters())))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=str(PACKAGE.parent), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "cflow_torch" in done.stdout.split()
-    assert not set(done.stdout.split()) & set(HEAVY)
+    imported, made = map(str.split, done.stdout.splitlines())
+    assert "cflow_torch" in imported and not set(imported) & set(HEAVY)
+    assert made == ["CorrelationFlow", "0"]
 
 
 # Phrases of a private dialect, see "Style" in CONTRIBUTING.md.

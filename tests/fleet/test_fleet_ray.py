@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from cflow_torch.fleet.job import Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.ray_engine import run_ray
 
-pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
+pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install ray")
 
 
 @pytest.mark.slow

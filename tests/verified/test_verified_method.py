@@ -17,7 +17,7 @@ from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.verified import candidates, confidence, paired_test
 
-NEAR = (-12.0, -6.0, -math.inf, 0.0, 4.0, math.inf)
+NEAR = (-12.0, -3.0, -math.inf, -2.0, 4.0, math.inf)
 WIDER = (-35.0, -25.0, -math.inf, 25.0, 25.0, math.inf)
 
 

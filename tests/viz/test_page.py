@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import zlib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Iterator
 
@@ -24,7 +25,7 @@ from cflow_torch.simulator import make_drive
 from cflow_torch.viz import flow_to_rgb, save_page, show
 from cflow_torch.viz.clusters import PALETTE
 
-pytest.importorskip("k3d", reason="needs the extra html")
+pytestmark = pytest.mark.skipif(find_spec("k3d") is None, reason="needs the extra html")
 STATIC, GROUND, UNKNOWN, FIRST = range(4)
 
 

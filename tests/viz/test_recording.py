@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Dict
 
@@ -12,7 +13,7 @@ from toy_street import CAR, CAR_FLOW, FLOOR, STEP, WALL, Street, result_of
 from cflow_torch.viz import flow_to_rgb, record_log
 from cflow_torch.viz.clusters import PALETTE
 
-pytest.importorskip("rerun", reason="needs the extra rerun")
+pytestmark = pytest.mark.skipif(find_spec("rerun") is None, reason="needs the extra rerun")
 Rows = Dict[str, Dict[int, Dict[str, Any]]]
 
 LIDAR = "world/ego_vehicle/lidar"
