@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
 
 import pytest
@@ -20,9 +21,12 @@ from cflow_torch.simulator.writers.waymo import write_waymo_segment
 SMALL_LOGS = ("av2", "aevascenes", "arrays", "bags", "hdf5", "nuscenes", "truckscenes", "waymo")
 
 
+make_small_drive = lru_cache(maxsize=None)(partial(make_drive, seed=3, profile="demo"))  # many tests write this drive
+
+
 def write_small_log(name: str, folder: Path) -> Path:
     """Write three sweeps or more and return the folder."""
-    drive = make_drive(seed=3, num_sweeps=3, profile="demo")
+    drive = make_small_drive(num_sweeps=3)
     if name == "av2":
         write_av2_log(drive, folder)
     elif name == "aevascenes":

@@ -10,6 +10,7 @@ import pytest
 import torch
 from command_line import cflow
 from scenes import pose, rows_of
+from small_logs import make_small_drive
 from staged_cars import Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
@@ -18,7 +19,6 @@ from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import windows
-from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 
@@ -286,7 +286,7 @@ RANGE = (-20, -20, -float("inf"), 20, 20, float("inf"))
 
 def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
     """Write a small simulated drive; returns (command, folder of its output, settings) -> exit status."""
-    write_av2_log(make_drive(seed=3, num_sweeps=num_sweeps, profile="demo"), folder / "data")
+    write_av2_log(make_small_drive(num_sweeps=num_sweeps), folder / "data")
     data = ("data=av2", f"data.root={folder / 'data'}", "data.check=false", SMALL)
     return lambda command, output, *settings: cflow(command, *data, f"output={folder / output}", *settings)
 

@@ -9,16 +9,16 @@ import command_line
 import hydra
 import pytest
 from hydra.core.hydra_config import HydraConfig
+from small_logs import make_small_drive
 
 from cflow_torch.cli import schemas  # noqa: F401 (registers them)
-from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 
 @pytest.fixture(scope="session")
 def log_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small simulated log in Argoverse 2's format: three pairs."""
-    return write_av2_log(make_drive(seed=3, num_sweeps=4, profile="demo"), tmp_path_factory.mktemp("drive"))
+    return write_av2_log(make_small_drive(num_sweeps=4), tmp_path_factory.mktemp("drive"))
 
 
 @pytest.fixture(scope="session")

@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import cflow
+from small_logs import make_small_drive
 
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import GroundSegmentedLog, find_sources, open_log
-from cflow_torch.simulator import Drive, make_drive
+from cflow_torch.simulator import Drive
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.types import CFlowError, CFlowWarning
 
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    return make_drive(seed=3, num_sweeps=3, profile="demo")
+    return make_small_drive(num_sweeps=3)
 
 
 @pytest.fixture(scope="module")

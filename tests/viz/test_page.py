@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from small_logs import make_small_drive
 from toy_street import CAR, CAR_FLOW, FLOOR, STEP, WALL, Street, result_of
 
 from cflow_torch import make_config, make_model
 from cflow_torch.applications.tracking import track
 from cflow_torch.data.log import window
-from cflow_torch.simulator import make_drive
 from cflow_torch.viz import flow_to_rgb, save_page, show
 from cflow_torch.viz.clusters import PALETTE
 
@@ -170,7 +170,7 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def drive_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated drive: four sweeps, with labels and tracks."""
-    drive, model = make_drive(seed=3, num_sweeps=4, profile="demo"), make_model(make_config(num_history=2))
+    drive, model = make_small_drive(num_sweeps=4), make_model(make_config(num_history=2))
     results = [(i, model([window(drive, i, model.config.num_history)])[0]) for i in range(3)]
     table, path = track(drive, results), tmp_path_factory.mktemp("drive") / "drive.html"
     save_page(drive, results, path, tracks=lambda: table, preset="default")

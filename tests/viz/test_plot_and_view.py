@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from PIL import Image
+from small_logs import make_small_drive
 
 from cflow_torch import CFlowError
 from cflow_torch.cli import plot as plot_command
 from cflow_torch.cli import run
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
-from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.viz import page
 
@@ -30,7 +30,7 @@ SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of one small simulated log: three pairs."""
     folder = tmp_path_factory.mktemp("drives")
-    write_av2_log(make_drive(seed=3, num_sweeps=4, profile="demo"), folder).rename(folder / NAME)
+    write_av2_log(make_small_drive(num_sweeps=4), folder).rename(folder / NAME)
     return folder
 
 
