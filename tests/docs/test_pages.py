@@ -96,22 +96,17 @@ def test_python_of_the_readme_runs(names: dict[str, Any]) -> None:
         run(*part, names)
 
 
-def test_scripts_of_the_quick_start_run(names: dict[str, Any], capfd: pytest.CaptureFixture) -> None:
-    arrays, tracks, bag, many = (part for part in parts(PAGES[1]) if part[0] == "python")
-    run(*arrays, names)
-    assert re.search(r"object \d+ at \[.*\] m: \d+\.\d m/s", capfd.readouterr().out) and Path("flow.png").is_file()
-    run(*many, names)
-    run(*tracks, {})
-    assert re.search(r"object \d+: .* m/s", capfd.readouterr().out)
-    run(*bag, {})
-    assert 0 < len(read_cloud("clean_map.ply")) < len(read_cloud("map.ply"))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
-def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: dict[str, Any]) -> None:
+def test_commands_and_python_run_in_the_order_of_the_page(
+    page: str, names: dict[str, Any], capfd: pytest.CaptureFixture
+) -> None:
     for part in parts(page):
         run(*part, names)
+    if page == PAGES[1]:
+        printed = capfd.readouterr().out
+        assert re.search(r"object \d+ at \[.*\] m: \d+\.\d m/s", printed) and re.search(r"object \d+: .* m/s", printed)
+        assert Path("flow.png").is_file() and 0 < len(read_cloud("clean_map.ply")) < len(read_cloud("map.ply"))
 
 
 EVERY_PAGE = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.[im][pd]*")]

@@ -12,7 +12,7 @@ import pytest
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 NAMES = sorted(file.stem for file in FOLDER.glob("*.ipynb"))
-SLOW = ("03_own_sensor",)  # calls the command line, which starts anew each time
+SLOW = ("01_quick_start", "03_own_sensor", "04_training_labels")
 MACHINE_PATHS = re.compile(r"/home/|/root/|/Users/|/work/|/tmp/|[A-Z]:\\\\")
 REFRESH = "run python scripts/refresh_notebooks.py"
 
