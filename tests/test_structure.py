@@ -1,4 +1,4 @@
-"""The shape of the package: imports point one way, importing costs little and changes nothing, a model has no state."""
+"""The shape of the package: imports point one way and change nothing, a model has no state, and torch.hub loads it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import torch
+from scenes import assert_same, scene
+
 import cflow_torch
-from cflow_torch import CorrelationFlow
+from cflow_torch import CorrelationFlow, make_config, make_model
 
 PACKAGE = Path(cflow_torch.__file__).parent
 # A room imports from itself and from rooms that stand before it.
@@ -70,8 +73,12 @@ def test_prose_uses_the_words_of_the_field():
     assert not [(name, hit.group()) for name, text in texts.items() for hit in PHRASES.finditer(text)]
 
 
-def test_a_model_has_no_state():
-    model = CorrelationFlow.from_preset("paper")
+def test_the_hub_loads_the_model_of_a_preset_which_has_no_state():
+    window, settings = scene(0, num_history=1), {"preset": "paper", "device": "cpu", "num_history": 1}
+    model = torch.hub.load(str(PACKAGE.parent), "cflow", source="local", **settings)
+    assert model.config == make_config("paper", num_history=1)
+    assert torch.hub.load(str(PACKAGE.parent), "cflow", source="local").config == make_config()
+    assert_same(model([window])[0], make_model(make_config("paper", num_history=1))([window])[0])
     assert not list(model.parameters()) and not list(model.buffers()) and not model.state_dict()
     assert [type(module) for module in model.modules()] == [CorrelationFlow]
     assert model.eval() is model and model.to("cpu") is model

@@ -43,11 +43,10 @@ def test_every_choice_of_every_group_composes(compose):
 
 
 def test_examples_use_existing_settings_and_choices(compose):
-    """Examples of a command with the same choices are composed together."""
     texts = [HELP, *((Path(settings.__file__).parent / f"{command}.py").read_text() for command in WITH_SETTINGS)]
     lines = [line for text in texts for line in text.splitlines() if line.startswith("  cflow ")]
     assert len(lines) > 30
-    calls: dict[tuple[str, ...], dict[str, None]] = {}
+    calls: dict[tuple[str, ...], dict[str, None]] = {}  # examples with the same choices are one call
     for command, *words in (shlex.split(line.strip().partition("   ")[0])[1:] for line in lines):
         if command in WITH_SETTINGS:
             overrides, options = split([word for word in words if word != "..."])

@@ -98,9 +98,7 @@ def test_python_of_the_readme_runs(names: dict[str, Any]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
-def test_commands_and_python_run_in_the_order_of_the_page(
-    page: str, names: dict[str, Any], capfd: pytest.CaptureFixture
-) -> None:
+def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: dict[str, Any], capfd: Any) -> None:
     for part in parts(page):
         run(*part, names)
     if page == PAGES[1]:
