@@ -22,7 +22,7 @@ _BIAS_Z, _LEAST_BIAS = 3, 0.1  # least difference, in standard deviations of noi
 _NUM_LAYERS = 16  # numbers of the layers of cubes repeat after so many
 # Steps to the best motion, and their length; above 1, because the nearest partners change with each step.
 NUM_STEPS, STEP_LENGTH = 4, 1.4
-_Z = 4.0  # standard deviations of noise
+_Z, _LEAST_GAIN = 4.0, 0.05  # standard deviations of noise; gain per cube, as a share of a perfect match
 _SIGMA = 0.07  # metres, of the weight of two centroids by their distance
 _BEYOND = 2.0**12  # units; cubes so far apart never match
 BYTES_PER_POINT = 560  # cubes and the 25 around each
@@ -102,8 +102,8 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
         shift += (STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # no weight is smaller
         weight, error = _meet(ahead - take_columns(shift, of)[:, None], weights)
     gain = weight - unshifted
-    gain, square = scatter_count(of, num_objects, torch.stack((gain, gain * gain)))
-    return shift.t() * (gain > _Z * square.sqrt())[:, None]
+    gain, square, count = scatter_count(of, num_objects, torch.stack((gain, gain * gain, torch.ones_like(gain))))
+    return shift.t() * ((gain > _Z * square.sqrt()) & (gain >= _LEAST_GAIN * count))[:, None]
 
 
 def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

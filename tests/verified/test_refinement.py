@@ -172,8 +172,8 @@ def shift_of(count: int, moved: float) -> list[float]:
     return (shift[0] / 1024).tolist()
 
 
-@pytest.mark.parametrize("count, moved, found", [(9, 0.02, 0.02), (9, 0.04, 0.04), (8, 0.04, 0.0)])
-def test_a_shift_gains_more_than_noise(count, moved, found, monkeypatch):
-    """The gain of equal cubes is 4 standard deviations of noise if there are more than 16 in both sweeps."""
+@pytest.mark.parametrize("count, moved, found", [(12, 0.025, 0.025), (12, 0.02, 0.0), (9, 0.04, 0.04), (8, 0.04, 0.0)])
+def test_a_shift_gains_enough_and_more_than_noise(count, moved, found, monkeypatch):
+    """By exp(-d^2 / 2 sigma^2), 0.025 m gain 0.062 a cube, 0.02 m 0.039; 4 standard deviations are 17 cubes of 18."""
     monkeypatch.setattr(fast, "STEP_LENGTH", 1.0)  # lone points need no longer steps
     np.testing.assert_allclose(shift_of(count, moved), (found, 0.0), atol=0.001)
