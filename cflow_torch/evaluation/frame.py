@@ -92,7 +92,7 @@ class EvalFrame:
         stored_motion: StoredMotion | None = None,
         **parts: Any,
     ) -> EvalFrame:
-        """Make the frame of a window and the flow that was estimated for it.
+        """Make a frame from a window and the flow that was estimated for it.
 
         Args:
             window: with the poses of both pc0 and pc1, or of neither.

@@ -1,4 +1,4 @@
-"""Refinement: from motions in pixels to rigid motions in centimetres, with rotation and times of points.
+"""Refinement: turn pixel motions into rigid motions accurate to centimetres, with rotation and the times of points.
 
 Registration takes a few Gauss-Newton steps on the voxels of objects, surface to surface, all objects at once. Beams hit
 a surface at positions that are fixed in the frame of the vehicle. Pairs of nearest points would align these positions,
@@ -180,13 +180,13 @@ class VoxelPairs:
         """Return the ratio of the time between two measurements of an object to the time between their sweeps.
 
         Args:
-            rigid: apparent motion of the objects, whose points have times: the result of `register`.
+            rigid: apparent motion of the objects, the result of `register`. Their points must have times.
 
         Returns:
             (G,) float64: the sum of w k (k + b - a) divided by the sum of w k^2, over all pairs of voxels. Here w is
-            the weight of a pair in x plus that in y, k the intervals between its sweeps, and a and b are the mean times
-            of its voxels in intervals. The motion divided by this ratio explains the pairs best. The ratio is 1 for
-            objects without pairs, and if it would be below 0.75.
+            the weight of a pair in x plus that in y, k is the time between its sweeps, and a and b are the mean times
+            of the points in its voxels, all in sweep intervals. The motion divided by this ratio explains the pairs
+            best. The ratio is 1 for objects without pairs, and if it would be below 0.75.
 
         Convention: k is rounded to a 16th and b - a to a 1024th.
         """
