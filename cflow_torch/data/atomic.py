@@ -41,7 +41,7 @@ def atomic_file(path: PathLike) -> Iterator[Any]:
 
 @contextmanager
 def atomic_name(path: Path) -> Iterator[Path]:
-    """Yield a temporary name for a library that opens a local file itself; the file is renamed when the block ends."""
+    """Yield a temporary name, for libraries that open a local file themselves. The file is then renamed to `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(_temporary_name(path.name))
     try:

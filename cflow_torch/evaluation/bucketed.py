@@ -60,7 +60,7 @@ class BucketedByRange(Accumulator):
         super().__init__(definition, (num_ranges, len(META_NAMES), len(definition.speed_edges) - 1))
 
     def ranges(self, scored: ScoredPoints) -> np.ndarray:
-        """Return the (M,) range of each point, -1 = none."""
+        """Return (M,), the index of the distance range that contains each point, -1 = none."""
         return interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:

@@ -72,7 +72,7 @@ def benchmark_logs(
         cache: folder for the drives: `cache/<generator key>-<sweeps>/<log id>`.
         profile: a sensor, a name in `profiles.PROFILES`.
         seeds: one drive each.
-        num_sweeps: sweeps per drive, as they are read.
+        num_sweeps: sweeps per drive that the reader returns; we simulate more if it skips some (`sweep_step`).
         scenes: kinds of scene, assigned to the seeds in rotation.
 
     Returns:

@@ -59,7 +59,10 @@ class MovingSolids:
         return transform, change
 
     def dynamic_at(self, row: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-        """Transforms from the world to rows (E,) int64 of `dynamic`, and their derivatives: (E, 3, 4) float64 each."""
+        """Return the transforms from the world to E moving solids, and their derivatives: (E, 3, 4) float64 each.
+
+        `row` is (E,) int64, the row of `dynamic` of each solid.
+        """
         step = float(self.knots[1] - self.knots[0])
         after = seconds - self.knots[0]
         first = (after / step).floor().long().clamp(0, len(self.knots) - 2)

@@ -40,7 +40,7 @@ INTRODUCTION = """# The paper's tables next to ours
 The score is the dynamic bucket-normalised EPE; lower is better. The paper's rows are of Argoverse 2 val or the set
 that they name. benchmark (av2) is simulated: compare whether a change helps, not the numbers. The tables have the
 means over the classes; the CSV files next to the pictures have each class. A line with windows and versions describes
-our run, and holds until the next such line. docs/settings.md has the commands.
+our run for the table above and later ones, until the next such line. docs/settings.md has the commands.
 """
 ABOUT_OTHERS = "this picture and the next also show the paper's other methods (numbers: scripts/paper/figures.yaml)"
 Cells = List[List[str]]

@@ -106,7 +106,10 @@ class Frames:
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t for t in times if len(t) > 1)]))
 
     def in_root(self, frame: str, times_ns: np.ndarray) -> np.ndarray:
-        """Return (K, 4, 4) float64 `T_root_frame`; a transform is constant outside the time of its samples."""
+        """Return (K, 4, 4) float64 `T_root_frame` at the times.
+
+        Transforms are constant before their first sample and after their last one.
+        """
         result = np.tile(np.eye(4), (len(times_ns), 1, 1))
         for child in self.chain(frame)[:-1]:
             times, poses = self._links[child]
