@@ -57,7 +57,10 @@ class ThreeWayEPE(Accumulator):
         self.frame_sums = np.zeros(len(_SETS) + 1, dtype=np.float64)  # per-frame values of the sets and the IoU
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Cells are category, motion and distance. Quantities are `QUANTITIES`, then 1 if predicted as dynamic."""
+        """Return the cell (category, motion, distance) of each scored point, and its quantities.
+
+        These are `QUANTITIES`, then 1 if the point is predicted as dynamic, else 0.
+        """
         keep, meta = scored.in_region, meta_class(scored.category)
         if self.definition.foreground == "meta":
             keep = keep & (meta >= 0)

@@ -61,8 +61,8 @@ def points_of_objects(
         sweeps: finest images.
         objects: G of them.
         wanted: (G,) bool.
-        slice_height: metres.
-        num_slices: a power of 2.
+        slice_height: of the `layer` of each point, metres.
+        num_slices: number of layers before they repeat, a power of 2.
         most_time: sweep intervals; sweeps farther in time from t+1 are left out.
 
     Cost: a lookup for each point, and more for each that is kept.
