@@ -292,12 +292,12 @@ def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
 
 
 def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    call = calls_on_a_drive(tmp_path)
+    call = calls_on_a_drive(tmp_path, num_sweeps=5)
     run = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", "engine.workers=1", "tracks=true")
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
     whole = read_tracks(file)
-    assert len(whole["id"]) > 4 and set(whole["sweep"]) <= set(range(3)) and not np.isnan(whole["confidence"]).any()
+    assert len(whole["id"]) > 4 and set(whole["sweep"]) <= set(range(4)) and not np.isnan(whole["confidence"]).any()
     model = make_model(make_config(num_history=0, pixel_sizes=(0.4, 0.2), point_cloud_range=RANGE))
     (source,) = find_sources("av2", tmp_path / "data")
     log = open_log("av2", source)
