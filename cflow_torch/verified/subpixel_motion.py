@@ -84,8 +84,8 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
 
     Convention: a cube of t, moved by the shift, matches the nearest cube of t+1 among those in the 5 x 5 pixels around
         it. A cube of t+1, moved back, likewise matches one of t. Ties: the first in raster order. Each step changes the
-        shift by 1.4 times the weighted mean of the errors. The gain is the weight of all matches minus their weight
-        without a shift. It must exceed `_Z` standard deviations of noise.
+        shift by `STEP_LENGTH` times the weighted mean of the errors. The gain is the weight of all matches minus their
+        weight without a shift. It must exceed `_Z` standard deviations of noise, and reach `_LEAST_GAIN` per cube.
     """
     some = flat_nonzero(voxels.step < 2)
     window, step, layer, of = gather(some, voxels.window, voxels.step, voxels.layer, voxels.object_id)
