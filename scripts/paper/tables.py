@@ -37,12 +37,12 @@ EXPERIMENTS = ("pixel_size", "views", "history", "scales", "keypoints", "dataset
 PER_SET = ("datasets", "range_split")  # experiments whose columns are data sets, not classes
 INTRODUCTION = """# The paper's tables next to ours
 
-The score is the dynamic bucket-normalised EPE; lower is better. The paper's rows are of Argoverse 2 val or the set
-that they name. benchmark (av2) is simulated: compare whether a change helps, not the numbers. The tables have the
-means over the classes; the CSV files next to the pictures have each class. A line with windows and versions describes
-our run for the table above and later ones, until the next such line. docs/settings.md has the commands.
+The score is the dynamic bucket-normalised EPE, averaged over classes; lower is better. Rows "paper" are of Argoverse 2
+val, or of the set that they name. Rows "benchmark (av2)" are ours, on simulated drives: compare whether a change helps,
+not the numbers. A line below a table describes our run. A table without it has the run of the table above. The CSV
+files next to the pictures have the score of each class. docs/settings.md has the commands.
 """
-ABOUT_OTHERS = "this picture and the next also show the paper's other methods (numbers: scripts/paper/figures.yaml)"
+ABOUT_OTHERS = "the next two pictures also show the paper's other methods; scripts/paper/figures.yaml has their numbers"
 Cells = List[List[str]]
 
 
