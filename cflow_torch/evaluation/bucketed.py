@@ -6,6 +6,7 @@ static and dynamic points, by distance from the sensor.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Sequence
 
 import numpy as np
@@ -15,6 +16,8 @@ from cflow_torch.evaluation.definitions import Definition, interval_of, range_na
 from cflow_torch.evaluation.scored_points import Accumulator, ScoredPoints
 
 _MEANS = ("static_epe", "dynamic_error")
+_RANGE_EDGES = (0.0, 35.0, 50.0, 75.0, 100.0, np.inf)  # metres, of the range-wise error
+_RANGE_DYNAMIC_SPEED = 1.4  # m/s, from which a point is dynamic in the range-wise error
 
 
 def mean_of_present(values: np.ndarray) -> float:
@@ -55,20 +58,17 @@ class BucketedByRange(Accumulator):
     point is in at most one range.
     """
 
-    def __init__(self, definition: Definition, num_ranges: int | None = None) -> None:
-        num_ranges = num_ranges or len(definition.region_edges) - 1
-        super().__init__(definition, (num_ranges, len(META_NAMES), len(definition.speed_edges) - 1))
-
-    def ranges(self, scored: ScoredPoints) -> np.ndarray:
-        """Return (M,), the index of the distance range that contains each point, -1 = none."""
-        return interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
+    def __init__(self, definition: Definition) -> None:
+        shape = len(definition.region_edges) - 1, len(META_NAMES), len(definition.speed_edges) - 1
+        super().__init__(definition, shape)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Return the cell (range, class, bucket) of each scored point, and its two quantities: error and speed."""
+        ranges = interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
         meta, bucket = meta_class(scored.category), interval_of(scored.speed, self.definition.speed_edges)
         if self.definition.background == "static":
             bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
-        place = np.stack([self.ranges(scored), meta, bucket])
+        place = np.stack([ranges, meta, bucket])
         keep = (place >= 0).all(axis=0)
         cell = np.ravel_multi_index(tuple(place[:, keep]), self.count.shape)
         return cell, (scored.error[keep], scored.speed[keep])
@@ -95,11 +95,7 @@ class BucketedEPE(BucketedByRange):
     """
 
     def __init__(self, definition: Definition) -> None:
-        super().__init__(definition, num_ranges=1)
-
-    def ranges(self, scored: ScoredPoints) -> np.ndarray:
-        """Return 0 for points in the region, -1 for others."""
-        return scored.in_region.astype(np.int64) - 1
+        super().__init__(replace(definition, region_edges=(0.0, definition.max_range)))
 
     def compute(self) -> dict[str, Any]:
         """Return "classes", "mean" and "speed_edges" (metres per frame).
@@ -118,13 +114,13 @@ class RangeWiseEPE(Accumulator):
     """
 
     def __init__(self, definition: Definition) -> None:
-        super().__init__(definition, (len(definition.range_edges) - 1, 2), num_quantities=1)
+        super().__init__(definition, (len(_RANGE_EDGES) - 1, 2), num_quantities=1)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Cells are range and motion; the quantity is the error."""
-        ring = interval_of(scored.distance, self.definition.range_edges)
+        ring = interval_of(scored.distance, _RANGE_EDGES)
         # We multiply by the rate, as OpenSceneFlow does: a division rounds differently at the threshold.
-        dynamic = scored.speed * (1.0 / self.definition.sweep_interval) >= self.definition.range_dynamic_speed
+        dynamic = scored.speed * (1.0 / self.definition.sweep_interval) >= _RANGE_DYNAMIC_SPEED
         keep = ring >= 0
         return (2 * ring + dynamic)[keep], (scored.error[keep],)
 
@@ -139,7 +135,7 @@ class RangeWiseEPE(Accumulator):
                 "num_static": int(self.count[row, 0]),
                 "num_dynamic": int(self.count[row, 1]),
             }
-            for row, name in enumerate(range_names(self.definition.range_edges))
+            for row, name in enumerate(range_names(_RANGE_EDGES))
         }
         result["mean"] = {"static_epe": mean_of_present(epe[:, 0]), "dynamic_epe": mean_of_present(epe[:, 1])}
         return result

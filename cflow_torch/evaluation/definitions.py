@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Dict, List, Literal, Optional, Sequence, Tuple, Union, get_args, get_origin, get_type_hints
+from typing import Dict, List, Literal, Optional, Sequence, Tuple, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from cflow_torch.types import CFlowError
 METRICS = ("bucketed", "bucketed_by_range", "three_way", "range_wise")
 
 SPEED_EDGES: Tuple[float, ...] = (*(float(edge) for edge in np.linspace(0.0, 2.0, 51)), math.inf)
-RANGE_EDGES: Tuple[float, ...] = (0.0, 35.0, 50.0, 75.0, 100.0, math.inf)
 REGION_EDGES: Tuple[float, ...] = (0.0, 35.0, 70.0)
 
 
@@ -26,9 +25,8 @@ class Definition:
         metrics: which of `METRICS` are computed.
         ego_motion: ego motion that is removed from the flow. "points": that of the frame of the points. "stored": that
             of the stored poses, even where they belong to another frame (OpenSceneFlow's Argoverse 2 scenes).
-        region: points that "bucketed" and "three_way" score: "box" max(|x|, |y|), "disc" sqrt(x^2 + y^2), or "all".
-            "bucketed_by_range" measures ranges by the box if it is the region, else by the disc.
-        max_range: metres, outer bound of the region.
+        region: how ranges are measured, "box" by max(|x|, |y|), "disc" by sqrt(x^2 + y^2).
+        max_range: metres, outer bound of the region whose points "bucketed" and "three_way" score; inf = all points.
         closed: whether a point at exactly `max_range` is scored (<= or <). The same holds for the upper edge of each
             range of "bucketed_by_range"; a point that one range leaves out belongs to the next one.
         region_edges: metres, ascending edges of the ranges that "bucketed_by_range" scores one by one.
@@ -36,7 +34,6 @@ class Definition:
         point_cloud_range: (x0, y0, z0, x1, y1, z1) metres, open interval, in `region_axes`; None = no crop.
         mask_box: metres; in a frame without an evaluation mask, only points with |x|, |y| <= this (frame of t) are
             scored; None = all.
-        exclude_ground: whether ground points are ignored.
         residual_axes: axes in which residuals are compared.
         three_way_flow: flow that the three-way scores compare. It affects accuracy and angle, not the end-point error.
         half_precision: round truth and prediction of the three-way scores to float16 (the files of the 2023 challenge).
@@ -49,8 +46,6 @@ class Definition:
         norm_dtype: precision in which lengths of residuals are computed.
         dynamic_threshold: metres per frame; true or predicted residual from which a point is dynamic (three-way).
         speed_edges: metres per frame, ascending edges of the speed buckets, lower one included; the first is "static".
-        range_edges: metres, ascending edges of the range-wise metric, lower one included.
-        range_dynamic_speed: m/s, from which a point is dynamic in the range-wise metric.
         sweep_interval: seconds between the sweeps of a pair (angle error, range-wise speed).
 
     Raises:
@@ -60,14 +55,13 @@ class Definition:
     name: str
     metrics: Tuple[str, ...] = ("bucketed", "three_way", "range_wise")
     ego_motion: Literal["points", "stored"] = "points"
-    region: Literal["box", "disc", "all"] = "disc"
+    region: Literal["box", "disc"] = "disc"
     max_range: float = 35.0
     closed: bool = True
     region_edges: Tuple[float, ...] = REGION_EDGES
     region_axes: Literal["t", "t+1"] = "t"
     point_cloud_range: Optional[Tuple[float, ...]] = None
     mask_box: Optional[float] = None
-    exclude_ground: bool = True
     residual_axes: Literal["t", "t+1"] = "t+1"
     three_way_flow: Literal["total", "residual"] = "total"
     half_precision: bool = False
@@ -78,8 +72,6 @@ class Definition:
     norm_dtype: Literal["float32", "float64"] = "float64"
     dynamic_threshold: float = 0.05
     speed_edges: Tuple[float, ...] = SPEED_EDGES
-    range_edges: Tuple[float, ...] = RANGE_EDGES
-    range_dynamic_speed: float = 1.4
     sweep_interval: float = 0.1
 
     def __post_init__(self) -> None:
@@ -89,7 +81,7 @@ class Definition:
                 raise CFlowError(f"definition {self.name}: {field}={value!r}, give one of {choices}")
         if not set(self.metrics) <= set(METRICS):
             raise CFlowError(f"definition {self.name}: metrics={self.metrics}, give some of {METRICS}")
-        for field in ("speed_edges", "range_edges", "region_edges"):
+        for field in ("speed_edges", "region_edges"):
             edges = getattr(self, field)
             if len(edges) < 2 or not all(a < b for a, b in zip(edges, edges[1:])):
                 raise CFlowError(f"definition {self.name}: {field}={edges}, give at least two ascending values")
@@ -118,7 +110,7 @@ DEFINITIONS: Dict[str, Definition] = {
     "av2": Definition(
         name="av2",
         metrics=("three_way",),
-        region="all",
+        max_range=math.inf,
         mask_box=50.0,
         half_precision=True,
         nan_rows="error",
@@ -130,15 +122,6 @@ DEFINITIONS: Dict[str, Definition] = {
         name="challenge_2026_box", metrics=METRICS, average="frames", ego_motion="stored", region="box"
     ),
 }
-
-
-def get_definition(definition: Union[str, Definition]) -> Definition:
-    """Return the definition of a name, or the given one; a `CFlowError` if no definition has the name."""
-    if isinstance(definition, Definition):
-        return definition
-    if definition not in DEFINITIONS:
-        raise CFlowError(f"definition={definition!r}: give one of {sorted(DEFINITIONS)}")
-    return DEFINITIONS[definition]
 
 
 def interval_of(values: np.ndarray, edges: Sequence[float], closed: bool = False) -> np.ndarray:

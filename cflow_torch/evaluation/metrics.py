@@ -8,14 +8,11 @@ from statistics import fmean
 from typing import Any, Callable, Mapping, Sequence
 
 from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE, RangeWiseEPE
-from cflow_torch.evaluation.definitions import Definition, get_definition
+from cflow_torch.evaluation.definitions import DEFINITIONS, Definition
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.scored_points import Accumulator, score_points
 from cflow_torch.evaluation.three_way import ThreeWayEPE
 from cflow_torch.types import CFlowError
-
-CHALLENGE_DATA_SETS: tuple[str, ...] = ("AEVA", "AV2", "nuScenes", "TruckScenes", "Waymo")
-CHALLENGE_RANGES: tuple[str, ...] = ("0-35", "35-70")
 
 _ACCUMULATORS: dict[str, Callable[..., Accumulator]] = {
     "bucketed": BucketedEPE,
@@ -34,7 +31,11 @@ class SceneFlowMetrics:
     """
 
     def __init__(self, definition: str | Definition = "opensceneflow") -> None:
-        self.definition = get_definition(definition)
+        if not isinstance(definition, Definition):
+            if definition not in DEFINITIONS:
+                raise CFlowError(f"definition={definition!r}: give one of {sorted(DEFINITIONS)}")
+            definition = DEFINITIONS[definition]
+        self.definition = definition
         self.parts: dict[str, Accumulator] = {
             name: _ACCUMULATORS[name](self.definition) for name in self.definition.metrics
         }
@@ -108,7 +109,8 @@ def score_data_sets(
 
     Args:
         results: data set -> range -> error, for example `{"AV2": errors_by_range(scores)}`; NaN or None = no value.
-        data_sets: required data sets, for example `CHALLENGE_DATA_SETS`; None = those of `results`.
+        data_sets: required data sets, for example ("AEVA", "AV2", "nuScenes", "TruckScenes", "Waymo"); None = those of
+            `results`.
         ranges: ranges that every data set must have; None = every range of any data set.
 
     Returns:

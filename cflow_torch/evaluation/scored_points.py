@@ -8,7 +8,7 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.rigid_motion import transform_points
-from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.definitions import Definition, interval_of
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.types import CFlowError, as_numpy
 
@@ -108,9 +108,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
         predicted_flow, true_flow = predicted_flow.astype(np.float16), true_flow.astype(np.float16)
     is_box = definition.region == "box"
     reach = np.abs(position[:, :2]).max(axis=1) if is_box else np.linalg.norm(position[:, :2], axis=1)
-    in_region = reach <= definition.max_range if definition.closed else reach < definition.max_range
-    if definition.region == "all":
-        in_region = np.ones_like(keep)
+    in_region = interval_of(reach, (0.0, definition.max_range), definition.closed) == 0
     difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
     return ScoredPoints(
         error=np.linalg.norm(difference, axis=1).astype(np.float64),
@@ -148,7 +146,7 @@ def _residual_at_t(points: np.ndarray, total: np.ndarray, T_ego1_ego0: np.ndarra
 def _candidates(frame: EvalFrame, definition: Definition, position: np.ndarray) -> np.ndarray:
     """Return (N,) bool: valid truth, not ground, inside the evaluation mask and the crop."""
     keep = frame.labels.is_valid.copy()
-    if definition.exclude_ground and frame.is_ground is not None:
+    if frame.is_ground is not None:
         keep &= ~as_numpy(frame.is_ground)
     if frame.eval_mask is not None:
         keep &= as_numpy(frame.eval_mask)

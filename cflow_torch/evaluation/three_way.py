@@ -6,7 +6,7 @@ from typing import Any, Sequence
 
 import numpy as np
 
-from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX, META_CLASSES, meta_class
+from cflow_torch.data.categories import CATEGORIES, meta_class
 from cflow_torch.evaluation.definitions import Definition
 from cflow_torch.evaluation.scored_points import Accumulator, ScoredPoints
 
@@ -21,7 +21,6 @@ FRAME_COUNT_EPS, FRAME_IOU_EPS = 1e-8, 1e-6  # of OpenSceneFlow's per-frame valu
 _FOREGROUND = slice(1, None)
 _SETS: dict[str, tuple[Any, int]] = {"epe_fd": (_FOREGROUND, 1), "epe_fs": (_FOREGROUND, 0), "epe_bs": (0, 0)}
 _GROUPS: dict[str, Any] = {"background": slice(0, 1), "foreground": _FOREGROUND}
-_META_GROUPS: dict[str, Any] = {name: [CATEGORY_INDEX[c] for c in members] for name, members in META_CLASSES.items()}
 
 
 def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: float) -> np.ndarray:
@@ -75,11 +74,10 @@ class ThreeWayEPE(Accumulator):
         self.frame_sums += _values(count, sums, FRAME_COUNT_EPS, FRAME_IOU_EPS)
 
     def compute(self) -> dict[str, Any]:
-        """Return `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou`, `num_frames` and two breakdowns.
+        """Return `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou`, `num_frames` and "breakdown".
 
         The keys of "breakdown" are "background" and "foreground", then "static" and "dynamic", then "all", "close" and
         "far". Each entry has `count`, `num_predicted` (points predicted as dynamic) and the values of `QUANTITIES`.
-        "by_class" has the same for each class.
         """
         values = _values(self.count, self.sums)
         if self.definition.average == "frames":
@@ -91,7 +89,6 @@ class ThreeWayEPE(Accumulator):
             "dynamic_iou": float(values[-1]),
             "num_frames": self.num_frames,
             "breakdown": {name: self._group(members) for name, members in _GROUPS.items()},
-            "by_class": {name: self._group(members) for name, members in _META_GROUPS.items()},
         }
 
     def _group(self, categories: Any) -> dict[str, dict[str, dict[str, float]]]:

@@ -243,8 +243,9 @@ def test_bsfe_on_made_up_frames(bsfe: ModuleType, tmp_path: Path, seed: int) -> 
         kinds = ("bucketed_epe", "threeway_epe")
         data_sets = [public.bsfe_data_set(bsfe, raw, truth, kind, output, ground) for kind in kinds]
         buckets, three_way = (run_bsfe(data_set, predictions) for data_set in data_sets)
-        for distance, region in ((35, "box"), (math.inf, "all")):
-            ours = score(replace(definition, region=region, exclude_ground=not ground), frames)
+        scored = [replace(frame, is_ground=None) for frame in frames] if ground else frames
+        for distance in (35, math.inf):
+            ours = score(replace(definition, max_range=distance), scored)
             where = f"made up {seed}, {distance} m, ground {ground}"
             check(f"bsfe buckets, {where}", public.bucket_numbers(ours["bucketed"], buckets, output, distance))
             found = three_way.compute_results(return_distance_threshold=distance)
