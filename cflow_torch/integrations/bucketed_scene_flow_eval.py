@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, NamedTuple, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -13,21 +13,18 @@ from cflow_torch.types import CFlowError, check_array
 from cflow_torch.windows.ego_motion import rigid_transform
 
 
-class CorrelationFlowEstimator:
+class CorrelationFlowEstimator(SequenceFlow):
     """Estimates flow for the frames of a data set of BucketedSceneFlowEval (2.0.25).
 
     The arguments are those of `SequenceFlow`, for example `num_history=2`.
     """
 
-    def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
-        self.sequence_flow = SequenceFlow(preset, device, ground, **settings)
-
-    def __call__(self, frames: Sequence[Any]) -> list[Any]:
+    def forward(self, frames: Sequence[Any]) -> list[Any]:
         """Estimate the flow of every frame but the last.
 
         Args:
             frames: K >= 2 consecutive `TimeSyncedSceneFlowFrame` (or raw frames) of one log, in order of time, such as
-                an item of a data set; or pairs (frame, `TimeSyncedAVLidarData`), as `load_frame_list` returns them.
+                an item of a data set.
 
         Returns:
             K - 1 `EgoLidarFlow`. Flow i has a row for each point of `frames[i].pc.full_pc`, in their order. The frames
@@ -37,15 +34,10 @@ class CorrelationFlowEstimator:
             mask: the frame's own `pc.mask`. A flow of 0 outside the method's range is scored like any other.
 
         Convention:
-            A point is active if `pc.mask` is True (not ground, in the range of the data set) and, in a pair
-            (frame, data), `is_ground_points` is False. `in_range_mask` of a pair is ignored. A `CFlowError` names a bad
-            field ("frames[1].pc.mask").
+            A point is active if `pc.mask` is True (not ground, in the range of the data set). A `CFlowError` names a
+            bad field ("frames[1].pc.mask").
         """
-        return self._flows(_read_frames(frames), 0)
-
-    def last(self, frames: Sequence[Any]) -> Any:
-        """Estimate the `EgoLidarFlow` of `frames[-2]`, which a causal data set scores; arguments as for a call."""
-        return self._flows(_read_frames(frames), len(frames) - 2)[0]
+        return self._ego_flows(_read_frames(frames), 0)
 
     def evaluate(self, dataset: Any) -> Any:
         """Estimate and score all frames that an `AbstractDataset` scores.
@@ -63,57 +55,53 @@ class CorrelationFlowEstimator:
         for number in range(len(dataset)):
             item = dataset[number]
             frames = _read_frames(item)
-            older = _earlier(known, frames[0], self.sequence_flow.num_history)
+            older = _earlier(known, frames[0], self.num_history)
             known = [*older, *frames]
             first = len(item) - 2 if is_causal else 0
-            for frame, flow in zip(item[first:], self._flows(known, len(older) + first)):
+            for frame, flow in zip(item[first:], self._ego_flows(known, len(older) + first)):
                 evaluator.eval(flow, frame)
         return evaluator
 
-    def _flows(self, frames: Sequence[_LogFrame], first: int) -> list[Any]:
+    def _ego_flows(self, frames: Sequence[_LogFrame], first: int) -> list[Any]:
         need = "this needs pip install 'bucketed-scene-flow-eval>=2.0.25', which needs Python 3.10 and open3d"
         flow_class = import_optional("bucketed_scene_flow_eval.datastructures", need, "EgoLidarFlow")
-        (flows,) = self.sequence_flow([[frame.sweep for frame in frames]], [first])
+        (flows,) = self.flows([frames], [first])
         return [
-            flow_class(full_flow=flow.cpu().numpy(), mask=frame.mask.copy())  # the evaluator overwrites masks
+            flow_class(full_flow=flow.cpu().numpy(), mask=np.array(frame.is_active))  # a copy: the evaluator changes it
             for flow, frame in zip(flows, frames[first:])
         ]
 
 
-class _LogFrame(NamedTuple):
-    """A frame with its log, its index there, and (N,) bool `pc.mask`."""
+@dataclass(frozen=True)
+class _LogFrame(Frame):
+    """A frame with its log and its index there."""
 
-    log_id: str
-    log_idx: int
-    sweep: Frame
-    mask: np.ndarray
+    log_id: str = ""
+    log_idx: int = 0
 
 
 def _read_frames(frames: Any) -> list[_LogFrame]:
     """Read and check the frames of one log. Any class with the same fields is accepted."""
     if not isinstance(frames, (list, tuple)) or len(frames) < 2:
         raise CFlowError("frames: give a list of at least two frames of one log, in order of time")
-    pairs = [frame if isinstance(frame, tuple) and len(frame) == 2 else (frame, None) for frame in frames]
-    read = [_read_frame(f"frames[{i}]", *pair) for i, pair in enumerate(pairs)]
+    stamps = times_in_ns([frame.log_timestamp for frame in frames])
+    read = [_read_frame(f"frames[{i}]", *pair) for i, pair in enumerate(zip(frames, stamps))]
     for i, (old, new) in enumerate(zip(read, read[1:]), 1):
         if (new.log_id, new.log_idx) != (old.log_id, old.log_idx + 1):
             found = f"{new.log_id!r}, {new.log_idx} after {old.log_id!r}, {old.log_idx}"
             raise CFlowError(f"frames[{i}].log_id, log_idx: {found}; give consecutive frames of one log")
-    stamps = times_in_ns([frame.log_timestamp for frame, _ in pairs])
-    return [frame._replace(sweep=replace(frame.sweep, timestamp_ns=t)) for frame, t in zip(read, stamps)]
+    return read
 
 
-def _read_frame(name: str, frame: Any, data: Any) -> _LogFrame:
-    """Read a frame without its time; `data` is its `TimeSyncedAVLidarData`, or None."""
+def _read_frame(name: str, frame: Any, timestamp_ns: int | None) -> _LogFrame:
     points = np.asarray(getattr(frame.pc.full_pc, "points", frame.pc.full_pc))
     check_array(points, f"{name}.pc.full_pc", (None, 3), "f", "(N, 3) floats, metres")
     if points.dtype == np.float16:  # of the files of Argoverse 2; our own reader converts them as well
         points = points.astype(np.float32)
-    is_active = mask = _mask(frame.pc.mask, f"{name}.pc.mask", len(points))
-    if data is not None:
-        is_active = mask & ~_mask(data.is_ground_points, f"{name}[1].is_ground_points", len(points))
+    mask = np.asarray(frame.pc.mask)
+    check_array(mask, f"{name}.pc.mask", (len(points),), "b", f"({len(points)},) bool, one per point")
     T_ego_sensor, T_global_ego = (_pose(frame.pc.pose, name, side) for side in ("sensor_to_ego", "ego_to_global"))
-    return _LogFrame(frame.log_id, frame.log_idx, Frame(points, is_active, T_ego_sensor, T_global_ego), mask)
+    return _LogFrame(points, mask, T_ego_sensor, T_global_ego, timestamp_ns, frame.log_id, frame.log_idx)
 
 
 def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> list[_LogFrame]:
@@ -121,18 +109,9 @@ def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> 
     same = [frame for frame in known if (frame.log_id, frame.log_idx) == (first.log_id, first.log_idx)]
     if not same:  # another log, or items that do not overlap, whose global frames are unrelated
         return []
-    shift = first.sweep.ego_to_global @ np.linalg.inv(same[0].sweep.ego_to_global)
-    older = [frame for frame in known if frame.log_idx < first.log_idx]
-    return [
-        frame._replace(sweep=replace(frame.sweep, ego_to_global=shift @ frame.sweep.ego_to_global))
-        for frame in older[max(len(older) - num_history, 0) :]
-    ]
-
-
-def _mask(values: Any, name: str, length: int) -> np.ndarray:
-    mask = np.asarray(values)
-    check_array(mask, name, (length,), "b", f"({length},) bool, one per point")
-    return mask
+    shift = first.ego_to_global @ np.linalg.inv(same[0].ego_to_global)
+    older = [frame for frame in known if first.log_idx - num_history <= frame.log_idx < first.log_idx]
+    return [replace(frame, ego_to_global=shift @ frame.ego_to_global) for frame in older]
 
 
 def _pose(poses: Any, name: str, side: str) -> np.ndarray:

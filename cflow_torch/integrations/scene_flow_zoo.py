@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from cflow_torch.errors import import_optional
 from cflow_torch.integrations.sequence import Frame, SequenceFlow
@@ -19,17 +19,11 @@ _NEED = (
 _POSES = ("pc_poses_sensor_to_ego", "pc_poses_ego_to_global")
 
 
-class CorrelationFlowModel(nn.Module):
+class CorrelationFlowModel(SequenceFlow):
     """A method with the interface that SceneFlowZoo's `ModelWrapper` expects. There is nothing to train.
 
-    Args:
-        preset, ground, **settings: as for `SequenceFlow`, for example `num_history=3`.
-        device: device for the computation; "auto" = that of the sequence. The output is on that of the sequence.
+    The arguments are those of `SequenceFlow`, for example `num_history=3`.
     """
-
-    def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
-        super().__init__()
-        self.sequence_flow = SequenceFlow(preset, device, ground, **settings)
 
     def forward(self, forward_mode: Any, batched_sequence: Any, logger: Any = None) -> list[Any]:
         """Estimate the flow of a batch of sequences.
@@ -52,7 +46,7 @@ class CorrelationFlowModel(nn.Module):
         """
         output_class = import_optional("dataloaders", _NEED, "TorchFullFrameOutputSequence")
         read = [_read_sequence(sequence, f"batched_sequence[{i}]") for i, sequence in enumerate(batched_sequence)]
-        flows = self.sequence_flow([frames for frames, _, _ in read], [first for _, first, _ in read])
+        flows = self.flows([frames for frames, _, _ in read], [first for _, first, _ in read])
         outputs = []
         for (_, first, valid), own in zip(read, flows):
             mask = valid[first:-1]

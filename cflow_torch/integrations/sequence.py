@@ -5,7 +5,6 @@ BucketedSceneFlowEval and SceneFlowZoo, which builds on it, both pass such seque
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Sequence
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 
 from cflow_torch.config import make_config
 from cflow_torch.data.log import window
+from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.types import Array, CFlowError, Sweep, Window
 from cflow_torch.windows.ego_motion import compensate
@@ -44,7 +44,7 @@ class Frame:
 
 
 class SequenceFlow(nn.Module):
-    """Estimates residual flow from frames. It has no parameters and no buffers.
+    """Base class of models that estimate residual flow from frames. They have no parameters and no buffers.
 
     Args:
         preset: "default", "offline", "keypoints" or "paper" (`make_config`).
@@ -64,7 +64,7 @@ class SequenceFlow(nn.Module):
         self._has_checked_ground = False
 
     @torch.no_grad()
-    def forward(self, sequences: Sequence[Sequence[Frame]], firsts: Sequence[int]) -> list[list[Tensor]]:
+    def flows(self, sequences: Sequence[Sequence[Frame]], firsts: Sequence[int]) -> list[list[Tensor]]:
         """Estimate the residual flow of the pairs (i, i + 1) of several sequences.
 
         Args:
@@ -104,10 +104,9 @@ class SequenceFlow(nn.Module):
         elif not self._has_checked_ground:
             self._has_checked_ground = True
             if has_ground(points[-2][frames[-2].is_active]):
-                warnings.warn(
+                warn(
                     "the active points contain ground, which connects the objects on it, so that moving ones are "
-                    "missed. Load the data set with with_ground=False, or pass ground='auto'",
-                    stacklevel=4,
+                    "missed. Load the data set with with_ground=False, or pass ground='auto'"
                 )
         return [
             Sweep(cloud, mask, frame.ego_to_global, frame.timestamp_ns)

@@ -115,7 +115,7 @@ def test_sequences_of_a_batch_may_differ_in_length_and_kind() -> None:
 def test_a_config_can_name_the_registered_model(zoo: dict[str, Any]) -> None:
     register()
     model = zoo["correlationflow"](preset="default", num_history=2, max_speed=30.0, device="cpu")
-    assert model.sequence_flow.model.config.max_speed == 30.0 and model.sequence_flow.num_history == 2
+    assert model.model.config.max_speed == 30.0 and model.num_history == 2
     with pytest.raises(CFlowError, match="unknown setting voxel"):
         zoo["correlationflow"](voxel=0.1)
 

@@ -43,20 +43,16 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
         Rows with NaN are ignored: they are padding, or beams without a return. "flow" and other truth is never read. A
         `CFlowError` names the key of a value that is missing, has a wrong shape, or is not a rigid motion.
     """
-    history = [f"h{i}" for i in range(1, num_history + 1)]
-    present = [name for name in history if f"pc{name}" in batch]
+    history = [f"h{i}" for i in range(1, num_history + 1) if f"pch{i}" in batch]
     _entry(batch, "pose0", 0)
-    return [_sample(batch, b, present, ego_T_lidar) for b in range(len(batch["pose0"]))]
+    return [_sample(batch, b, history, ego_T_lidar) for b in range(len(batch["pose0"]))]
 
 
 def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: Any) -> Sample:
     extrinsics = _extrinsics(batch, b, ego_T_lidar)
-    clouds, poses, rows = [], [], []
-    for name in ("0", "1", *history):
-        points, kept = _points(batch, b, name)
-        clouds.append(points)
-        rows.append(kept)
-        poses.append(rigid_transform(_entry(batch, f"pose{name}", b), f"batch['pose{name}'][{b}]"))
+    names = ("0", "1", *history)
+    clouds, rows = zip(*(_points(batch, b, name) for name in names))
+    poses = [rigid_transform(_entry(batch, f"pose{name}", b), f"batch['pose{name}'][{b}]") for name in names]
     lidar_poses = poses if extrinsics is None else [pose @ extrinsics for pose in poses]
     sweeps = [Sweep(points, None, pose) for points, pose in zip(clouds, lidar_poses)]
     ground = _ground_of_t(batch, b).to(clouds[0])
@@ -94,13 +90,12 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor
 
 def _ground_of_t(batch: Mapping[str, Any], b: int) -> Tensor:
     """Return the (K, 3) ground points of t, which the harness has taken out of pc0; none if the batch lacks them."""
-    if "origin_pc0" not in batch or "gm0" not in batch:
-        return torch.zeros((0, 3))
-    points, is_ground = _entry(batch, "origin_pc0", b), _mask(batch, "gm0", b)
-    if len(points) != is_ground.numel():
-        return torch.zeros((0, 3))
-    points = points[is_ground.to(points.device), :3]
-    return points[points.isfinite().all(dim=1)]
+    if "origin_pc0" in batch and "gm0" in batch:
+        points, is_ground = _entry(batch, "origin_pc0", b), _mask(batch, "gm0", b)
+        if len(points) == is_ground.numel():
+            points = points[is_ground.to(points.device), :3]
+            return points[points.isfinite().all(dim=1)]
+    return torch.zeros((0, 3))
 
 
 def _mask(batch: Mapping[str, Any], key: str, b: int) -> Tensor:

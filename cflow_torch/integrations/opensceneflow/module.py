@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
@@ -15,6 +14,7 @@ from torch import Tensor, nn
 from cflow_torch.config import WINDOW, Config, make_config
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.hdf5.frames import harness_pose_flow, residual_for_harness
+from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
 from cflow_torch.types import CFlowError, FlowResult
@@ -61,15 +61,15 @@ class CFlow(nn.Module):
         unknown = [name for name in sorted(settings) if name not in names]
         if unknown:
             known = f"method={config.method!r} has {', '.join(names)} (history is set by num_frames)"
-            warnings.warn(f"ignored settings: {', '.join(unknown)}; {known}", stacklevel=2)
+            warn(f"ignored settings: {', '.join(unknown)}; {known}")
         config = config.replace(**{name: value for name, value in settings.items() if name in names})
         self.config = _with_history(config, num_frames)
         self.estimator = make_model(self.config, device)
         if output not in OUTPUTS:
             raise CFlowError(f"output={output!r}: give one of {', '.join(map(repr, OUTPUTS))}")
         self.output = output
-        has_matrix = ego_T_lidar is not None and not (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto")
-        self.ego_T_lidar = rigid_transform(ego_T_lidar, "ego_T_lidar") if has_matrix else ego_T_lidar
+        is_matrix = ego_T_lidar is not None and not (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto")
+        self.ego_T_lidar = rigid_transform(ego_T_lidar, "ego_T_lidar") if is_matrix else ego_T_lidar
         self.timer: Any = None
         with suppress(ImportError):  # the harness always has it, and requires the attribute
             self.timer = import_module("dztimer").Timing()
@@ -91,9 +91,8 @@ class CFlow(nn.Module):
 
         A `CFlowError` names a bad key of the batch.
         """
-        num_history = self.config.num_history
-        samples = read_batch(batch, num_history, self.ego_T_lidar)
-        self._check_history(samples, num_history)
+        samples = read_batch(batch, self.config.num_history, self.ego_T_lidar)
+        self._check_history(samples)
         results = self.estimator([sample.window for sample in samples])
         with torch.no_grad(), torch.autocast(results[0].flow.device.type, enabled=False):
             outputs = [self._output(batch, b, *pair) for b, pair in enumerate(zip(samples, results))]
@@ -122,16 +121,15 @@ class CFlow(nn.Module):
             "pc1_points_lst": pc1.to(device)[rows1],
         }
 
-    def _check_history(self, samples: list[Sample], num_history: int) -> None:
+    def _check_history(self, samples: list[Sample]) -> None:
         """Warn once if the batches have less history than the settings."""
-        given = min(len(sample.window.pch) for sample in samples)
+        num_history, given = self.config.num_history, min(len(sample.window.pch) for sample in samples)
         if given < num_history and not self._has_warned:
             self._has_warned = True
-            warnings.warn(
+            warn(
                 f"num_frames={num_history + 2} needs {num_history} history sweeps, but the batch has {given}, and the "
                 f"flow is estimated from those. Pass num_frames={num_history + 2} to the script as well (iter_only), "
-                f"or set model.target.num_frames={given + 2}",
-                stacklevel=3,
+                f"or set model.target.num_frames={given + 2}"
             )
 
 
