@@ -32,7 +32,7 @@ def write_small_log(name: str, folder: Path) -> Path:
     elif name == "aevascenes":
         write_aevascenes_sequence(TinyRecording(("front", "rear"), num_sweeps=3), folder)
     elif name == "arrays":
-        write_array_log(drive, folder, ".npz", "tum")
+        write_array_log(drive, folder, ".npz")
     elif name == "bags":
         pytest.importorskip("rosbags")
         from bag_writer import write_bag

@@ -50,8 +50,7 @@ def task(cfg: DictConfig) -> None:
             suffix = cfg.suffix or (own.files[0].suffix.lower() if isinstance(own, ArraysLog) else ".npy")
             if not folder.exists():
                 clean = CleanLog(log, model, flow, cfg.remove_stopped)
-                poses = None if log.sweep(0).pose is None else "kitti"
-                write_array_log(clean, output, suffix, poses)
+                write_array_log(clean, output, suffix)
                 if clean.num_stopped is not None:
                     more = f"; remove_stopped removed {clean.num_stopped} more points"
             bin_columns = max(3 + len(log.columns(0)), KITTI_COLUMNS) if suffix == ".bin" else KITTI_COLUMNS

@@ -76,9 +76,9 @@ def test_ground_times_and_other_columns_stay_with_their_rows(tmp_path: Path, suf
     log = WithRows([straight((0, 0), (0.9, 0.0))])
     sweep, stays = cleaned(log)[3], np.flatnonzero(~cleaned(log).moving(3))
     assert np.array_equal(sweep.is_ground, stays % 7 == 0) and np.allclose(sweep.point_times, stays * 1e-6)
-    source = ArraysLog(write_array_log(log, tmp_path / "all", suffix, poses=None))
+    source = ArraysLog(write_array_log(log, tmp_path / "all", suffix))
     clean = CleanLog(source, flow=log.result)
-    back = ArraysLog(write_array_log(clean, tmp_path / "clean", suffix, poses=None))
+    back = ArraysLog(write_array_log(clean, tmp_path / "clean", suffix))
     for index in (3, len(log) - 1):
         row, points = back.columns(index)["column_3"].astype(int), source.sweep(index).points
         assert 0 < len(row) < len(points) and np.array_equal(back.sweep(index).points, points[row])

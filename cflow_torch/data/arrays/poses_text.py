@@ -11,7 +11,7 @@ import numpy as np
 
 from cflow_torch.data.files import file_errors, read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.data.rigid_motion import interpolate_poses, poses_from_quaternions, to_quaternions
+from cflow_torch.data.rigid_motion import interpolate_poses, poses_from_quaternions
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -20,11 +20,12 @@ _LONGEST_GAP_NS = 500_000_000  # longest gap between two poses that we interpola
 
 
 class Trajectory(NamedTuple):
-    """K poses."""
+    """K poses, and their `source` for messages."""
 
     poses: np.ndarray  # (K, 4, 4) float64 `T_world_frame`; the file does not say which frame
     times_ns: np.ndarray | None  # (K,) int64 nanoseconds, ascending; None if the format has no times
     layout: str  # "kitti", "tum" or "matrix"
+    source: str
 
 
 def read_poses(path: PathLike) -> Trajectory:
@@ -50,7 +51,7 @@ def read_poses(path: PathLike) -> Trajectory:
             )
         else:
             matrices = values.reshape(len(values), -1, 4)
-    return Trajectory(checked_poses(matrices, str(path)), times_ns, layout)
+    return Trajectory(checked_poses(matrices, str(path)), times_ns, layout, str(path))
 
 
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
@@ -89,24 +90,16 @@ def write_kitti_poses(path: PathLike, poses: np.ndarray) -> None:
     np.savetxt(path, np.asarray(poses)[:, :3].reshape(-1, 12), "%.17g")
 
 
-def write_tum_poses(path: PathLike, times_ns: Sequence[int], poses: np.ndarray) -> None:
-    """Write (K, 4, 4) poses as `t x y z qx qy qz qw`, seconds with 9 decimals, the rest with 17 digits."""
-    poses = np.asarray(poses, np.float64)
-    numbers = np.concatenate([poses[:, :3, 3], to_quaternions(poses[:, :3, :3])[:, [1, 2, 3, 0]]], axis=1)
-    lines = [" ".join([_seconds(time), *(f"{v:.17g}" for v in row)]) for time, row in zip(times_ns, numbers)]
-    np.savetxt(path, lines, "%s")
-
-
 def write_times(path: PathLike, times_ns: Sequence[int]) -> None:
     """Write nanoseconds as one time in seconds per line, with 9 decimals."""
-    np.savetxt(path, [_seconds(time) for time in times_ns], "%s")
+    np.savetxt(path, [f"{Decimal(int(time)).scaleb(-9):.9f}" for time in times_ns], "%s")
 
 
-def covered_poses(trajectory: Trajectory, times_ns: Sequence[int], source: str) -> np.ndarray:
+def covered_poses(trajectory: Trajectory, times_ns: Sequence[int]) -> np.ndarray:
     """Interpolate poses at (M,) nanoseconds: positions linearly, rotations at a constant rate.
 
-    A time before the first pose, after the last one, or in a gap of more than half a second is a `CFlowError` that
-    names the `source`. At exactly the time of a pose, the result is this pose, unchanged.
+    A time before the first pose, after the last one, or in a gap of more than half a second is a `CFlowError`. At
+    exactly the time of a pose, the result is this pose, unchanged.
     """
     known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
     after = np.searchsorted(known, wanted).clip(0, len(known) - 1)  # the first pose that is not before
@@ -116,8 +109,8 @@ def covered_poses(trajectory: Trajectory, times_ns: Sequence[int], source: str) 
     if bad.any():
         row = int(bad.argmax())
         raise CFlowError(
-            f"{source} covers {known[0]} ... {known[-1]} ns and has no pose near sweep {row} at {wanted[row]} ns; "
-            "do both count from the same time?"
+            f"{trajectory.source} covers {known[0]} ... {known[-1]} ns and has no pose near sweep {row} at "
+            f"{wanted[row]} ns; do both count from the same time?"
         )
     share = (wanted - known[before]) / np.maximum(gap, 1)
     return interpolate_poses(trajectory.poses[before], trajectory.poses[after], share)
@@ -145,7 +138,3 @@ def _nanoseconds(path: PathLike, seconds: np.ndarray) -> np.ndarray:
     if falls.any():
         raise CFlowError(f"{path}: times must ascend, line {int(falls.argmax()) + 2} does not")
     return result
-
-
-def _seconds(time_ns: int) -> str:
-    return f"{Decimal(int(time_ns)).scaleb(-9):.9f}"

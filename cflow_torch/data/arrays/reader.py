@@ -89,12 +89,12 @@ class ArraysLog(Log):
         self._bin_columns = bin_columns
         self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
-        trajectory, source, in_lidar = self._trajectory(poses, calibration)
+        trajectory, are_of_lidar = self._trajectory(poses, calibration)
         stamps = self._times(times, trajectory)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        self.poses = None if trajectory is None else self._one_each(trajectory, source, stamps)
-        if self.poses is not None and (in_lidar or poses_of == "lidar"):
+        self.poses = None if trajectory is None else self._one_each(trajectory, stamps)
+        if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
 
     def sweep(self, index: int) -> Sweep:
@@ -113,23 +113,20 @@ class ArraysLog(Log):
         self._timestamp(index)
         return read_columns(self.files[index], self._bin_columns)
 
-    def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, str, bool]:
-        """Return the poses, their name for messages, and whether a calibration converted them to the LiDAR's."""
-        if is_path_like(poses):
-            kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
-            file = _resolve(self.folder, poses, POSE_FILES, "poses", kitti)
-            if file is None:
-                return None, "", False
-            trajectory = poses_text.read_poses(file)
-            chosen = _resolve(self.folder, calibration, ("calib.txt",), "calibration")
-            if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
-                return trajectory, str(file), False
-            T_cam_lidar = poses_text.read_calibration(chosen)
-            in_lidar = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
-            return trajectory._replace(poses=in_lidar), str(file), True
-        if poses is None:
-            return None, "", False
-        return Trajectory(poses_text.checked_poses(np.asarray(poses), "poses"), None, "matrix"), "poses", False
+    def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, bool]:
+        """Return the poses, and whether a calibration converted them to the LiDAR's."""
+        if poses is not None and not is_path_like(poses):
+            return Trajectory(poses_text.checked_poses(np.asarray(poses), "poses"), None, "matrix", "poses"), False
+        kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
+        file = _resolve(self.folder, poses, POSE_FILES, "poses", kitti)
+        if file is None:
+            return None, False
+        trajectory = poses_text.read_poses(file)
+        chosen = _resolve(self.folder, calibration, ("calib.txt",), "calibration")
+        if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
+            return trajectory, False
+        T_cam_lidar = poses_text.read_calibration(chosen)
+        return trajectory._replace(poses=np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar), True
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
@@ -147,13 +144,13 @@ class ArraysLog(Log):
             return trajectory.times_ns.tolist()
         return None
 
-    def _one_each(self, trajectory: Trajectory, source: str, stamps: list[int] | None) -> np.ndarray:
+    def _one_each(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
         if trajectory.times_ns is not None and stamps is not None:
-            return poses_text.covered_poses(trajectory, stamps, source)
+            return poses_text.covered_poses(trajectory, stamps)
         if len(trajectory.poses) != len(self.files):
             raise CFlowError(
-                f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
-                "with times (TUM) and the times of the sweeps in times.txt"
+                f"{trajectory.source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, "
+                "or poses with times (TUM) and the times of the sweeps in times.txt"
             )
         return trajectory.poses
 

@@ -102,8 +102,8 @@ class BagLog(Log):
                 self.timestamps = [time for time in self.timestamps if first <= time <= last]
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             if poses is not None:
-                known = Trajectory(self._known_poses, self._known_times, "bag")
-                self.poses = covered_poses(known, self.timestamps, poses)
+                known = Trajectory(self._known_poses, self._known_times, "bag", poses)
+                self.poses = covered_poses(known, self.timestamps)
             if self._mount is None:
                 self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
 
