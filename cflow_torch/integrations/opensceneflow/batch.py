@@ -20,7 +20,6 @@ class Sample(NamedTuple):
     # t as "origin_pc0", its ground points follow those of pc0, with a mask.
     window: Window
     rows0: Tensor  # (K,) int64, rows of batch["pc0"] that are in `window.pc0`
-    rows1: Tensor  # (K1,) int64, rows of batch["pc1"] that are in `window.pc1`
     T_ego1_ego0: np.ndarray  # (4, 4) float32, motion that the harness computes from the poses and adds itself
     # (4, 4) float64, motion of the frame of the points; None = `T_ego1_ego0` is that motion.
     T_lidar1_lidar0: np.ndarray | None
@@ -66,7 +65,7 @@ def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: A
         sweeps = [whole if repeated else sweep for sweep, repeated in zip(sweeps, repeats)]
     T_ego1_ego0 = harness_motion(_entry(batch, "pose0", b), _entry(batch, "pose1", b))
     T_lidar1_lidar0 = None if extrinsics is None else relative_transform(lidar_poses[1], lidar_poses[0])
-    return Sample(Window(sweeps[0], sweeps[1], tuple(sweeps[2:])), rows[0], rows[1], T_ego1_ego0, T_lidar1_lidar0)
+    return Sample(Window(sweeps[0], sweeps[1], tuple(sweeps[2:])), rows[0], T_ego1_ego0, T_lidar1_lidar0)
 
 
 def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor]:

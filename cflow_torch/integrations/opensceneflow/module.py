@@ -87,7 +87,6 @@ class CFlow(nn.Module):
                 With `ego_T_lidar`, it also contains the error of the harness's own pose_flow.
             pc0_valid_point_idxes: (M,) int64, the rows of batch["pc0"] that `flow` belongs to.
             pose_flow: (N, 3) float32, T p - p of all rows of pc0, as the harness computes it.
-            pc1_valid_point_idxes: (M1,) int64; pc0_points_lst: (M, 3), pc1_points_lst: (M1, 3), for losses.
 
         A `CFlowError` names a bad key of the batch.
         """
@@ -99,27 +98,19 @@ class CFlow(nn.Module):
         return {key: [output[key] for output in outputs] for key in outputs[0]}
 
     def _output(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> dict[str, Tensor]:
-        pc0, pc1 = batch["pc0"][b][:, :3], batch["pc1"][b][:, :3]
         num_points = len(sample.rows0)  # ground points follow them
         residual, is_valid = result.residual_flow[:num_points], result.is_valid[:num_points]
         device = residual.device
-        points, rows = pc0.detach().to(device).float(), sample.rows0.to(device)
+        points, rows = batch["pc0"][b][:, :3].detach().to(device).float(), sample.rows0.to(device)
         if sample.T_lidar1_lidar0 is not None:
             residual = residual_for_harness(residual, points[rows], sample.T_ego1_ego0, sample.T_lidar1_lidar0)
         flow = torch.zeros_like(points).index_copy_(0, rows, residual)
         if self.output == "valid":
             rows = rows[is_valid]
         elif "gm0" in batch:  # without padding, the iter_only path expects a row for every point
-            rows = torch.arange(len(pc0), device=device)
-        rows1 = sample.rows1.to(device)
-        return {
-            "flow": flow[rows],
-            "pose_flow": harness_pose_flow(points, sample.T_ego1_ego0),
-            "pc0_valid_point_idxes": rows,
-            "pc1_valid_point_idxes": rows1,
-            "pc0_points_lst": pc0.to(device)[rows],
-            "pc1_points_lst": pc1.to(device)[rows1],
-        }
+            rows = torch.arange(len(points), device=device)
+        pose_flow = harness_pose_flow(points, sample.T_ego1_ego0)
+        return {"flow": flow[rows], "pose_flow": pose_flow, "pc0_valid_point_idxes": rows}
 
     def _check_history(self, samples: list[Sample]) -> None:
         """Warn once if the batches have less history than the settings."""
