@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import secrets
 import shutil
-import tempfile
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, Iterator
+from typing import Any, Iterator
 
 from cflow_torch.data.paths import PathLike, as_path, forget_listings, is_remote, remote_errors, safe_name
 from cflow_torch.errors import CFlowError
@@ -27,13 +27,14 @@ def atomic_file(path: PathLike) -> Iterator[Any]:
 
     If the block raises, the new file is removed and an older one stays. Missing folders are created. Local files get a
     temporary name in the same folder, `.NAME.<random>.tmp`, and are renamed at the end. Only a killed process leaves
-    the temporary file behind, see `remove_stale`. Remote files are written locally first. An object store receives them
-    under their name; on other file systems they are put under a temporary name and then moved.
+    the temporary file behind, see `remove_stale`. Remote files are in memory until the end. An object store receives
+    them under their name; on other file systems they are put under a temporary name and then moved.
     """
     path = as_path(path)
     if is_remote(path):
-        with _put_file(path) as file:
-            yield file
+        content = io.BytesIO()
+        yield content
+        _put(path, content.getvalue())
     else:
         with atomic_name(path) as temporary, open(temporary, "xb") as file:
             yield file
@@ -61,25 +62,20 @@ def write_text(path: PathLike, text: str) -> None:
         file.write(text.encode())
 
 
-@contextmanager
-def _put_file(path: Any) -> Iterator[IO[bytes]]:
-    with tempfile.TemporaryDirectory() as folder:
-        local = os.path.join(folder, "local")
-        with open(local, "w+b") as file:
-            yield file
-        with remote_errors(path):
-            if path.protocol in _ATOMIC_PUTS:
-                path.fs.put_file(local, path.path)
-                return
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = path.parent / _temporary_name(path.name)
-            try:
-                path.fs.put_file(local, temporary.path)
-                path.fs.mv(temporary.path, path.path)
-            except BaseException:
-                with suppress(Exception):
-                    temporary.unlink()
-                raise
+def _put(path: Any, content: bytes) -> None:
+    with remote_errors(path):
+        if path.protocol in _ATOMIC_PUTS:
+            path.fs.pipe_file(path.path, content)
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.parent / _temporary_name(path.name)
+        try:
+            path.fs.pipe_file(temporary.path, content)
+            path.fs.mv(temporary.path, path.path)
+        except BaseException:
+            with suppress(Exception):
+                temporary.unlink()
+            raise
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Sequence
+from typing import Sequence
 
 import numpy as np
 from tqdm import tqdm
@@ -81,13 +81,11 @@ class Odometry:
 
 
 class PosedLog(LogWrapper):
-    """A log with other poses, (K, 4, 4) `T_world_ego`, one rigid motion per sweep."""
+    """A log with other poses, (K, 4, 4) float64 `T_world_ego`, one per sweep."""
 
-    def __init__(self, log: Log, poses: Any) -> None:
+    def __init__(self, log: Log, poses: np.ndarray) -> None:
         super().__init__(log)
-        if len(poses) != len(log.timestamps):
-            raise CFlowError(f"{len(poses)} poses for {len(log.timestamps)} sweeps of log {log.log_id}: pass one each")
-        self.poses = np.stack([rigid_transform(pose, f"poses[{index}]") for index, pose in enumerate(poses)])
+        self.poses = poses
 
     def sweep(self, index: int) -> Sweep:
         return replace(self.log.sweep(index), pose=self.poses[index].copy())

@@ -202,7 +202,7 @@ def test_a_file_appears_complete_when_its_block_ends(remote, error):
     assert (remote / "deep" / "a").read_bytes() == b"new" and names(remote / "deep") == ("a",)
 
 
-@pytest.mark.parametrize("method", ["put_file", "mv"])
+@pytest.mark.parametrize("method", ["pipe_file", "mv"])
 def test_a_failed_put_leaves_the_old_file(remote, method, monkeypatch):
     with atomic_file(remote / "a") as file:
         file.write(b"old" * 100)
