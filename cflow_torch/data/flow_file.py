@@ -38,7 +38,7 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
         lacking = ", ".join(sorted(set(names) - columns.keys()))
         raise CFlowError(f"this result has no {lacking}: estimate it with preset default or offline, or leave it out")
     with atomic_file(path) as file:
-        feather.write_feather(pa.table({name: pa.array(columns[name]) for name in names}), file)
+        feather.write_feather(pa.table({name: columns[name] for name in names}), file)
 
 
 def read_flow(path: PathLike) -> FlowResult:

@@ -57,9 +57,6 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
 
     Source: the fit is the normal distributions transform in the plane (Biber and Strasser, 2003).
     """
-    count = len(log.timestamps)
-    if baseline < 1 or not 0 <= index < count - baseline:
-        raise CFlowError(f"log {log.log_id} has {count} sweeps; you asked for the pair {index}, {index + baseline}")
     older, newer = log.sweep(index), log.sweep(index + baseline)
     has_poses = older.pose is not None and newer.pose is not None
     pose0, pose1 = (rigid_transform(s.pose, "pose") if has_poses else np.eye(4) for s in (older, newer))

@@ -11,6 +11,7 @@ from typing import Any, Callable, Dict
 import numpy as np
 import pyarrow as pa
 import pytest
+import torch
 from command_line import cflow
 from hdf5_scene import write_scene
 from public_evaluators import FLOW, LOG, TIME, official_mask, read_pair
@@ -20,7 +21,7 @@ from cflow_torch import CFlowError, CorrelationFlow
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window
-from cflow_torch.evaluation.submission.archive import check_submission, encode, get_version, pack, to_half, write_frame
+from cflow_torch.evaluation.submission.archive import check_submission, encode, get_version, pack, write_frame
 from cflow_torch.evaluation.submission.frames import MaskArchive, plan_log, point_mask, read_frame_list, require_logs
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
@@ -100,7 +101,8 @@ def test_unsuitable_masks_values_and_versions_are_refused(estimated: dict[int, A
             encode(get_version(number), flow, mask=mask)
     for value, message in ((np.nan, "NaN"), (np.inf, "infinite"), (65505.0, "beyond float16")):
         with pytest.raises(CFlowError, match=message):
-            to_half(np.array([[0, 0, 0], [0, value, 0]], np.float32))
+            spoiled = type(flow)(**{**vars(flow), "residual_flow": torch.full_like(flow.residual_flow, value)})
+            encode(get_version(3), spoiled)
     for number, message in ((2, "closed"), (4, "1, 3")):
         with pytest.raises(CFlowError, match=message):
             get_version(number)

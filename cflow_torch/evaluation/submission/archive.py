@@ -18,7 +18,7 @@ from pyarrow import feather
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.files import file_errors, shortened
-from cflow_torch.data.paths import read_bytes, safe_name
+from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
 
 DYNAMIC_THRESHOLD = 0.05  # metres per sweep, the evaluation's threshold for dynamic points
@@ -40,16 +40,10 @@ class SubmissionVersion:
 
 
 VERSIONS: dict[int, SubmissionVersion] = {
-    version.number: version
-    for version in (
-        SubmissionVersion(
-            1,
-            "Argoverse 2 scene flow 2023 (EvalAI challenge 2010, phase 4018)",
-            {**_FLOW, "is_dynamic": "bool"},
-            True,
-        ),
-        SubmissionVersion(3, "multi-dataset challenge 2026 (sceneflow.argoverse.org)", _FLOW, False),
-    )
+    1: SubmissionVersion(
+        1, "Argoverse 2 scene flow 2023 (EvalAI challenge 2010, phase 4018)", {**_FLOW, "is_dynamic": "bool"}, True
+    ),
+    3: SubmissionVersion(3, "multi-dataset challenge 2026 (sceneflow.argoverse.org)", _FLOW, False),
 }
 
 
@@ -84,7 +78,11 @@ def encode(
         residual, flow = residual[keep], as_numpy(result.flow)[keep]
     else:
         flow = residual if is_ground is None else np.where(as_numpy(is_ground)[:, None], np.float32(0), residual)
-    half, error = to_half(flow)
+    bad = ~(np.abs(flow) <= LARGEST).all(axis=1)
+    if bad.any():
+        raise CFlowError(f"the flow of {bad.sum()} points is NaN, infinite or beyond float16 ({LARGEST:g} m)")
+    half = flow.astype(np.float16)
+    error = np.linalg.norm(half.astype(np.float64) - flow.astype(np.float64), axis=1)
     columns = {
         **{f"flow_t{axis}_m": half[:, i] for i, axis in enumerate("xyz")},
         "is_dynamic": np.linalg.norm(residual, axis=1) >= np.float32(DYNAMIC_THRESHOLD),
@@ -92,22 +90,10 @@ def encode(
     return {name: columns[name] for name in version.columns}, error
 
 
-def to_half(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Round a flow, (M, 3) metres, to float16; also return the (M,) float64 metres by which each row is off."""
-    bad = ~(np.abs(flow) <= LARGEST).all(axis=1)
-    if bad.any():
-        raise CFlowError(f"the flow of {bad.sum()} points is NaN, infinite or beyond float16 ({LARGEST:g} m)")
-    half = flow.astype(np.float16)
-    return half, np.linalg.norm(half.astype(np.float64) - flow.astype(np.float64), axis=1)
-
-
 def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]) -> None:
-    """Write the columns of one frame atomically to a submission folder, as `<log>/<time stamp>.feather`."""
-    log_id, _, stem = name.rpartition("/")
-    file = Path(folder) / safe_name(log_id, "the log") / stem
-    table = pa.table({key: pa.array(values) for key, values in columns.items()})
-    with atomic_file(file) as stream:
-        feather.write_feather(table, stream)
+    """Write the columns of one frame atomically to a submission folder; `name` is that of `Frame`."""
+    with atomic_file(Path(folder) / name) as file:
+        feather.write_feather(pa.table(dict(columns)), file)
 
 
 def is_complete(folder: str | Path, name: str, rows: int, version: SubmissionVersion) -> bool:
