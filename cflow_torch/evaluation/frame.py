@@ -75,11 +75,9 @@ class EvalFrame:
             ("T_ego1_ego0", np.float64, (4, 4)),
         ):
             self._set(name, _checked(name, getattr(self, name), dtype, shape))
-        truth = {
-            name: _checked(f"labels.{name}", getattr(labels, name), dtype, (rows, *tail))
-            for name, dtype, *tail in (("flow", np.float32, 3), ("category", np.int64), ("is_valid", np.bool_))
-        }
-        self._set("labels", FlowLabels(**truth))
+        true_flow = _checked("labels.flow", labels.flow, np.float32, (rows, 3))
+        truth = FlowLabels(true_flow, as_numpy(labels.category, np.int64), as_numpy(labels.is_valid))
+        self._set("labels", truth)
         if self.pose_flow is None:
             self._set("pose_flow", ego_motion_flow(self.points, self.T_ego1_ego0))  # type: ignore[arg-type]
 

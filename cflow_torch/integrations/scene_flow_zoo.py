@@ -55,10 +55,6 @@ class CorrelationFlowModel(SequenceFlow):
             outputs.append(output_class(ego_flows=ego_flows, valid_flow_mask=mask.clone()))
         return outputs
 
-    def loss_fn(self, input_batch: Any, model_res: Any) -> Any:
-        """Raise a `CFlowError`, because there is no loss."""
-        raise CFlowError("this model cannot be trained: set is_trainable = False in the config and run test_pl.py")
-
 
 def register(name: str = "CorrelationFlow") -> None:
     """Register the model with `models.construct_model` of the checkout, so that a config can name it."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.data.hdf5.frames import harness_motion, recognized_extrinsics
-from cflow_torch.types import CFlowError, Sweep, Window
+from cflow_torch.types import CFlowError, Sweep, Window, check_array, check_points
 from cflow_torch.windows.ego_motion import relative_transform, rigid_transform
 
 
@@ -72,8 +72,7 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor
     """Select the points of one sweep that are finite and not ground; return them and their rows."""
     key = f"pc{name}"
     points = _entry(batch, key, b)
-    if not isinstance(points, Tensor) or points.ndim != 2 or points.shape[1] < 3:
-        raise CFlowError(f"batch['{key}'][{b}] is {_described(points)}: give a tensor of shape (N, 3)")
+    check_points(points, f"batch['{key}'][{b}]")
     keep = points[:, :3].isfinite().all(dim=1)
     mask_key = f"gm{name}"
     if mask_key in batch:
@@ -98,11 +97,9 @@ def _ground_of_t(batch: Mapping[str, Any], b: int) -> Tensor:
 
 
 def _mask(batch: Mapping[str, Any], key: str, b: int) -> Tensor:
-    mask = _entry(batch, key, b)
-    is_mask = isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.ndim in (1, 2)
-    if not is_mask or mask.numel() != mask.shape[0]:
-        raise CFlowError(f"batch['{key}'][{b}] is {_described(mask)}: give a bool tensor of shape (N,), True = ground")
-    return mask.reshape(-1)
+    mask: Tensor = _entry(batch, key, b)
+    check_array(mask, f"batch['{key}'][{b}]", (None,), "b", "(N,) bool, True = ground")
+    return mask
 
 
 def _extrinsics(batch: Mapping[str, Any], b: int, ego_T_lidar: Any) -> np.ndarray | None:
@@ -128,9 +125,5 @@ def _entry(batch: Mapping[str, Any], key: str, b: int) -> Any:
     try:
         return batch[key][b]
     except (IndexError, TypeError, KeyError):
-        raise CFlowError(f"batch['{key}'] is {_described(batch[key])}: give one entry per sample") from None
-
-
-def _described(value: Any) -> str:
-    what = f", {value.dtype}, of shape {tuple(value.shape)}" if isinstance(value, Tensor) else ""
-    return f"a {type(value).__name__}{what}"
+        shape = f" of shape {tuple(batch[key].shape)}" if isinstance(batch[key], Tensor) else ""
+        raise CFlowError(f"batch['{key}'] is {type(batch[key]).__name__}{shape}: give one entry per sample") from None
