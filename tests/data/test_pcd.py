@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError
-from cflow_torch.data.arrays.cloud_file import pcd_fields, read_cloud, write_pcd
+from cflow_torch.data.arrays.cloud_file import pcd_fields, read_cloud, write_cloud
 
 DTYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 
@@ -58,7 +58,7 @@ def test_padding_and_vector_fields_are_left_out(tmp_path):
 
 
 def test_without_pypcd4_the_message_names_it(tmp_path, monkeypatch):
-    write_pcd(tmp_path / "a.pcd", {"x": np.zeros(2, np.float32)})
+    write_cloud(tmp_path / "a.pcd", np.zeros((2, 3), np.float32))
     monkeypatch.setitem(sys.modules, "pypcd4", None)
     with pytest.raises(CFlowError, match=r"pip install pypcd4"):
         pcd_fields((tmp_path / "a.pcd").read_bytes())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_recording import CAR_VELOCITY, TinyRecording
 
-from cflow_torch.data.arrays.cloud_file import pcd_fields, write_pcd
+from cflow_torch.data.arrays.cloud_file import pcd_fields, read_cloud, write_cloud
 from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.data.truckscenes import TruckScenesLog, find_truckscenes_scenes
@@ -122,8 +122,7 @@ def test_truck_and_trailer_are_removed(recording, tiny):
     local = np.concatenate([local, np.zeros((1, 3)), np.full((1, 3), np.nan)]).astype(np.float32)
     # 99 ms later the truck has moved by 1.5 m, but not relative to itself.
     times = np.full(len(local), log.timestamps[0] + 99_000, np.uint64)
-    fields = {axis: local[:, k] for k, axis in enumerate("xyz")}
-    write_pcd(file, {**fields, "intensity": np.zeros(len(local), np.float32), "timestamp": times})
+    write_cloud(file, local, {"intensity": np.zeros(len(local), np.float32), "timestamp": times})
     assert len(log.sweep(0).points) == 4
     assert len(open_log(tiny, lidars=["LIDAR_LEFT"], own_vehicle=None).sweep(0).points) == 6
     names = read(tiny, "category")
@@ -138,13 +137,13 @@ def test_truck_and_trailer_are_removed(recording, tiny):
 def test_a_bad_sweep_costs_no_other(recording, tiny):
     log = open_log(tiny)
     file = next((tiny / "samples" / "LIDAR_LEFT").glob(f"*_{log.timestamps[0]}.pcd"))
-    fields = pcd_fields(file.read_bytes())
-    for change, complaint in [
-        ({"timestamp": None}, r"lacks the columns \['timestamp'\]"),
-        ({"timestamp": fields["timestamp"] - fields["timestamp"].min()}, "microseconds since 1970.* deskew=False"),
-        ({"timestamp": fields["timestamp"] * np.uint64(1000)}, "microseconds since 1970.* deskew=False"),
+    points, times = read_cloud(file), pcd_fields(file.read_bytes())["timestamp"]
+    for columns, complaint in [
+        ({}, r"lacks the columns \['timestamp'\]"),
+        ({"timestamp": times - times.min()}, "microseconds since 1970.* deskew=False"),
+        ({"timestamp": times * np.uint64(1000)}, "microseconds since 1970.* deskew=False"),
     ]:
-        write_pcd(file, {name: values for name, values in {**fields, **change}.items() if values is not None})
+        write_cloud(file, points, columns)
         with pytest.raises(CFlowError, match=f"{file.name}.*{complaint}"):
             log.sweep(0)
     assert len(log.sweep(1).points) > 0

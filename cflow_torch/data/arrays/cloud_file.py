@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather, parquet
 
-from cflow_torch.data.arrays.ply import ply_fields, write_ply
+from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.files import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
@@ -101,11 +101,14 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
         fields[allowed] = _storable(values, suffix)
     if all(name == f"column_{k}" for k, name in enumerate(named, 3)):
         points, named = np.column_stack([points, *named.values()]), {}
-    if suffix in (".pcd", ".ply"):
-        (write_pcd if suffix == ".pcd" else write_ply)(path, fields)
-        return
     with atomic_file(path) as file:
-        if suffix == ".bin":
+        if suffix == ".pcd":
+            pypcd4, kinds = _pypcd4(), [values.dtype for values in fields.values()]
+            cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
+            cloud.save(file, pypcd4.Encoding.BINARY)
+        elif suffix == ".ply":
+            file.write(ply_bytes(fields))
+        elif suffix == ".bin":
             table = np.column_stack([points, *named.values()])
             padding = max(0, KITTI_COLUMNS - table.shape[1])
             file.write(np.pad(table, ((0, 0), (0, padding))).astype("<f4").tobytes())
@@ -221,15 +224,6 @@ def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
     names = [name for name, count in zip(header.fields, header.count) if count == 1 and name[0] != "#"]
     # pypcd4 1.4 makes a two-dimensional table of a cloud without points.
     return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}
-
-
-def write_pcd(path: PathLike, fields: Mapping[str, np.ndarray]) -> None:
-    """Write a binary cloud, atomically. Fields are (N,) float32, float64 or integers; their names have no spaces."""
-    pypcd4 = _pypcd4()
-    kinds = [values.dtype for values in fields.values()]
-    cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
-    with atomic_file(path) as file:
-        cloud.save(file, pypcd4.Encoding.BINARY)
 
 
 def _pypcd4() -> Any:

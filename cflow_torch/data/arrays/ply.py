@@ -14,9 +14,6 @@ from typing import Mapping
 
 import numpy as np
 
-from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.paths import PathLike
-
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = dict(zip(_CODES, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")))
 _TYPES = {
@@ -56,12 +53,11 @@ def ply_fields(content: bytes) -> dict[str, np.ndarray]:
     return {name: table[name].astype(kind[name].newbyteorder("=")) for name in kind.names or ()}
 
 
-def write_ply(path: PathLike, fields: Mapping[str, np.ndarray]) -> None:
-    """Write vertices in binary, atomically; property name -> (N,) float32, float64 or integers of up to 32 bits."""
+def ply_bytes(fields: Mapping[str, np.ndarray]) -> bytes:
+    """Return a binary `.ply` file of vertices; property -> (N,) float32, float64 or integers of up to 32 bits."""
     kinds = {name: values.dtype.str[1:] for name, values in fields.items()}
     properties = "".join(f"property {_NAMES[kind]} {name}\n" for name, kind in kinds.items())
     little = np.dtype([(name, "<" + kind) for name, kind in kinds.items()])
     table = np.rec.fromarrays(list(fields.values()), dtype=little)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(table)}\n{properties}end_header\n"
-    with atomic_file(path) as file:
-        file.write(header.encode("ascii") + table.tobytes())
+    return header.encode("ascii") + table.tobytes()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cflow_torch.data.arrays.cloud_file import write_pcd
+from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
@@ -44,10 +44,9 @@ def write_truckscenes(recording: Recording, root: str | Path) -> Path:
     """
 
     def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
-        x, y, z = np.asarray(unit.points, dtype=np.float32).T
         times = ((int(stamp_ns) + np.asarray(unit.offset_ns, dtype=np.int64)) // 1000).astype(np.uint64)
-        fields = {"x": x, "y": y, "z": z, "intensity": unit.intensity.astype(np.float32), "timestamp": times}
-        write_pcd(file, fields)
+        points, intensity = np.asarray(unit.points, dtype=np.float32), unit.intensity.astype(np.float32)
+        write_cloud(file, points, {"intensity": intensity, "timestamp": times})
 
     with new_folder(root, recording.log_id) as folder:
         scene = SceneWriter(recording, folder, "LIDAR_LEFT", TRUCKSCENES_NAMES)
