@@ -13,7 +13,7 @@ from cflow_torch.types import CFlowError
 
 
 class FeatherFile:
-    """A feather file in memory, with the `names` of its columns and `num_rows`. A damaged file is a `CFlowError`.
+    """A feather file in memory: `table`, `names` of its columns, and `num_rows`. A damaged file is a `CFlowError`.
 
     If you pass the contents as `data`, `file` is only the name in messages. Otherwise the whole file is read at once,
     so it does no harm if the file shrinks later.
@@ -22,16 +22,11 @@ class FeatherFile:
     def __init__(self, file: Any, data: bytes | None = None) -> None:
         with file_errors(file, "copy it from the data set"):
             source = read_bytes(file) if data is None else data
-            self._table = pa.ipc.open_file(source, options=pa.ipc.IpcReadOptions(use_threads=False)).read_all()
-            self._table.validate(full=True)
+            self.table = pa.ipc.open_file(source, options=pa.ipc.IpcReadOptions(use_threads=False)).read_all()
+            self.table.validate(full=True)
         self.file = file
-        self.names: list[str] = self._table.column_names
-        self.num_rows: int = self._table.num_rows
-
-    def read(self, columns: Sequence[str]) -> pa.Table:
-        """Return some columns, in the given order; a column that is missing or occurs twice is a `CFlowError`."""
-        check_columns(self.file, self.names, columns)
-        return self._table.select(list(columns))
+        self.names: list[str] = self.table.column_names
+        self.num_rows: int = self.table.num_rows
 
     def floats(self, columns: Sequence[str], dtype: type = np.float64) -> np.ndarray:
         """Return K floating-point columns as (rows, K); another type or an empty entry is a `CFlowError`."""
@@ -53,7 +48,7 @@ class FeatherFile:
 
     def _column(self, column: str, kind: str, is_kind: Any) -> pa.ChunkedArray:
         check_columns(self.file, self.names, [column])
-        values = self._table.column(column)
+        values = self.table.column(column)
         if not is_kind(values.type):
             raise CFlowError(f"{self.file}: column {column} must be {kind}, got {values.type}")
         if values.null_count:

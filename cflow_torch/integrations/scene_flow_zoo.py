@@ -79,8 +79,5 @@ def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
         Frame(cloud[rows], flags[rows] > 0, sensor_to_ego, ego_to_global)
         for cloud, flags, rows, sensor_to_ego, ego_to_global in zip(points, mask, is_row, *poses)
     ]
-    loader = getattr(getattr(sequence, "loader_type", None), "name", None)
-    if loader not in ("CAUSAL", "NON_CAUSAL"):
-        raise CFlowError(f"{name}.loader_type is {loader!r}: give LoaderType.CAUSAL or LoaderType.NON_CAUSAL")
     valid = (mask > 0).float().masked_fill(~is_row, torch.nan)
-    return frames, len(frames) - 2 if loader == "CAUSAL" else 0, valid
+    return frames, len(frames) - 2 if sequence.loader_type.name == "CAUSAL" else 0, valid

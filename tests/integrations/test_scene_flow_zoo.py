@@ -136,7 +136,6 @@ def test_the_error_outside_of_a_checkout_has_the_fix(monkeypatch: pytest.MonkeyP
         ({"full_pc_mask": torch.zeros(2, 7)}, r"full_pc_mask has shape \(2, 7\).*give \(2, 640\)"),
         ({"pc_poses_ego_to_global": torch.full((2, 4, 4), NAN)}, r"pc_poses_ego_to_global\[0\] holds NaN"),
         ({"pc_poses_sensor_to_ego": 2 * torch.eye(4).repeat(2, 1, 1)}, r"pc_poses_sensor_to_ego\[0\] is not rigid"),
-        ({"loader_type": "causal"}, r"loader_type is None: give LoaderType\.CAUSAL"),
     ],
 )
 def test_the_error_names_the_bad_field_of_a_sequence(changes: dict[str, Any], complaint: str) -> None:

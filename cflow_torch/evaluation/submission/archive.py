@@ -64,14 +64,12 @@ def encode(
         version: the format.
         result: flow of the N points of sweep t; values that are NaN, infinite or beyond float16 are a `CFlowError`.
         is_ground: (N,) bool, True = ground; None = no point is ground.
-        mask: (N,) bool, points to write; None = all, for versions without a mask.
+        mask: (N,) bool, the points to write of a version with a mask; None for the others.
 
     Convention:
         The flow is float16 metres until the next sweep. A residual flow is in the axes of t+1, as OpenSceneFlow writes
         it, and 0 for ground points. `is_dynamic` is True where the unrounded residual is 0.05 m or longer.
     """
-    if (mask is not None) != version.is_masked:
-        raise CFlowError(f"submission version {version.number} needs {'a' if version.is_masked else 'no'} mask")
     residual = as_numpy(result.residual_flow).astype(np.float32)
     if mask is not None:
         keep = np.asarray(mask, dtype=bool)
@@ -158,7 +156,7 @@ def _check_file(name: str, read: Callable[[], bytes], rows: int, version: Submis
     try:
         with file_errors(name):  # a damaged zip makes zipfile raise nearly anything
             file = FeatherFile(name, read())
-            columns = {each: file.read([each]).column(0) for each in version.columns if each in file.names}
+            columns = {each: file.table.column(each) for each in version.columns if each in file.names}
             dtypes = {each: np.dtype(column.type.to_pandas_dtype()) for each, column in columns.items()}
     except CFlowError as error:
         return [f"{name}: cannot be read ({shortened(error)})"]

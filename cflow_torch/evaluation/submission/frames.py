@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Iterable, Mapping, Sequence
 
 import numpy as np
-import pyarrow as pa
 
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.files import file_errors
@@ -45,11 +44,10 @@ class MaskArchive:
         """Read the (N,) bool mask of a sweep; a missing or damaged one is a `CFlowError`."""
         name = f"{log_id}/{timestamp}.feather"
         with file_errors(f"{self.file}: {name}"):
-            file = FeatherFile(name, self._zip.read(name))
-            columns = file.read(file.names).columns
-        if len(columns) != 1 or not pa.types.is_boolean(columns[0].type) or columns[0].null_count:
-            raise CFlowError(f"{self.file}: {name} must have one bool column without empty values")
-        return columns[0].to_numpy()
+            file = FeatherFile(f"{self.file}: {name}", self._zip.read(name))
+        if len(file.names) != 1:
+            raise CFlowError(f"{self.file}: {name} must have one bool column, it has {file.names}")
+        return file.bools(file.names[0])
 
 
 def log_mask(log: Log, index: int) -> np.ndarray | None:
@@ -101,12 +99,17 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> lis
     OpenSceneFlow writes no file for it either.
     """
     safe_name(log.log_id, "the log")
-    pairs = range(len(log.timestamps) - 1)
-    if listed is not None:
-        indices = [_index_of(log, stamp) for stamp in sorted(set(listed.get(log.log_id, ())))]
-    else:
-        indices = [i for i in pairs if log_mask(log, i) is not None] or list(pairs[::STRIDE])
-    return [Frame(log, i) for i in indices]
+    stamps = list(log.timestamps)[:-1]
+    if listed is None:
+        pairs = range(len(stamps))
+        masked = [i for i in pairs if log_mask(log, i) is not None]
+        return [Frame(log, i) for i in masked or pairs[::STRIDE]]
+    wanted = sorted(set(listed.get(log.log_id, ())))
+    for stamp in set(wanted) - set(stamps):
+        raise CFlowError(
+            f"{log.log_id}/{stamp} is listed, but is not a sweep of the log or is its last one, which has no flow"
+        )
+    return [Frame(log, stamps.index(stamp)) for stamp in wanted]
 
 
 def read_frame_list(file: str | Path) -> dict[str, list[int]]:
@@ -134,12 +137,3 @@ def require_logs(logs: Iterable[Log], listed: Mapping[str, Sequence[int]] | None
     missing = sorted(set(listed or ()) - set(names))
     if missing:
         raise CFlowError(f"{len(missing)} listed logs are not in the data: {', '.join(missing[:5])}")
-
-
-def _index_of(log: Log, timestamp: int) -> int:
-    stamps = list(log.timestamps)
-    if timestamp not in stamps[:-1]:
-        raise CFlowError(
-            f"{log.log_id}/{timestamp} is listed, but is not a sweep of the log or is its last one, which has no flow"
-        )
-    return stamps.index(timestamp)
