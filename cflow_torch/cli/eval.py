@@ -39,9 +39,9 @@ def task(cfg: DictConfig) -> float:
     logs, failures = run.open_logs(cfg)
     ensure_writable(output)
     failures += for_each_pair([(log, index) for log in logs for index in pairs(log)], model, scores.add)
-    if scores.metrics.num_frames == 0 and failures:
+    if scores.metrics.counts["num_frames"] == 0 and failures:
         raise CFlowError("no pair could be scored; {} failed first: {}".format(*failures[0]))
-    if scores.metrics.num_frames == 0:
+    if scores.metrics.counts["num_frames"] == 0:
         raise CFlowError("no pair has labels, so there is nothing to score; `cflow flow` needs no labels")
     results = scores.report(output, logs, model.report(), failures)
     with suppress(run.UnfinishedJob):  # a job of a sweep returns its score; a single run exits with status 1

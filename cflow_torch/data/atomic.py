@@ -101,25 +101,22 @@ def new_folder(root: PathLike, name: str) -> Iterator[Path]:
         shutil.rmtree(new, ignore_errors=True)
 
 
-def remove_stale(folder: PathLike) -> list[str]:
-    """Remove the temporary files and folders that killed processes have left in a folder, and return their names.
+def remove_stale(folder: PathLike) -> None:
+    """Remove the temporary files and folders that killed processes have left in a folder.
 
     They count as left if they have not changed for an hour. Newer ones may belong to a process that is still writing.
     The folder may be remote. Its subfolders are not searched.
     """
-    folder, removed = as_path(folder), []
+    folder = as_path(folder)
     forget_listings(folder)
     with remote_errors(folder):
-        for path in list(folder.iterdir()) if folder.is_dir() else []:
-            if not (_TEMPORARY.fullmatch(path.name) and _is_abandoned(path)):
-                continue
+        left = [path for path in folder.iterdir() if _TEMPORARY.fullmatch(path.name)] if folder.is_dir() else []
+        for path in filter(_is_abandoned, left):
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             else:
                 with suppress(FileNotFoundError):  # another process was quicker
                     path.unlink()
-            removed.append(path.name)
-    return sorted(removed)
 
 
 def _is_abandoned(path: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any, Callable, Mapping, Sequence
@@ -39,16 +40,14 @@ class SceneFlowMetrics:
         self.parts: dict[str, Accumulator] = {
             name: _ACCUMULATORS[name](self.definition) for name in self.definition.metrics
         }
-        self.num_frames = self.num_points = self.num_nan = 0
+        self.counts = Counter(num_frames=0, num_points=0, num_nan=0)
 
     def update(self, frame: EvalFrame) -> None:
         """Add one frame; a `CFlowError` as in `score_points`."""
         scored = score_points(frame, self.definition)
         for metric in self.parts.values():
             metric.update_points(scored)
-        self.num_frames += 1
-        self.num_points += len(scored.error)
-        self.num_nan += scored.num_nan
+        self.counts.update(num_frames=1, num_points=len(scored.error), num_nan=scored.num_nan)
 
     def merge(self, other: SceneFlowMetrics) -> None:
         """Add the frames of another accumulator; a `CFlowError` if its definition is another one."""
@@ -56,17 +55,13 @@ class SceneFlowMetrics:
             raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
         for metric, another in zip(self.parts.values(), other.parts.values()):
             metric.merge(another)
-        self.num_frames += other.num_frames
-        self.num_points += other.num_points
-        self.num_nan += other.num_nan
+        self.counts.update(other.counts)
 
     def compute(self) -> dict[str, Any]:
         """Return a dictionary: "definition", "num_frames", "num_points", "num_nan", and a dictionary per metric."""
         return {
             "definition": self.definition.name,
-            "num_frames": self.num_frames,
-            "num_points": self.num_points,
-            "num_nan": self.num_nan,
+            **self.counts,
             **{name: metric.compute() for name, metric in self.parts.items()},
         }
 

@@ -249,8 +249,10 @@ def test_leftovers_of_a_killed_process_are_removed_when_they_are_old(tmp_path):
     left = [".1.feather.0123abcd.tmp", ".log.0123abcd.tmp"]
     (tmp_path / left[0]).write_bytes(b"half"), (tmp_path / left[1]).mkdir()
     (tmp_path / ".1.feather.tmp").write_bytes(b"")  # not ours
-    assert remove_stale(tmp_path) == [], "a process may still write them"
+    remove_stale(tmp_path)
+    assert len(names(tmp_path)) == 3, "a process may still write them"
     for name in left:
         os.utime(tmp_path / name, (0, 0))
-    assert remove_stale(tmp_path) == left and names(tmp_path) == (".1.feather.tmp",)
-    assert remove_stale(tmp_path / "absent") == []
+    remove_stale(tmp_path)
+    assert names(tmp_path) == (".1.feather.tmp",)
+    remove_stale(tmp_path / "absent")

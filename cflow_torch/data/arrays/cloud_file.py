@@ -91,12 +91,11 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
     path, points = as_path(path), np.asarray(points)
     named: dict[str, Any] = dict(columns or {})
     suffix = _suffix(path)
-    if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
-        raise CFlowError(f"points have shape {points.shape} and dtype {points.dtype}; pass (N, 3) float32 or float64")
+    check_array(points, "points", (None, 3), "f", "(N, 3) floats, metres")
     for name, values in named.items():
         check_array(values, f"column {name}", (len(points),), "biuf", f"({len(points)},) numbers, one per point")
-    fields = {axis: np.ascontiguousarray(points[:, k]) for k, axis in enumerate(_AXES)}
-    for name, values in named.items():
+    fields = {}
+    for name, values in (*zip(_AXES, points.T), *named.items()):
         allowed = re.sub("[^!-~]", "_", name) if suffix in (".pcd", ".ply") else name
         fields[allowed] = _storable(values, suffix)
     if all(name == f"column_{k}" for k, name in enumerate(named, 3)):
