@@ -12,9 +12,6 @@ from cflow_torch.types import CFlowError
 
 METRICS = ("bucketed", "bucketed_by_range", "three_way", "range_wise")
 
-SPEED_EDGES: Tuple[float, ...] = (*(float(edge) for edge in np.linspace(0.0, 2.0, 51)), math.inf)
-REGION_EDGES: Tuple[float, ...] = (0.0, 35.0, 70.0)
-
 
 @dataclass(frozen=True)
 class Definition:
@@ -58,7 +55,7 @@ class Definition:
     region: Literal["box", "disc"] = "disc"
     max_range: float = 35.0
     closed: bool = True
-    region_edges: Tuple[float, ...] = REGION_EDGES
+    region_edges: Tuple[float, ...] = (0.0, 35.0, 70.0)
     region_axes: Literal["t", "t+1"] = "t"
     point_cloud_range: Optional[Tuple[float, ...]] = None
     mask_box: Optional[float] = None
@@ -71,7 +68,7 @@ class Definition:
     nan_rows: Literal["drop", "error"] = "drop"
     norm_dtype: Literal["float32", "float64"] = "float64"
     dynamic_threshold: float = 0.05
-    speed_edges: Tuple[float, ...] = SPEED_EDGES
+    speed_edges: Tuple[float, ...] = (*np.linspace(0.0, 2.0, 51).tolist(), math.inf)
     sweep_interval: float = 0.1
 
     def __post_init__(self) -> None:

@@ -88,10 +88,9 @@ class SequenceFlow(nn.Module):
         return flows
 
     def _windows(self, frames: Sequence[Frame], first: int) -> list[Window]:
-        oldest = max(first - self.num_history, 0)
-        sweeps = self._sweeps(frames[oldest:])
+        sweeps = self._sweeps(frames)
         log: Any = SimpleNamespace(timestamps=sweeps, sweep=sweeps.__getitem__)
-        indices = range(first - oldest, len(sweeps) - 1)
+        indices = range(first, len(sweeps) - 1)
         return [window(log, i, self.num_history, self.model.config.num_future) for i in indices]
 
     def _sweeps(self, frames: Sequence[Frame]) -> list[Sweep]:

@@ -183,7 +183,7 @@ def test_damaged_zips_are_one_problem(archives: dict[int, Any], tmp_path: Path) 
     _, good, expected = archives[3]
     whole = good.read_bytes()
     (tmp_path / "half.zip").write_bytes(whole[: len(whole) // 2])
-    for name, words in (("half.zip", "zip"), ("missing.zip", "does not exist")):
+    for name, words in (("half.zip", "zip"), ("missing.zip", "is missing")):
         (problem,) = check_submission(tmp_path / name, get_version(3), expected)
         assert name in problem and words in problem
     damaged = bytearray(whole)

@@ -16,10 +16,7 @@ import numpy as np
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = dict(zip(_CODES, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")))
-_TYPES = {
-    **{name: code for code, name in _NAMES.items()},
-    **dict(zip(("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"), _CODES)),
-}
+_TYPES = {name: code for code in _CODES for name in (_NAMES[code], np.dtype(code).name)}  # "char" and "int8"
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 65536  # bytes
 

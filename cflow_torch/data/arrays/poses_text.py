@@ -46,9 +46,8 @@ def read_poses(path: PathLike) -> Trajectory:
             raise CFlowError(f"{path} has {values.shape[1]} numbers per line; poses have 12 (KITTI), 8 (TUM) or 16")
         if layout == "tum":
             times_ns = _nanoseconds(path, words[:, 0])
-            matrices = poses_from_quaternions(
-                values[:, 1:4], values[:, [7, 4, 5, 6]], lambda row: f"{path}: pose {row}"
-            )
+            shifts, quaternions = values[:, 1:4], values[:, [7, 4, 5, 6]]
+            matrices = poses_from_quaternions(shifts, quaternions, lambda row: f"{path}: pose {row}")
         else:
             matrices = values.reshape(len(values), -1, 4)
     return Trajectory(checked_poses(matrices, str(path)), times_ns, layout, str(path))

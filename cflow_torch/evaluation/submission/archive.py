@@ -138,15 +138,10 @@ def check_submission(path: str | Path, version: SubmissionVersion, expected: Map
 def _open_archive(path: Path) -> dict[str, Callable[[], bytes]]:
     """Return name -> function that reads the file, of a zip or a folder."""
     if path.is_dir():
-        files = {file.relative_to(path): file for file in sorted(path.rglob("*")) if file.is_file()}
-        return {
-            name.as_posix(): partial(read_bytes, file)
-            for name, file in files.items()
-            if not any(folder.startswith(".") for folder in name.parts)
-        }
-    if not path.is_file():
-        raise CFlowError(f"{path} does not exist: give a zip, or the folder that it is made from")
-    with file_errors(path):
+        names = [file.relative_to(path) for file in path.rglob("*") if file.is_file()]
+        visible = [name for name in names if not any(part.startswith(".") for part in name.parts)]
+        return {name.as_posix(): partial(read_bytes, path / name) for name in visible}
+    with file_errors(path, "give a zip, or the folder that it is made from"):
         archive = zipfile.ZipFile(path)
     return {name: partial(archive.read, name) for name in archive.namelist() if not name.endswith("/")}
 

@@ -1,4 +1,4 @@
-"""python -m cflow_torch.integrations.opensceneflow FILE: write the checkpoint without weights."""
+"""Write the checkpoint without weights that the scripts of OpenSceneFlow require."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from cflow_torch.types import CFlowError
 
 def main() -> None:
     """Run `python -m cflow_torch.integrations.opensceneflow`; an error exits with status 1 and one line on stderr."""
-    parser = argparse.ArgumentParser(
-        prog="python -m cflow_torch.integrations.opensceneflow", description="Write the checkpoint without weights."
-    )
+    parser = argparse.ArgumentParser("python -m cflow_torch.integrations.opensceneflow", description=__doc__)
     parser.add_argument("file", metavar="FILE", help="for example cflow.ckpt; its stem is the default name of results")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     arguments = parser.parse_args()

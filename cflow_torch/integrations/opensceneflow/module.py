@@ -20,8 +20,6 @@ from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.windows.ego_motion import rigid_transform
 
-OUTPUTS = ("full", "valid")
-
 
 class CFlow(nn.Module):
     """A method with the interface of OpenSceneFlow's models. It has no parameters, no buffers and no layers.
@@ -65,8 +63,8 @@ class CFlow(nn.Module):
         config = config.replace(**{name: value for name, value in settings.items() if name in names})
         self.config = _with_history(config, num_frames)
         self.estimator = make_model(self.config, device)
-        if output not in OUTPUTS:
-            raise CFlowError(f"output={output!r}: give one of {', '.join(map(repr, OUTPUTS))}")
+        if output not in ("full", "valid"):
+            raise CFlowError(f"output={output!r}: give 'full' or 'valid'")
         self.output = output
         is_matrix = ego_T_lidar is not None and not (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto")
         self.ego_T_lidar = rigid_transform(ego_T_lidar, "ego_T_lidar") if is_matrix else ego_T_lidar
