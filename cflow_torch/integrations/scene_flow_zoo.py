@@ -16,7 +16,6 @@ _NEED = (
     "SceneFlowZoo is not a package: clone github.com/kylevedder/SceneFlowZoo, install its requirements, and run from "
     "its root folder or add that to PYTHONPATH"
 )
-_POSES = ("pc_poses_sensor_to_ego", "pc_poses_ego_to_global")
 
 
 class CorrelationFlowModel(SequenceFlow):
@@ -71,7 +70,7 @@ def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
     check_array(mask, f"{name}.full_pc_mask", shape, "f", f"{shape} floats with NaN in padding rows")
     is_row = ~torch.isnan(mask)
     poses = []
-    for side in _POSES:
+    for side in ("pc_poses_sensor_to_ego", "pc_poses_ego_to_global"):
         pose = getattr(sequence, side)
         check_array(pose, f"{name}.{side}", (len(points), 4, 4), "f", f"({len(points)}, 4, 4) floats, one per sweep")
         poses.append([rigid_transform(matrix, f"{name}.{side}[{k}]") for k, matrix in enumerate(pose.detach().cpu())])

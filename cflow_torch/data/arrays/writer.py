@@ -36,17 +36,14 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy") -> Path:
     """
     if suffix not in SUFFIXES:
         raise CFlowError(f"suffix={suffix!r}: pass one of {', '.join(SUFFIXES)}")
-    poses: list[Any] = []
-    times: list[Any] = []
-    masks: list[Any] = []
+    kept: list[Any] = []
     with new_folder(root, log.log_id) as folder:
         for index in range(len(log.timestamps)):
             sweep = log.sweep(index)
             points = np.asarray(sweep.points)[:, :3]
             write_cloud(folder / "points" / f"{index:06d}{suffix}", points, log.columns(index))
-            poses.append(sweep.pose)
-            times.append(sweep.timestamp_ns)
-            masks.append(sweep.is_ground)
+            kept.append((sweep.pose, sweep.timestamp_ns, sweep.is_ground))
+        poses, times, masks = zip(*kept)
         if all(mask is not None for mask in masks):
             (folder / GROUND_FOLDER).mkdir()
             for index, mask in enumerate(masks):
