@@ -34,8 +34,8 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
     """
     columns = result.columns()
     names = [column for name in contents for column in (vector_columns(name) if name in VECTORS else [name])]
-    if not columns.keys() >= set(names):
-        lacking = ", ".join(sorted(set(names) - columns.keys()))
+    lacking = ", ".join(sorted(set(names) - columns.keys()))
+    if lacking:
         raise CFlowError(f"this result has no {lacking}: estimate it with preset default or offline, or leave it out")
     with atomic_file(path) as file:
         feather.write_feather(pa.table({name: columns[name] for name in names}), file)

@@ -49,10 +49,8 @@ class KissICPLog(Log):
             self._dataset = datasets.dataset_factory(loader, self.root, **settings)
             self.timestamps = range(len(self._dataset))
             poses = getattr(self._dataset, "gt_poses", None)
+            self._poses = None if poses is None else np.asarray(poses, np.float64).reshape(len(self), 4, 4)
         self._check_count(self._what)
-        self._poses = None if poses is None else np.asarray(poses, np.float64)
-        if self._poses is not None and len(self._poses) != len(self):
-            raise CFlowError(f"{self._what}: {len(self._poses)} poses for {len(self)} sweeps; copy the data set again")
 
     def sweep(self, index: int) -> Sweep:
         self._timestamp(index)

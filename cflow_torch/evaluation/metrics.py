@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
 from statistics import fmean
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Callable, Mapping, NamedTuple, Sequence
 
 from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE, RangeWiseEPE
 from cflow_torch.evaluation.definitions import DEFINITIONS, Definition
@@ -66,8 +65,7 @@ class SceneFlowMetrics:
         }
 
 
-@dataclass(frozen=True)
-class ProtocolScores:
+class ProtocolScores(NamedTuple):
     """Combined scores of several data sets.
 
     Args:

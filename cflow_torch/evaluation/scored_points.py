@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Sequence
+from typing import Any, NamedTuple, Sequence
 
 import numpy as np
 
@@ -15,8 +14,7 @@ from cflow_torch.types import CFlowError, as_numpy
 CLOSE_RANGE = 35.0  # metres, half side of the square that Argoverse 2 calls "close"
 
 
-@dataclass(frozen=True)
-class ScoredPoints:
+class ScoredPoints(NamedTuple):
     """The M scored points of one frame."""
 
     error: np.ndarray  # (M,) float64, metres, length of predicted minus true residual

@@ -13,9 +13,8 @@ def format_table(results: dict[str, Any]) -> str:
 
     Metrics that the definition lacks have no table. A "-" means that there are no points.
     """
-    frames, points, num_nan = (results[key] for key in ("num_frames", "num_points", "num_nan"))
-    scored = f"{frames} frames, {points} points scored, {num_nan} ignored because of NaN"
-    lines = [f"definition {results['definition']}: {scored}"]
+    scored = "{num_frames} frames, {num_points} points scored, {num_nan} ignored because of NaN"
+    lines = [f"definition {results['definition']}: {scored.format_map(results)}"]
     for metric, table in _TABLES.items():
         if metric in results:
             header, rows = table(results[metric])

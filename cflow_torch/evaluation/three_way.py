@@ -74,7 +74,7 @@ class ThreeWayEPE(Accumulator):
         self.frame_sums += _values(count, sums, FRAME_COUNT_EPS, FRAME_IOU_EPS)
 
     def compute(self) -> dict[str, Any]:
-        """Return `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou`, `num_frames` and "breakdown".
+        """Return `epe_fd`, `epe_fs`, `epe_bs`, `epe_3way` in metres, `dynamic_iou` and "breakdown".
 
         The keys of "breakdown" are "background" and "foreground", then "static" and "dynamic", then "all", "close" and
         "far". Each entry has `count`, `num_predicted` (points predicted as dynamic) and the values of `QUANTITIES`.
@@ -87,7 +87,6 @@ class ThreeWayEPE(Accumulator):
             **dict(zip(_SETS, values.tolist())),
             "epe_3way": float(np.mean(values[:-1])),
             "dynamic_iou": float(values[-1]),
-            "num_frames": self.num_frames,
             "breakdown": {name: self._group(members) for name, members in _GROUPS.items()},
         }
 

@@ -6,10 +6,9 @@ Files are written whole or not at all, and packed into the same bytes every time
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Iterable, Mapping
+from typing import Any, Callable, Iterable, Mapping, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -19,16 +18,15 @@ from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.files import file_errors, shortened
 from cflow_torch.data.paths import read_bytes
-from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy
+from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy, vector_columns
 
 DYNAMIC_THRESHOLD = 0.05  # metres per sweep, the evaluation's threshold for dynamic points
 LARGEST = float(np.finfo(np.float16).max)  # 65504 m
-_FLOW = dict.fromkeys(("flow_tx_m", "flow_ty_m", "flow_tz_m"), "float16")
+_FLOW = dict.fromkeys(vector_columns("flow"), "float16")
 _EARLIEST = (1980, 1, 1, 0, 0, 0)  # the first time that a zip can store
 
 
-@dataclass(frozen=True)
-class SubmissionVersion:
+class SubmissionVersion(NamedTuple):
     """One submission format."""
 
     number: int  # 1 or 3, as OpenSceneFlow numbers them
@@ -81,10 +79,8 @@ def encode(
         raise CFlowError(f"the flow of {bad.sum()} points is NaN, infinite or beyond float16 ({LARGEST:g} m)")
     half = flow.astype(np.float16)
     error = np.linalg.norm(half.astype(np.float64) - flow.astype(np.float64), axis=1)
-    columns = {
-        **{f"flow_t{axis}_m": half[:, i] for i, axis in enumerate("xyz")},
-        "is_dynamic": np.linalg.norm(residual, axis=1) >= np.float32(DYNAMIC_THRESHOLD),
-    }
+    is_dynamic = np.linalg.norm(residual, axis=1) >= np.float32(DYNAMIC_THRESHOLD)
+    columns = {**dict(zip(_FLOW, half.T)), "is_dynamic": is_dynamic}
     return {name: columns[name] for name in version.columns}, error
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import zipfile
-from collections import defaultdict
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -19,7 +17,6 @@ from cflow_torch.evaluation.submission.archive import SubmissionVersion
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 
 STRIDE = 5  # without masks, every fifth pair of a log is evaluated
-_MASK = re.compile(r"(?P<log>.+)/(?P<stamp>0|[1-9][0-9]{0,18})\.feather", re.ASCII)
 _HALF_SIDE = 50.0  # metres; the official masks contain the points that are not ground with |x|, |y| <= 50
 
 
@@ -34,9 +31,9 @@ class MaskArchive:
         self.frames: dict[str, list[int]] = {}
         with file_errors(self.file):
             self._zip = zipfile.ZipFile(self.file)
-        for match in map(_MASK.fullmatch, sorted(self._zip.namelist())):
-            if match is not None:
-                self.frames.setdefault(match["log"], []).append(int(match["stamp"]))
+        for path in map(PurePosixPath, sorted(self._zip.namelist())):
+            if path.suffix == ".feather" and is_timestamp(path.stem):
+                self.frames.setdefault(str(path.parent), []).append(int(path.stem))
         if not self.frames:
             raise CFlowError(f"{self.file} contains no masks: give a zip of <log>/<time stamp>.feather")
 
@@ -114,7 +111,8 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> lis
 
 def read_frame_list(file: str | Path) -> dict[str, list[int]]:
     """Read log id -> time stamps from a text file: one `<log>/<time stamp>` a line, # for comments."""
-    file, result = Path(file), defaultdict(list)
+    file = Path(file)
+    result: dict[str, list[int]] = {}
     with file_errors(file, "pass a text file of frames"):
         lines = read_bytes(file).decode("utf-8").splitlines()
     for number, line in enumerate(lines, 1):
@@ -124,8 +122,8 @@ def read_frame_list(file: str | Path) -> dict[str, list[int]]:
         log, _, stamp = entry.rpartition("/")
         if not log or not is_timestamp(stamp):
             raise CFlowError(f"{file}, line {number}: {entry!r} is not a frame; write <log>/<time stamp>")
-        result[log].append(int(stamp))
-    return dict(result)
+        result.setdefault(log, []).append(int(stamp))
+    return result
 
 
 def require_logs(logs: Iterable[Log], listed: Mapping[str, Sequence[int]] | None) -> None:
