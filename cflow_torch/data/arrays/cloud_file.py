@@ -49,8 +49,7 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     path = as_path(path)
     with file_errors(path, _hint(path)):
         points = np.stack(_positions(_read(path, bin_columns)), axis=1)
-        if points.ndim != 2 or points.dtype.kind != "f":
-            raise CFlowError(f"x, y, z must be (N,) floating-point metres each, got {points.dtype}, {points.shape}")
+        check_array(points, "its cloud", (None, 3), "f", "(N,) floating-point metres each for x, y and z")
     return points.astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
 
 

@@ -85,7 +85,7 @@ def encode(
 
 
 def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]) -> None:
-    """Write the columns of one frame atomically to a submission folder; `name` is that of `Frame`."""
+    """Write the columns of one frame atomically to a submission folder; `name` is `<log>/<time stamp>.feather`."""
     with atomic_file(Path(folder) / name) as file:
         feather.write_feather(pa.table(dict(columns)), file)
 

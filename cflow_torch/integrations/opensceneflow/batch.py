@@ -59,10 +59,9 @@ def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: A
         is_ground = torch.arange(len(clouds[0]) + len(ground), device=ground.device) >= len(clouds[0])
         whole = Sweep(torch.cat((clouds[0], ground)), is_ground, lidar_poses[0])
         # At the start of a scene the harness repeats t as history. Copies must stay equal to t, or they would count.
-        repeats = [
-            torch.equal(points, clouds[0]) and np.array_equal(pose, poses[0]) for points, pose in zip(clouds, poses)
-        ]
-        sweeps = [whole if repeated else sweep for sweep, repeated in zip(sweeps, repeats)]
+        for i, (points, pose) in enumerate(zip(clouds, poses)):
+            if torch.equal(points, clouds[0]) and np.array_equal(pose, poses[0]):
+                sweeps[i] = whole
     T_ego1_ego0 = harness_motion(_entry(batch, "pose0", b), _entry(batch, "pose1", b))
     T_lidar1_lidar0 = None if extrinsics is None else relative_transform(lidar_poses[1], lidar_poses[0])
     return Sample(Window(sweeps[0], sweeps[1], tuple(sweeps[2:])), rows[0], T_ego1_ego0, T_lidar1_lidar0)

@@ -66,8 +66,8 @@ class CFlow(nn.Module):
         if output not in ("full", "valid"):
             raise CFlowError(f"output={output!r}: give 'full' or 'valid'")
         self.output = output
-        is_matrix = ego_T_lidar is not None and not (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto")
-        self.ego_T_lidar = rigid_transform(ego_T_lidar, "ego_T_lidar") if is_matrix else ego_T_lidar
+        has_matrix = ego_T_lidar is not None and not (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto")
+        self.ego_T_lidar = rigid_transform(ego_T_lidar, "ego_T_lidar") if has_matrix else ego_T_lidar
         self.timer: Any = None
         with suppress(ImportError):  # the harness always has it, and requires the attribute
             self.timer = import_module("dztimer").Timing()
