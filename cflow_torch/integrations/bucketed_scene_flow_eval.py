@@ -82,8 +82,8 @@ class _LogFrame(Frame):
 
 def _read_frames(frames: Any) -> list[_LogFrame]:
     """Read and check the frames of one log. Any class with the same fields is accepted."""
-    if not isinstance(frames, (list, tuple)) or len(frames) < 2:
-        raise CFlowError("frames: give a list of at least two frames of one log, in order of time")
+    if not isinstance(frames, (list, tuple)) or len(frames) < 2 or isinstance(frames[0], tuple):
+        raise CFlowError("frames: give a list of at least two frames of one log, such as an item of a data set")
     stamps = times_in_ns([frame.log_timestamp for frame in frames])
     read = [_read_frame(f"frames[{i}]", *pair) for i, pair in enumerate(zip(frames, stamps))]
     for i, (old, new) in enumerate(zip(read, read[1:]), 1):

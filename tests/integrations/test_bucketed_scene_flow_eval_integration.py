@@ -155,8 +155,9 @@ def test_the_error_names_the_bad_field_of_a_frame(bsfe: ModuleType, path: str, v
     setattr(holder, last, value)
     with pytest.raises(CFlowError, match=complaint):
         estimator()(frames)
-    with pytest.raises(CFlowError, match="at least two frames"):
-        estimator()(frames[:1])
+    for few_or_pairs in (frames[:1], [(frame, None) for frame in frames]):
+        with pytest.raises(CFlowError, match="at least two frames"):
+            estimator()(few_or_pairs)
 
 
 @pytest.mark.parametrize("preset", ["paper", "default"])
