@@ -151,6 +151,10 @@ def test_missing_poses_times_and_masks_are_not_written(tmp_path, folder):
     assert list(log.timestamps) == [0, 1, 2] and log.sweep(1).timestamp_ns is None and log.sweep(1).is_ground is None
     with pytest.raises(CFlowError, match="exists already"):
         write_array_log(SmallLog(), tmp_path)
+    partly = SmallLog()
+    partly.sweeps[1] = Sweep(partly.sweeps[1].points)
+    with pytest.raises(CFlowError, match="no pose of sweep 1"):
+        write_array_log(partly, tmp_path / "b")
 
 
 def test_columns_are_found_by_name_or_position(tmp_path):

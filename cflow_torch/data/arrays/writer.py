@@ -32,7 +32,7 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy") -> Path:
         columns that the log has for it.
 
     Raises:
-        CFlowError: an unknown suffix, or the folder exists.
+        CFlowError: an unknown suffix, poses of only some sweeps, or the folder exists.
     """
     if suffix not in SUFFIXES:
         raise CFlowError(f"suffix={suffix!r}: pass one of {', '.join(SUFFIXES)}")
@@ -50,6 +50,9 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy") -> Path:
                 np.save(folder / GROUND_FOLDER / f"{index:06d}.npy", np.asarray(mask))
         if all(time is not None for time in times):
             write_times(folder / "times.txt", times)
-        if all(pose is not None for pose in poses):
+        has_pose = [pose is not None for pose in poses]
+        if any(has_pose) and not all(has_pose):
+            raise CFlowError(f"log {log.log_id} has no pose of sweep {has_pose.index(False)}: give all poses or none")
+        if all(has_pose):
             write_kitti_poses(folder / "poses.txt", np.stack(poses))
     return Path(root) / log.log_id
