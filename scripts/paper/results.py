@@ -1,12 +1,11 @@
-"""Load the paper's numbers and our results files, both by experiment and row."""
+"""The numbers of the paper and of our results files, as lines of tables."""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Dict, Mapping
+from typing import Any, Dict, Mapping, Tuple
 
 from omegaconf import OmegaConf
 
@@ -16,6 +15,7 @@ from cflow_torch.evaluation.metrics import ProtocolScores, errors_by_range, scor
 PAPER_FILE = Path(__file__).resolve().with_name("figures.yaml")
 # The paper's name of a class -> its name in the evaluation.
 CLASSES = {"CAR": "CAR", "OTHER": "OTHER_VEHICLES", "PED": "PEDESTRIAN", "VRU": "WHEELED_VRU"}
+CLASS_COLUMNS = (*CLASSES, "mean", "time")
 METHODS = {"dense": "CorrelationFlow", "keypoints": "CorrelationFlow-Keypoint"}
 RANGES = ("0-35", "35-70")
 DENSIFIED = {
@@ -26,45 +26,35 @@ DENSIFIED = {
 PRESET = "Preset keypoints (not in the paper)"
 STAGES = {"views": ("correlate", "pool"), "clustering": ("cluster",)}  # stages in the paper's time column
 
-
-@dataclass(frozen=True)
-class Run:
-    """One results file."""
-
-    experiment: str  # name of the table or figure
-    data_set: str  # its name in the tables
-    row: str  # row of the table, or point of the figure
-    record: dict[str, Any]  # content of results.json
-
-    def values(self) -> list[float]:
-        """Dynamic bucket-normalised error of CAR, OTHER, PED, VRU, and their mean; NaN = no moving points."""
-        scores = self.record["results"]["bucketed"]
-        classes = [scores["classes"][name]["dynamic_error"] for name in CLASSES.values()]
-        return [math.nan if value is None else value for value in (*classes, scores["mean"]["dynamic_error"])]
-
-    def seconds(self) -> float:
-        """Median seconds per pair of the stages in the paper's time column."""
-        times = self.record["seconds_per_pair"]
-        stages = STAGES.get(self.experiment)
-        return float(times["median"] if stages is None else sum(times["stages"].get(name, 0.0) for name in stages))
-
-
-Ours = Mapping[str, Mapping[str, Run]]  # data set -> row
-Runs = Dict[str, Dict[str, Dict[str, Run]]]  # experiment -> data set -> row
+Numbers = Dict[str, float]  # column -> number
+Line = Tuple[str, str, Numbers]  # row of a table, "paper" or the name of our data, numbers; absent = unknown
+Records = Dict[str, Dict[str, Dict[str, Any]]]  # data set -> row -> content of results.json
 
 
 def load_paper() -> dict[str, Any]:
-    """Load the paper's numbers by experiment. Figures of classes get `rows` like tables."""
+    """Load the paper's numbers: experiment -> description, with row -> numbers in "rows"."""
     paper: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(PAPER_FILE))  # type: ignore[assignment]
-    for name in ("history", "scales"):
-        figure, rows = paper[name], {}
-        for index, x in enumerate(figure["at"]):
-            for h in ("",) if name == "history" else ("h=0", "h=2", "h=4"):
-                lines = {c: figure["lines"][c] if name == "history" else figure["panels"][c][h] for c in CLASSES}
-                values = [lines[c][index] for c in CLASSES]
-                rows[f"h={x}" if name == "history" else f"{h}, {x} scales"] = [*values, sum(values) / len(values)]
-        figure["rows"], figure["row"] = dict(sorted(rows.items(), key=lambda row: row[0].split(",")[0])), "setting"
+    for about in paper.values():
+        columns = about.get("columns", CLASS_COLUMNS)
+        about["rows"] = {row: dict(zip(columns, values)) for row, values in about["rows"].items()}
+        if "columns" not in about:
+            for numbers in about["rows"].values():
+                numbers.setdefault("mean", sum(numbers.values()) / len(numbers))
     return paper
+
+
+def load_runs(folder: Path) -> dict[str, Records]:
+    """Load the latest run of each row below a folder, by experiment."""
+    runs: dict[str, Records] = {}
+    for file in sorted(folder.rglob("results.json")):
+        record = json.loads(file.read_text(encoding="utf-8"))
+        experiment, data = record["config"].get("experiment_name"), record["config"]["data"]
+        if experiment is not None:
+            name = data["label"] + (f" ({data['profile']})" if data["name"] == "benchmark" else "")
+            row = row_of(experiment, record["config"]["model"])
+            rows = runs.setdefault(experiment, {}).setdefault(name, {})
+            rows[row] = max(record, rows.get(row, record), key=lambda each: each["date"])
+    return runs
 
 
 def row_of(experiment: str, model: dict[str, Any]) -> str:
@@ -88,39 +78,55 @@ def row_of(experiment: str, model: dict[str, Any]) -> str:
     return METHODS[model["method"]]
 
 
-def load_runs(folder: Path) -> tuple[Runs, list[str]]:
-    """Load the latest run of each row below a folder; also returns remarks on files that cannot be used."""
-    runs: Runs = {}
-    remarks: list[str] = []
-    for file in sorted(folder.rglob("results.json")):
-        try:
-            record = json.loads(file.read_text(encoding="utf-8"))
-            config = record["config"]
-            experiment = config.get("experiment_name")
-        except (ValueError, KeyError, TypeError) as error:
-            remarks.append(f"{file} is not a results file of this version ({error!r})")
-            continue
-        if experiment is None:
-            continue
-        data = config["data"]
-        name = data["label"] + (f" ({data['profile']})" if data["name"] == "benchmark" else "")
-        run = Run(experiment, name, row_of(experiment, config["model"]), record)
-        rows = runs.setdefault(experiment, {}).setdefault(name, {})
-        rows[run.row] = max(run, rows.get(run.row, run), key=lambda each: each.record["date"])
-    return runs, remarks
+def make_lines(experiment: str, about: dict[str, Any], ours: Records) -> list[Line]:
+    """Lines of the paper and ours. Rows of classes are next to each other; our rows of methods follow the paper's."""
+    if "columns" in about:
+        paper = [(row, "paper", numbers) for row, numbers in about["rows"].items()]
+        return paper + [(row, "ours", numbers) for row, numbers in _of_methods(experiment, ours).items()]
+    rows_of = {data_set: _of_classes(experiment, about, rows) for data_set, rows in ours.items()}
+    lines: list[Line] = []
+    for row in dict.fromkeys([*about["rows"], *(row for rows in rows_of.values() for row in rows)]):
+        if row in about["rows"]:
+            lines.append((row, "paper", about["rows"][row]))
+        lines += [(row, data_set, rows.get(row, {})) for data_set, rows in rows_of.items()]
+    return lines
 
 
-def range_errors(run: Run) -> list[float]:
-    """Error of a run of `datasets` or `range_split` at short and long range; NaN = no moving points."""
-    errors = errors_by_range(run.record["results"])
-    return [errors[name] for name in RANGES]
+def _of_classes(experiment: str, about: dict[str, Any], records: Mapping[str, Any]) -> dict[str, Numbers]:
+    """Dynamic bucket-normalised errors of a data set by row, and median seconds per pair of the paper's stages."""
+    rows: dict[str, Numbers] = {}
+    for row, record in records.items():
+        scores, times = record["results"]["bucketed"], record["seconds_per_pair"]
+        parts = [*(scores["classes"][name] for name in CLASSES.values()), scores["mean"]]
+        errors = [math.nan if part["dynamic_error"] is None else part["dynamic_error"] for part in parts]
+        stages = STAGES.get(experiment)
+        seconds = times["median"] if stages is None else sum(times["stages"].get(name, 0.0) for name in stages)
+        rows[row] = dict(zip(CLASS_COLUMNS, [*errors, seconds]))
+    if "difference_to" in about:
+        base = rows.get(about["difference_to"], {})
+        for row in rows.keys() - {about["difference_to"]}:
+            rows[row] = {column: value - base.get(column, math.nan) for column, value in rows[row].items()}
+    return rows
 
 
-def protocol(ours: Ours) -> dict[str, ProtocolScores]:
+def _of_methods(experiment: str, ours: Records) -> dict[str, Numbers]:
+    """Errors of our methods by row: combined as in the challenge (`datasets`), or at short and long range."""
+    if experiment == "datasets":
+        scores = protocol(ours)
+        rows = {name: {method: score.data_sets[name] for method, score in scores.items()} for name in ours}
+        return {"Overall": {method: score.overall for method, score in scores.items()}, **rows} if scores else rows
+    return {
+        f"{name} {reach} m": {method: errors_by_range(run["results"])[reach] for method, run in runs.items()}
+        for name, runs in ours.items()
+        for reach in RANGES
+    }
+
+
+def protocol(ours: Records) -> dict[str, ProtocolScores]:
     """Scores of our variants over our data sets, combined as in the challenge: method -> scores."""
     result = {}
     for method in METHODS.values():
-        errors = {name: dict(zip(RANGES, range_errors(runs[method]))) for name, runs in ours.items() if method in runs}
+        errors = {name: errors_by_range(runs[method]["results"]) for name, runs in ours.items() if method in runs}
         if errors:
             result[method] = score_data_sets(errors, data_sets=list(ours), ranges=RANGES)
     return result
