@@ -1,16 +1,15 @@
 #!/usr/bin/env python3
-"""Confidence of the flow (docs/verified.md): fit its table on simulated drives, and evaluate it on others.
+"""Confidence of the flow (docs/verified.md): fit its table on simulated drives, or evaluate it on real data.
 
-  python scripts/ablation/calibrate_confidence.py fit                            writes verified/confidence.json
-  python scripts/ablation/calibrate_confidence.py evaluate --seeds 300-303       simulated drives
-  python scripts/ablation/calibrate_confidence.py evaluate --real                Argoverse 2 pair, KITTI 0000, PandaSet
+  python scripts/ablation/calibrate_confidence.py fit         writes verified/confidence.json
+  python scripts/ablation/calibrate_confidence.py evaluate    Argoverse 2 pair, KITTI 0000, PandaSet
 
-The windows come from sets.py: five sensors, four kinds of scenes, pairs (h = 0) and history (h = 4), region +-70 m,
-without ground. We fit on seeds 100-103. A point is right if the end-point error of its residual flow is below 0.1 m per
-interval. The columns are the expected calibration error of all and of dynamic points; the end-point error in metres of
-dynamic and of static points after a share of them is dropped, the least confident first; and what an alarm finds that
-2 % of the static points raise: the share of the dynamic points that are missed (their flow is less than half of the
-true one), and the number of missed points.
+The windows come from sets.py. We fit on pairs (h = 0) and history (h = 4) of five sensors and four kinds of scenes,
+seeds 100-103, region +-70 m, without ground. A point is right if the end-point error of its residual flow is below
+0.1 m per interval. The columns are the expected calibration error of all and of dynamic points; the end-point error in
+metres of dynamic and of static points after a share of them is dropped, the least confident first; and what an alarm
+finds that 2 % of the static points raise: the share of the dynamic points that are missed (their flow is less than half
+of the true one), and the number of missed points.
 """
 
 from __future__ import annotations
@@ -20,20 +19,22 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Iterable, Iterator, Sequence
+from typing import Iterable, Sequence
+from unittest.mock import patch
 
 import numpy as np
 import sets
 import torch
 from derived_sets import MOVES
-from run import CACHE, seed_range
-from sets import Item
+from sets import HISTORY, Item
 from sklearn.isotonic import isotonic_regression
 
 from cflow_torch import make_config, make_model
+from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.types import FlowResult
 from cflow_torch.verified import confidence
 
+SEEDS = range(100, 104)
 RIGHT = 0.1  # metres
 DROPPED = (0.0, 0.05, 0.1, 0.3)
 NUM_BINS = 10  # of the calibration error
@@ -45,35 +46,27 @@ POINTS, RIGHT_ONES, DYNAMIC, RIGHT_DYNAMIC, ERROR, DYNAMIC_ERROR, MISSED = range
 FALSE_ALARMS = 0.02  # share of static points
 
 
-def simulated(seeds: tuple[int, int]) -> Iterator[Item]:
-    """Windows of all sensors, simulated with the first to the last of the seeds."""
-    for profile in sets.PROFILES:
-        yield from sets.simulated(profile, range(seeds[0], seeds[1] + 1), CACHE)
-
-
 def statistics(items: Iterable[Item], histories: Sequence[int], max_points: float = math.inf) -> np.ndarray:
     """(C, 7) float64: sums over the points of each of the C bins of the table, for windows with each of some h.
 
     `max_points` is the weight of a window in a bin; if it has more points, all of them get less weight.
     """
     num_bins = len(confidence.TABLE["probabilities"])
-    kept, sums = confidence.TABLE["probabilities"], np.zeros((num_bins, 7))
+    sums = np.zeros((num_bins, 7))
     models = {h: make_model(make_config("default", num_history=h, point_cloud_range=BOX)) for h in histories}
-    confidence.TABLE["probabilities"] = [i / num_bins for i in range(num_bins)]  # the result encodes the bin
-    try:
-        for item in items:
+    encoded = [i / num_bins for i in range(num_bins)]  # so that the confidence of a point is the number of its bin
+    with patch.dict(confidence.TABLE, probabilities=encoded):
+        for window, frame in items:
             for h, model in models.items():
-                (result,) = model([replace(item.window, pch=item.window.pch[:h], pcf=())])
-                of_window = _sums(result, item, num_bins)
+                (result,) = model([replace(window, pch=window.pch[:h], pcf=())])
+                of_window = _sums(result, frame, num_bins)
                 sums += of_window * np.minimum(1, max_points / np.maximum(of_window[:, :1], 1))
-    finally:
-        confidence.TABLE["probabilities"] = kept
     return sums
 
 
-def _sums(result: FlowResult, item: Item, num_bins: int) -> np.ndarray:
-    flow, truth = result.numpy(), item.labels.flow - item.pose_flow
-    is_scored = item.labels.is_valid if item.eval_mask is None else item.labels.is_valid & item.eval_mask
+def _sums(result: FlowResult, frame: EvalFrame, num_bins: int) -> np.ndarray:
+    flow, truth = result.numpy(), frame.labels.flow - frame.pose_flow
+    is_scored = frame.labels.is_valid if frame.eval_mask is None else frame.labels.is_valid & frame.eval_mask
     rows = np.flatnonzero(flow["is_valid"] & is_scored)
     bins = np.rint(flow["confidence"][rows] * num_bins).astype(int)
     error = np.linalg.norm(flow["residual_flow"][rows] - truth[rows], axis=1)
@@ -137,35 +130,28 @@ def main() -> None:
     """Fit the table, or print how well it is calibrated."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=("fit", "evaluate"))
-    parser.add_argument("--seeds", type=seed_range, metavar="FIRST-LAST", help="of simulated drives")
-    parser.add_argument("--real", action="store_true", help="evaluate on real data")
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.task == "fit":
-        sums = statistics(simulated(given.seeds or (100, 103)), (0, 4), MAX_POINTS)
-        table = {**confidence.TABLE, "probabilities": fit(sums)}
+        items = (item for profile in sets.PROFILES for item in sets.simulated(profile, SEEDS))
+        table = {**confidence.TABLE, "probabilities": fit(statistics(items, (0, HISTORY), MAX_POINTS))}
         TABLE_FILE.write_text(json.dumps(table) + "\n", encoding="utf-8")
         return
-    sums_of: dict[str, np.ndarray] = {}
-    if given.real:
-        pair = [sets.make_item(item.window, item.labels) for item in sets.av2_pair()]  # ego motion of the poses
-        sums_of["Argoverse 2 pair"] = statistics(pair, (0,))
-    for h in (0, sets.HISTORY):
-        if given.seeds:
-            sums_of[f"simulated, h = {h}"] = statistics(simulated(given.seeds), (h,))
-        if given.real:
-            items = [item for path in (sets.KITTI, sets.KITTI_LATER) for item in sets.kitti(path)[sets.HISTORY :]]
-            sums_of[f"KITTI 0000, h = {h}"] = statistics(items, (h,))
-            items = [item for path in sets.PANDASET.values() for item in sets.kitti(path)[sets.HISTORY :: 4]]
-            sums_of[f"PandaSet, h = {h}"] = statistics(items, (h,))
+    pair = [sets.make_item(item.window, item.frame.labels) for item in sets.av2_pair()]  # ego motion of the poses
+    kitti = [item for path in (sets.KITTI, sets.KITTI_LATER) for item in sets.kitti(path)[HISTORY:]]
+    pandaset = [item for path in sets.PANDASET.values() for item in sets.kitti(path)[HISTORY::4]]
     dropped = ", ".join(f"{100 * share:.0f}" for share in DROPPED)
     columns = f"error, all / dynamic | dynamic, dropped {dropped} % | static, the same | missed found"
     print(f"| set | {columns} |\n|{'---|' * 5}")
-    for name, sums in sums_of.items():
+    for name, items, h in (
+        ("Argoverse 2 pair", pair, 0),
+        *((name, items, h) for h in (0, HISTORY) for name, items in (("KITTI 0000", kitti), ("PandaSet", pandaset))),
+    ):
+        sums = statistics(items, (h,))
         gaps = " / ".join(f"{calibration_error(sums, dynamic):.4f}" for dynamic in (False, True))
         left = (", ".join(f"{value:.4f}" for value in sparsification(sums, dynamic)) for dynamic in (True, False))
         found = f"{share_of_missed_found(sums):.2f} of {sums[:, MISSED].sum():.0f}"
-        print(f"| {name} | {gaps} | {' | '.join(left)} | {found} |")
+        print(f"| {name}, h = {h} | {gaps} | {' | '.join(left)} | {found} |")
 
 
 if __name__ == "__main__":

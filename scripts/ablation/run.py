@@ -15,39 +15,43 @@ Columns: end-point errors in metres over all points within 35 m ("border": 76.8 
 over the drives. dynamic: objects that move by at least 0.05 m per sweep; in a scene, its scored objects. pedestrian:
 error divided by speed. static: background. near, far: dynamic bucket-normalised error, mean over the classes, 0-35 m
 and 35-70 m. missed: share of moving points whose flow is less than half of the true one. moving: number of moving
-points. The JSON file also has near and far of each class.
+points.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import os
-import re
 import sys
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any, Callable, Mapping, Sequence
+from typing import Any, Callable, Dict, Mapping, Sequence
 
+import numpy as np
 import torch
+from derived_sets import MOVES
 from omegaconf import OmegaConf
-from score import Figures, mean_figures, score
-from sets import ScoredSet, make_sets
+from sets import NEAR, ScoredSet, make_sets
 
-from cflow_torch.config import make_config
-from cflow_torch.data.files import write_json
+from cflow_torch import make_config, make_model
+from cflow_torch.data.categories import CATEGORY_INDEX
+from cflow_torch.evaluation.bucketed import mean_of_present
+from cflow_torch.evaluation.definitions import Definition
+from cflow_torch.evaluation.frame import EvalFrame
+from cflow_torch.evaluation.metrics import SceneFlowMetrics
+from cflow_torch.evaluation.scored_points import score_points
 from cflow_torch.types import CFlowError
 
 COLUMNS = ("dynamic", "pedestrian", "static", "near", "far", "missed", "moving")
-CACHE = Path(os.environ.get("CFLOW_CACHE") or "outputs/cache")
+RANGES = {"near": "0-35", "far": "35-70"}
+Figures = Dict[str, float]
 
 
-def main() -> int:
-    """Print the table, row by row; returns the exit status."""
-    parser = make_parser(__doc__, ["real", "odd", "merged"], (100, 103))
+def main() -> None:
+    """Print the table, row by row."""
+    parser = make_parser(__doc__, ["real", "odd", "merged"], range(100, 104))
     parser.add_argument("--presets", nargs="+", default=["default"])
     parser.add_argument("--set", nargs="*", action="append", metavar="NAME=VALUE", help="once a setting")
-    parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     settings = {}
     for preset in given.presets:
@@ -55,16 +59,12 @@ def main() -> int:
             name = " ".join([preset, *(f"{key}={value}" for key, value in changes.items())])
             settings[name] = partial(score_preset, preset=preset, changes=changes)
     try:
-        scores = print_table(make_sets(given.sets, given.seeds, CACHE), settings)
+        print_table(make_sets(given.sets, given.seeds), settings)
     except CFlowError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    if given.json:
-        write_json(given.json, scores)
-    return 0
+        sys.exit(f"error: {error}")
 
 
-def make_parser(description: str | None, sets: list[str], seeds: tuple[int, int]) -> argparse.ArgumentParser:
+def make_parser(description: str | None, sets: list[str], seeds: range) -> argparse.ArgumentParser:
     """Return a parser that knows the choice of sets, with its defaults."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", nargs="+", default=sets, help="groups, or sets by their names")
@@ -72,33 +72,25 @@ def make_parser(description: str | None, sets: list[str], seeds: tuple[int, int]
     return parser
 
 
-def seed_range(text: str) -> tuple[int, int]:
-    """First and last seed of "100-103"."""
-    match = re.fullmatch(r"(\d+)-(\d+)", text)
-    if match is None or int(match[1]) > int(match[2]):
-        raise argparse.ArgumentTypeError(f"{text!r}: give a first and a last seed, for example 100-103")
-    return int(match[1]), int(match[2])
+def seed_range(text: str) -> range:
+    """The seeds of "100-103"."""
+    first, last = map(int, text.split("-"))
+    return range(first, last + 1)
 
 
-def print_table(
-    sets: Sequence[ScoredSet], settings: Mapping[str, Callable[[ScoredSet], Figures]]
-) -> dict[str, dict[str, Figures]]:
-    """Print a row for every setting on every set and means over sensors; return the figures by set, then by setting."""
+def print_table(sets: Sequence[ScoredSet], settings: Mapping[str, Callable[[ScoredSet], Figures]]) -> None:
+    """Print a row for every setting on every set, then means over sensors."""
     torch.set_num_threads(1)
-    scores: dict[str, dict[str, Figures]] = {}
-    sensors: dict[str, list[str]] = {}
+    of_sensors: dict[tuple[str, str], list[Figures]] = {}
     print(f"| set | setting | {' | '.join(COLUMNS)} |\n|{'---|' * (2 + len(COLUMNS))}", flush=True)
     for scored in sets:
         for name, score_on in settings.items():
-            figures = scores.setdefault(scored.name, {})[name] = score_on(scored)
+            figures = score_on(scored)
             print_row(scored.name, name, figures)
-        if scored.mean:
-            sensors.setdefault(scored.mean, []).append(scored.name)
-    for mean, parts in sensors.items():
-        for name in settings:
-            figures = scores.setdefault(mean, {})[name] = mean_figures([scores[part][name] for part in parts])
-            print_row(mean, name, figures)
-    return scores
+            if scored.mean:
+                of_sensors.setdefault((scored.mean, name), []).append(figures)
+    for (mean, name), parts in of_sensors.items():
+        print_row(mean, name, mean_figures(parts))
 
 
 def print_row(of_set: str, setting: str, figures: Figures) -> None:
@@ -109,13 +101,63 @@ def print_row(of_set: str, setting: str, figures: Figures) -> None:
 
 
 def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any]) -> Figures:
-    """Score a preset with the history and the region of a set, for a fair comparison, and with the given changes."""
+    """Score a preset with the history and the region of a set, for a fair comparison, and with the given changes.
+
+    Small drives are scored one by one and averaged, as in docs/limits.md.
+    """
     of_set: dict[str, Any] = {"num_history": scored.history}
     if scored.half_side is not None:
         half = scored.half_side
         of_set["point_cloud_range"] = (-half, -half, -math.inf, half, half, math.inf)
-    return score(scored, make_config(preset, **{**of_set, **changes}))
+    config = make_config(preset, **{**of_set, **changes})
+    model, frames = make_model(config), []
+    for window, frame in scored.items:
+        past, future = window.pch[: config.num_history], window.pcf[: config.num_future]
+        (result,) = model([replace(window, pch=past, pcf=future)])
+        frames.append(replace(frame, residual_flow=result.residual_flow))
+    if scored.group == "scenes":
+        return mean_figures([pooled_figures([frame], reach=scored.reach) for frame in frames])
+    figures = pooled_figures(frames, scored.step, scored.reach)
+    return {**figures, **range_figures(frames)} if scored.group == "sim" else figures
+
+
+def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NEAR) -> Figures:
+    """Errors over all points of a set in a square box around the sensor; NaN without such points.
+
+    "dynamic", "static": end-point error in metres of dynamic objects and of the static background; "ratio",
+    "pedestrian": mean of error divided by speed of dynamic objects and of those that are pedestrians; "missed": share
+    of the points of dynamic objects whose flow is less than half of the true one; "moving": their number. With `step`
+    sweeps from t to t+1, a point is dynamic from 0.05 m per sweep on.
+    """
+    scored = {"region": "box", "max_range": reach, "dynamic_threshold": MOVES * step, "three_way_flow": "residual"}
+    definition = Definition("pooled", ("three_way",), **scored)
+    of_frames: list[tuple[np.ndarray, ...]] = []
+    for frame in frames:
+        points = score_points(frame, definition)
+        moves = points.in_region & points.is_dynamic & (points.category > 0)
+        walks = moves & (points.category == CATEGORY_INDEX["PEDESTRIAN"])
+        static = points.in_region & ~points.is_dynamic & (points.category == 0)
+        is_missed = np.linalg.norm(points.predicted_flow, axis=1) < 0.5 * points.speed
+        ratios = (points.error[chosen] / points.speed[chosen] for chosen in (moves, walks))
+        of_frames.append((points.error[moves], *ratios, points.error[static], is_missed[moves]))
+    pooled = [np.concatenate(values) for values in zip(*of_frames)]
+    names = ("dynamic", "ratio", "pedestrian", "static", "missed")
+    return {**dict(zip(names, map(mean_of_present, pooled))), "moving": float(len(pooled[0]))}
+
+
+def range_figures(frames: Sequence[EvalFrame]) -> Figures:
+    """Dynamic bucket-normalised errors within 35 m, "near", and at 35-70 m, "far"."""
+    metrics = SceneFlowMetrics("challenge_2026_box")
+    for frame in frames:
+        metrics.update(frame)
+    ranges = metrics.parts["bucketed_by_range"].compute()["ranges"]
+    return {name: ranges[key]["mean"]["dynamic_error"] for name, key in RANGES.items()}
+
+
+def mean_figures(parts: Sequence[Figures]) -> Figures:
+    """Mean of each figure over several drives or sensors, without those that do not have it."""
+    return {key: mean_of_present(np.array([part[key] for part in parts])) for key in parts[0]}
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

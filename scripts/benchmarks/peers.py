@@ -12,10 +12,10 @@ Open3D's ICP for each cluster); `icpflow`, `nsfp`, `fastnsf` of a checkout of Op
 of its YAML files, on a CPU (opensceneflow_cpu.py). `icpflow-author` has the search radius of the original code: twice
 the greater of 1.67 m and the ego motion. OpenSceneFlow uses 1.67 m. A method whose package is missing is skipped.
 
-All methods get the same points: both sweeps in the frame of t+1, without ground, within `--reach` metres (a square).
-Our presets get the sweeps with the ground mask and the same region. We score labelled points that are not ground. Each
-set has the windows `--start`, `--start` + `--every`, ... ; with `--history 0 4` our presets also run with four older
-sweeps. Processor time is that of the process, on one thread.
+All methods get the same points: both sweeps in the frame of t+1, without ground, within 35 m (a square). Our presets
+get the sweeps with the ground mask and the same region. We score labelled points that are not ground. Each set has the
+windows 4, 12, 20, ... , or window 0 if it is short; with `--history 0 4` our presets also run with four older sweeps.
+Processor time is that of the process, on one thread.
 
 Columns: mean over the sets of the mean over the windows: end-point error in metres of dynamic objects / that error
 divided by speed / end-point error of the static background in centimetres; processor seconds, mean over the windows.
@@ -42,11 +42,10 @@ from cflow_torch.config import PRESETS
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.files import read_json, write_json
 from cflow_torch.data.log import window
-from cflow_torch.types import as_numpy
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "ablation"))
-from score import pooled_figures  # noqa: E402
-from sets import Item, between, make_item  # noqa: E402
+from run import pooled_figures  # noqa: E402
+from sets import NEAR, Item, make_item  # noqa: E402
 
 OURS = ("default", "paper", "keypoints")
 HARNESS = {  # name -> YAML file and class of the model in the checkout
@@ -57,6 +56,7 @@ HARNESS = {  # name -> YAML file and class of the model in the checkout
 }
 METHODS = (*OURS, "zero", "nearest", "clusters", *HARNESS)
 SEED = 0  # of torch and NumPy, set before every window
+START, EVERY = 4, 8  # first window, step between windows
 RADIUS = 1.67  # metres, least search radius of ICP-Flow
 Method = Callable[["Case"], np.ndarray]
 
@@ -65,44 +65,40 @@ class Case(NamedTuple):
     """A window with its truth, and what the methods get."""
 
     item: Item  # the window, with ground masks
-    T_ego1_ego0: np.ndarray  # (4, 4) float64
     rows: np.ndarray  # (N0',) int64, rows of sweep t that are not ground and within reach
     pc0: np.ndarray  # (N0', 3) float32 metres, frame of t+1
     pc1: np.ndarray  # (N1', 3) float32 metres, frame of t+1
 
 
-def cases(path: Path, given: argparse.Namespace) -> Iterator[tuple[str, str, Case]]:
+def cases(path: Path, num_history: int, num_windows: int | None = None) -> Iterator[tuple[str, str, Case]]:
     """The chosen windows of the logs at a path, with the names of their sets and windows."""
     data_set = recognise(path)
     for source in find_sources(data_set, path):
         log = open_log(data_set, source, check=False)
-        has_history = len(log.timestamps) > given.start + 1
-        chosen = range(given.start, len(log.timestamps) - 1, given.every) if has_history else [0]
-        for index in list(chosen)[: given.windows]:
+        chosen = range(START, len(log) - 1, EVERY) or [0]
+        for index in chosen[:num_windows]:
             labels = log.labels(index)
             if labels is not None:
                 eval_mask = log.eval_mask(index) if hasattr(log, "eval_mask") else None
-                item = make_item(window(log, index, max(given.history)), labels, eval_mask)
-                yield log.log_id, f"{log.log_id}, {index}", make_case(item, given.reach)
+                item = make_item(window(log, index, num_history), labels, eval_mask)
+                yield log.log_id, f"{log.log_id}, {index}", make_case(item)
 
 
-def make_case(item: Item, reach: float) -> Case:
+def make_case(item: Item) -> Case:
     """Compensate ego motion, and leave out ground and what is out of reach."""
-    pair = item.window.pc0, item.window.pc1
-    points = [as_numpy(sweep.points)[:, :3].astype(np.float32) for sweep in pair]
-    moved = (points[0] + item.pose_flow, points[1])
+    pc0, pc1 = item.window.pc0, item.window.pc1
+    moved = (pc0.points + item.frame.pose_flow, pc1.points)
     rows = []
-    for sweep, at in zip(pair, moved):
-        ground = np.zeros(len(at), bool) if sweep.is_ground is None else as_numpy(sweep.is_ground)
-        rows.append(np.flatnonzero(~ground & np.isfinite(at).all(1) & (np.abs(at[:, :2]) <= reach).all(1)))
-    return Case(item, between(item.window), rows[0], moved[0][rows[0]], moved[1][rows[1]])
+    for sweep, at in zip((pc0, pc1), moved):
+        rows.append(np.flatnonzero(~sweep.is_ground & np.isfinite(at).all(1) & (np.abs(at[:, :2]) <= NEAR).all(1)))
+    return Case(item, rows[0], moved[0][rows[0]], moved[1][rows[1]])
 
 
-def preset(name: str, num_history: int, reach: float) -> Method:
+def preset(name: str, num_history: int) -> Method:
     """A preset of this package."""
-    low, high = (-reach, -reach, -np.inf), (reach, reach, np.inf)
+    region = (-NEAR, -NEAR, -np.inf, NEAR, NEAR, np.inf)
     settings = {} if "num_history" not in make_config(name).as_dict() else {"num_history": num_history}
-    model = make_model(make_config(name, point_cloud_range=(*low, *high), **settings), "cpu")
+    model = make_model(make_config(name, point_cloud_range=region, **settings), "cpu")
 
     def method(case: Case) -> np.ndarray:
         sweeps = case.item.window
@@ -115,7 +111,7 @@ def on_rows(estimate: Callable[[Case], np.ndarray]) -> Method:
     """A method that returns the flow of `pc0` only; other points get zero."""
 
     def method(case: Case) -> np.ndarray:
-        flow = np.zeros_like(case.item.pose_flow)
+        flow = np.zeros_like(case.item.frame.pose_flow)
         flow[case.rows] = estimate(case)
         return flow
 
@@ -171,7 +167,7 @@ def of_harness(name: str, root: Path) -> Method:
 
     def estimate(case: Case) -> np.ndarray:
         if name == "icpflow-author":
-            model.args.translation_frame = 2 * max(RADIUS, float(np.linalg.norm(case.T_ego1_ego0[:3, 3])))
+            model.args.translation_frame = 2 * max(RADIUS, float(np.linalg.norm(case.item.frame.T_ego1_ego0[:3, 3])))
         clouds = {"pc0": [torch.from_numpy(case.pc0)], "pc1": [torch.from_numpy(case.pc1)]}  # compensated already
         with parallel_config("sequential"):  # its HDBSCAN would start processes, whose time is not that of this one
             return model({**clouds, "pose0": [torch.eye(4)], "pose1": [torch.eye(4)]})["flow"][0].numpy()
@@ -179,14 +175,14 @@ def of_harness(name: str, root: Path) -> Method:
     return on_rows(estimate)
 
 
-def make_method(name: str, num_history: int, given: argparse.Namespace) -> Method:
+def make_method(name: str, num_history: int, opensceneflow: Path | None) -> Method:
     """A method by its name; an ImportError if a package is missing."""
     if name in HARNESS:
-        if given.opensceneflow is None:
+        if opensceneflow is None:
             raise ImportError("give --opensceneflow PATH")
-        return of_harness(name, given.opensceneflow)
+        return of_harness(name, opensceneflow)
     if name in PRESETS:
-        return preset(name, num_history, given.reach)
+        return preset(name, num_history)
     if name == "zero":
         return on_rows(lambda case: np.zeros_like(case.pc0))
     if name == "clusters":
@@ -195,14 +191,14 @@ def make_method(name: str, num_history: int, given: argparse.Namespace) -> Metho
     return on_rows({"nearest": nearest, "clusters": clusters}[name])
 
 
-def measure(method: Method, case: Case, reach: float) -> dict[str, float]:
+def measure(method: Method, case: Case) -> dict[str, float]:
     """Errors and processor seconds of a window."""
     torch.manual_seed(SEED)
     np.random.seed(SEED)
     begin = time.process_time()
     flow = method(case)
     seconds = time.process_time() - begin
-    figures = pooled_figures([case.item.frame(flow)], reach=reach)
+    figures = pooled_figures([replace(case.item.frame, residual_flow=flow)])
     return {**{name: figures[name] for name in ("dynamic", "ratio", "static")}, "cpu": seconds}
 
 
@@ -250,20 +246,17 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS, metavar="NAME")
     parser.add_argument("--opensceneflow", type=Path, metavar="PATH", help="checkout of OpenSceneFlow")
     parser.add_argument("--history", type=int, nargs="+", default=(0, 4), help="numbers of older sweeps of our presets")
-    parser.add_argument("--start", type=int, default=4, help="first window of logs that have so many sweeps; else 0")
-    parser.add_argument("--every", type=int, default=8, help="step between windows")
     parser.add_argument("--windows", type=int, help="at most so many windows of a set")
-    parser.add_argument("--reach", type=float, default=35.0, help="metres, half side of the square")
     parser.add_argument("--json", type=Path, help="file for the figures of every window; those of other runs are kept")
     given = parser.parse_args()
     torch.set_num_threads(1)
     key = itemgetter("window", "method", "history")
     rows = {key(row): row for row in (read_json(given.json) if given.json and given.json.is_file() else [])}
     runs = [(name, history) for name in given.methods for history in (given.history if name in OURS[:2] else (0,))]
-    all_cases = [each for path in given.paths for each in cases(path, given)]
-    for name, history in runs if all_cases else []:
+    all_cases = [each for path in given.paths for each in cases(path, max(given.history), given.windows)]
+    for name, history in runs:
         try:
-            method = make_method(name, history, given)
+            method = make_method(name, history, given.opensceneflow)
         except ImportError as error:
             print(f"skipped {name}: {error}", file=sys.stderr)
             continue
@@ -271,7 +264,7 @@ def main() -> None:
             if len(case.item.window.pch) < history:
                 continue
             row = {"set": set_name, "window": window_name, "method": name, "history": history}
-            row.update(measure(method, case, given.reach))
+            row.update(measure(method, case))
             rows[key(row)] = row
             print(json.dumps(row), file=sys.stderr, flush=True)
             if given.json:

@@ -160,7 +160,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_rows_of_a_scene(script: Any, scene: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     """Known values of zero flow; a table; rows of an earlier run are kept, and replaced by the same run again."""
     peers, file = script("benchmarks", "peers"), tmp_path / "rows.json"
-    call = ["peers.py", str(scene), "--start", "2", "--history", "0", "2", "--json", str(file)]
+    monkeypatch.setattr(peers, "START", 2)
+    call = ["peers.py", str(scene), "--history", "0", "2", "--json", str(file)]
     monkeypatch.setattr(sys, "argv", [*call, "--methods", "zero", "nearest", "nsfp"])
     peers.main()
     monkeypatch.setattr(sys, "argv", [*call, "--methods", "default", "zero"])
@@ -178,14 +179,13 @@ def test_rows_of_a_scene(script: Any, scene: Path, tmp_path: Path, monkeypatch: 
     assert f"{zero['dynamic']:.3f} / 1.00 / 0.0" in lines[1]
 
 
-def test_clouds_of_the_peers(script: Any, scene: Path) -> None:
+def test_clouds_of_the_peers(script: Any, scene: Path, monkeypatch: Any) -> None:
     """They lie in the frame of t+1: with the true flow a static world coincides, and no point is ground or far."""
-    import argparse
-
     peers = script("benchmarks", "peers")
-    given = argparse.Namespace(start=2, every=8, windows=None, history=(0,), reach=20.0)
-    ((*_, case),) = peers.cases(scene, given)
-    truth, pc0 = case.item.frame(np.zeros_like(case.item.pose_flow)), case.item.window.pc0
+    monkeypatch.setattr(peers, "START", 2)
+    monkeypatch.setattr(peers, "NEAR", 20.0)
+    ((*_, case),) = peers.cases(scene, 0)
+    truth, pc0 = case.item.frame, case.item.window.pc0
     assert np.abs(case.pc0[:, :2]).max() <= 20 and np.abs(case.pc1[:, :2]).max() <= 20
     assert len(case.rows) > 1000 and not pc0.is_ground[case.rows].any()
     expected = truth.points[case.rows] + truth.pose_flow[case.rows]
