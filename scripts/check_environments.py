@@ -2,17 +2,17 @@
 """Build the wheel of the last commit, install it in an environment, run its commands, and run the tests there.
 
   python scripts/check_environments.py old --python /path/to/python3.8
-  PYTHON_NEW=/path/to/python3.13 python scripts/check_environments.py new -k dense
+  python scripts/check_environments.py new --python /path/to/python3.13
   python scripts/check_environments.py wheel --python /path/to/python3.11
 
 old: the versions of constraints_old.txt (torch 2.0.1, numpy 1.24, kornia 0.7.3), for Python 3.8.
 new: the newest versions that pip finds, for Python 3.13.
 wheel: an empty environment in which pip installs the wheel and what it needs. Only the commands run, no tests.
 
-The interpreter is that of --python, else of $PYTHON_OLD or $PYTHON_NEW. Commands and tests run in folders without the
-package, so that only the wheel can be imported. Real data is read from $CFLOW_DATA, else from the folder ../shared/data
-next to the checkout. An environment needs about 6 GB, because pip may find torch with CUDA only; PIP_CONSTRAINT names
-a file of versions. The exit status is that of pytest. FOLDER/NAME/freeze.txt lists the installed versions.
+Commands and tests run in folders without the package, so that only the wheel can be imported. Real data is read from
+$CFLOW_DATA, else from the folder ../shared/data next to the checkout. An environment needs about 6 GB, because pip may
+find torch with CUDA only; PIP_CONSTRAINT names a file of versions. The exit status is that of pytest.
+outputs/environments/NAME/freeze.txt lists the installed versions.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Sequence
 
 ROOT = Path(__file__).resolve().parents[1]
 INSTALL = {
@@ -53,25 +52,20 @@ for module in (cflow_torch, cflow_torch.configs):
 """
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Check one environment; returns the exit status of the tests."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=sorted(INSTALL))
-    parser.add_argument("--python", help="interpreter of the environment")
-    parser.add_argument("--folder", type=Path, default=ROOT / "outputs" / "environments", help="for what is installed")
-    parser.add_argument("-k", dest="chosen", default="", metavar="EXPRESSION", help="only these tests, as in pytest -k")
-    given = parser.parse_args(arguments)
-    base = given.python or os.environ.get(f"PYTHON_{given.name.upper()}")
-    if not base:
-        parser.error(f"which Python? give --python PATH or set PYTHON_{given.name.upper()}")
-    home = given.folder.resolve() / given.name
+    parser.add_argument("--python", required=True, help="interpreter of the environment")
+    given = parser.parse_args()
+    home = ROOT / "outputs" / "environments" / given.name
     home.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="cflow-check-") as temporary:
         source = Path(temporary) / "source"
         run("git", "clone", "--quiet", "--depth", "1", ROOT.as_uri(), source)
         run(sys.executable, "-m", "build", "--outdir", Path(temporary) / "dist", source)
         (wheel,) = (Path(temporary) / "dist").glob("*.whl")
-        python = install(given.name, base, home, wheel)
+        python = install(given.name, given.python, home, wheel)
         run_commands(python, Path(temporary))
         if given.name == "wheel":
             return 0
@@ -80,7 +74,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (shutil.rmtree if path.is_dir() else os.remove)(path)
         run(python, "-c", INSTALLED, cwd=source)
         tests = ["tests", "-m", "not slow", *(f"--ignore={file}" for file in NEED_PACKAGE)]
-        tests += ["-k", given.chosen] if given.chosen else []
         return subprocess.run([python, "-m", "pytest", *tests], cwd=source, env=environment()).returncode
 
 

@@ -83,7 +83,6 @@ def _nanoseconds(stamp: Any) -> int:
 
 
 def main() -> None:
-    """Run the node until it is stopped."""
     rclpy.init()
     node = FlowNode()
     try:

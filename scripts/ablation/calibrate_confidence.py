@@ -53,12 +53,12 @@ def statistics(items: Iterable[Item], histories: Sequence[int], max_points: floa
     """
     num_bins = len(confidence.TABLE["probabilities"])
     sums = np.zeros((num_bins, 7))
-    models = {h: make_model(make_config("default", num_history=h, point_cloud_range=BOX)) for h in histories}
+    models = [make_model(make_config("default", num_history=h, point_cloud_range=BOX)) for h in histories]
     encoded = [i / num_bins for i in range(num_bins)]  # so that the confidence of a point is the number of its bin
     with patch.dict(confidence.TABLE, probabilities=encoded):
         for window, frame in items:
-            for h, model in models.items():
-                (result,) = model([replace(window, pch=window.pch[:h], pcf=())])
+            for model in models:
+                (result,) = model([replace(window, pcf=())])
                 of_window = _sums(result, frame, num_bins)
                 sums += of_window * np.minimum(1, max_points / np.maximum(of_window[:, :1], 1))
     return sums
@@ -127,7 +127,6 @@ def share_of_missed_found(sums: np.ndarray) -> float:
 
 
 def main() -> None:
-    """Fit the table, or print how well it is calibrated."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=("fit", "evaluate"))
     given = parser.parse_args()

@@ -48,7 +48,6 @@ Figures = Dict[str, float]
 
 
 def main() -> None:
-    """Print the table, row by row."""
     parser = make_parser(__doc__, ["real", "odd", "merged"], range(100, 104))
     parser.add_argument("--presets", nargs="+", default=["default"])
     parser.add_argument("--set", nargs="*", action="append", metavar="NAME=VALUE", help="once a setting")
@@ -112,8 +111,7 @@ def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any]) -> Fig
     config = make_config(preset, **{**of_set, **changes})
     model, frames = make_model(config), []
     for window, frame in scored.items:
-        past, future = window.pch[: config.num_history], window.pcf[: config.num_future]
-        (result,) = model([replace(window, pch=past, pcf=future)])
+        (result,) = model([replace(window, pcf=window.pcf[: config.num_future])])
         frames.append(replace(frame, residual_flow=result.residual_flow))
     if scored.group == "scenes":
         return mean_figures([pooled_figures([frame], reach=scored.reach) for frame in frames])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Callable, NamedTuple, Sequence
@@ -65,8 +65,8 @@ class ScoredSet:
 
     @cached_property
     def items(self) -> list[Item]:
-        """The windows, with `history` older sweeps."""
-        return [item._replace(window=replace(item.window, pch=item.window.pch[: self.history])) for item in self.load()]
+        """The windows, with at least `history` older sweeps."""
+        return self.load()
 
 
 def make_sets(names: Sequence[str], seeds: Sequence[range]) -> list[ScoredSet]:

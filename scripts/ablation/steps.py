@@ -71,7 +71,6 @@ def score_without(scored: ScoredSet, name: str) -> Figures:
 
 
 def main() -> None:
-    """Print the table, row by row."""
     sets = ["sim av2 700-703 h=4", "sim waymo 700-703 h=4", "kitti odd h=4"]
     given = make_parser(__doc__, sets, range(700, 704)).parse_args()
     settings = {name: partial(score_without, name=name) for name in (*STEPS, *SETTINGS)}

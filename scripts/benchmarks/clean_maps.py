@@ -30,7 +30,7 @@ from table import markdown
 
 from cflow_torch import make_config, make_model
 from cflow_torch.applications.cleaning import CleanLog
-from cflow_torch.data.log import CachedLog, window
+from cflow_torch.data.log import CachedLog, windows
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.simulator.drive import Drive
@@ -60,7 +60,7 @@ def light(num_sweeps: int) -> SimulatedLog:
 def scores(name: str, log: Any, removed: Sequence[np.ndarray], seconds: float) -> dict[str, Any]:
     """A row of the table."""
     total = np.zeros((3, 2))
-    for index, is_removed in zip(range(len(log.timestamps) - 1), removed):
+    for index, is_removed in enumerate(removed[: len(log) - 1]):
         truth, points = log.truth(index), np.asarray(log.sweep(index).points)
         is_scored = truth.is_known & (np.hypot(points[:, 0], points[:, 1]) < RANGE)
         waits = is_scored & ~truth.moves & truth.moves_sometimes
@@ -72,32 +72,27 @@ def scores(name: str, log: Any, removed: Sequence[np.ndarray], seconds: float) -
 
 
 def main() -> None:
-    """Simulate, estimate, clean, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="*", default=("light", "av2", "nuscenes", "waymo"), help="sensors, light, files")
-    parser.add_argument("--model", default="offline", help="preset")
     parser.add_argument("--num-sweeps", type=int, default=20, help="of a simulated drive")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    model, rows = make_model(make_config(given.model), "auto"), []
+    model, rows = make_model(make_config("offline"), "auto"), []
     for name in given.logs:
         if name in FORMATS or name == "light":
             log = light(given.num_sweeps) if name == "light" else SimulatedLog(name, SEED, "crossing", given.num_sweeps)
-            opened, T_ego_lidar = with_ground(log), next(iter(log.drive.calibration.values()))
+            T_ego_lidar = next(iter(log.drive.calibration.values()))
         else:
-            log = opened = LabelledLog(name)
-            T_ego_lidar = np.eye(4)
-        recent, pairs = CachedLog(opened, model.config.num_sweeps), range(len(opened.timestamps) - 1)
-        flow, seconds = [], 0.0
-        for index in pairs:
-            sweeps = window(recent, index, model.config.num_history, model.config.num_future)
-            begin = time.process_time()  # simulation and reading are not timed
-            flow.append(model([sweeps])[0])
-            seconds += time.process_time() - begin
+            log, T_ego_lidar = LabelledLog(name), np.eye(4)
+        opened = CachedLog(with_ground(log), len(log))
+        list(opened)  # simulates or reads the sweeps before a clock starts
+        begin = time.process_time()
+        flow = [model([each])[0] for each in windows(opened, model.config.num_history, model.config.num_future)]
+        seconds = time.process_time() - begin
         for label, remove_stopped in (("cflow", False), ("cflow, stopped", True)):
             begin = time.process_time()
             clean = CleanLog(opened, flow=flow.__getitem__, remove_stopped=remove_stopped)
-            removed = [clean.moving(index) for index in pairs]
+            removed = [clean.moving(index) for index in range(len(flow))]
             spent = (seconds + time.process_time() - begin) / len(flow)
             rows.append(scores(f"{name}: {label}", log, removed, spent))
         try:

@@ -1,8 +1,7 @@
 #!/usr/bin/env python3
 """Check a GPU within minutes: equality with the CPU, speed, launches, memory.
 
-  PYTHONPATH=. python scripts/benchmarks/gpu_check.py                      tables, and outputs/gpu_check.json
-  PYTHONPATH=. python scripts/benchmarks/gpu_check.py --output FILE --skip memory
+  PYTHONPATH=. python scripts/benchmarks/gpu_check.py    tables, and outputs/gpu_check.json
 
 We have not run this script on a GPU, because we had none. Without a GPU it compares the CPU with itself, which only
 tests the script.
@@ -13,7 +12,7 @@ from __future__ import annotations
 import argparse
 import platform
 from dataclasses import replace
-from pathlib import Path
+from functools import lru_cache, partial
 from typing import Any, Callable, Dict, Iterator, Sequence
 
 import numpy as np
@@ -66,21 +65,24 @@ CALLS = {
     "syncs": ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"),
     "copies": ("cudaMemcpy", "cudaMemset"),
 }
-SEEDS, SWEEPS = (7, 8, 9), 6  # t + 1, t, and a history of four
-STREETS: list[Window] = []  # filled by `main`
 Rows = Iterator[Dict[str, Any]]
 
 
-def windows_for(config: Config, number: int) -> list[Window]:
-    """Windows with the history of a config; there are three different ones, which are repeated."""
-    chosen = [STREETS[i % len(STREETS)] for i in range(number)]
-    return [replace(sweeps, pch=sweeps.pch[: config.num_history]) for sweeps in chosen]
+@lru_cache(maxsize=None)
+def street(seed: int) -> Window:
+    """A window of a simulated street, with four older sweeps."""
+    return window(make_drive(seed, num_sweeps=6), 4, 4)
+
+
+def streets(number: int) -> list[Window]:
+    """Windows for a batch: three different ones, which are repeated."""
+    return [street(7 + i % 3) for i in range(number)]
 
 
 def check_equality(device: str) -> Rows:
     """Compare GPU and CPU in every variant: rows that differ in each field, the largest difference of the floats."""
     for name, (config, number) in VARIANTS.items():
-        results = (make_model(config, where)(windows_for(config, number)) for where in (device, "cpu"))
+        results = (make_model(config, where)(streets(number)) for where in (device, "cpu"))
         yield {"variant": name, **compare(*results)}
 
 
@@ -102,8 +104,7 @@ def compare(results: Sequence[FlowResult], expected: Sequence[FlowResult]) -> di
 def measure_speed(device: str) -> Rows:
     """Milliseconds of a batch and windows per second, from NumPy arrays and from tensors on the device."""
     for name, config in MEASURED.items():
-        host = windows_for(config, len(STREETS))
-        for kind, windows in (("arrays", host), (device, [on_device(each, device) for each in host])):
+        for kind, windows in (("arrays", streets(3)), (device, [on_device(each, device) for each in streets(3)])):
             sizes = (1, 8, 32) if device == "cuda" else (1, 2)
             for size, found in measure(make_model(config, device), windows, 3, sizes)["batches"].items():
                 of_batch = {"ms": 1000 * found["median"], "windows/s": found["windows_per_s"]}
@@ -125,8 +126,7 @@ def count_launches(device: str) -> Rows:
     for name, config in MEASURED.items() if device == "cuda" else ():
         model = make_model(config, device)
         for size in (1, 16):
-            windows = windows_for(config, size)
-            yield {"work": name, "batch": size, **by_profiler(lambda: model(windows))}  # noqa: B023
+            yield {"work": name, "batch": size, **by_profiler(partial(model, streets(size)))}
 
 
 def by_profiler(run: Callable[[], Any]) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def measure_memory(device: str) -> Rows:
     for name, config in MEASURED.items():
         for limit in (None, 1_000_000_000, 200_000_000):
             model = make_model(config.replace(max_memory=limit), device)
-            peak = measure(model, windows_for(config, size), 1, [size])["peak_bytes"] or 0
+            peak = measure(model, streets(size), 1, [size])["peak_bytes"] or 0
             yield {"work": name, "batch": size, "max_memory_MB": limit and limit / 1e6, "peak_MB": peak / 1e6}
 
 
@@ -164,25 +164,21 @@ PARTS: dict[str, Callable[[str], Rows]] = {
 
 def main() -> None:
     """Run the parts, print tables, write JSON; the exit status is 1 if results differ or a part failed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path("outputs/gpu_check.json"))
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu", choices=("cuda", "cpu"))
-    parser.add_argument("--skip", nargs="*", default=[], choices=list(PARTS))
-    given = parser.parse_args()
-    STREETS.extend(window(make_drive(seed=seed, num_sweeps=SWEEPS), SWEEPS - 2, SWEEPS - 2) for seed in SEEDS)
-    name = torch.cuda.get_device_name() if given.device == "cuda" else "no GPU: the CPU is compared with itself"
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    name = torch.cuda.get_device_name() if device == "cuda" else "no GPU: the CPU is compared with itself"
     report: dict[str, Any] = {"device": name, "platform": platform.platform(), "torch": torch.__version__}
     print(report)
     wrong: list[str] = []
-    for title in (title for title in PARTS if title not in given.skip):
+    for title, measured in PARTS.items():
         try:
-            rows = report[title] = list(PARTS[title](given.device))
+            rows = report[title] = list(measured(device))
         except Exception as error:  # go on with the other parts
             rows, report[title] = [], f"{type(error).__name__}: {error}"
             wrong.append(f"{title}: {report[title]}")
         print(f"\n## {title}\n\n{markdown(rows)}", flush=True)
         wrong += [f"{title}: {row['variant']}" for row in rows if not row.get("same", True)]
-        write_json(given.output, report)
+        write_json("outputs/gpu_check.json", report)
     if wrong:
         raise SystemExit("wrong: " + "; ".join(wrong))
 

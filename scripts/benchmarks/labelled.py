@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import NamedTuple, Sequence
 
 import numpy as np
 
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import GroundSegmentedLog
-from cflow_torch.data.hdf5 import HDF5Log
+from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
@@ -53,6 +54,11 @@ class LabelledLog(HDF5Log):
         velocity[0] = 0
         moves = np.linalg.norm(residual, axis=1) >= MOVING
         return Truth(object_id, labels.is_valid, velocity @ self.sweep(index + 1).pose[:3, :3].T, moves, moves)
+
+
+def open_scenes(paths: Sequence[Path]) -> list[LabelledLog]:
+    """Open labelled HDF5 scenes, or all scenes of folders."""
+    return [LabelledLog(file) for path in paths for file in find_hdf5_scenes(path)]
 
 
 class SimulatedLog(Log):

@@ -17,14 +17,13 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any, Sequence
 
 import numpy as np
 import torch
-from labelled import true_residual
+from labelled import open_scenes, true_residual
 from scipy import spatial  # noqa: F401 (its import is not timed)
 from table import markdown
 
@@ -33,15 +32,14 @@ from cflow_torch.applications.labels import find_labels
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes, write_hdf5_scene
 from cflow_torch.data.log import CachedLog, Log, window, windows
 from cflow_torch.simulator.benchmark import FORMATS, benchmark_logs
 from cflow_torch.types import as_numpy
 
 RANGE = 50.0  # metres
 TIMED = 4  # about so many sweeps of a scene are grouped by HDBSCAN, only for its time
-SCENES = ("street", "highway", "crossing", "narrow")
-SEEDS = (300, 301)  # settings were chosen on 100 to 103
+DRIVES = ((300, "street"), (301, "highway"))  # settings were chosen on 100 to 103
+NUM_SWEEPS = 8  # of a simulated drive
 
 
 def dufomap_labels(log: Log, T_points_lidar: np.ndarray, settings: tuple[float, float, int]) -> list[np.ndarray]:
@@ -65,30 +63,29 @@ def dufomap_labels(log: Log, T_points_lidar: np.ndarray, settings: tuple[float, 
     return [np.asarray(found.segment(cloud, pose, cloud_transform=True)) > 0 for cloud, pose in zip(points, poses)]
 
 
-def theirs(log: Log, height: float) -> dict[str, Any] | None:
-    """Label a scene by DUFOMap, and group points by HDBSCAN; None if a package is missing."""
+def theirs(log: Log, height: float) -> dict[str, dict[str, Any]]:
+    """Label a scene by DUFOMap, and group points by HDBSCAN; empty if a package is missing."""
     try:
         import dufomap  # noqa: F401
         from hdbscan import HDBSCAN
     except ImportError as error:
         print(f"only our labels: {error}", file=sys.stderr)
-        return None
+        return {}
     T_points_lidar = np.eye(4)
     T_points_lidar[2, 3] = height
     begin = time.process_time()
     labels = dufomap_labels(log, T_points_lidar, (0.15, 0.2, 1))
     seconds = (time.process_time() - begin) / len(log)
-    ground = [as_numpy(sweep.is_ground) for sweep in log]
-    labels = [found & ~mask for found, mask in zip(labels, ground)]
+    labels = [found & ~sweep.is_ground for found, sweep in zip(labels, log)]
     settings = {"min_cluster_size": 20, "cluster_selection_epsilon": 0.7, "core_dist_n_jobs": 1}
     begin, chosen = time.process_time(), range(0, len(log), max(1, len(log) // TIMED))
     for index in chosen:
-        points = as_numpy(log.sweep(index).points)[:, :3]
-        HDBSCAN(alpha=1.1, **settings).fit_predict(points[~ground[index]])
+        sweep = log.sweep(index)
+        HDBSCAN(alpha=1.1, **settings).fit_predict(sweep.points[~sweep.is_ground])
         if labels[index].sum() >= 20:
-            HDBSCAN(**settings).fit_predict(points[labels[index]])
+            HDBSCAN(**settings).fit_predict(sweep.points[labels[index]])
     grouping = (time.process_time() - begin) / len(chosen)
-    return {"seconds": seconds, "hdbscan": grouping, "counts": counts(log, labels)}
+    return {"DUFOMap": {"seconds": seconds, "hdbscan": grouping, "counts": counts(log, labels)}}
 
 
 def ours(log: Log, preset: str) -> dict[str, Any]:
@@ -116,15 +113,13 @@ def counts(log: Log, labels: Sequence[np.ndarray]) -> list[int]:
     return total.tolist()
 
 
-def simulated(folder: Path, sensor: str, num_sweeps: int) -> list[Path]:
-    """Write scenes of simulated drives of a sensor."""
-    made, files = FORMATS[sensor], []
-    for seed in SEEDS:
-        scene = SCENES[seed % len(SCENES)]
-        files.append(folder / f"{sensor}-{scene}-{seed}.h5")
-        (source,) = benchmark_logs(folder / "cache", sensor, [seed], num_sweeps, [scene])
-        write_hdf5_scene(open_log(made.data_set, source, check=False, **made.settings), files[-1])
-    return files
+def simulated(sensor: str) -> list[Log]:
+    """Simulated drives of a sensor, read with the reader of its data set."""
+    made, logs = FORMATS[sensor], []
+    for seed, scene in DRIVES:
+        (source,) = benchmark_logs("outputs/cache", sensor, [seed], NUM_SWEEPS, [scene])
+        logs.append(open_log(made.data_set, source, check=False, **made.settings))
+    return logs
 
 
 def score(parts: Sequence[dict[str, Any]]) -> str:
@@ -134,7 +129,7 @@ def score(parts: Sequence[dict[str, Any]]) -> str:
     return ", ".join(f"{part / (part + rest):.3f}" if part + rest else "–" for part, rest in pairs)
 
 
-def table_row(name: str, scenes: list[dict[str, Any]]) -> dict[str, Any]:
+def table_row(name: str, scenes: list[dict[str, dict[str, Any]]]) -> dict[str, Any]:
     """A row of the table."""
     row: dict[str, Any] = {"scenes": f"{name} ({len(scenes)})"}
     for method in scenes[0]:
@@ -147,30 +142,23 @@ def table_row(name: str, scenes: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Label, score, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", type=Path, nargs="*", help="labelled HDF5 scenes, or folders of them")
     parser.add_argument("--sensor-height", type=float, default=0.0, help="metres of the LiDAR above the points' origin")
     parser.add_argument("--simulated", nargs="*", default=[], choices=tuple(FORMATS), metavar="SENSOR")
-    parser.add_argument("--presets", nargs="+", default=["offline", "default"])
-    parser.add_argument("--num-sweeps", type=int, default=8, help="of a simulated drive")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    table: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as scratch:
-        rows = {f"simulated {sensor}": simulated(Path(scratch), sensor, given.num_sweeps) for sensor in given.simulated}
-        rows.update({file.stem: [file] for path in given.paths for file in find_hdf5_scenes(path)})
-        for name, files in rows.items():
-            scenes = []
-            for file in files:
-                log = HDF5Log(file)
-                cached = CachedLog(log, len(log))
-                list(cached)  # reads the sweeps before a clock starts
-                result = {preset: ours(cached, preset) for preset in given.presets}
-                peer = theirs(cached, given.sensor_height)
-                result.update({} if peer is None else {"DUFOMap": peer})
-                scenes.append(result)
-            table.append(table_row(name, scenes))
+    rows: dict[str, list[Log]] = {f"simulated {sensor}": simulated(sensor) for sensor in given.simulated}
+    rows.update({log.log_id: [log] for log in open_scenes(given.paths)})
+    table = []
+    for name, logs in rows.items():
+        scenes = []
+        for log in logs:
+            cached = CachedLog(log, len(log))
+            list(cached)  # reads the sweeps before a clock starts
+            own = {preset: ours(cached, preset) for preset in ("offline", "default")}
+            scenes.append({**own, **theirs(cached, given.sensor_height)})
+        table.append(table_row(name, scenes))
     print(markdown(table))
 
 

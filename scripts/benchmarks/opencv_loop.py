@@ -8,13 +8,13 @@ ties of the argmax in another way.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Sequence
+from typing import NamedTuple, Sequence
 
+import cv2
 import numpy as np
 import torch
 
-from cflow_torch.config import Config, DenseConfig
-from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch import Config
 from cflow_torch.types import FlowResult, Sweep, Window, as_numpy
 
 _SQUARE = np.ones((3, 3), np.uint8)
@@ -38,24 +38,17 @@ class Clusters(NamedTuple):
     boxes: list[list[int]]  # M times (top, left, height, width), pixels
 
 
-def opencv() -> Any:
-    """Import cv2."""
-    return import_optional("cv2", "the OpenCV loop needs OpenCV: pip install opencv-python-headless")
-
-
 def opencv_flow(window: Window, config: Config) -> FlowResult:
     """Estimate the flow of every point of `window.pc0`, whose sweeps t-h ... t+1 have equal intervals.
 
-    Settings that choose engines are ignored; others that the loop does not have are a `CFlowError`.
+    The method must be dense, with connected components; other settings that the loop does not have are ignored.
 
     Cost: one `cv2.matchTemplate` per cluster, sweep and scale.
     """
-    if not isinstance(config, DenseConfig) or config.clustering != "components":
-        raise CFlowError("the OpenCV loop has method='dense', clustering='components' only")
-    if config.sectional_view or config.max_speed is not None:
-        raise CFlowError("the OpenCV loop has sectional_view=False, max_speed=None only")
     points0, moved0 = _compensate(window.pc0, window.pc1)
-    clouds = _clouds(window, moved0, config)
+    clouds = [_cloud(window.pc0, moved0, 1.0, config)]
+    for m, sweep in enumerate(window.pch[: config.num_history], 2):
+        clouds.append(_cloud(sweep, _compensate(sweep, window.pc1)[1], float(m), config))
     cloud1 = _cloud(window.pc1, _columns(window.pc1), 0.0, config)
     flows: list[np.ndarray] = []
     for pixel_size in config.pixel_sizes:
@@ -124,13 +117,13 @@ def project(xy: np.ndarray, pixel_size: float, config: Config) -> tuple[np.ndarr
 
 def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Config) -> Clusters:
     """Alg. clustering on (H, W) uint8 images, t+1 first: dilate and label; erode too large clusters and label again."""
-    cv2 = opencv()
     aggregated = images[0].copy()
     for image in images[1:]:
         aggregated |= image
     height, width = aggregated.shape
     # We find boxes from the occupied pixels, because connectedComponentsWithStats is six times slower than labelling.
-    dilated, count, labels = dilate_and_label(aggregated, config.connectivity)
+    dilated = cv2.dilate(aggregated, _SQUARE)
+    count, labels = cv2.connectedComponents(dilated, connectivity=config.connectivity)
     pixel = np.flatnonzero(aggregated.view(bool))
     label = labels.ravel()[pixel]
     group = _grouped(pixel, label, width)
@@ -166,13 +159,6 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     return Clusters(number, np.stack([group.top, group.left, *sizes], 1)[by_raster].tolist())
 
 
-def dilate_and_label(aggregated: np.ndarray, connectivity: int) -> tuple[np.ndarray, int, np.ndarray]:
-    """(H, W) uint8 dilated image, number of labels, (H, W) int32 labels."""
-    cv2 = opencv()
-    dilated = cv2.dilate(aggregated, _SQUARE)
-    return (dilated, *cv2.connectedComponents(dilated, connectivity=connectivity))
-
-
 class Groups(NamedTuple):
     """Groups of pixels with the same label: index of the first pixel in the given order, and the box; (G,) each."""
 
@@ -199,7 +185,6 @@ def _correlate(
     clusters: Clusters, images: Sequence[np.ndarray], num_clouds: int, pixel_size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The loop: shifts (2, M, K) in metres, scores (M,) of the newest sweep, and mask (M, K) of sweeps with pixels."""
-    cv2 = opencv()
     num_clusters = len(clusters.boxes)
     shifts = np.zeros((2, num_clusters, num_clouds))
     scores = np.zeros(num_clusters, np.float32)
@@ -252,15 +237,6 @@ def _middle(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices (M, 1) of the middle one or two among the sorted masked entries of each row."""
     count = mask.sum(1, keepdims=True)
     return np.maximum(count - 1, 0) // 2, np.minimum(count // 2, mask.shape[1] - 1)
-
-
-def _clouds(window: Window, moved0: np.ndarray, config: Config) -> list[Cloud]:
-    """Sweeps t, t-1, ... in the frame of t+1."""
-    older = window.pch[: config.num_history]
-    clouds = [_cloud(window.pc0, moved0, 1.0, config)]
-    for m, sweep in enumerate(older, 2):
-        clouds.append(_cloud(sweep, _compensate(sweep, window.pc1)[1], float(m), config))
-    return clouds
 
 
 def _cloud(sweep: Sweep, moved: np.ndarray, steps: float, config: Config) -> Cloud:

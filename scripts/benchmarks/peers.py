@@ -99,12 +99,7 @@ def preset(name: str, num_history: int) -> Method:
     region = (-NEAR, -NEAR, -np.inf, NEAR, NEAR, np.inf)
     settings = {} if "num_history" not in make_config(name).as_dict() else {"num_history": num_history}
     model = make_model(make_config(name, point_cloud_range=region, **settings), "cpu")
-
-    def method(case: Case) -> np.ndarray:
-        sweeps = case.item.window
-        return model([replace(sweeps, pch=sweeps.pch[:num_history])])[0].numpy()["residual_flow"]
-
-    return method
+    return lambda case: model([case.item.window])[0].numpy()["residual_flow"]
 
 
 def on_rows(estimate: Callable[[Case], np.ndarray]) -> Method:
@@ -240,7 +235,6 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Run, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", type=Path, nargs="*", help="labelled scenes, or folders that a reader knows")
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS, metavar="NAME")

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Compare the times of presets, settings and the OpenCV loop: medians of alternating runs in this process, one thread.
 
-  python scripts/benchmarks/speed_table.py                                              a simulated street
-  python scripts/benchmarks/speed_table.py --data-set av2 --root /data/av2/val/LOG --repeats 50 --json FILE
+  python scripts/benchmarks/speed_table.py                                  a simulated street
+  python scripts/benchmarks/speed_table.py /data/av2/val/LOG --repeats 50   the first log of a path
 
 The table also has the launches and waits of a window, counted on a simulated accelerator (tests/pretend_device.py).
 Needs opencv-python-headless, and torch 2.9 for the counts. `cflow bench` measures one setting in more detail.
@@ -11,7 +11,6 @@ Needs opencv-python-headless, and torch 2.9 for the counts. `cflow bench` measur
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import time
@@ -26,8 +25,8 @@ from table import markdown
 
 from cflow_torch import Config, Window, make_config, make_model
 from cflow_torch.cli.run import machine, versions
-from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.log import window
+from cflow_torch.data.catalog import find_sources, open_log, recognise
+from cflow_torch.data.log import Log, window
 from cflow_torch.simulator import make_drive
 
 HISTORY = 4
@@ -42,19 +41,14 @@ Rows = Iterator[Dict[str, Any]]
 
 
 def of(config: Config) -> Call:
-    """The flow by a model with these settings, with its history."""
+    """The flow by a model with these settings."""
     model = make_model(config, "cpu")
-    return lambda sweeps: model([with_history(sweeps, config)])
+    return lambda sweeps: model([sweeps])
 
 
 def loop(config: Config) -> Call:
     """The flow by the OpenCV loop."""
-    return lambda sweeps: opencv_flow(with_history(sweeps, config), config)
-
-
-def with_history(sweeps: Window, config: Config) -> Window:
-    """The window with as many older sweeps as the settings use."""
-    return Window(sweeps.pc0, sweeps.pc1, sweeps.pch[: config.num_history])
+    return lambda sweeps: opencv_flow(sweeps, config)
 
 
 # What is compared: the two calls whose times are divided.
@@ -66,7 +60,7 @@ COMPARED: dict[str, tuple[Call, Call]] = {
     "OpenCV loop / `paper`, h = 4, five scales": (loop(FULL), of(FULL)),
     "`keypoints` / `paper`, h = 0": (of(KEYS), of(PAPER)),
 }
-COUNTED = {"`paper`": PAPER, "`default`": DEFAULT, "`paper`, h = 4, five scales": FULL, "`keypoints`": KEYS}
+COUNTED = {"`paper`": PAPER, "`default`": DEFAULT}
 
 
 def times(sweeps: Window, repeats: int) -> Rows:
@@ -90,45 +84,28 @@ def counts(sweeps: Window) -> Rows:
     import pretend_device
 
     for name, config in COUNTED.items() if pretend_device.IS_THERE else ():
-        given = with_history(sweeps, config)
         with pretend_device.PretendDevice() as device:
             model = make_model(config, pretend_device.DEVICE)
-            model([given])
-            one, sixteen = (device.count(partial(model, [given] * number)) for number in (1, 16))
+            model([sweeps])
+            one, sixteen = (device.count(partial(model, [sweeps] * number)) for number in (1, 16))
         yield {"what": f"launches / waits of a window, {name}", "is": "{} / {}".format(*one)}
         yield {"what": f"launches of 16 windows / one, {name}", "is": sixteen[0] / one[0]}
 
 
-def load(data_set: str, root: str) -> Window:
-    """A window of a simulated street, or of the first log below a folder."""
-    log: Any = make_drive(seed=7, num_sweeps=HISTORY + 2, profile="av2")
-    if root:
-        log = open_log(data_set, find_sources(data_set, root)[0], check=False)
-    return window(log, min(HISTORY, len(log.timestamps) - 2), HISTORY)
-
-
 def main() -> None:
-    """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data-set", default="av2", help="data set of --root, as in cflow's data=")
-    parser.add_argument("--root", default="", help="a log or a folder of logs; default: a simulated street")
+    parser.add_argument("path", nargs="?", help="a log or a folder of logs; default: a simulated street")
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    sweeps = load(given.data_set, given.root)
-    rows = []
-    for part in (times(sweeps, given.repeats), counts(sweeps)):
-        for row in part:
-            rows.append(row)
-            print(row, file=sys.stderr, flush=True)
-    about = {"points": len(sweeps.pc0.points), "older_sweeps": len(sweeps.pch), "repeats": given.repeats}
-    report = {"machine": machine(), "versions": versions(), **about}
-    print(json.dumps(report))
-    print(markdown(rows))
-    if given.json:
-        given.json.write_text(json.dumps({**report, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+    log: Log = make_drive(seed=7, num_sweeps=HISTORY + 2, profile="av2")
+    if given.path:
+        data_set = recognise(given.path)
+        log = open_log(data_set, find_sources(data_set, given.path)[0], check=False)
+    sweeps = window(log, min(HISTORY, len(log) - 2), HISTORY)
+    print({**machine(), **versions(), "points": len(sweeps.pc0.points), "older_sweeps": len(sweeps.pch)}, flush=True)
+    print(markdown([*times(sweeps, given.repeats), *counts(sweeps)]))
 
 
 if __name__ == "__main__":

@@ -22,13 +22,12 @@ from typing import Any, Dict
 
 import numpy as np
 import torch
-from labelled import LabelledLog, SimulatedLog, Truth, with_ground
+from labelled import LabelledLog, SimulatedLog, Truth, open_scenes, with_ground
 from table import markdown
 
 from cflow_torch import Tracker, VerifiedFlow, make_config, make_model
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
-from cflow_torch.data.hdf5 import find_hdf5_scenes
 from cflow_torch.data.log import windows
 from cflow_torch.simulator.benchmark import FORMATS
 
@@ -105,17 +104,14 @@ def summary(name: str, parts: list[Row]) -> Row:
 
 
 def main() -> None:
-    """Estimate, track, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", nargs="*", type=Path)
     parser.add_argument("--simulated", nargs="*", default=(), choices=tuple(FORMATS), metavar="SENSOR")
-    parser.add_argument("--model", default="default", help="preset")
     parser.add_argument("--num-sweeps", type=int, default=20, help="of a simulated drive")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    model = make_model(make_config(given.model), "auto")
-    files = [file for path in given.paths for file in find_hdf5_scenes(path)]
-    rows = [summary(file.stem, [score(LabelledLog(file), model)]) for file in files]
+    model = make_model(make_config("default"), "auto")
+    rows = [summary(log.log_id, [score(log, model)]) for log in open_scenes(given.paths)]
     for sensor in given.simulated:
         drives = [SimulatedLog(sensor, seed, scene, given.num_sweeps) for seed, scene in DRIVES]
         rows.append(summary(f"simulated {sensor}", [score(log, model) for log in drives]))

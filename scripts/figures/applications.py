@@ -174,14 +174,12 @@ PICTURES = {each.__name__: each for each in DRAWN}
 
 
 def main() -> None:
-    """Draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=tuple(PICTURES), default=tuple(PICTURES))
-    parser.add_argument("--folder", type=Path, default=FOLDER)
     given = parser.parse_args()
     torch.set_num_threads(1)
     for name in given.only:
-        PICTURES[name](given.folder / f"{name}.png")
+        PICTURES[name](FOLDER / f"{name}.png")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 
   python scripts/figures/failure_cases.py                         docs/pictures/limit_*.png, and the table
   python scripts/figures/failure_cases.py --only rail fast        some cases
-  python scripts/figures/failure_cases.py --pictures ""           the table only
 
 A row of the table has the mean end-point error of the named objects, in metres per sweep: its mean over the seeds, with
 the smallest and the largest in brackets, and the mean confidence. A picture shows one seed: the first setting above the
@@ -19,21 +18,21 @@ import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable, Iterator, NamedTuple, Sequence
+from typing import Any, Callable, NamedTuple, Sequence
 
 import drives
 import numpy as np
 from drives import PAIR, Staged, body_of
 from PIL import Image
 
-from cflow_torch import Sweep, make_config, make_model
-from cflow_torch.data.catalog import GroundSegmentedLog, LogWrapper
+from cflow_torch import Sweep, Window, make_config, make_model
 from cflow_torch.data.log import window
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.viz import plot_flow
+from cflow_torch.windows.ground import find_ground
 
-SEEDS = (0, 1, 2, 3, 4)
+SEEDS = range(5)
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDE = (-100.0, -100.0, -math.inf, 100.0, 100.0, math.inf)
 
@@ -58,8 +57,10 @@ class Case(NamedTuple):
 Setting = Callable[[Staged], Attempt]
 
 
-def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: drive, **overrides: Any) -> Setting:
-    """A setting: estimates the flow of the scored pair of a drive, whose poses or points `of` may change.
+def by(
+    preset: str, name: str = "", change: Callable[[Sweep], Sweep] = lambda sweep: sweep, **overrides: Any
+) -> Setting:
+    """A setting: estimates the flow of the scored pair of a drive, whose sweeps may be changed.
 
     Its name in the table is the preset and the overrides, unless one is given.
     """
@@ -67,7 +68,9 @@ def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: d
 
     def attempt(staged: Staged) -> Attempt:
         config, drive = make_config(preset, **overrides), staged.drive
-        (result,) = make_model(config)([window(of(drive), PAIR, config.num_history, config.num_future)])
+        given = window(drive, PAIR, config.num_history, config.num_future)
+        past, future = (tuple(map(change, sweeps)) for sweeps in (given.pch, given.pcf))
+        (result,) = make_model(config)([Window(change(given.pc0), change(given.pc1), past, future)])
         is_scored = np.isin(body_of(drive), list(staged.bodies))
         residual, truth = (residual_of(flow, drive) for flow in (result.flow.numpy(), drive.labels(PAIR).flow))
         error = np.linalg.norm(residual - truth, axis=1)[is_scored].mean()
@@ -77,28 +80,16 @@ def by(preset: str, name: str = "", of: Callable[[Drive], Any] = lambda drive: d
     return attempt
 
 
-class MisplacedPoses(LogWrapper):
-    """A log whose poses belong to a frame 1.4 m behind the frame of its points."""
-
-    def sweep(self, index: int) -> Sweep:
-        """The sweep with the wrong pose."""
-        sweep = self.log.sweep(index)
-        return replace(sweep, pose=sweep.pose @ np.array([[1, 0, 0, -1.4], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
-
-
-class WithoutMasks(LogWrapper):
-    """A log whose sweeps have no ground masks."""
-
-    def sweep(self, index: int) -> Sweep:
-        """The sweep without its mask."""
-        return replace(self.log.sweep(index), is_ground=None)
+def misplace(sweep: Sweep) -> Sweep:
+    """Replace the pose by that of a frame 1.4 m behind the frame of the points."""
+    return replace(sweep, pose=sweep.pose @ np.array([[1, 0, 0, -1.4], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
 
 
 _DEFAULT, _PAIR = (by("default"),), by("default", num_history=0)
 _PAPER_AND_DEFAULT = (by("paper"), *_DEFAULT)
-_GROUND_LEFT_IN = by("default", "`default`, ground=None", WithoutMasks)
-_GROUND_FOUND = by("default", "`default`, ground='auto'", lambda drive: GroundSegmentedLog(WithoutMasks(drive)))
-_WRONG_FRAME = by("default", "`default`, wrong frame", MisplacedPoses)
+_GROUND_LEFT_IN = by("default", "`default`, ground=None", lambda sweep: replace(sweep, is_ground=None))
+_GROUND_FOUND = by("default", "`default`, ground='auto'", lambda s: replace(s, is_ground=find_ground(s.points)))
+_WRONG_FRAME = by("default", "`default`, wrong frame", misplace)
 # The drive, the settings (the first one fails), and the seed of the picture.
 CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] = {
     "long_side": (drives.tram, [by(p, num_history=h) for p, h in (("default", 0), ("offline", 0), ("default", 4))], 0),
@@ -159,35 +150,29 @@ def draw(case: Case) -> Image.Image:
     return picture.quantize(palette=picture.quantize(256))  # half the bytes; dithering keeps the colour wheel smooth
 
 
-def table(names: Sequence[str], seeds: Sequence[int]) -> Iterator[str]:
-    """Lines of the Markdown table."""
-    yield "| | of | setting | error, m | confidence |"
-    yield "|---|---|---|---|---|"
-    for name in names:
-        cases = [make_case(name, seed) for seed in seeds]
-        heading = (cases[0].staged.title, cases[0].staged.whose)
-        for attempts in zip(*(case.attempts for case in cases)):
-            errors, trust = np.array([(attempt.error, attempt.confidence) for attempt in attempts]).T
-            error = f"{errors.mean():.3f} ({errors.min():.3f}–{errors.max():.3f})"
-            shown = "-" if np.isnan(trust).any() else f"{trust.mean():.2f}"
-            yield f"| {' | '.join((*heading, attempts[0].name, error, shown))} |"
-            heading = ("", "")
+def print_rows(cases: Sequence[Case]) -> None:
+    """Print the rows of a failure: one per setting, over several seeds."""
+    heading = (cases[0].staged.title, cases[0].staged.whose)
+    for attempts in zip(*(case.attempts for case in cases)):
+        errors, trust = np.array([(attempt.error, attempt.confidence) for attempt in attempts]).T
+        error = f"{errors.mean():.3f} ({errors.min():.3f}–{errors.max():.3f})"
+        shown = "-" if np.isnan(trust).any() else f"{trust.mean():.2f}"
+        print(f"| {' | '.join((*heading, attempts[0].name, error, shown))} |", flush=True)
+        heading = ("", "")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table, draw the pictures."""
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=tuple(CASES), default=tuple(CASES), metavar="CASE")
-    parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
-    parser.add_argument("--pictures", default=str(FOLDER), metavar="FOLDER", help='"" = none')
-    given = parser.parse_args(arguments)
+    given = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)  # one of the cases leaves the ground in
-    print("\n".join(table(given.only, given.seeds)))
-    for name in given.only if given.pictures else ():
-        *_, seed = CASES[name]
-        if seed is not None:
-            Path(given.pictures).mkdir(parents=True, exist_ok=True)
-            draw(make_case(name, seed)).save(Path(given.pictures) / f"limit_{name}.png", optimize=True)
+    print("| | of | setting | error, m | confidence |\n|---|---|---|---|---|")
+    for name in given.only:
+        cases = [make_case(name, seed) for seed in SEEDS]
+        print_rows(cases)
+        *_, drawn = CASES[name]
+        if drawn is not None:
+            draw(cases[drawn]).save(FOLDER / f"limit_{name}.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -118,7 +118,6 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
 
 
 def main() -> None:
-    """Draw the picture."""
     torch.set_num_threads(1)
     figure = style.blank_figure((LEFT + 5 * (WIDE + GAP), FOOT + HEAD + 2 * (HIGH + GAP)), 100)
     for row, (name, staged, low, width) in enumerate(ROWS):
