@@ -23,7 +23,6 @@ METADATA = {
 
 
 def refresh(file: Path) -> None:
-    """Run one notebook and overwrite it."""
     notebook = nbformat.read(file, as_version=4)
     NotebookClient(notebook, timeout=600, record_timing=False).execute()
     notebook.metadata = nbformat.from_dict(METADATA)

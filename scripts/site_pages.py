@@ -36,7 +36,6 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def notebook_page(path: Path) -> str:
-    """Return a stored notebook as Markdown."""
     parts = []
     for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
         source = "".join(cell["source"])

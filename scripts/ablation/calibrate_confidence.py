@@ -1,15 +1,11 @@
 #!/usr/bin/env python3
-"""Confidence of the flow (docs/verified.md): fit its table on simulated drives, or evaluate it on real data.
+"""Confidence of the flow: fit its table on simulated drives, or evaluate it on real data.
 
   python scripts/ablation/calibrate_confidence.py fit         writes verified/confidence.json
   python scripts/ablation/calibrate_confidence.py evaluate    Argoverse 2 pair, KITTI 0000, PandaSet
 
 The windows come from sets.py. We fit on pairs (h = 0) and history (h = 4) of five sensors and four kinds of scenes,
-seeds 100-103, region +-70 m, without ground. A point is right if the end-point error of its residual flow is below
-0.1 m per interval. The columns are the expected calibration error of all and of dynamic points; the end-point error in
-metres of dynamic and of static points after a share of them is dropped, the least confident first; and what an alarm
-finds that 2 % of the static points raise: the share of the dynamic points that are missed (their flow is less than half
-of the true one), and the number of missed points.
+seeds 100-103, region +-70 m, without ground. docs/verified.md explains the columns.
 """
 
 from __future__ import annotations
@@ -25,11 +21,11 @@ from unittest.mock import patch
 import numpy as np
 import sets
 import torch
-from derived_sets import MOVES
 from sets import HISTORY, Item
 from sklearn.isotonic import isotonic_regression
 
 from cflow_torch import make_config, make_model
+from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.types import FlowResult
 from cflow_torch.verified import confidence
@@ -70,7 +66,7 @@ def _sums(result: FlowResult, frame: EvalFrame, num_bins: int) -> np.ndarray:
     rows = np.flatnonzero(flow["is_valid"] & is_scored)
     bins = np.rint(flow["confidence"][rows] * num_bins).astype(int)
     error = np.linalg.norm(flow["residual_flow"][rows] - truth[rows], axis=1)
-    moves = np.linalg.norm(truth[rows], axis=1) >= MOVES
+    moves = np.linalg.norm(truth[rows], axis=1) >= MOVING
     right = error < RIGHT
     is_missed = moves & (2 * np.linalg.norm(flow["residual_flow"][rows], axis=1) < np.linalg.norm(truth[rows], axis=1))
     columns = (np.ones(len(rows)), right, moves, right & moves, error, error * moves, is_missed)

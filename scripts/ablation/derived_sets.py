@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, Sequence, Tuple
+from typing import Sequence, Tuple
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.evaluation.frame import ego_motion_flow
+from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
 from cflow_torch.types import Sweep, Window
 
 # Points (N, 3), instance (N,) with 0 = background, total flow (N, 3), usable (N,) bool; all of one sweep.
 Labelled = Tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Component = Tuple[np.ndarray, np.ndarray]  # of a static component: its points at t and at t+1, (N, 3), frame of t+1
 MIN_POINTS = 6  # to fit the motion of an object
 GAP = 0.22  # metres between an object and the pasted component: one component at pixels of 0.1 m
 DYNAMIC_POINTS, STATIC_POINTS = 20, 80  # least of a moving object; of a pasted component, per sweep
 LONGER_SIDE = (0.6, 4.0)  # metres, of a pasted component
 REACH, PIXEL = 34.0, 0.1  # metres: half side of the square in which we search components; side of its pixels
-MOVES = 0.05  # metres per sweep, least motion of a dynamic point
 SQUARE = np.ones((3, 3), bool)
 
 
@@ -48,45 +50,35 @@ def chain_flow(pairs: Sequence[Labelled], pose_flow: np.ndarray) -> tuple[np.nda
     return flow.astype(np.float32), is_known
 
 
-class Component(NamedTuple):
-    """A static component: its points at t and at t+1, (N, 3) float64 each, frame of t+1."""
-
-    at0: np.ndarray
-    at1: np.ndarray
-
-
 def paste_static(
-    pair: Window, labels: FlowLabels, instance: np.ndarray, scored: np.ndarray, number: int
-) -> tuple[Window, FlowLabels]:
-    """Paste a static component of the pair next to every moving object; return pair and labels with its points.
+    pair: Window, frame: EvalFrame, instance: np.ndarray, number: int
+) -> tuple[Window, FlowLabels, np.ndarray]:
+    """Paste a static component of the pair next to every moving object; return pair, labels and mask with its points.
 
     The component is `GAP` away from the area that the object covers from t to t+1, on the far side from the sensor,
-    where it does not occlude the object. It has the same position in the world in both sweeps. `scored` are the points
-    with valid truth, and `number` varies which component is pasted next to which object.
+    where it does not occlude the object. It has the same position in the world in both sweeps. `number` varies which
+    component is pasted next to which object.
     """
-    pc0, pc1 = pair.pc0, pair.pc1
-    T_ego1_ego0 = np.linalg.inv(pc1.pose) @ pc0.pose
-    points0 = pc0.points.astype(np.float64) @ T_ego1_ego0[:3, :3].T + T_ego1_ego0[:3, 3]  # frame of t+1
-    residual = labels.flow - ego_motion_flow(pc0.points, T_ego1_ego0)
-    counted = scored & ~pc0.is_ground & (np.abs(pc0.points[:, :2]) <= REACH + 1).all(1)
-    is_dynamic = counted & (np.linalg.norm(residual, axis=1) >= MOVES)
-    static = counted & ~is_dynamic & (instance == 0)
-    components = find_components(points0, pair, static, instance)
-    added: list[Component] = []
+    pc0, labels, T_ego1_ego0 = pair.pc0, frame.labels, frame.transform()
+    points0, residual = transform_points(pc0.points, T_ego1_ego0), labels.flow - frame.pose_flow
+    counted = frame.eval_mask & labels.is_valid & ~pc0.is_ground & (np.abs(pc0.points[:, :2]) <= REACH + 1).all(1)
+    is_dynamic = counted & (np.linalg.norm(residual, axis=1) >= MOVING)
+    components = find_components(points0, pair, counted & ~is_dynamic & (instance == 0), instance)
+    added: list[Component] = [(np.zeros((0, 3)), np.zeros((0, 3)))]
     for moving in np.unique(instance[instance > 0]):
         rows = (instance == moving) & is_dynamic
         if rows.sum() >= DYNAMIC_POINTS and components:
             chosen = components[(number + int(moving)) % len(components)]
             added.append(shift_next_to(chosen, points0[rows], residual[rows]))
-    if not added:
-        return pair, labels
     more0, more1 = (np.concatenate(parts) for parts in zip(*added))
     more0 = (more0 - T_ego1_ego0[:3, 3]) @ T_ego1_ego0[:3, :3]  # back to the frame of t
-    return Window(_append(pc0, more0), _append(pc1, more1)), FlowLabels(
+    labels = FlowLabels(
         np.concatenate([labels.flow, ego_motion_flow(more0, T_ego1_ego0)]),
         np.concatenate([labels.category, np.zeros(len(more0), labels.category.dtype)]),
         np.concatenate([labels.is_valid, np.ones(len(more0), bool)]),
     )
+    eval_mask = np.concatenate([frame.eval_mask, np.ones(len(more0), bool)])
+    return Window(_append(pc0, more0), _append(pair.pc1, more1)), labels, eval_mask
 
 
 def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, instance: np.ndarray) -> list[Component]:
@@ -107,8 +99,8 @@ def find_components(points0: np.ndarray, pair: Window, static: np.ndarray, insta
     label0, label1 = (labels[tuple(row_and_col)] for row_and_col in pixels)
     found = []
     for label in np.setdiff1d(label0[static & (label0 > 0)], label0[instance > 0]):
-        pasted = Component(points0[(label0 == label) & static], points1[label1 == label])
-        longer = np.ptp(pasted.at0[:, :2], 0).max()
+        pasted = points0[(label0 == label) & static], points1[label1 == label]
+        longer = np.ptp(pasted[0][:, :2], 0).max()
         if min(map(len, pasted)) >= STATIC_POINTS and LONGER_SIDE[0] <= longer <= LONGER_SIDE[1]:
             found.append(pasted)
     return found
@@ -124,7 +116,8 @@ def shift_next_to(component: Component, points: np.ndarray, residual: np.ndarray
     lane, own = (np.concatenate(parts)[:, :2] for parts in ((points, points + residual), component))
     shift = ((lane @ across).max() + GAP - (own @ across).min()) * across
     shift += ((lane @ along).mean() - (own @ along).mean()) * along
-    return Component(*(each + np.append(shift, 0.0) for each in component))
+    at0, at1 = (each + np.append(shift, 0.0) for each in component)
+    return at0, at1
 
 
 def _append(sweep: Sweep, points: np.ndarray) -> Sweep:

@@ -29,11 +29,11 @@ from typing import Any, Callable, Dict, Mapping, Sequence
 
 import numpy as np
 import torch
-from derived_sets import MOVES
 from omegaconf import OmegaConf
 from sets import NEAR, ScoredSet, make_sets
 
 from cflow_torch import make_config, make_model
+from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.evaluation.bucketed import mean_of_present
 from cflow_torch.evaluation.definitions import Definition
@@ -127,7 +127,7 @@ def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NE
     of the points of dynamic objects whose flow is less than half of the true one; "moving": their number. With `step`
     sweeps from t to t+1, a point is dynamic from 0.05 m per sweep on.
     """
-    scored = {"region": "box", "max_range": reach, "dynamic_threshold": MOVES * step, "three_way_flow": "residual"}
+    scored = {"region": "box", "max_range": reach, "dynamic_threshold": MOVING * step, "three_way_flow": "residual"}
     definition = Definition("pooled", ("three_way",), **scored)
     of_frames: list[tuple[np.ndarray, ...]] = []
     for frame in frames:

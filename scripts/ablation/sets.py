@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Callable, NamedTuple, Sequence
 
 import numpy as np
-from derived_sets import MOVES, chain_flow, paste_static
+from derived_sets import chain_flow, paste_static
 
+from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5 import HDF5Log
@@ -163,14 +164,9 @@ def kitti_steps(step: int) -> list[Item]:
 def merged() -> list[Item]:
     """The pairs of KITTI 0000, with a static component pasted next to every moving object."""
     log = scene(KITTI)
-    items = []
-    for number, (sweeps, frame) in enumerate(kitti(KITTI)):
-        pair = Window(sweeps.pc0, sweeps.pc1)
-        scored = frame.eval_mask & frame.labels.is_valid
-        made = paste_static(pair, frame.labels, log.values(number, "flow_instance_id"), scored, number)
-        more = len(made[1].flow) - len(frame.labels.flow)
-        items.append(make_item(*made, np.concatenate([frame.eval_mask, np.ones(more, bool)])))
-    return items
+    instances = (log.values(number, "flow_instance_id") for number in range(len(log) - 1))
+    pairs = enumerate(zip(kitti(KITTI), instances))
+    return [make_item(*paste_static(*item, instance, number)) for number, (item, instance) in pairs]
 
 
 def simulated(profile: str, seeds: Sequence[int]) -> list[Item]:
@@ -194,7 +190,7 @@ def staged(stage: Callable[[int], drives.Staged]) -> list[Item]:
         drive, _, _, bodies, _ = stage(seed)
         sweeps, labels = window(drive, drives.PAIR, HISTORY, FUTURE), drive.labels(drives.PAIR)
         residual = labels.flow - ego_motion_flow(sweeps.pc0.points, between(sweeps))
-        is_scored = np.isin(drives.body_of(drive), list(bodies)) | (np.linalg.norm(residual, axis=1) < MOVES)
+        is_scored = np.isin(drives.body_of(drive), list(bodies)) | (np.linalg.norm(residual, axis=1) < MOVING)
         items.append(make_item(sweeps, labels, is_scored))
     return items
 

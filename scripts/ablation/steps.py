@@ -65,7 +65,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 def score_without(scored: ScoredSet, name: str) -> Figures:
-    """Score `default` without a step."""
     with STEPS.get(name, nullcontext()):
         return score_preset(scored, "default", SETTINGS.get(name, {}))
 

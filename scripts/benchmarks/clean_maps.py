@@ -3,11 +3,10 @@
 python scripts/benchmarks/clean_maps.py light av2 nuscenes waymo                  simulated: a crossing, or "light"
 python scripts/benchmarks/clean_maps.py DATA/kitti-0000/kitti-0000-c2.h5          labelled HDF5 scenes
 
-Scores per point, in per cent, as in DynamicMap_Benchmark: static accuracy SA (share of the static points that are
-kept), dynamic accuracy DA (share of the moving points that are removed), AA = sqrt(SA DA). A point moves if its true
-residual flow is at least 0.05 m per sweep. "Waiting" is the share of removed points of objects that are static now and
-move elsewhere in the drive; SA and DA leave them out. Ground is scored. We score points within 50 m in all sweeps but
-the last, in real scenes those with labels. Times are processor seconds per sweep, one thread, flow included.
+The scores SA, DA and AA are those of DynamicMap_Benchmark; docs/applications.md explains them. A point moves if its
+true residual flow is at least 0.05 m per sweep. SA and DA leave waiting points out. Ground is scored. We score points
+within 50 m in all sweeps but the last, in real scenes those with labels. Times are processor seconds per sweep, one
+thread, flow included.
 
 DUFOMap (pip install dufomap; optional): 0.1 m, d_s 0.2, d_p 2 and 1, clusters and propagation, rays from the LiDAR (the
 first one of several), points of 2 ... 50 m (with others it finds no moving point on KITTI).
@@ -24,12 +23,13 @@ from typing import Any, Sequence
 
 import numpy as np
 import torch
-from labelled import LabelledLog, SimulatedLog, with_ground
+from labelled import LabelledLog, SimulatedLog
 from labels import RANGE, dufomap_labels
 from table import markdown
 
 from cflow_torch import make_config, make_model
 from cflow_torch.applications.cleaning import CleanLog
+from cflow_torch.data.catalog import GroundSegmentedLog
 from cflow_torch.data.log import CachedLog, windows
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.benchmark import FORMATS
@@ -58,7 +58,6 @@ def light(num_sweeps: int) -> SimulatedLog:
 
 
 def scores(name: str, log: Any, removed: Sequence[np.ndarray], seconds: float) -> dict[str, Any]:
-    """A row of the table."""
     total = np.zeros((3, 2))
     for index, is_removed in enumerate(removed[: len(log) - 1]):
         truth, points = log.truth(index), np.asarray(log.sweep(index).points)
@@ -84,7 +83,7 @@ def main() -> None:
             T_ego_lidar = next(iter(log.drive.calibration.values()))
         else:
             log, T_ego_lidar = LabelledLog(name), np.eye(4)
-        opened = CachedLog(with_ground(log), len(log))
+        opened = CachedLog(GroundSegmentedLog(log), len(log))
         list(opened)  # simulates or reads the sweeps before a clock starts
         begin = time.process_time()
         flow = [model([each])[0] for each in windows(opened, model.config.num_history, model.config.num_future)]

@@ -112,8 +112,6 @@ def measure_speed(device: str) -> Rows:
 
 
 def on_device(sweeps: Window, device: str) -> Window:
-    """The window with its points on the device."""
-
     def uploaded(sweep: Sweep) -> Sweep:
         points, is_ground = (torch.as_tensor(np.asarray(x)).to(device) for x in (sweep.points, sweep.is_ground))
         return replace(sweep, points=points, is_ground=is_ground)

@@ -9,7 +9,6 @@ from typing import NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.applications.moving_groups import MOVING
-from cflow_torch.data.catalog import GroundSegmentedLog
 from cflow_torch.data.hdf5 import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import ego_motion_flow
@@ -34,11 +33,6 @@ def true_residual(log: Log, index: int) -> np.ndarray:
     """(N, 3) true residual flow of a labelled sweep, metres per sweep, axes of the next sweep."""
     sweep, after = log.sweep(index), log.sweep(index + 1)
     return log.labels(index).flow - ego_motion_flow(sweep.points, np.linalg.inv(after.pose) @ sweep.pose)
-
-
-def with_ground(log: Log) -> Log:
-    """The log, with ground found by grid if it has no masks."""
-    return log if log.sweep(0).is_ground is not None else GroundSegmentedLog(log, "grid")
 
 
 class LabelledLog(HDF5Log):

@@ -6,10 +6,9 @@
   python scripts/benchmarks/labels.py --simulated av2 waymo             simulated drives
   pip install dufomap hdbscan h5py                                      else only our columns
 
-We score labelled points within 50 m that are not ground. A point moves if its true residual flow is at least 0.05 m per
-sweep. Columns: precision, recall, and recall of pedestrians. DUFOMap follows rays from the LiDAR, so its place must be
-right; settings are those of OpenSceneFlow's process.py. Our labels include `nnd`, which DUFOMap and HDBSCAN lack.
-Times are processor seconds per sweep on one thread, without reading and writing, medians over the scenes of a row.
+docs/applications.md explains the columns. A point moves if its true residual flow is at least 0.05 m per sweep. DUFOMap
+follows rays from the LiDAR, so its place must be right; settings are those of OpenSceneFlow's process.py. Times are
+processor seconds per sweep on one thread, without reading and writing, medians over the scenes of a row.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import CachedLog, Log, window, windows
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator.benchmark import FORMATS, benchmark_logs
-from cflow_torch.types import as_numpy
 
 RANGE = 50.0  # metres
 TIMED = 4  # about so many sweeps of a scene are grouped by HDBSCAN, only for its time
@@ -51,9 +50,8 @@ def dufomap_labels(log: Log, T_points_lidar: np.ndarray, settings: tuple[float, 
     from dufomap import dufomap
 
     sweeps, to_lidar = list(log), np.linalg.inv(T_points_lidar)
-    points = [as_numpy(sweep.points, np.float64)[:, :3] @ to_lidar[:3, :3].T + to_lidar[:3, 3] for sweep in sweeps]
-    to_first = np.linalg.inv(as_numpy(sweeps[0].pose, np.float64))
-    poses = [to_first @ as_numpy(sweep.pose, np.float64) @ T_points_lidar for sweep in sweeps]
+    points = [transform_points(sweep.points, to_lidar) for sweep in sweeps]
+    poses = [np.linalg.inv(sweeps[0].pose) @ sweep.pose @ T_points_lidar for sweep in sweeps]
     found = dufomap(*settings, num_threads=1)
     found.setCluster(0, 20, 0.2)
     for cloud, pose in zip(points, poses):
@@ -89,7 +87,6 @@ def theirs(log: Log, height: float) -> dict[str, dict[str, Any]]:
 
 
 def ours(log: Log, preset: str) -> dict[str, Any]:
-    """Label a scene by a preset."""
     model = make_model(make_config(preset), "cpu")
     model([window(log, 0)])
     begin = time.process_time()
@@ -130,7 +127,6 @@ def score(parts: Sequence[dict[str, Any]]) -> str:
 
 
 def table_row(name: str, scenes: list[dict[str, dict[str, Any]]]) -> dict[str, Any]:
-    """A row of the table."""
     row: dict[str, Any] = {"scenes": f"{name} ({len(scenes)})"}
     for method in scenes[0]:
         results = [scene[method] for scene in scenes]

@@ -78,17 +78,10 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
 def motion_at_scale(
     clouds: Sequence[Cloud], cloud1: Cloud, pixel_size: float, config: Config
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """One scale: project, cluster, correlate, pool.
+    """One scale: project, cluster, correlate, pool. `clouds` are the sweeps t, t-1, ..., moved by the flow so far.
 
-    Args:
-        clouds: sweeps t, t-1, ..., moved by the flow so far.
-        cloud1: sweep t+1.
-        pixel_size: s, metres.
-        config: settings.
-
-    Returns:
-        Flow of each of `clouds`, (2, N) float64 metres per sweep interval; cluster, (N,) int32, -1 = none, and score,
-        (N,) float32, of the points of sweep t.
+    Returns the flow of each of them, (2, N) float64 metres per sweep interval; the cluster, (N,) int32, -1 = none, and
+    the score, (N,) float32, of the points of sweep t.
     """
     images, pixels = zip(*(project(cloud.xy, pixel_size, config) for cloud in (cloud1, *clouds)))
     clusters = find_clusters(images, pixel_size, config)

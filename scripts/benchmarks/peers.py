@@ -16,9 +16,7 @@ All methods get the same points: both sweeps in the frame of t+1, without ground
 get the sweeps with the ground mask and the same region. We score labelled points that are not ground. Each set has the
 windows 4, 12, 20, ... , or window 0 if it is short; with `--history 0 4` our presets also run with four older sweeps.
 Processor time is that of the process, on one thread.
-
-Columns: mean over the sets of the mean over the windows: end-point error in metres of dynamic objects / that error
-divided by speed / end-point error of the static background in centimetres; processor seconds, mean over the windows.
+docs/benchmarks.md explains the columns, which are means over the sets of the mean over the windows.
 """
 
 from __future__ import annotations
@@ -38,7 +36,6 @@ from opensceneflow_cpu import load_models
 from table import markdown
 
 from cflow_torch import make_config, make_model
-from cflow_torch.config import PRESETS
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.files import read_json, write_json
 from cflow_torch.data.log import window
@@ -48,13 +45,9 @@ from run import pooled_figures  # noqa: E402
 from sets import NEAR, Item, make_item  # noqa: E402
 
 OURS = ("default", "paper", "keypoints")
-HARNESS = {  # name -> YAML file and class of the model in the checkout
-    "icpflow": ("icpflow", "ICPFlow"),
-    "icpflow-author": ("icpflow", "ICPFlow"),
-    "fastnsf": ("fastnsf", "FastNSF"),
-    "nsfp": ("nsfp", "NSFP"),
-}
-METHODS = (*OURS, "zero", "nearest", "clusters", *HARNESS)
+# Name -> class of the model in the checkout, whose YAML file has its name in lower case.
+HARNESS = {"icpflow": "ICPFlow", "icpflow-author": "ICPFlow", "fastnsf": "FastNSF", "nsfp": "NSFP"}
+METHODS = (*OURS, "zero", "nearest", "clusters", *HARNESS)  # rows of the table in this order
 SEED = 0  # of torch and NumPy, set before every window
 START, EVERY = 4, 8  # first window, step between windows
 RADIUS = 1.67  # metres, least search radius of ICP-Flow
@@ -95,7 +88,6 @@ def make_case(item: Item) -> Case:
 
 
 def preset(name: str, num_history: int) -> Method:
-    """A preset of this package."""
     region = (-NEAR, -NEAR, -np.inf, NEAR, NEAR, np.inf)
     settings = {} if "num_history" not in make_config(name).as_dict() else {"num_history": num_history}
     model = make_model(make_config(name, point_cloud_range=region, **settings), "cpu")
@@ -111,6 +103,10 @@ def on_rows(estimate: Callable[[Case], np.ndarray]) -> Method:
         return flow
 
     return method
+
+
+def zero(case: Case) -> np.ndarray:
+    return np.zeros_like(case.pc0)
 
 
 def nearest(case: Case) -> np.ndarray:
@@ -152,11 +148,10 @@ def of_harness(name: str, root: Path) -> Method:
     from joblib import parallel_config
     from omegaconf import OmegaConf
 
-    file, kind = HARNESS[name]
-    models = load_models(root)
+    kind, models = HARNESS[name], load_models(root)
     if not hasattr(models, kind):
         raise ImportError(f"{kind}: a package of OpenSceneFlow is missing")
-    settings: Any = OmegaConf.to_container(OmegaConf.load(root / "conf" / "model" / f"{file}.yaml").target)
+    settings: Any = OmegaConf.to_container(OmegaConf.load(root / "conf" / "model" / f"{kind.lower()}.yaml").target)
     del settings["_target_"]
     model = getattr(models, kind)(**settings)
 
@@ -170,24 +165,21 @@ def of_harness(name: str, root: Path) -> Method:
     return on_rows(estimate)
 
 
+PLAIN = {"zero": zero, "nearest": nearest, "clusters": clusters}
+
+
 def make_method(name: str, num_history: int, opensceneflow: Path | None) -> Method:
     """A method by its name; an ImportError if a package is missing."""
-    if name in HARNESS:
-        if opensceneflow is None:
-            raise ImportError("give --opensceneflow PATH")
-        return of_harness(name, opensceneflow)
-    if name in PRESETS:
+    if name in OURS:
         return preset(name, num_history)
-    if name == "zero":
-        return on_rows(lambda case: np.zeros_like(case.pc0))
-    if name == "clusters":
-        import hdbscan  # noqa: F401
-        import open3d  # noqa: F401
-    return on_rows({"nearest": nearest, "clusters": clusters}[name])
+    if name in PLAIN:
+        return on_rows(PLAIN[name])
+    if opensceneflow is None:
+        raise ImportError("give --opensceneflow PATH")
+    return of_harness(name, opensceneflow)
 
 
 def measure(method: Method, case: Case) -> dict[str, float]:
-    """Errors and processor seconds of a window."""
     torch.manual_seed(SEED)
     np.random.seed(SEED)
     begin = time.process_time()
@@ -251,18 +243,16 @@ def main() -> None:
     for name, history in runs:
         try:
             method = make_method(name, history, given.opensceneflow)
+            for set_name, window_name, case in all_cases:
+                if len(case.item.window.pch) >= history:
+                    row = {"set": set_name, "window": window_name, "method": name, "history": history}
+                    row.update(measure(method, case))
+                    rows[key(row)] = row
+                    print(json.dumps(row), file=sys.stderr, flush=True)
+                    if given.json:
+                        write_json(given.json, list(rows.values()))
         except ImportError as error:
             print(f"skipped {name}: {error}", file=sys.stderr)
-            continue
-        for set_name, window_name, case in all_cases:
-            if len(case.item.window.pch) < history:
-                continue
-            row = {"set": set_name, "window": window_name, "method": name, "history": history}
-            row.update(measure(method, case))
-            rows[key(row)] = row
-            print(json.dumps(row), file=sys.stderr, flush=True)
-            if given.json:
-                write_json(given.json, list(rows.values()))
     print(table(sorted(rows.values(), key=lambda row: (METHODS.index(row["method"]), row["history"]))))
 
 

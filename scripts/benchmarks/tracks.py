@@ -1,16 +1,12 @@
-"""Score tracks on labelled HDF5 scenes and on simulated drives.
+"""Score tracks on labelled HDF5 scenes and on simulated drives. docs/applications.md explains the columns.
 
 python scripts/benchmarks/tracks.py DATA/pandaset-002 DATA/kitti-0000/kitti-0000-c2.h5     scenes, or folders of them
 python scripts/benchmarks/tracks.py --simulated av2 nuscenes --num-sweeps 12               a street and a crossing each
 
 The drives have the seeds 300 and 301; we chose settings of the tracker on 400, 401 and 700 to 703. Ground masks are
 exact where the data set has masks, and estimated by grid elsewhere. nuScenes is read at 10 Hz. We score confirmed
-tracks. A moving object has a labelled speed of 0.5 m/s or more.
-
-Columns: moving objects with 20 active points or more, over all sweeps; the share of them that the flow moves in part,
-and of which a track has a point (coverage); changes of the track that has most points of an object; moving boxes a
-sweep most of whose points have labels; those of them whose labelled points mostly belong to no moving object (false
-boxes); median error of the horizontal velocity of the flow and of the tracks, m/s.
+tracks, and only boxes most of whose points have labels. The id of an object switches when another track has most of its
+points. The errors of the velocity are horizontal.
 """
 
 from __future__ import annotations
@@ -22,12 +18,13 @@ from typing import Any, Dict
 
 import numpy as np
 import torch
-from labelled import LabelledLog, SimulatedLog, Truth, open_scenes, with_ground
+from labelled import LabelledLog, SimulatedLog, Truth, open_scenes
 from table import markdown
 
 from cflow_torch import Tracker, VerifiedFlow, make_config, make_model
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
+from cflow_torch.data.catalog import GroundSegmentedLog
 from cflow_torch.data.log import windows
 from cflow_torch.simulator.benchmark import FORMATS
 
@@ -39,7 +36,7 @@ Row = Dict[str, Any]
 def score(log: LabelledLog | SimulatedLog, model: VerifiedFlow) -> Row:
     """Counts and errors of a drive, to be summed."""
     tracker, tables, sweeps = Tracker(), [], []
-    for index, given in enumerate(windows(with_ground(log), model.config.num_history, model.config.num_future)):
+    for index, given in enumerate(windows(GroundSegmentedLog(log), model.config.num_history, model.config.num_future)):
         flow = model([given])[0]
         table, track_id = tracker.push(given, flow)
         tables.append({**table, "sweep": np.full(len(table["id"]), index)})
@@ -87,7 +84,6 @@ def moving(truth: Truth) -> np.ndarray:
 
 
 def summary(name: str, parts: list[Row]) -> Row:
-    """A row of the table."""
     total = {key: sum((part[key] for part in parts[1:]), parts[0][key]) for key in parts[0]}
     return {
         "drive": name,

@@ -26,6 +26,8 @@ from cflow_torch.applications.labels import label_scene
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_scene
 from cflow_torch.data.log import Log, window, windows
+from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
 from cflow_torch.viz.clusters import PALETTE
 from cflow_torch.viz.style import FAINT, GROUND, INK, STATIC, add_panel, blank_figure
@@ -44,17 +46,15 @@ STREAMED, INTERVAL = 40, 0.1  # sweeps; seconds between them
 
 @lru_cache(maxsize=None)
 def crossing() -> tuple[Log, list[FlowResult]]:
-    """A simulated crossing and its flow."""
     log, model = make_drive(301, CROSSING_SWEEPS, "av2", "crossing"), make_model(make_config("offline"))
     return log, [model([each])[0] for each in windows(log, model.config.num_history, model.config.num_future)]
 
 
 def tracks(file: Path) -> None:
-    """Tracks of the crossing."""
     log, flow = crossing()
     last = len(flow) - 1
     sweep = log.sweep(last)
-    points = sweep.points[~sweep.is_ground].astype(float) @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
+    points = transform_points(sweep.points[~sweep.is_ground], sweep.pose)
     figure, (axes,) = square_panels(1)
     draw_tracks(axes, points, track(log, enumerate(flow)), last)
     axes.set_title(f"tracks after {last + 1} sweeps: id, speed in m/s; lines: the path so far", fontsize=9)
@@ -110,7 +110,7 @@ def labels(file: Path) -> None:
             values = {key: log.values(LABELLED, key) for key in keys}
             T = np.linalg.inv(log.poses[LABELLED + 1]) @ log.poses[LABELLED]
     points, ground = values["lidar"], values["ground_mask"]
-    residual = values["flow"] - (points @ T[:3, :3].T + T[:3, 3] - points)
+    residual = values["flow"] - ego_motion_flow(points, T)
     moves = np.linalg.norm(residual, axis=1) >= MOVING
     shown = [
         ("truth: moving points, by object", moves * values["flow_instance_id"] + 0),
@@ -169,8 +169,9 @@ def deskewed(file: Path) -> None:
     figure.savefig(file, dpi=110)
 
 
-DRAWN: tuple[Callable[[Path], None], ...] = (tracks, clean, labels, stream, deskewed)
-PICTURES = {each.__name__: each for each in DRAWN}
+PICTURES: dict[str, Callable[[Path], None]] = {
+    each.__name__: each for each in (tracks, clean, labels, stream, deskewed)
+}
 
 
 def main() -> None:

@@ -51,7 +51,6 @@ def main() -> None:
 
 
 def write_page(drive, page: Path) -> None:
-    """Estimate the flow and the tracks, and save the page."""
     model = make_model(make_config("default"))
     log = CachedLog(drive, FIRST + COUNT + 1)  # a sweep is simulated once
     results = []

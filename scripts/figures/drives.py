@@ -61,7 +61,6 @@ def hedge(seed: int) -> Staged:
 
 
 def crowd(seed: int) -> Staged:
-    """A person who walks through a static group."""
     rng = np.random.default_rng(seed)
     people = [objects.pedestrian(rng, Route(8, 4.5, EAST, start=-0.5, speed=1.2))]
     for x, y in ((x, y) for x in (6.5, 7.2, 7.9, 8.6, 9.3) for y in (3.9, 5.1)):
@@ -70,7 +69,6 @@ def crowd(seed: int) -> Staged:
 
 
 def tram(seed: int) -> Staged:
-    """A tram of 32 m."""
     long = Body([box(-16, 16, -1.3, 1.3, 0.35, 3.3, 0.6)], Route(6, 6, EAST, speed=8), "BUS", (32.0, 2.6, 3.3))
     drive = drive_past([long, objects.car(np.random.default_rng(seed), Route(12, -4, WEST, speed=8))], seed, speed=4)
     return Staged(drive, "a long side seen in two sweeps", "tram of 32 m, 8 m/s", [0], (-14, -14, 30, 18))
@@ -115,7 +113,6 @@ def touching(seed: int) -> Staged:
 
 
 def turning(seed: int) -> Staged:
-    """A bus that turns by 4.5 degrees a sweep."""
     bus = objects.bus(Route(14, -6, NORTH, start=4, speed=7, radius=9, angle=NORTH))
     drive = drive_past([bus], seed, speed=0)
     return Staged(drive, "an object that turns", "bus, 7 m/s, 4.5 degrees a sweep", [0], (-8, -11, 22, 11))
@@ -129,7 +126,6 @@ def vertical(seed: int) -> Staged:
 
 
 def fast(seed: int) -> Staged:
-    """Cars of 48 and 52 m/s."""
     rng = np.random.default_rng(seed)
     bodies = [objects.car(rng, Route(-4, 4, EAST, speed=48)), objects.car(rng, Route(-10, -4, WEST, -20, 52))]
     drive = drive_past([*bodies, objects.wall(25, 9, 30, 0.5, 4)], seed, speed=20)
@@ -147,7 +143,6 @@ def far(seed: int) -> Staged:
 
 
 def street(seed: int) -> Staged:
-    """Two cars, a person, a wall."""
     rng = np.random.default_rng(seed)
     bodies = [
         objects.car(rng, Route(8, 3.5, WEST, speed=9)),
@@ -180,14 +175,12 @@ def tree(seed: int) -> Staged:
 
 
 def bridge(seed: int) -> Staged:
-    """A bridge of 9 m across the road, cars below it."""
     slab = [box(-4.5, 4.5, -14, 14, 4.7, 5.5, 0.5), box(-4.5, -4.2, -14, 14, 5.5, 6.4, 0.5)]
     abutments = [box(-4.5, 4.5, side * 10 - 1, side * 10 + 1, -1, 4.7, 0.5) for side in (-1, 1)]
     return _below(seed, Body([*slab, *abutments], Route(16, 0)), "cars under a bridge")
 
 
 def gantry(seed: int) -> Staged:
-    """A gantry with signs over the lanes, cars below it."""
     posts = [box(-0.2, 0.2, side * 9 - 0.2, side * 9 + 0.2, 0, 6.2, 0.5) for side in (-1, 1)]
     signs = [box(-0.1, 0.1, y - 1.4, y + 1.4, 4.6, 6.4, 0.8) for y in (-5.5, -2, 2, 5.5)]
     return _below(

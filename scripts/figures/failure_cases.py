@@ -12,7 +12,6 @@ last, each with estimate, truth and error.
 from __future__ import annotations
 
 import argparse
-import io
 import math
 import warnings
 from dataclasses import replace
@@ -38,8 +37,6 @@ WIDE = (-100.0, -100.0, -math.inf, 100.0, 100.0, math.inf)
 
 
 class Attempt(NamedTuple):
-    """The result of one setting."""
-
     name: str  # preset and overrides
     residual: np.ndarray  # (N, 3) estimated total flow minus the flow of the TRUE ego motion, metres per sweep
     error: float  # mean end-point error of the scored objects, metres per sweep
@@ -113,7 +110,6 @@ CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] 
 
 
 def make_case(name: str, seed: int) -> Case:
-    """Simulate a drive, and estimate the flow of its pair with each setting."""
     stage, settings, _ = CASES[name]
     staged = stage(seed)
     truth = residual_of(staged.drive.labels(PAIR).flow, staged.drive)
@@ -143,9 +139,8 @@ def draw(case: Case) -> Image.Image:
             truth=truth[kept],
             title=f"{attempt.name.replace('`', '')}: error {attempt.error:.2f} m ({case.staged.whose})",
         )
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=figure.dpi)
-        rows.append(np.asarray(Image.open(buffer).convert("RGB")))
+        figure.canvas.draw()
+        rows.append(np.asarray(figure.canvas.buffer_rgba())[:, :, :3])
     picture = Image.fromarray(np.concatenate(rows))
     return picture.quantize(palette=picture.quantize(256))  # half the bytes; dithering keeps the colour wheel smooth
 

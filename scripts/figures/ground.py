@@ -43,7 +43,6 @@ def simulated() -> Iterator[Case]:
 
 
 def real() -> Iterator[Case]:
-    """Sweeps of real data."""
     folder = DATA / "av2-7fab2350" / "val" / "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
     raster = read_ground_raster(folder / "map")
     for sweep in AV2Log(folder):

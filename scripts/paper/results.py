@@ -58,7 +58,6 @@ def load_runs(folder: Path) -> dict[str, Records]:
 
 
 def row_of(experiment: str, model: dict[str, Any]) -> str:
-    """The row of a table to which the settings of a run belong."""
     sizes, h = model["pixel_sizes"], model.get("num_history", 0)
     if experiment == "pixel_size":
         return ", ".join(f"{size:g}" for size in sizes)

@@ -44,7 +44,6 @@ Cells = List[List[str]]
 
 
 def main() -> None:
-    """Run the experiments; the exit status is 1 if any of them failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("overrides", nargs="*", metavar="SETTING=VALUE")
     parser.add_argument("--only", nargs="*", choices=EXPERIMENTS, default=EXPERIMENTS)
@@ -157,7 +156,6 @@ def about_runs(ours: Records) -> list[str]:
 
 
 def markdown(cells: Cells) -> str:
-    """A Markdown table."""
     words = 1 + (cells[0][1] == "from")
     rule = ["---"] * words + ["---:"] * (len(cells[0]) - words)
     return "".join("| " + " | ".join(row) + " |\n" for row in (cells[0], rule, *cells[1:]))
