@@ -15,8 +15,7 @@ FORMULA = re.compile(r'<(?P<tag>div|span) class="arithmatex">\\[(\[](?P<latex>.*
 # Sections of our docstrings that mkdocstrings takes for paragraphs, and their names of pages.
 SECTION = re.compile(r"<p>(Convention|Cost|Source|Ties|Warns|Example): ")
 PAGE = re.compile(r"(?<![\w/\"])docs/(\w+)\.md(?!\")")
-STYLE = """.md-grid { max-width: 76rem; }
-"""
+STYLE = ".md-grid { max-width: 76rem; }\n"
 
 
 def on_files(files: Any, config: Any) -> Any:

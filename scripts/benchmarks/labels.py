@@ -119,18 +119,13 @@ def simulated(sensor: str) -> list[Log]:
     return logs
 
 
-def score(parts: Sequence[dict[str, Any]]) -> str:
-    """Precision, recall and recall of pedestrians over several scenes."""
-    found, false, missed, walkers, missed_walkers = np.sum([part["counts"] for part in parts], 0)
-    pairs = ((found, false), (found, missed), (walkers, missed_walkers))
-    return ", ".join(f"{part / (part + rest):.3f}" if part + rest else "–" for part, rest in pairs)
-
-
 def table_row(name: str, scenes: list[dict[str, dict[str, Any]]]) -> dict[str, Any]:
     row: dict[str, Any] = {"scenes": f"{name} ({len(scenes)})"}
     for method in scenes[0]:
         results = [scene[method] for scene in scenes]
-        row[method] = score(results)
+        found, false, missed, walkers, missed_walkers = np.sum([each["counts"] for each in results], 0)
+        pairs = ((found, false), (found, missed), (walkers, missed_walkers))  # precision, recall, that of pedestrians
+        row[method] = ", ".join(f"{part / (part + rest):.3f}" if part + rest else "–" for part, rest in pairs)
         row[f"{method}, s"] = f"{statistics.median(each['seconds'] for each in results):.2f}"
         if "hdbscan" in results[0]:
             row["+ HDBSCAN, s"] = f"{statistics.median(each['hdbscan'] for each in results):.2f}"

@@ -39,9 +39,10 @@ class Clusters(NamedTuple):
 
 
 def opencv_flow(window: Window, config: Config) -> FlowResult:
-    """Estimate the flow of every point of `window.pc0`, whose sweeps t-h ... t+1 have equal intervals.
+    """Estimate the flow of every point of `window.pc0`.
 
-    The method must be dense, with connected components; other settings that the loop does not have are ignored.
+    All points must be finite, the sweeps t-h ... t+1 must have equal intervals, and the method must be dense with
+    connected components. Other settings that the loop does not have are ignored.
 
     Cost: one `cv2.matchTemplate` per cluster, sweep and scale.
     """
@@ -60,11 +61,7 @@ def opencv_flow(window: Window, config: Config) -> FlowResult:
     residual_flow = np.zeros((num_points, 3), np.float32)
     residual_flow[rows, :2] = flows[0].T
     pose_flow = np.empty((num_points, 3), np.float32)
-    with np.errstate(invalid="ignore"):  # for points that are not finite
-        np.subtract(moved0.T, points0.T, out=pose_flow, casting="same_kind")
-    finite = np.isfinite(pose_flow)
-    if not finite.all():
-        pose_flow[~finite.all(1)] = 0
+    np.subtract(moved0.T, points0.T, out=pose_flow, casting="same_kind")
     cluster_id = np.full(num_points, -1, np.int64)
     cluster_id[rows] = number
     scores = np.zeros(num_points, np.float32)
@@ -119,11 +116,11 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     count, labels = cv2.connectedComponents(dilated, connectivity=config.connectivity)
     pixel = np.flatnonzero(aggregated.view(bool))
     label = labels.ravel()[pixel]
-    group = _grouped(pixel, label, width)
-    down = np.minimum(group.last_row + 1, height - 1) - np.maximum(group.top - 1, 0) + 1
-    right = np.minimum(group.last_col + 1, width - 1) - np.maximum(group.left - 1, 0) + 1
+    first, top, left, last_row, last_col = _grouped(pixel, label, width)
+    down = np.minimum(last_row + 1, height - 1) - np.maximum(top - 1, 0) + 1
+    right = np.minimum(last_col + 1, width - 1) - np.maximum(left - 1, 0) + 1
     too_large = np.zeros(count, bool)
-    too_large[label[group.first]] = np.maximum(down, right) * pixel_size > config.max_extent
+    too_large[label[first]] = np.maximum(down, right) * pixel_size > config.max_extent
     if too_large.any():
         # A 3 x 3 square of foreground is in one component, so all components can be eroded together.
         num_pieces, piece = cv2.connectedComponents(cv2.erode(dilated, _SQUARE), connectivity=config.connectivity)
@@ -140,38 +137,27 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     kept = (has_target & has_source)[label]
     pixel, label = pixel[kept], label[kept]
 
-    number = np.full((height, width), -1, np.int32)
-    if len(pixel) == 0:
-        return Clusters(number, [])
-    group = _grouped(pixel, label, width)
-    by_raster = np.argsort(group.first)
+    first, top, left, last_row, last_col = _grouped(pixel, label, width)
+    by_raster = np.argsort(first)
     number_of_label = np.empty(count, np.int32)
-    number_of_label[label[group.first[by_raster]]] = np.arange(len(by_raster), dtype=np.int32)
+    number_of_label[label[first[by_raster]]] = np.arange(len(by_raster), dtype=np.int32)
+    number = np.full((height, width), -1, np.int32)
     number.ravel()[pixel] = number_of_label[label]
-    sizes = group.last_row - group.top + 1, group.last_col - group.left + 1
-    return Clusters(number, np.stack([group.top, group.left, *sizes], 1)[by_raster].tolist())
+    boxes = np.stack([top, left, last_row - top + 1, last_col - left + 1], 1)
+    return Clusters(number, boxes[by_raster].tolist())
 
 
-class Groups(NamedTuple):
-    """Groups of pixels with the same label: index of the first pixel in the given order, and the box; (G,) each."""
+def _grouped(pixel: np.ndarray, label: np.ndarray, width: int) -> tuple[np.ndarray, ...]:
+    """Group raster indices by label: index of the first pixel, top, left, last row and last column, (G,) each.
 
-    first: np.ndarray
-    top: np.ndarray
-    left: np.ndarray
-    last_row: np.ndarray
-    last_col: np.ndarray
-
-
-def _grouped(pixel: np.ndarray, label: np.ndarray, width: int) -> Groups:
-    """Group raster indices by label: sort once, so that a group is a slice."""
+    It sorts once, so that a group is a slice.
+    """
     order = np.argsort(label, kind="stable")
     row, col = np.divmod(pixel[order], width)
     start = np.flatnonzero(np.diff(label[order], prepend=-1))
-    if len(start) == 0:
-        return Groups(start, start, start, start, start)
     smallest, largest = np.minimum.reduceat, np.maximum.reduceat
     boxes = smallest(row, start), smallest(col, start), largest(row, start), largest(col, start)
-    return Groups(order[start], *boxes)
+    return (order[start], *boxes)
 
 
 def _correlate(
@@ -233,10 +219,10 @@ def _middle(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cloud(sweep: Sweep, moved: np.ndarray, steps: float, config: Config) -> Cloud:
-    """The points of a sweep that are finite, not ground and inside the region; `moved` (3, N) in the frame of t+1."""
+    """The points of a sweep that are not ground and inside the region; `moved` (3, N) in the frame of t+1."""
     x0, y0, z0, x1, y1, z1 = config.point_cloud_range
     x, y, z = moved
-    is_active = (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= z0) & (z <= z1) & np.isfinite(z)
+    is_active = (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= z0) & (z <= z1)
     if sweep.is_ground is not None:
         is_active &= ~as_numpy(sweep.is_ground)
     rows = np.flatnonzero(is_active)
@@ -250,12 +236,11 @@ def _compensate(sweep: Sweep, sweep1: Sweep) -> tuple[np.ndarray, np.ndarray]:
         return points, points
     matrix = np.linalg.inv(as_numpy(sweep1.pose)) @ as_numpy(sweep.pose)
     rotation, translation = matrix[:3, :3, None], matrix[:3, 3:]
-    with np.errstate(invalid="ignore"):  # for points that are not finite
-        # We avoid a product of large matrices, after which the threads of BLAS spin for tens of milliseconds.
-        moved = rotation[:, 0] * points[0]
-        moved += rotation[:, 1] * points[1]
-        moved += rotation[:, 2] * points[2]
-        moved += translation
+    # We avoid a product of large matrices, after which the threads of BLAS spin for tens of milliseconds.
+    moved = rotation[:, 0] * points[0]
+    moved += rotation[:, 1] * points[1]
+    moved += rotation[:, 2] * points[2]
+    moved += translation
     return points, moved
 
 

@@ -117,9 +117,7 @@ def weighted_mean(x: Tensor, weight: Tensor | None = None, eps: float = 1e-9) ->
 
 
 def euler_angles(matrix: Tensor, convention: str) -> Tensor:
-    """(B, 3) angles a, b, c in radians of (B, 3, 3) rotations Rz(a) Ry(b) Rx(c)."""
-    if convention != "ZYX":
-        raise NotImplementedError("this replacement knows the convention ZYX")
+    """(B, 3) angles a, b, c in radians of (B, 3, 3) rotations Rz(a) Ry(b) Rx(c). The convention must be "ZYX"."""
     yaw, roll = (torch.atan2(matrix[:, row, column], matrix[:, of, of]) for row, column, of in ((1, 0, 0), (2, 1, 2)))
     return torch.stack([yaw, torch.asin((-matrix[:, 2, 0]).clamp(-1, 1)), roll], 1)
 
@@ -133,8 +131,6 @@ def distance_transform(
     """
     from scipy.ndimage import distance_transform_edt
 
-    if weight != 0:
-        raise NotImplementedError("this replacement computes distances without an image")
     return torch.from_numpy(distance_transform_edt(mask[0, 0].numpy() != 0, spacing)).float()[None, None]
 
 

@@ -51,23 +51,18 @@ def crossing() -> tuple[Log, list[FlowResult]]:
 
 
 def tracks(file: Path) -> None:
+    """Boxes and ids at the last sweep, and the path of each track until then, over the points of the sweep."""
     log, flow = crossing()
     last = len(flow) - 1
     sweep = log.sweep(last)
     points = transform_points(sweep.points[~sweep.is_ground], sweep.pose)
+    table = track(log, enumerate(flow))
     figure, (axes,) = square_panels(1)
-    draw_tracks(axes, points, track(log, enumerate(flow)), last)
-    axes.set_title(f"tracks after {last + 1} sweeps: id, speed in m/s; lines: the path so far", fontsize=9)
-    figure.savefig(file, bbox_inches="tight")
-
-
-def draw_tracks(axes: Any, points: np.ndarray, table: dict[str, np.ndarray], index: int) -> None:
-    """Boxes and ids at a sweep, and the path of each track until then, over the points of the sweep."""
     axes.scatter(points[:, 0], points[:, 1], s=0.15, c=BACKGROUND, linewidths=0)
-    for row in np.flatnonzero(table["sweep"] == index):
+    for row in np.flatnonzero(table["sweep"] == last):
         number = table["id"][row]
         colour = PALETTE[number % len(PALETTE)] / 255
-        before = (table["id"] == number) & (table["sweep"] <= index)
+        before = table["id"] == number
         axes.plot(table["x"][before], table["y"][before], color=colour, lw=1.2)
         x, y, angle = (table[name][row] for name in ("x", "y", "heading"))
         length, width = table["length"][row], table["width"][row]
@@ -76,6 +71,8 @@ def draw_tracks(axes: Any, points: np.ndarray, table: dict[str, np.ndarray], ind
         if max(abs(x), abs(y)) < VIEW - 3:
             speed = np.hypot(table["vx"][row], table["vy"][row])
             axes.annotate(f"{number}: {speed:.1f}", (x + 0.6, y + 0.9), fontsize=6, color=0.7 * colour)
+    axes.set_title(f"tracks after {last + 1} sweeps: id, speed in m/s; lines: the path so far", fontsize=9)
+    figure.savefig(file, bbox_inches="tight")
 
 
 def clean(file: Path) -> None:

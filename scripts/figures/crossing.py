@@ -1,6 +1,6 @@
 """Draw docs/pictures/crossing.webp, the animation of the README: a simulated crossing in the page of `cflow view`.
 
-    python scripts/figures/crossing.py outputs/crossing            # estimates the flow (minutes), then draws
+    python scripts/figures/crossing.py            # estimates the flow (minutes), then draws; the page is in outputs
 
 Needs the extras `html` and `test`, and Chromium on the path. Five seconds of the drive are shown at half speed. Each
 sweep is in two pictures, because the camera follows the vehicle smoothly.
@@ -8,7 +8,6 @@ sweep is in two pictures, because the camera follows the vehicle smoothly.
 
 from __future__ import annotations
 
-import argparse
 import io
 import shutil
 from pathlib import Path
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from playwright.sync_api import sync_playwright
+from tqdm import tqdm
 
 from cflow_torch import make_config, make_model
 from cflow_torch.applications.tracking import track
@@ -23,6 +23,7 @@ from cflow_torch.data.log import CachedLog, window
 from cflow_torch.simulator import make_drive
 from cflow_torch.viz import save_page
 
+FILE = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "crossing.webp"
 SEED, FIRST, COUNT = 2, 2, 50
 SIZE, MILLISECONDS, QUALITY = {"width": 720, "height": 405}, 100, 30
 BACK, HEIGHT, AHEAD, SWING = 27.0, 17.0, 6.0, 12.0  # metres from the vehicle; degrees to either side
@@ -34,29 +35,22 @@ Object.assign(viewer.state, { follow: false, rings: false, labels: true, size: 1
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("output", type=Path)
-    given = parser.parse_args()
-    given.output.mkdir(parents=True, exist_ok=True)
-    page = given.output / "crossing.html"
+    page = Path("outputs/crossing.html")
+    page.parent.mkdir(exist_ok=True)
     drive = make_drive(SEED, FIRST + COUNT + 2, "av2", "crossing")
-    if not page.exists():
-        write_page(drive, page)
+    write_page(drive, page)
     T_viewer_ego = np.linalg.inv(drive.poses[FIRST + 1]) @ drive.poses[FIRST + 1 : FIRST + 2 + COUNT]
     pictures = take(page, T_viewer_ego[:, :3, 3])
-    file = given.output / "crossing.webp"
     settings = {"duration": MILLISECONDS, "loop": 0, "quality": QUALITY, "method": 4}
-    pictures[0].save(file, save_all=True, append_images=pictures[1:], **settings)
-    print(f"{file}: {len(pictures)} pictures, {file.stat().st_size / 1e6:.2f} MB")
+    pictures[0].save(FILE, save_all=True, append_images=pictures[1:], **settings)
+    print(f"{FILE}: {len(pictures)} pictures, {FILE.stat().st_size / 1e6:.2f} MB")
 
 
 def write_page(drive, page: Path) -> None:
     model = make_model(make_config("default"))
     log = CachedLog(drive, FIRST + COUNT + 1)  # a sweep is simulated once
-    results = []
-    for i in range(FIRST, FIRST + COUNT):
-        results += [(i, model([window(log, i, model.config.num_history, model.config.num_future)])[0])]
-        print(f"\r{i - FIRST + 1} of {COUNT} pairs", end="", flush=True)
+    pairs = tqdm(range(FIRST, FIRST + COUNT), unit="pair")
+    results = [(i, model([window(log, i, model.config.num_history)])[0]) for i in pairs]
     table = track(log, results)
     save_page(log, results, page, tracks=lambda: table, preset="default")
 

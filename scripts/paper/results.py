@@ -59,22 +59,18 @@ def load_runs(folder: Path) -> dict[str, Records]:
 
 def row_of(experiment: str, model: dict[str, Any]) -> str:
     sizes, h = model["pixel_sizes"], model.get("num_history", 0)
-    if experiment == "pixel_size":
-        return ", ".join(f"{size:g}" for size in sizes)
-    if experiment == "views":
-        return "+Sectional" if model["sectional_view"] else "BEV"
-    if experiment == "clustering":
-        return "HDBSCAN" if model["clustering"] == "hdbscan" else "Connected components"
-    if experiment == "history":
-        return f"h={h}"
-    if experiment == "scales":
-        return f"h={h}, {len(sizes)} scales"
-    if experiment == "keypoints":
-        if model["method"] == "dense":
-            return f"CorrelationFlow (h={h})"
+    if experiment == "keypoints" and model["method"] == "keypoints":
         is_preset = model["densify"] == "clusters" and model["patch_size"] == PRESETS["keypoints"][1]["patch_size"]
         return PRESET if is_preset else DENSIFIED[model["densify"]]
-    return METHODS[model["method"]]
+    rows = {
+        "pixel_size": ", ".join(f"{size:g}" for size in sizes),
+        "views": "+Sectional" if model.get("sectional_view") else "BEV",
+        "clustering": "HDBSCAN" if model.get("clustering") == "hdbscan" else "Connected components",
+        "history": f"h={h}",
+        "scales": f"h={h}, {len(sizes)} scales",
+        "keypoints": f"CorrelationFlow (h={h})",
+    }
+    return rows.get(experiment, METHODS[model["method"]])
 
 
 def make_lines(experiment: str, about: dict[str, Any], ours: Records) -> list[Line]:

@@ -142,17 +142,15 @@ def about_runs(ours: Records) -> list[str]:
     """A line per data set with the data, versions and dates of our numbers."""
     lines = []
     for data_set, rows in ours.items():
-        about = []
         for r in rows.values():
             logs, versions = r["data"]["logs"], r["versions"]
-            about.append(
+            lines.append(
                 f"{data_set}: {r['num_pairs']} windows of {len(logs)} logs (digest {r['data']['digest']}), definition "
                 f"{r['definition']['name']}, cflow_torch {versions['cflow_torch']}, torch {versions['torch']}, "
                 f"{r['date'][:10]}; {r['machine']['threads']} thread(s)"
                 + (f"; {len(r['failures'])} pairs failed" if r["failures"] else "")
             )
-        lines += dict.fromkeys(about)
-    return lines
+    return list(dict.fromkeys(lines))
 
 
 def markdown(cells: Cells) -> str:
