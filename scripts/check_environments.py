@@ -41,15 +41,7 @@ COMMANDS = {
     "plot": ("plot/flow.png",),
     "view count=1": ("view/*.html",),
 }
-PACKAGE = ("cflow_torch", "configs")
 NEED_PACKAGE = ("tests/test_distribution.py", "tests/integrations/test_hubconf.py")  # these read the checkout
-# Only the wheel of this Python may be imported.
-INSTALLED = """
-import pathlib, sysconfig, cflow_torch, cflow_torch.configs
-site = pathlib.Path(sysconfig.get_paths()["purelib"]).resolve()
-for module in (cflow_torch, cflow_torch.configs):
-    assert site in pathlib.Path(module.__file__).resolve().parents, f"{module.__file__} is not in {site}"
-"""
 
 
 def main() -> int:
@@ -69,10 +61,8 @@ def main() -> int:
         run_commands(python, Path(temporary))
         if given.name == "wheel":
             return 0
-        for name in PACKAGE:
-            path = source / name
-            (shutil.rmtree if path.is_dir() else os.remove)(path)
-        run(python, "-c", INSTALLED, cwd=source)
+        for name in ("cflow_torch", "configs"):  # so that the tests can only import the wheel
+            shutil.rmtree(source / name)
         tests = ["tests", "-m", "not slow", *(f"--ignore={file}" for file in NEED_PACKAGE)]
         return subprocess.run([python, "-m", "pytest", *tests], cwd=source, env=environment()).returncode
 

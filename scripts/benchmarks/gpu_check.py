@@ -53,12 +53,7 @@ VARIANTS: dict[str, tuple[Config, int]] = {
     "preset default, h = 0": (DEFAULT.replace(num_history=0), 3),
     "preset default, max_memory 30 MB": (DEFAULT.replace(max_memory=LITTLE), 3),
 }
-MEASURED: dict[str, Config] = {
-    "dense, h = 4, 5 scales": VARIANTS["dense, h = 4, 5 scales"][0],
-    "dense, h = 0": PAPER,
-    "key points": KEYS,
-    "preset default": DEFAULT,
-}
+MEASURED = ("dense, h = 4, 5 scales", "dense, h = 0", "key points", "preset default")
 # Prefixes of CUDA functions, because the suffixes differ from version to version.
 CALLS = {
     "launches": ("cudaLaunchKernel", "cuLaunchKernel"),
@@ -103,10 +98,10 @@ def compare(results: Sequence[FlowResult], expected: Sequence[FlowResult]) -> di
 
 def measure_speed(device: str) -> Rows:
     """Milliseconds of a batch and windows per second, from NumPy arrays and from tensors on the device."""
-    for name, config in MEASURED.items():
+    for name in MEASURED:
         for kind, windows in (("arrays", streets(3)), (device, [on_device(each, device) for each in streets(3)])):
             sizes = (1, 8, 32) if device == "cuda" else (1, 2)
-            for size, found in measure(make_model(config, device), windows, 3, sizes)["batches"].items():
+            for size, found in measure(make_model(VARIANTS[name][0], device), windows, 3, sizes)["batches"].items():
                 of_batch = {"ms": 1000 * found["median"], "windows/s": found["windows_per_s"]}
                 yield {"work": name, "input": kind, "batch": size, **of_batch}
 
@@ -121,8 +116,8 @@ def on_device(sweeps: Window, device: str) -> Window:
 
 def count_launches(device: str) -> Rows:
     """Kernel launches, waits and copies of warm batches; on a GPU only (tests/test_devices.py counts on a CPU)."""
-    for name, config in MEASURED.items() if device == "cuda" else ():
-        model = make_model(config, device)
+    for name in MEASURED if device == "cuda" else ():
+        model = make_model(VARIANTS[name][0], device)
         for size in (1, 16):
             yield {"work": name, "batch": size, **by_profiler(partial(model, streets(size)))}
 
@@ -145,9 +140,9 @@ def by_profiler(run: Callable[[], Any]) -> dict[str, Any]:
 def measure_memory(device: str) -> Rows:
     """Peak memory of a batch, on a CPU that of the process so far, with and without a limit."""
     size = 32 if device == "cuda" else 2
-    for name, config in MEASURED.items():
+    for name in MEASURED:
         for limit in (None, 1_000_000_000, 200_000_000):
-            model = make_model(config.replace(max_memory=limit), device)
+            model = make_model(VARIANTS[name][0].replace(max_memory=limit), device)
             peak = measure(model, streets(size), 1, [size])["peak_bytes"] or 0
             yield {"work": name, "batch": size, "max_memory_MB": limit and limit / 1e6, "peak_MB": peak / 1e6}
 

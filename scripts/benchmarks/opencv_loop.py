@@ -31,13 +31,6 @@ class Cloud(NamedTuple):
     rows: np.ndarray  # (N,) int64, rows of these points in the sweep
 
 
-class Clusters(NamedTuple):
-    """Clusters with pixels both at t+1 and before."""
-
-    number: np.ndarray  # (H, W) int32, cluster of every occupied pixel; -1 elsewhere and in other components
-    boxes: list[list[int]]  # M times (top, left, height, width), pixels
-
-
 def opencv_flow(window: Window, config: Config) -> FlowResult:
     """Estimate the flow of every point of `window.pc0`.
 
@@ -81,11 +74,11 @@ def motion_at_scale(
     the score, (N,) float32, of the points of sweep t.
     """
     images, pixels = zip(*(project(cloud.xy, pixel_size, config) for cloud in (cloud1, *clouds)))
-    clusters = find_clusters(images, pixel_size, config)
-    estimates, scores, seen = _correlate(clusters, images, len(clouds), pixel_size)
+    of_pixel, boxes = find_clusters(images, pixel_size, config)
+    estimates, scores, seen = _correlate(of_pixel, boxes, images, pixel_size)
     motion = np.zeros((2, len(scores) + 1))  # the last column is for points without cluster, number -1
     motion[:, :-1] = _pool(estimates / np.array([cloud.steps for cloud in clouds]), seen)
-    numbers = [np.where(pixel >= 0, clusters.number.ravel().take(pixel), -1) for pixel in pixels[1:]]
+    numbers = [np.where(pixel >= 0, of_pixel.ravel().take(pixel), -1) for pixel in pixels[1:]]
     return [motion.take(number, 1) for number in numbers], numbers[0], np.append(scores, np.float32(0))[numbers[0]]
 
 
@@ -105,8 +98,14 @@ def project(xy: np.ndarray, pixel_size: float, config: Config) -> tuple[np.ndarr
     return image, pixel
 
 
-def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Config) -> Clusters:
-    """Alg. clustering on (H, W) uint8 images, t+1 first: dilate and label; erode too large clusters and label again."""
+def find_clusters(
+    images: Sequence[np.ndarray], pixel_size: float, config: Config
+) -> tuple[np.ndarray, list[list[int]]]:
+    """Alg. clustering on (H, W) uint8 images, t+1 first: dilate and label; erode too large clusters and label again.
+
+    Returns the cluster of every occupied pixel, (H, W) int32, -1 elsewhere and in components without pixels at t+1 or
+    before, and the box of each of M clusters: top, left, height, width in pixels.
+    """
     aggregated = images[0].copy()
     for image in images[1:]:
         aggregated |= image
@@ -144,7 +143,7 @@ def find_clusters(images: Sequence[np.ndarray], pixel_size: float, config: Confi
     number = np.full((height, width), -1, np.int32)
     number.ravel()[pixel] = number_of_label[label]
     boxes = np.stack([top, left, last_row - top + 1, last_col - left + 1], 1)
-    return Clusters(number, boxes[by_raster].tolist())
+    return number, boxes[by_raster].tolist()
 
 
 def _grouped(pixel: np.ndarray, label: np.ndarray, width: int) -> tuple[np.ndarray, ...]:
@@ -161,19 +160,19 @@ def _grouped(pixel: np.ndarray, label: np.ndarray, width: int) -> tuple[np.ndarr
 
 
 def _correlate(
-    clusters: Clusters, images: Sequence[np.ndarray], num_clouds: int, pixel_size: float
+    of_pixel: np.ndarray, boxes: list[list[int]], images: Sequence[np.ndarray], pixel_size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The loop: shifts (2, M, K) in metres, scores (M,) of the newest sweep, and mask (M, K) of sweeps with pixels."""
-    num_clusters = len(clusters.boxes)
+    num_clusters, num_clouds = len(boxes), len(images) - 1
     shifts = np.zeros((2, num_clusters, num_clouds))
     scores = np.zeros(num_clusters, np.float32)
     seen = np.zeros((num_clusters, num_clouds), bool)
     for m in range(num_clouds):
-        present = clusters.number[images[m + 1].view(bool)]
+        present = of_pixel[images[m + 1].view(bool)]
         seen[present[present >= 0], m] = True
-    for i, (top, left, height, width) in enumerate(clusters.boxes):
+    for i, (top, left, height, width) in enumerate(boxes):
         crop = slice(top, top + height), slice(left, left + width)
-        own = clusters.number[crop] == i
+        own = of_pixel[crop] == i
         target = (images[0][crop] & own).astype(np.float32)
         newest = True
         for m in np.flatnonzero(seen[i]).tolist():

@@ -105,10 +105,6 @@ def on_rows(estimate: Callable[[Case], np.ndarray]) -> Method:
     return method
 
 
-def zero(case: Case) -> np.ndarray:
-    return np.zeros_like(case.pc0)
-
-
 def nearest(case: Case) -> np.ndarray:
     """The nearest point of the next sweep."""
     from scipy.spatial import cKDTree
@@ -165,7 +161,7 @@ def of_harness(name: str, root: Path) -> Method:
     return on_rows(estimate)
 
 
-PLAIN = {"zero": zero, "nearest": nearest, "clusters": clusters}
+PLAIN = {"zero": lambda case: np.zeros_like(case.pc0), "nearest": nearest, "clusters": clusters}
 
 
 def make_method(name: str, num_history: int, opensceneflow: Path | None) -> Method:

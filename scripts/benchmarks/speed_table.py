@@ -46,18 +46,13 @@ def of(config: Config) -> Call:
     return lambda sweeps: model([sweeps])
 
 
-def loop(config: Config) -> Call:
-    """The flow by the OpenCV loop."""
-    return lambda sweeps: opencv_flow(sweeps, config)
-
-
 # What is compared: the two calls whose times are divided.
 COMPARED: dict[str, tuple[Call, Call]] = {
     "`default` / `paper`, h = 0, equal region": (of(DEFAULT.replace(num_history=0)), of(WIDE)),
     "`default` / `paper`, h = 4, equal region": (of(DEFAULT), of(WIDE_HISTORY)),
-    "OpenCV loop / `default`, h = 4, equal region and scales": (loop(WIDE_SCALES), of(DEFAULT)),
-    "OpenCV loop / `paper`, h = 0": (loop(PAPER), of(PAPER)),
-    "OpenCV loop / `paper`, h = 4, five scales": (loop(FULL), of(FULL)),
+    "OpenCV loop / `default`, h = 4, equal region and scales": (partial(opencv_flow, config=WIDE_SCALES), of(DEFAULT)),
+    "OpenCV loop / `paper`, h = 0": (partial(opencv_flow, config=PAPER), of(PAPER)),
+    "OpenCV loop / `paper`, h = 4, five scales": (partial(opencv_flow, config=FULL), of(FULL)),
     "`keypoints` / `paper`, h = 0": (of(KEYS), of(PAPER)),
 }
 COUNTED = {"`paper`": PAPER, "`default`": DEFAULT}
