@@ -108,7 +108,7 @@ def measure_speed(device: str) -> Rows:
 
 def on_device(sweeps: Window, device: str) -> Window:
     def uploaded(sweep: Sweep) -> Sweep:
-        points, is_ground = (torch.as_tensor(np.asarray(x)).to(device) for x in (sweep.points, sweep.is_ground))
+        points, is_ground = (torch.from_numpy(values).to(device) for values in (sweep.points, sweep.is_ground))
         return replace(sweep, points=points, is_ground=is_ground)
 
     return Window(uploaded(sweeps.pc0), uploaded(sweeps.pc1), tuple(map(uploaded, sweeps.pch)))

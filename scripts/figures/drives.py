@@ -183,9 +183,8 @@ def bridge(seed: int) -> Staged:
 def gantry(seed: int) -> Staged:
     posts = [box(-0.2, 0.2, side * 9 - 0.2, side * 9 + 0.2, 0, 6.2, 0.5) for side in (-1, 1)]
     signs = [box(-0.1, 0.1, y - 1.4, y + 1.4, 4.6, 6.4, 0.8) for y in (-5.5, -2, 2, 5.5)]
-    return _below(
-        seed, Body([box(-0.2, 0.2, -9, 9, 5.6, 6.0, 0.5), *posts, *signs], Route(16, 0)), "cars under a gantry"
-    )
+    beam = box(-0.2, 0.2, -9, 9, 5.6, 6.0, 0.5)
+    return _below(seed, Body([beam, *posts, *signs], Route(16, 0)), "cars under a gantry")
 
 
 def _below(seed: int, above: Body, title: str) -> Staged:
