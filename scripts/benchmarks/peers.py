@@ -2,15 +2,14 @@
 """Compare scene flow of this package with that of other methods without training: error and processor time.
 
   python scripts/benchmarks/peers.py DATA/*.h5 DATA/av2/val --json rows.json
-  python scripts/benchmarks/peers.py DATA/*.h5 --opensceneflow PATH --methods icpflow-author nsfp --json rows.json
+  python scripts/benchmarks/peers.py DATA/*.h5 --opensceneflow PATH --methods icpflow nsfp --json rows.json
 
-  pip install open3d-cpu hdbscan scipy h5py                             # `nearest`, `clusters`
+  pip install open3d-cpu hdbscan h5py                                   # `clusters`
   pip install dztimer lightning torchmetrics tabulate                   # OpenSceneFlow's models, also the above
 
-Methods: presets of this package; `zero`; `nearest` (the nearest point of the next sweep); `clusters` (HDBSCAN, and
-Open3D's ICP for each cluster); `icpflow`, `nsfp`, `fastnsf` of a checkout of OpenSceneFlow (848bf86) with the settings
-of its YAML files, on a CPU (opensceneflow_cpu.py). `icpflow-author` has the search radius of the original code: twice
-the greater of 1.67 m and the ego motion. OpenSceneFlow uses 1.67 m. A method whose package is missing is skipped.
+Methods: presets of this package; `zero`; `clusters` (HDBSCAN, and Open3D's ICP for each cluster); `icpflow`, `nsfp`,
+`fastnsf` of a checkout of OpenSceneFlow (848bf86) with the settings of its YAML files, on a CPU (opensceneflow_cpu.py).
+A method whose package is missing is skipped.
 
 All methods get the same points: both sweeps in the frame of t+1, without ground, within 35 m (a square). Our presets
 get the sweeps with the ground mask and the same region. We score labelled points that are not ground. Each set has the
@@ -46,11 +45,11 @@ from sets import NEAR, Item, make_item  # noqa: E402
 
 OURS = ("default", "paper", "keypoints")
 # Name -> class of the model in the checkout, whose YAML file has its name in lower case.
-HARNESS = {"icpflow": "ICPFlow", "icpflow-author": "ICPFlow", "fastnsf": "FastNSF", "nsfp": "NSFP"}
-METHODS = (*OURS, "zero", "nearest", "clusters", *HARNESS)  # rows of the table in this order
+HARNESS = {"icpflow": "ICPFlow", "fastnsf": "FastNSF", "nsfp": "NSFP"}
+METHODS = (*OURS, "zero", "clusters", *HARNESS)  # rows of the table in this order
 SEED = 0  # of torch and NumPy, set before every window
 START, EVERY = 4, 8  # first window, step between windows
-RADIUS = 1.67  # metres, least search radius of ICP-Flow
+RADIUS = 1.67  # metres, search radius of ICP-Flow in OpenSceneFlow
 Method = Callable[["Case"], np.ndarray]
 
 
@@ -105,13 +104,6 @@ def on_rows(estimate: Callable[[Case], np.ndarray]) -> Method:
     return method
 
 
-def nearest(case: Case) -> np.ndarray:
-    """The nearest point of the next sweep."""
-    from scipy.spatial import cKDTree
-
-    return case.pc1[cKDTree(case.pc1).query(case.pc0)[1]] - case.pc0
-
-
 def clusters(case: Case) -> np.ndarray:
     """Rigid motion of each cluster by point-to-point ICP, if 5 % more of its points match within 0.1 m than without."""
     import open3d
@@ -152,8 +144,6 @@ def of_harness(name: str, root: Path) -> Method:
     model = getattr(models, kind)(**settings)
 
     def estimate(case: Case) -> np.ndarray:
-        if name == "icpflow-author":
-            model.args.translation_frame = 2 * max(RADIUS, float(np.linalg.norm(case.item.frame.T_ego1_ego0[:3, 3])))
         clouds = {"pc0": [torch.from_numpy(case.pc0)], "pc1": [torch.from_numpy(case.pc1)]}  # compensated already
         with parallel_config("sequential"):  # its HDBSCAN would start processes, whose time is not that of this one
             return model({**clouds, "pose0": [torch.eye(4)], "pose1": [torch.eye(4)]})["flow"][0].numpy()
@@ -161,7 +151,7 @@ def of_harness(name: str, root: Path) -> Method:
     return on_rows(estimate)
 
 
-PLAIN = {"zero": lambda case: np.zeros_like(case.pc0), "nearest": nearest, "clusters": clusters}
+PLAIN = {"zero": lambda case: np.zeros_like(case.pc0), "clusters": clusters}
 
 
 def make_method(name: str, num_history: int, opensceneflow: Path | None) -> Method:
