@@ -60,7 +60,7 @@ class Config:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            object.__setattr__(self, f.name, checked(f, getattr(self, f.name)))
+            object.__setattr__(self, f.name, checked(f.name, getattr(self, f.name), f.metadata))
         _check_space(self.pixel_sizes, self.point_cloud_range, self.ego_box)
 
     @property

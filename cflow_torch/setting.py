@@ -1,4 +1,4 @@
-"""One setting of a method: its default, meaning and bounds, and the check of a value."""
+"""One setting: its default, meaning and bounds, and the check of a value."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from contextlib import suppress
 from dataclasses import field
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Mapping
 
 from cflow_torch.errors import CFlowError
 
@@ -16,30 +16,34 @@ LIMIT = 2**53
 _NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers"}
 
 
-def setting(
-    default: Any,
-    help: str,
+def setting(default: Any, help: str, *, kind: type | None = None, **limits: Any) -> Any:
+    """Make a field of a `Config` with its default value, its meaning and unit, and its `bounds`.
+
+    `kind` None = the type of the default.
+    """
+    return field(default=default, metadata={"help": help, **bounds(kind or type(default), **limits)})
+
+
+def bounds(
+    kind: type,
     *,
-    kind: type | None = None,
     optional: bool = False,
     low: float = -math.inf,
     above: float = -math.inf,
     high: float = math.inf,
     choices: tuple[Any, ...] = (),
-) -> Any:
-    """Make a field of a `Config` with its default value, its meaning and unit, and its bounds.
+) -> dict[str, Any]:
+    """What is allowed as the value of a setting.
 
-    `kind` is int, float, bool, str or tuple (of floats); None = the type of the default. If `optional`, the value None
-    is allowed. `low` and `high` are the smallest and the largest value, both allowed. `above` is a lower bound that is
-    not allowed itself. `choices` are all allowed values, if these can be listed.
+    `kind` is int, float, bool, str, tuple (of floats) or object (any of the choices). If `optional`, the value None is
+    allowed. `low` and `high` are the smallest and the largest value, both allowed. `above` is a lower bound that is not
+    allowed itself. `choices` are all allowed values, if these can be listed.
     """
-    limits = {"kind": kind or type(default), "optional": optional, "low": low, "above": above, "high": high}
-    return field(default=default, metadata={"help": help, "choices": choices, **limits})
+    return {"kind": kind, "optional": optional, "low": low, "above": above, "high": high, "choices": choices}
 
 
-def describe(f: Any) -> str:
-    """The allowed values of a field of a `Config` in words: "a number of at least 1 and of at most 2, or None"."""
-    limits = f.metadata
+def describe(limits: Mapping[str, Any]) -> str:
+    """The allowed values in words: "a number of at least 1 and of at most 2, or None"."""
     low, above, high = limits["low"], limits["above"], limits["high"]
     if limits["choices"]:
         return f"one of {', '.join(map(repr, limits['choices']))}"
@@ -50,9 +54,8 @@ def describe(f: Any) -> str:
     return text + (", or None" if limits["optional"] else "")
 
 
-def checked(f: Any, value: Any) -> Any:
+def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
     """Return a setting as int, float, bool, str, tuple or None. One that is not allowed raises a `CFlowError`."""
-    limits = f.metadata
     kind = limits["kind"]
     if value is None and limits["optional"]:
         return None
@@ -67,5 +70,5 @@ def checked(f: Any, value: Any) -> Any:
         if limits["choices"]:
             is_allowed &= value in limits["choices"]
         if is_allowed:
-            return kind(value)
-    raise CFlowError(f"{f.name}={value!r}: give {describe(f)}")
+            return value if kind is object else kind(value)
+    raise CFlowError(f"{name}={value!r}: give {describe(limits)}")

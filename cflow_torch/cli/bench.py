@@ -23,21 +23,18 @@ from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.files import write_json
 from cflow_torch.data.log import Log, window
 from cflow_torch.stages import FlowModel, TimedModel
-from cflow_torch.types import CFlowError, Window
+from cflow_torch.types import Window
 from cflow_torch.windows.memory import peak_memory
 
 
 def task(cfg: DictConfig) -> None:
     output = run.output_folder(cfg)
-    repeats, num_pairs = run.whole_number(cfg, "repeats", 1), run.whole_number(cfg, "pairs", 1)
-    if any(size < 1 for size in cfg.batches):
-        raise CFlowError(f"batches={cfg.batches}: give whole numbers of at least 1, as in 'batches=[1,8]'")
     model = run.make_model(cfg)
     sources = run.find_logs(cfg)
     log = sources.open(sources.logs[0])
-    windows = _windows(log, num_pairs, model.config)
+    windows = _windows(log, cfg.pairs, model.config)
     ensure_writable(output)
-    report = {"log": log.log_id, **measure(model, windows, repeats, cfg.batches), "machine": run.machine()}
+    report = {"log": log.log_id, **measure(model, windows, cfg.repeats, cfg.batches), "machine": run.machine()}
     report.update(versions=run.versions(), model=model.config.as_dict())
     print(format_report(report))
     write_json(output / "bench.json", report)

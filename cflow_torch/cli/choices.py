@@ -14,7 +14,7 @@ import cflow_torch.configs
 from cflow_torch.config import PRESETS, make_config
 
 CONFIGS = Path(cflow_torch.configs.__path__[0])
-SETTERS = ("experiment", "row")  # groups that only change settings of others
+PREFIXES = {"data": "data.", "engine": "engine.", "picture": ""}  # of the settings of a group
 
 
 def groups(command: str) -> dict[str, list[str]]:
@@ -33,20 +33,22 @@ def settings(command: str) -> list[str]:
     found = [*own_settings(CONFIGS / f"{command}.yaml")]
     found += [f"model.{name}" for preset in PRESETS for name in make_config(preset).as_dict()]
     for group in groups(command):
-        if group not in SETTERS:
-            prefix = "" if group == "picture" else f"{group}."
-            found += [f"{prefix}{name}" for file in files(group) for name in own_settings(file)]
+        if group in PREFIXES:
+            found += [f"{PREFIXES[group]}{name}" for file in files(group) for name in own_settings(file)]
     return list(dict.fromkeys(found))
 
 
 def own_settings(file: Path) -> dict[str, Any]:
-    """The settings in a YAML file, in dotted form."""
-    found: dict[str, Any] = {}
-    for key, value in _load(file).items():
-        if key not in ("defaults", "hydra"):
-            found.update(
-                {f"{key}.{name}": own for name, own in value.items()} if isinstance(value, dict) else {key: value}
-            )
+    """The settings in a YAML file and in those that it extends, in dotted form."""
+    content, found = _load(file), {}
+    for base in content.get("defaults", ()):
+        if isinstance(base, str) and base not in ("_self_", "hydra"):
+            found.update(own_settings(file.with_name(f"{base}.yaml")))
+    for key, value in content.items():
+        if isinstance(value, dict):
+            found.update({f"{key}.{name}": own for name, own in value.items() if key != "hydra"})
+        elif key != "defaults":
+            found[key] = value
     return found
 
 

@@ -16,17 +16,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any, Callable
+from typing import Callable
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from cflow_torch.applications.cleaning import CleanLog, static_map
 from cflow_torch.cli import run
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, write_cloud
-from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.files import describe_changes
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.bev import plot_map, save_picture
 
@@ -35,13 +33,11 @@ def task(cfg: DictConfig) -> None:
     output = run.local_folder(cfg)
     if cfg.suffix is not None and cfg.suffix not in SUFFIXES:
         raise CFlowError(f"suffix={cfg.suffix}: give one of {', '.join(SUFFIXES)}")
-    if not cfg.voxel_size > 0:
-        raise CFlowError(f"voxel_size={cfg.voxel_size}: give a positive length in metres")
     needed = ("residual_flow", "cluster_id", "is_valid")
     stored = None if cfg.flow is None else run.stored_flow(cfg.flow, needed)
     model = None if stored is not None else run.make_model(cfg)
     logs, failures = run.open_logs(cfg)
-    _claim(cfg, ensure_writable(output))
+    run.claim_output(cfg, output, ("device", "map"))
     for log in logs:
         folder, file = output / log.log_id, output / f"{log.log_id}.ply"
         flow: Callable[[int], FlowResult] | None = None if stored is None else partial(stored, log)
@@ -69,16 +65,3 @@ def _draw(points: np.ndarray, file: Path) -> str:
         return f", drawn in {save_picture(plot_map(points, file.stem), file)}"
     except CFlowError as error:
         return f" (no picture: {error})"
-
-
-def _claim(cfg: DictConfig, output: Path) -> None:
-    """Reject a folder with logs of other settings."""
-    file = output / "config.yaml"
-    if file.exists():
-        before: Any = OmegaConf.to_container(OmegaConf.load(file))
-        settings: Any = OmegaConf.to_container(cfg, resolve=True)
-        now = {**settings, "versions": run.versions()}
-        changed = describe_changes(before, now, ("output", "device", "map"))
-        if changed:
-            raise CFlowError(f"{output} has logs of another run ({changed}): remove it, or give output=FOLDER")
-    run.write_config(cfg, output)

@@ -40,14 +40,14 @@ from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write
 from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures, Sources
-from cflow_torch.data.atomic import ensure_writable, write_text
+from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Shard, find_shard
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
-from cflow_torch.fleet.manifest import claim_folder, complete_frames, find_conflict, frame_file, make_identity
-from cflow_torch.fleet.report import count_todo, forecast, format_missing, format_report
+from cflow_torch.fleet.manifest import check_folder, claim_folder, complete_frames, frame_file, make_identity
+from cflow_torch.fleet.report import count_frames, forecast, format_missing, format_report
 from cflow_torch.fleet.run import report_file, run_fleet
 from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError
@@ -57,40 +57,33 @@ _TRACK_FORMATS = {"mot": write_mot, "kitti": write_kitti}
 
 
 class FlowRun(NamedTuple):
-    """The logs, the job and the report of a run."""
+    """The logs, the job and this process's share of a run."""
 
     sources: Sources
     job: Job
-    report: dict[str, Any]
+    shard: Shard
 
 
 def task(cfg: DictConfig) -> None:
-    shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
-    if cfg.result_name is not None:
-        _check_results(cfg, shard)
-    if cfg.tracks not in (False, True, *_TRACK_FORMATS):
-        raise CFlowError(f"tracks={cfg.tracks}: give true, false, {' or '.join(_TRACK_FORMATS)}")
-    contents = _contents(cfg, run.make_model(cfg).config.method == "verified")
-    done = compute(cfg, shard, contents, _check_scenes if cfg.result_name is not None else None)
-    if done is None:
-        return
-    failures: Failures = []
-    if cfg.result_name is not None and done.report["stopped_by"] is None:  # a signal leaves no time for this
-        failures = _into_scenes(cfg.result_name, done.sources.logs, as_path(done.job.output))
-    if cfg.tracks and done.report["stopped_by"] is None:
-        failures += _write_tracks(cfg.tracks, done.sources, shard, as_path(done.job.output))
-    finish(done, shard, failures, cfg.verbose)
+    compute(cfg, _contents(cfg, run.make_model(cfg).config.method == "verified"), _check_results, _write_more)
 
 
 def compute(
-    cfg: DictConfig, shard: Shard, contents: tuple[str, ...], check: Callable[[Job, Sources], None] | None = None
-) -> FlowRun | None:
-    """Write the flow of all logs of a shard to files. With dry_run=true, count the frames and return None.
+    cfg: DictConfig,
+    contents: tuple[str, ...],
+    check: Callable[[DictConfig, FlowRun], None],
+    use: Callable[[DictConfig, FlowRun, dict[str, Any]], Failures],
+) -> None:
+    """Write the flow of all logs of a shard to files, print the report, and exit with its status if something failed.
 
-    `contents` are the columns of a flow file. `check` is called before anything is computed, and raises an error if the
-    logs are not usable.
+    With dry_run=true, count the frames instead. A job of a sweep raises `UnfinishedJob` if something failed.
+
+    Args:
+        contents: columns of a flow file.
+        check: called before anything is computed; raises an error if the logs cannot be used.
+        use: gets the report of a run that no signal has stopped, and returns what failed.
     """
-    output = run.output_folder(cfg)
+    shard, output = find_shard(cfg.shard.index, cfg.shard.count, os.environ), run.output_folder(cfg)
     settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     engine = dict(settings["engine"])
     name, workers, batch = (engine.pop(key) for key in ("name", "workers", "batch"))
@@ -108,34 +101,29 @@ def compute(
         batch=layout.batch,
         redo=cfg.overwrite,
     )
+    claim = (output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
+    units = shard.units(sources.logs)
     if cfg.dry_run:
-        conflict = find_conflict(output, identity, cfg.resume or cfg.overwrite)
-        print(forecast(job, shard.units(sources.logs)))
-        if conflict is not None:
-            print(f"{output} has results of another run{conflict}; overwrite=true would replace them")
-        return None
-    if check is not None:
-        check(job, sources)
-    kept = {**{key: settings.get(key) for key in ("model", "data", "result_name")}, "versions": run.versions()}
+        check_folder(*claim)
+        print(forecast(job, units))
+        return
+    flow = FlowRun(sources, job, shard)
+    check(cfg, flow)
     ensure_writable(output)
-    claim_folder(output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
-    write_text(output / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(kept)))
-    about = {"config": settings, "versions": run.versions()}
+    claim_folder(*claim)
+    run.write_config(cfg, output)
     if name == "local" and workers == AUTO and layout.devices[0] == "cpu":
-        least = frames_per_worker(config)
-        count = count_todo(job, shard.units(sources.logs), least * len(layout.devices))
+        least, count = frames_per_worker(config), 0
+        for _, _, todo in count_frames(job, units):
+            count += todo
+            if count >= least * len(layout.devices):
+                break
         layout = choose_layout(cfg.device, workers, batch, os.environ, count // least)
-    return FlowRun(sources, job, run_fleet(job, sources.logs, layout, shard, name, about, **engine))
-
-
-def finish(done: FlowRun, shard: Shard, failures: Failures, verbose: bool) -> None:
-    """Print the report, with `verbose` also the times of the stages, and exit with its status if something is missing.
-
-    `failures` are those of later steps, such as tracks. A job of a sweep raises `UnfinishedJob` instead.
-    """
-    report, file = done.report, report_file(done.job.output, shard)
-    status = report["exit_status"] or int(bool(failures))
-    print(f"{format_report(report, verbose)}\nflow files in {done.job.output}, report in {file}")
+    about = {"config": settings, "versions": run.versions()}
+    report = run_fleet(job, sources.logs, layout, shard, name, about, **engine)
+    failures = [] if report["stopped_by"] else use(cfg, flow, report)  # a signal leaves no time for this
+    file, status = report_file(job.output, shard), report["exit_status"] or int(bool(failures))
+    print(f"{format_report(report, cfg.verbose)}\nflow files in {job.output}, report in {file}")
     if status:
         missing = format_missing(report) + "".join(f"\n  {scene}: {message}" for scene, message in failures)
         print(f"missing:\n{missing}", file=sys.stderr)
@@ -144,17 +132,16 @@ def finish(done: FlowRun, shard: Shard, failures: Failures, verbose: bool) -> No
         raise SystemExit(status)
 
 
-def _check_scenes(job: Job, sources: Sources) -> None:
-    for scene in sources.logs:
-        check_writable(scene)
-
-
-def _check_results(cfg: DictConfig, shard: Shard) -> None:
+def _check_results(cfg: DictConfig, flow: FlowRun) -> None:
+    if cfg.result_name is None:
+        return
     if cfg.data.get("name") != "hdf5":
         raise CFlowError("result_name= writes into HDF5 scenes: give data=hdf5")
-    if shard.count > 1:
+    if flow.shard.count > 1:
         raise CFlowError("result_name= needs the flow of whole scenes: give it in a last run without shards")
     check_result_name(cfg.result_name)
+    for scene in flow.sources.logs:
+        check_writable(scene)
 
 
 def _contents(cfg: DictConfig, has_confidence: bool) -> tuple[str, ...]:
@@ -174,19 +161,27 @@ def _contents(cfg: DictConfig, has_confidence: bool) -> tuple[str, ...]:
     return tuple(name for name in allowed if name in given)
 
 
-def _write_tracks(kind: Any, sources: run.Sources, shard: Shard, output: Path) -> Failures:
+def _write_more(cfg: DictConfig, flow: FlowRun, report: dict[str, Any]) -> Failures:
+    """Write the scenes and the tracks that the settings ask for."""
+    output, failures = as_path(flow.job.output), []
+    if cfg.result_name is not None:
+        failures = _into_scenes(cfg.result_name, flow.sources.logs, output)
+    return failures + (_write_tracks(cfg.tracks, flow, output) if cfg.tracks else [])
+
+
+def _write_tracks(kind: Any, flow: FlowRun, output: Path) -> Failures:
     """Write the tracks of each log of this shard whose frames are all complete, also those of other shards."""
     failures: Failures = []
-    flow = run.stored_flow(output, ())
-    for unit in tqdm(shard.units(sources.logs), desc="tracks", unit="log", disable=None):
+    stored = run.stored_flow(output, ())
+    for unit in tqdm(flow.shard.units(flow.sources.logs), desc="tracks", unit="log", disable=None):
         with run.collect_failures(failures, source_name(unit.source)):
-            log = sources.open(unit.source)
+            log = flow.sources.open(unit.source)
             folder = output / log.log_id
             stamps = [int(stamp) for stamp in log.timestamps[:-1]]
             if not complete_frames(folder) >= set(stamps):
                 continue
             if not (folder / TRACKS_FILE).exists():
-                results = ((index, flow(log, index)) for index in range(len(stamps)))
+                results = ((index, stored(log, index)) for index in range(len(stamps)))
                 write_tracks(folder / TRACKS_FILE, track(log, results))
             if kind in _TRACK_FORMATS:
                 _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)

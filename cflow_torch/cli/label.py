@@ -18,19 +18,19 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from typing import Any
 
 from omegaconf import DictConfig
 from tqdm import tqdm
 
 from cflow_torch.applications.labels import find_labels
 from cflow_torch.cli import run
-from cflow_torch.cli.flow import FlowRun, compute, finish
-from cflow_torch.cli.run import Failures, Sources
+from cflow_torch.cli.flow import FlowRun, compute
+from cflow_torch.cli.run import Failures
 from cflow_torch.data.files import write_json
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.results import check_writable, labelled_by, write_hdf5_labels
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.job import Job, Shard, find_shard
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.types import CFlowError
@@ -43,49 +43,46 @@ def task(cfg: DictConfig) -> None:
         raise CFlowError("labels are written into HDF5 scenes of OpenSceneFlow: give their folder, and leave data= out")
     if cfg.model.method != "verified":
         raise CFlowError("labels need the confidence of the flow: give model=offline or default")
-    shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
-
-    def check(job: Job, sources: Sources) -> None:
-        for scene in sources.logs:
-            check_writable(scene)
-            maker = None
-            with suppress(CFlowError):  # a scene that cannot be read is reported later
-                maker = labelled_by(scene)
-            if maker not in (None, job.identity) and not job.redo:
-                why = "labels of other settings or of another program"
-                raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
-
-    done = compute(cfg, shard, _CONTENTS, check)
-    if done is not None:
-        finish(done, shard, _label(done, shard, cfg) if done.report["stopped_by"] is None else [], cfg.verbose)
+    compute(cfg, _CONTENTS, _check, _label)
 
 
-def _label(done: FlowRun, shard: Shard, cfg: DictConfig) -> Failures:
+def _check(cfg: DictConfig, flow: FlowRun) -> None:
+    for scene in flow.sources.logs:
+        check_writable(scene)
+        maker = None
+        with suppress(CFlowError):  # a scene that cannot be read is reported later
+            maker = labelled_by(scene)
+        if maker not in (None, flow.job.identity) and not cfg.overwrite:
+            why = "labels of other settings or of another program"
+            raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
+
+
+def _label(cfg: DictConfig, flow: FlowRun, report: dict[str, Any]) -> Failures:
     """Label the scenes of a shard whose flow is complete. If one cannot be written, it stays as it was."""
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
     model = run.make_model(cfg)
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
-    scenes = [unit.source for unit in shard.units(done.sources.logs)]
+    scenes = [unit.source for unit in flow.shard.units(flow.sources.logs)]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
-        folder = as_path(done.job.output) / scene.stem
+        folder = as_path(flow.job.output) / scene.stem
         with run.collect_failures(failures, scene.stem):
-            if labelled_by(scene) == done.job.identity and not done.job.redo:
+            if labelled_by(scene) == flow.job.identity and not flow.job.redo:
                 continue
-            log = done.sources.open(scene)
+            log = flow.sources.open(scene)
             stamps = log.timestamps[:-1]
             if not set(stamps) <= complete_frames(folder):
                 waiting.append(scene.name)  # failed frames are in the report; others belong to another shard
                 continue
             flows = (read_flow(frame_file(folder, stamp)) for stamp in stamps)
             labels = find_labels(log, flows, model, workers)
-            write_hdf5_labels(scene, labels, done.job.identity, overwrite=done.job.redo)
+            write_hdf5_labels(scene, labels, flow.job.identity, overwrite=flow.job.redo)
             labelled.append(scene.name)
     print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
     if scenes:
-        file = scenes[0].parent / f"cflow_label-{shard.index}-of-{shard.count}.json"
+        file = scenes[0].parent / f"cflow_label-{flow.shard.index}-of-{flow.shard.count}.json"
         kept = {"labelled": labelled, "waiting": waiting, "not_labelled": [list(failure) for failure in failures]}
-        write_json(file, {**done.report, **kept})
+        write_json(file, {**report, **kept})
         print(f"report: {file}")
     return failures

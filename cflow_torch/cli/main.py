@@ -111,20 +111,23 @@ def _help(command: str, has_settings: bool) -> str:
 
 def _run_with_settings(command: str, rest: list[str]) -> None:
     import hydra
+    from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    from cflow_torch.cli import schemas  # noqa: F401 (registers them)
+    from cflow_torch.cli import presets  # noqa: F401 (registers them)
     from cflow_torch.cli.refusals import UnfinishedJob, explain
 
     overrides, options = split(rest)
     for option in unknown_options(options):
         _exit_wrong(f"unknown option {option!r}: give settings as NAME=VALUE; `cflow {command} --help` lists them")
-    # The folder of a job is named after what is swept, and after what tells sweeps into the same output apart.
-    unnamed = {"output", "overwrite", *fixed_settings(overrides)} - {"experiment", "data.label"}
-    names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
-    sys.argv = [f"cflow {command}", *overrides, names, *options]
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     main_of = hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)
     try:
+        # The folder of a job is named after what is swept, and after what tells sweeps into the same output apart.
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
+        unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}
+        names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
+        sys.argv = [f"cflow {command}", *overrides, names, *options]
         main_of(lambda cfg: _run_job(command, cfg))()
     except UnfinishedJob as error:
         print(f"error: {error}", file=sys.stderr)
@@ -150,18 +153,6 @@ def split(arguments: list[str]) -> tuple[list[str], list[str]]:
         else:
             overrides.append(f"data.root={_text(word)}")
     return overrides, options
-
-
-def fixed_settings(overrides: list[str]) -> list[str]:
-    """Return the names of the settings that have a single value. All jobs of a sweep share these."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import OverrideParseException
-
-    try:
-        parsed = OverridesParser.create().parse_overrides(overrides)
-    except OverrideParseException:  # Hydra meets the error again and reports it
-        return []
-    return [str(one.key_or_group) for one in parsed if not one.is_sweep_override() and not one.is_hydra_override()]
 
 
 def unknown_options(options: list[str]) -> list[str]:
@@ -194,8 +185,9 @@ def _run_job(command: str, cfg: Any) -> Any:
 
     try:
         OmegaConf.resolve(cfg)
-        check_settings(cfg)
-        for source in HydraConfig.get().runtime.config_sources:
+        runtime = HydraConfig.get().runtime
+        check_settings(cfg, command, runtime.choices)
+        for source in runtime.config_sources:
             if source.schema == "file" and source.path not in sys.path:  # the folder of a user's own reader
                 sys.path.append(source.path)
         from cflow_torch.cli.run import complete_data  # imports torch, which takes seconds

@@ -6,8 +6,8 @@ Threads would not help: a window is thousands of small operations, and only one 
 from __future__ import annotations
 
 import os
-from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from queue import SimpleQueue
 from typing import Any, Callable, Iterator, Sequence, Tuple
 
@@ -18,6 +18,7 @@ from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
 from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.progress import frames, show_warnings_as_lines
+from cflow_torch.fleet.work import run_ahead
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -66,7 +67,15 @@ def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, A
     for process in processes:
         idle.put(process)
 
-    def compute(sweeps: Window) -> tuple[Window, FlowResult]:
+    def try_to_read(pair: Pair) -> Window | Exception:
+        try:
+            return read(*pair)
+        except (CFlowError, OSError) as error:
+            return error
+
+    def compute(sweeps: Window | Exception) -> tuple[Window, FlowResult]:
+        if isinstance(sweeps, Exception):
+            raise sweeps
         process = idle.get()
         try:
             ((arrays, seconds),) = process.call(sweeps)
@@ -77,23 +86,12 @@ def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, A
         model.pairs.append(seconds)
         return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
-    waiting: deque[tuple[Pair, Future[Any]]] = deque()
     with ThreadPoolExecutor(count) as threads:
         try:
-            for pair in frames(pairs):
-                future: Future[Any] = Future()
-                try:
-                    future = threads.submit(compute, read(*pair))
-                except (CFlowError, OSError) as error:
-                    future.set_exception(error)
-                waiting.append((pair, future))
-                if len(waiting) > _AHEAD * count:
-                    yield waiting[0][0], waiting.popleft()[1].result
-            while waiting:
-                yield waiting[0][0], waiting.popleft()[1].result
+            with closing(run_ahead(threads, compute, map(try_to_read, pairs), _AHEAD * count)) as futures:
+                for pair, future in zip(frames(pairs), futures):
+                    yield pair, future.result
         finally:
-            for _, future in waiting:
-                future.cancel()
             for process in processes:
                 process.close()
 

@@ -4,17 +4,36 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Iterator, Mapping
 
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 
-from cflow_torch.cli.choices import files, groups, near, own_settings, settings
-from cflow_torch.config import CONFIGS, REMOVED_PRESETS, config_from, removed_preset
+from cflow_torch.cli.choices import CONFIGS, PREFIXES, files, groups, near, own_settings, settings
+from cflow_torch.config import CONFIGS as METHODS
+from cflow_torch.config import REMOVED_PRESETS, config_from, removed_preset
 from cflow_torch.errors import CFlowError
+from cflow_torch.setting import bounds, checked
 
 # Settings of the last version; those of the methods are in `config.REMOVED`.
 _REMOVED = {"standing": "use remove_stopped", "residual_axes": "leave it out"}
+# What is allowed besides the default. The other settings have the type of their default.
+_FROM_0, _FROM_1 = bounds(int, low=0), bounds(int, low=1)
+_ABOVE_0 = bounds(float, above=0, high=1e12)
+_ALLOWED = {
+    **dict.fromkeys(("first", "seed", "first_seed", "pair", "index", "retries"), _FROM_0),
+    **dict.fromkeys(("step", "count", "num_sweeps", "num_drives", "pairs", "repeats", "batches", "width"), _FROM_1),
+    **dict.fromkeys(("workers", "batch"), bounds(int, low=1, high=100_000)),  # more is a typing error
+    **dict.fromkeys(("voxel_size", "voxel", "max_flow", "frames_per_second", "timeout", "memory"), _ABOVE_0),
+    **dict.fromkeys(("num_cpus", "num_gpus"), bounds(float, low=0, high=1e6)),
+    "pace": {**_ABOVE_0, "optional": True},
+    "cluster": bounds(int),
+    "view.format": bounds(str, choices=("html", "rerun")),
+    "animation.format": bounds(str, choices=("gif", "mp4")),
+    "truth": bounds(object, choices=(True, False, "auto")),
+    "tracks": bounds(object, choices=(True, False, "mot", "kitti")),
+}
+_TYPES = {kind: bounds(kind) for kind in (bool, int, float)}
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
 
@@ -22,16 +41,33 @@ class UnfinishedJob(RuntimeError):
     """Something is missing, and a message says what. The other jobs of a sweep still run."""
 
 
-def check_settings(cfg: Any) -> None:
-    """Check the settings of a method and the path of the data, before torch is imported."""
+def check_settings(cfg: Any, command: str, choices: Mapping[str, Any]) -> None:
+    """Check settings and the path of the data, before torch is imported. `choices` are those of the groups."""
     config_from(OmegaConf.to_container(cfg.model, resolve=True))  # type: ignore[arg-type]
-    if "_target_" in cfg.data:
+    for name, file, default in _defaults(command, choices):
+        value = OmegaConf.select(cfg, name, default=default)
+        own = name.rpartition(".")[2]
+        limits = _ALLOWED.get(f"{file}.{own}") or _ALLOWED.get(own) or _TYPES.get(type(default))
+        if limits is not None and value != default:
+            for one in value if isinstance(default, list) and OmegaConf.is_list(value) else [value]:
+                checked(name, one, limits)
+    if "_target_" in cfg.data:  # your own reader; `first` and `step` are ours
+        for name in ("first", "step"):
+            checked(f"data.{name}", cfg.data.get(name, 1), _ALLOWED[name])
         return
     if OmegaConf.is_missing(cfg.data, "root"):
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     root = cfg.data.get("root")
     if isinstance(root, str) and "://" not in root and not Path(root).exists():
         raise CFlowError(f"{root}: there is no such file or folder; settings are NAME=VALUE")
+
+
+def _defaults(command: str, choices: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    """Yield the name, file and default of all settings of a command, except those of the method."""
+    chosen = [(prefix, CONFIGS / group / f"{choices.get(group)}.yaml") for group, prefix in PREFIXES.items()]
+    for prefix, file in [("", CONFIGS / f"{command}.yaml"), *chosen]:
+        if file.exists():
+            yield from ((prefix + name, file.stem, default) for name, default in own_settings(file).items())
 
 
 def explain(error: Exception, command: str) -> str:
@@ -51,7 +87,7 @@ def explain(error: Exception, command: str) -> str:
     message = " ".join((f"{error}: {error.__cause__}" if error.__cause__ else str(error)).split())
     unknown = re.search(r"Key '.*?' (?:is )?not in .*full_key: (\S+) object_type=(\w+)", message)
     if unknown:
-        methods = {config.__name__: method for method, config in CONFIGS.items()}
+        methods = {config.__name__: method for method, config in METHODS.items()}
         return _unknown_setting(unknown[1], methods.get(unknown[2]), command)
     message = message.partition(" full_key:")[0].replace("Error merging override ", "")
     return f"{message}; `cflow {command} --help` has examples"
@@ -62,7 +98,7 @@ def _unknown_setting(key: str, method: str | None, command: str) -> str:
     group, _, name = key.rpartition(".")
     if group == "model" and method is not None and name != "pixel_size":
         try:
-            CONFIGS[method]().replace(**{name: None})
+            METHODS[method]().replace(**{name: None})
         except CFlowError as error:
             if not str(error).startswith("unknown"):
                 return str(error)

@@ -20,8 +20,9 @@ from cflow_torch.cli.choices import CONFIGS, own_settings
 from cflow_torch.cli.info import processor
 from cflow_torch.cli.refusals import UnfinishedJob as UnfinishedJob
 from cflow_torch.config import config_from
-from cflow_torch.data.atomic import write_text
+from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
+from cflow_torch.data.files import describe_changes
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path, is_remote
@@ -101,10 +102,9 @@ def complete_data(data: DictConfig) -> DictConfig:
     if data.root is not None:
         name = recognise(data.root)
         print(f"{data.root}: data={name}")
-    settings, known = OmegaConf.load(CONFIGS / "data" / f"{name}.yaml"), {"name"}
-    for choice in (AUTO, "synthetic"):
-        known |= own_settings(CONFIGS / "data" / f"{choice}.yaml").keys()
-    given = {key: value for key, value in data.items() if key not in known - set(settings)}
+    settings = OmegaConf.load(CONFIGS / "data" / f"{name}.yaml")
+    others = own_settings(CONFIGS / "data" / f"{AUTO}.yaml").keys() - set(settings)
+    given = {key: value for key, value in data.items() if key not in others}
     given.update(name=name, label=data.label or settings.label)
     return OmegaConf.merge(settings, given)  # type: ignore[return-value]
 
@@ -114,17 +114,8 @@ def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
 
     `group`, "" or "data.", is the prefix of `first` and `step`. `count` has no prefix and may be missing.
     """
-    first, step = whole_number(cfg, f"{group}first", 0), whole_number(cfg, f"{group}step", 1)
-    count = None if OmegaConf.select(cfg, "count") is None else whole_number(cfg, "count", 1)
-    return lambda log: range(first, len(log.timestamps) - 1, step)[:count]
-
-
-def whole_number(cfg: DictConfig, key: str, least: int) -> int:
-    """Return the setting of a dotted name; what is not a whole number of at least `least` is a `CFlowError`."""
-    value = OmegaConf.select(cfg, key)
-    if type(value) is not int or value < least:
-        raise CFlowError(f"{key}={value}: give a whole number of at least {least}")
-    return value
+    first, step = (OmegaConf.select(cfg, f"{group}{name}") for name in ("first", "step"))
+    return lambda log: range(first, len(log.timestamps) - 1, step)[: cfg.get("count")]
 
 
 def check_pair(pair: int, log: Log) -> None:
@@ -154,14 +145,11 @@ def find_logs(cfg: DictConfig) -> Sources:
         target = settings.pop("_target_")
         return Sources(target, settings, find_user_sources(target, settings))
     if data.name == "synthetic":
-        seed, num_sweeps = whole_number(cfg, "data.seed", 0), whole_number(cfg, "data.num_sweeps", 1)
-        logs = benchmark_logs(data.cache, "av2", [seed], num_sweeps)
-        return Sources("av2", {"check": False}, logs)
+        return Sources("av2", {"check": False}, benchmark_logs(data.cache, "av2", [data.seed], data.num_sweeps))
     if data.name == "benchmark":
-        first, num_drives = whole_number(cfg, "data.first_seed", 0), whole_number(cfg, "data.num_drives", 1)
-        seeds, num_sweeps = range(first, first + num_drives), whole_number(cfg, "data.num_sweeps", 1)
+        seeds = range(data.first_seed, data.first_seed + data.num_drives)
         chosen = format_of(data.profile)
-        logs = benchmark_logs(data.cache, data.profile, seeds, num_sweeps, data.scenes)
+        logs = benchmark_logs(data.cache, data.profile, seeds, data.num_sweeps, data.scenes)
         return Sources(chosen.data_set, {"check": False, **chosen.settings}, logs)
     name, root = settings.pop("name"), settings.pop("root")
     return Sources(name, settings, list(find_sources(name, root)))
@@ -221,5 +209,24 @@ def finish(failures: Failures) -> None:
 
 def write_config(cfg: DictConfig, folder: Path) -> None:
     """Write the resolved settings and versions to `folder/config.yaml`."""
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(_record(cfg))))
+
+
+def claim_output(cfg: DictConfig, folder: Path, ignored: Sequence[str]) -> None:
+    """Reject a folder whose config.yaml has other settings or versions, unless `cfg.overwrite`; write config.yaml.
+
+    The settings `ignored` may differ, because files do not depend on them.
+    """
+    file = ensure_writable(folder) / "config.yaml"
+    if file.exists() and not cfg.get("overwrite"):
+        before = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+        changed = describe_changes(before, _record(cfg), ("output", "overwrite", *ignored))
+        if changed:
+            remedy = "give overwrite=true" if "overwrite" in cfg else "remove it"
+            raise CFlowError(f"{folder} has files of another run ({changed}): {remedy}, or give output=FOLDER")
+    write_config(cfg, folder)
+
+
+def _record(cfg: DictConfig) -> dict[str, Any]:
     settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**settings, "versions": versions()})))
+    return {**settings, "versions": versions()}

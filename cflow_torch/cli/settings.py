@@ -83,7 +83,7 @@ def harness_models() -> dict[str, str]:
         for f in fields(config):
             value = region if f.name == "point_cloud_range" else getattr(config, f.name)
             if f.name not in WINDOW:  # num_frames replaces it
-                text += f"  {f.name}: {_yaml(value)}  # {describe(f)}\n"
+                text += f"  {f.name}: {_yaml(value)}  # {describe(f.metadata)}\n"
         models[name] = text
     return models
 
@@ -96,7 +96,7 @@ def _sections() -> Iterator[tuple[list[str], str, list[str]]]:
         for f in fields(kind):
             values = {preset: getattr(config, f.name) for preset, config in presets.items()}
             changed = ", ".join(f"{p} `{_yaml(v)}`" for p, v in values.items() if v != f.default)
-            cells = [f"`model.{f.name}`", f"`{_yaml(f.default)}`", changed, describe(f), f.metadata["help"]]
+            cells = [f"`model.{f.name}`", f"`{_yaml(f.default)}`", changed, describe(f.metadata), f.metadata["help"]]
             rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
         chosen = [f"model={preset}" for preset in presets]
         yield [method, *presets, *chosen, "model"], f"Method `{method}`: {', '.join(chosen)}", rows

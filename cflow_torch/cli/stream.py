@@ -23,19 +23,16 @@ from cflow_torch.cli import run
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.files import write_json
 from cflow_torch.data.log import Log
-from cflow_torch.types import CFlowError
 
 
 def task(cfg: DictConfig) -> None:
-    output, pace = run.output_folder(cfg), cfg.pace
-    if pace is not None and not (isinstance(pace, (int, float)) and pace > 0):
-        raise CFlowError(f"pace={pace}: give a number above 0, 1 = as recorded, or null = as fast as possible")
-    count = None if cfg.count is None else run.whole_number(cfg, "count", 2)
+    output = run.output_folder(cfg)
     stream = FlowStream(config=run.make_model(cfg).config, device=cfg.device, max_gap=cfg.max_gap)
     sources = run.find_logs(cfg)
     log = sources.open(sources.logs[0])
     ensure_writable(output)
-    report = {"log": log.log_id, **play(stream, log, pace, count), "machine": run.machine(), "versions": run.versions()}
+    report = {"log": log.log_id, **play(stream, log, cfg.pace, cfg.count)}
+    report.update(machine=run.machine(), versions=run.versions())
     print(format_report(report))
     write_json(output / "stream.json", report)
     print(f"written to {output / 'stream.json'}")

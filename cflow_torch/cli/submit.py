@@ -19,19 +19,15 @@ import sys
 from pathlib import Path
 from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from cflow_torch import __version__
 from cflow_torch.cli import run
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.cli.run import Failures
-from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.files import json_ready
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.submission import archive, frames
 from cflow_torch.evaluation.submission.archive import SubmissionVersion
 from cflow_torch.evaluation.submission.frames import Frame, MaskArchive
-from cflow_torch.fleet.manifest import claim_folder
 from cflow_torch.fleet.progress import frames as counted
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -39,7 +35,6 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 Plan = List[Tuple[Frame, int]]  # with the number of rows
 _Masks = Optional[MaskArchive]
 _Listed = Optional[Mapping[str, Sequence[int]]]
-_SETTINGS = ("version", "model", "data", "frames", "masks")  # a file depends on these only
 
 
 def task(cfg: DictConfig) -> None:
@@ -59,7 +54,10 @@ def task(cfg: DictConfig) -> None:
         _check(cfg.archive, version, plan)
         return
     folder, file = output / f"v{version.number}", output / f"v{version.number}.zip"
-    _claim(cfg, output, folder, file)
+    if cfg.overwrite:
+        shutil.rmtree(folder, ignore_errors=True)
+        file.unlink(missing_ok=True)
+    run.claim_output(cfg, output, ("device", "archive"))
     failures += _write(plan, model, version, masks, folder)
     run.finish(failures)
     _check(folder, version, plan)
@@ -70,18 +68,6 @@ def task(cfg: DictConfig) -> None:
         file.unlink()
         raise
     print(f"version {version.number}, for {version.server}: {file}, {file.stat().st_size:,} bytes")
-
-
-def _claim(cfg: DictConfig, output: Path, folder: Path, file: Path) -> None:
-    """Claim the output folder for these settings, so that files of other settings are never mixed in."""
-    settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    identity = json_ready({**{name: settings[name] for name in _SETTINGS}, "cflow_torch": __version__})
-    ensure_writable(output)
-    if cfg.overwrite:
-        shutil.rmtree(folder, ignore_errors=True)
-        file.unlink(missing_ok=True)
-    claim_folder(output, identity, resume=True, overwrite=cfg.overwrite, alone=True)
-    run.write_config(cfg, output)
 
 
 def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, masks: _Masks) -> tuple[Plan, Failures]:

@@ -37,25 +37,18 @@ from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.page import load_k3d, save_page
 from cflow_torch.viz.recording import load_rerun, record_log
 
-FORMATS = {"html": ".html", "rerun": ".rrd"}
-
 
 def task(cfg: DictConfig) -> None:
-    if cfg.format not in FORMATS:
-        raise CFlowError(f"format={cfg.format}: give one of {', '.join(FORMATS)}")
     load_k3d() if cfg.format == "html" else load_rerun()  # fails now if it is missing, not after the work
     output = run.local_folder(cfg)
     chosen = run.chosen_pairs(cfg, "data.")
-    for name in ("max_flow", "voxel"):
-        if cfg[name] is None or not 0 < cfg[name] < float("inf"):
-            raise CFlowError(f"{name}={cfg[name]}: give a positive length in metres")
     flow, num_sweeps = _flow(cfg)
     logs, failures = run.open_logs(cfg)
     run.write_config(cfg, ensure_writable(output))
     files: list[Path] = []
     for log in logs:
         recent: Any = CachedLog(log, num_sweeps)
-        file = output / f"{log.log_id}{FORMATS[cfg.format]}"
+        file = output / f"{log.log_id}.{'html' if cfg.format == 'html' else 'rrd'}"
         with run.collect_failures(failures, log.log_id):
             if file in files:
                 raise CFlowError(f"{file} exists for another log of this name: give a data.root= with one of them")

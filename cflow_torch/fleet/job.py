@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, Mapping, NamedTuple, Sequence, Union
 
@@ -83,17 +84,6 @@ class Noted(NamedTuple):
 Event = Union[Opened, Done, Failed, Noted]
 
 
-def split(units: Sequence[Unit], workers: int) -> list[Unit]:
-    """Split units until there are enough of them for all workers, and number them from 0."""
-    count = -(-_UNITS_PER_WORKER * workers // max(1, len(units))) if workers > 1 else 1
-    pieces = []
-    for unit in units:
-        length = (unit.last - unit.first) / count
-        edges = [unit.first + length * k for k in range(count + 1)]
-        pieces += [replace(unit, first=first, last=last) for first, last in zip(edges, edges[1:])]
-    return [replace(unit, number=number) for number, unit in enumerate(pieces)]
-
-
 @dataclass(frozen=True)
 class Shard:
     """Share number `index`, 0 ... `count` - 1, of `count`."""
@@ -106,18 +96,20 @@ class Shard:
             allowed = "a count of at least 1 and an index of 0 ... count - 1"
             raise CFlowError(f"shard.index={self.index} of shard.count={self.count}: give {allowed}")
 
-    def units(self, sources: Sequence[Any]) -> list[Unit]:
-        """Return this shard's share of the logs.
+    def units(self, sources: Sequence[Any], workers: int = 1) -> list[Unit]:
+        """Return this shard's share of the logs, in units that are enough for all workers, numbered from 0.
 
         The sequence of all logs is divided into `count` parts of equal length. So a shard opens only its own logs, and
         shares at most the first and the last of them with a neighbour.
         """
         begin, end = (Fraction(edge * len(sources), self.count) for edge in (self.index, self.index + 1))
+        logs = range(math.floor(begin), math.ceil(end))
+        pieces = -(-_UNITS_PER_WORKER * workers // len(logs)) if workers > 1 else 1
         units: list[Unit] = []
-        for number, source in enumerate(sources):
-            first, last = max(begin - number, Fraction(0)), min(end - number, Fraction(1))
-            if first < last:
-                units.append(Unit(len(units), source, first, last))
+        for log in logs:
+            first, last = max(begin - log, Fraction(0)), min(end - log, Fraction(1))
+            edges = [first + (last - first) * k / pieces for k in range(pieces + 1)]
+            units += [Unit(len(units) + k, sources[log], edges[k], edges[k + 1]) for k in range(pieces)]
         return units
 
 
@@ -129,31 +121,24 @@ def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
     """
     if index != AUTO and count == AUTO:
         raise CFlowError(f"shard.index={index} is given without shard.count: give both")
-    if index != AUTO:
-        return Shard(_number("shard.index", index), _number("shard.count", count))
-    found = _from_environment(environ)
-    wanted = None if count == AUTO else _number("shard.count", count)
-    if wanted not in (None, found.count if found else 1):
-        tasks = f"{found.count} tasks" if found else "no number of tasks"
-        raise CFlowError(f"shard.count={wanted}, but the environment sets {tasks}: give shard.index as well")
-    return found or Shard()
+    shard = _from_environment(environ) if index == AUTO else Shard(index, count)
+    if count not in (AUTO, shard.count):
+        found = f"the environment sets {shard.count}"
+        raise CFlowError(f"shard.count={count} processes, but {found}: give shard.index as well")
+    return shard
 
 
-def _from_environment(environ: Mapping[str, str]) -> Shard | None:
-    """Return the shard that torchrun or SLURM gives this process; None if neither does.
+def _from_environment(environ: Mapping[str, str]) -> Shard:
+    """Return the shard that torchrun or SLURM gives this process, or the only one.
 
     A SLURM batch script is not a task of a step: only `srun` sets SLURM_STEP_NUM_TASKS. Without `srun`, a script with
     `--ntasks=8` must not compute one eighth.
     """
-
-    def value(name: str, default: Any = None) -> int:
-        return _number(name, environ.get(name, default))
-
-    index, count, is_array = 0, 1, "SLURM_ARRAY_TASK_ID" in environ
-    if is_array:
-        task = value("SLURM_ARRAY_TASK_ID")
-        index = (task - value("SLURM_ARRAY_TASK_MIN", 0)) // value("SLURM_ARRAY_TASK_STEP", 1)
-        count = value("SLURM_ARRAY_TASK_COUNT", index + 1)
+    index, count = 0, 1
+    if "SLURM_ARRAY_TASK_ID" in environ:
+        task = int(environ["SLURM_ARRAY_TASK_ID"])
+        index = (task - int(environ.get("SLURM_ARRAY_TASK_MIN", 0))) // int(environ.get("SLURM_ARRAY_TASK_STEP", 1))
+        count = int(environ.get("SLURM_ARRAY_TASK_COUNT", index + 1))
         if index >= count or (count == 1 and task > 0):
             raise CFlowError(
                 f"this SLURM array has {count} tasks, and this one is number {task}: give the array a range without "
@@ -161,12 +146,5 @@ def _from_environment(environ: Mapping[str, str]) -> Shard | None:
             )
     for rank, tasks in (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_STEP_NUM_TASKS")):
         if rank in environ and tasks in environ:
-            return Shard(index * value(tasks) + value(rank), count * value(tasks))
-    return Shard(index, count) if is_array else None
-
-
-def _number(name: str, value: Any) -> int:
-    try:
-        return int(str(value))
-    except ValueError:
-        raise CFlowError(f"{name}={value!r}: give a whole number") from None
+            return Shard(index * int(environ[tasks]) + int(environ[rank]), count * int(environ[tasks]))
+    return Shard(index, count)

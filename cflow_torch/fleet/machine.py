@@ -13,7 +13,6 @@ from cflow_torch.types import CFlowError
 from cflow_torch.windows.memory import available_memory, control_groups
 
 AUTO = "auto"
-_MOST = 100_000  # workers or windows; more is a typing error
 # Bytes of one worker: nearly twice the most that we measured with `default`, see docs/fleet.md.
 WORKER_MEMORY = 1_500_000_000
 # Windows that are computed together. On a CPU up to 4 are faster (fewer small operations), more are slower (caches). We
@@ -49,14 +48,14 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
     """
     gpus = _gpus(device, environ)
     if workers != AUTO:
-        count = _at_least_1("workers", workers)
+        count = workers
     elif gpus:
         count = len(gpus)
     else:
         cores, memory = usable_cores(environ), available_memory(environ)
         limits = [cores, *([] if memory is None else [memory // WORKER_MEMORY]), *([] if most is None else [most])]
         count = max(1, min(limits))
-    size = (GPU_BATCH if gpus else CPU_BATCH) if batch == AUTO else _at_least_1("batch", batch)
+    size = (GPU_BATCH if gpus else CPU_BATCH) if batch == AUTO else batch
     devices = tuple(gpus[k % len(gpus)] for k in range(count)) if gpus else ("cpu",) * count
     return Layout(devices, size)
 
@@ -89,10 +88,3 @@ def usable_cores(environ: Mapping[str, str]) -> int:
     with suppress(KeyError, ValueError, ZeroDivisionError):
         counts.append(min(counts) // int(environ["LOCAL_WORLD_SIZE"]))
     return max(1, min(counts))
-
-
-def _at_least_1(name: str, value: Any) -> int:
-    number = int(str(value)) if str(value).isdecimal() else 0
-    if not 1 <= number <= _MOST:
-        raise CFlowError(f"{name}={value!r}: give a whole number of at least 1, at most {_MOST}, or {AUTO}")
-    return number

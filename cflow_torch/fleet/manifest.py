@@ -56,34 +56,32 @@ def make_identity(
     return {**identity, "hash": hashlib.sha256(_text(identity).encode()).hexdigest()}
 
 
-def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
-    """Make sure that a folder has results of this identity only, and write its manifest; others are a `CFlowError`.
+def check_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
+    """Raise a `CFlowError` if results of this identity must not be added to a folder.
 
     `resume` continues an earlier run of the same identity. `overwrite` removes the results of earlier runs. It is
     allowed only if you are `alone`, that is, if no other shard works in this folder.
     """
     forget_listings(output)
-    why = find_conflict(output, identity, resume or overwrite)
-    if why is not None and not overwrite:
-        raise CFlowError(f"{output} has results of another run{why}: {_REMEDY}")
-    if why is not None and not alone:  # no shard knows whether another one has removed them already
-        raise CFlowError(f"{output} has results of another run{why}: remove the folder, or give output=FOLDER")
+    before = _read(output / MANIFEST)
+    if before is None or (overwrite and alone):
+        return
+    why = describe_changes(before, identity, ["hash"])
+    if why or not (resume or overwrite):
+        why = f"({why})" if why else "with the same settings (resume=true continues it)"
+        # No shard knows whether another one has removed the older results already.
+        remedy = "remove the folder, or give output=FOLDER" if overwrite else _REMEDY
+        raise CFlowError(f"{output} has results of another run {why}: {remedy}")
+
+
+def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
+    """Make sure that a folder has results of this identity only, see `check_folder`, and write its manifest."""
+    check_folder(output, identity, resume, overwrite, alone)
     if overwrite and alone and output.is_dir():
         _clear(output)
     remove_stale(output)
     if not (output / MANIFEST).exists():
         write_text(output / MANIFEST, _text(identity))
-
-
-def find_conflict(output: Path, identity: Mapping[str, Any], resume: bool) -> str | None:
-    """Return why results of this identity must not be added to a folder, as a phrase; None if they may be added."""
-    before = _read(output / MANIFEST)
-    if before is None:
-        return None
-    changed = describe_changes(before, identity, ["hash"])
-    if changed:
-        return f" ({changed})"
-    return None if resume else " with the same settings (resume=true continues it)"
 
 
 def claim_log(folder: Path, log: Log, run: str) -> None:

@@ -15,9 +15,14 @@ _LINE = "{desc}{n_fmt} of {total_fmt} frames, {rate_noinv_fmt}, {remaining} left
 
 
 class _Stderr:
-    """Standard error that may be gone, such as a closed terminal: the run goes on, and the text is lost."""
+    """Standard error that may be gone, such as a closed terminal: the run goes on, and the text is lost.
+
+    If it is not a terminal, each text of a bar is a line of its own.
+    """
 
     def write(self, text: str) -> None:
+        if not sys.stderr.isatty():
+            text = text.strip() and text.strip() + "\n"
         with suppress(OSError):
             sys.stderr.write(text)
             sys.stderr.flush()
@@ -29,14 +34,6 @@ class _Stderr:
         return getattr(sys.stderr, name)
 
 
-class _Lines(_Stderr):
-    """Standard error that is not a terminal: each text of a bar is a line of its own."""
-
-    def write(self, text: str) -> None:
-        if text.strip():
-            super().write(text.strip() + "\n")
-
-
 class Progress(tqdm):  # type: ignore[type-arg]
     """Counts frames and shows the count on stderr. It is a context manager, as every bar of tqdm.
 
@@ -44,11 +41,11 @@ class Progress(tqdm):  # type: ignore[type-arg]
     """
 
     def __init__(self, total: int | None = None, name: str = "") -> None:
-        settings = {"total": total, "unit": " frames", "smoothing": 0.05, "desc": f"{name}: " if name else ""}
-        if sys.stderr.isatty():
-            super().__init__(file=_Stderr(), bar_format=_BAR, **settings)
-        else:  # a short run prints nothing
-            super().__init__(file=_Lines(), bar_format=_LINE, mininterval=EVERY, miniters=1, delay=EVERY, **settings)
+        form: dict[str, Any] = {"bar_format": _BAR}
+        if not sys.stderr.isatty():  # a short run prints nothing
+            form = {"bar_format": _LINE, "mininterval": EVERY, "miniters": 1, "delay": EVERY}
+        desc = f"{name}: " if name else ""
+        super().__init__(total=total, file=_Stderr(), unit=" frames", smoothing=0.05, desc=desc, **form)
 
 
 def log_line(text: str) -> None:

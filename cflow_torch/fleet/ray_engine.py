@@ -7,7 +7,7 @@ import math
 import os
 import signal
 import threading
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from types import ModuleType
 from typing import Any, Callable, Iterator, Sequence
@@ -44,35 +44,43 @@ def run_ray(
 
     Args:
         address: None = start a cluster in this process, and end it; "auto" or "HOST:PORT" = join the cluster that this
-            machine is part of. An existing connection of the caller is used and kept.
+            machine is part of.
         num_cpus: CPUs of the cluster that a worker takes; "auto" = 1 without a GPU, 0 with one.
         num_gpus: GPUs that a worker takes, may be a fraction; "auto" = 1 if the device is a GPU.
         retries: how often a unit, and then each of its frames by itself, is repeated after a worker died on it.
     """
-    if isinstance(retries, bool) or not isinstance(retries, int) or retries < 0:
-        raise CFlowError(f"engine.retries={retries!r}: give a whole number of at least 0")
-    if not units:
-        return
     ray = import_optional("ray", "engine=ray needs Ray: pip install ray")
     is_gpu = layout.devices[0].startswith("cuda")
     needs = {
-        "CPU": _number("num_cpus", num_cpus, int(not is_gpu)),
-        "GPU": _number("num_gpus", num_gpus, int(is_gpu)),
+        "CPU": int(not is_gpu) if num_cpus == AUTO else num_cpus,
+        "GPU": int(is_gpu) if num_gpus == AUTO else num_gpus,
     }
     if not is_remote(as_path(job.output)):  # workers may run in another folder
         job = replace(job, output=str(as_path(job.output).absolute()))
-    count = min(len(layout.devices), len(units))
     used = sorted(set(layout.devices)) if is_gpu else []
-    if address is None and used not in ([], ["cuda"], [f"cuda:{k}" for k in range(len(used))]):
+    if address is None and used != [f"cuda:{k}" for k in range(len(used))]:
         # Ray hands out the GPUs of a machine in order, from the first one.
         raise CFlowError(f"engine=ray cannot choose {', '.join(used)}: set CUDA_VISIBLE_DEVICES, and give device=cuda")
-    with _cluster(ray, address, count, needs, len(used)):
+    settings: dict[str, Any] = {"address": address}
+    if address is None:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no reports to Ray's authors
+        settings = {
+            "address": "local",
+            "num_cpus": max(1, math.ceil(len(layout.devices) * needs["CPU"])),
+            "num_gpus": len(used),
+            "object_store_memory": _OBJECT_STORE_BYTES,
+            "include_dashboard": False,
+        }
+    _connect(ray, settings)
+    try:
         _check_room(ray, needs)
-        settings = {"num_cpus": needs["CPU"], "num_gpus": needs["GPU"], "max_concurrency": 2}  # `run` and `stop`
-        actor = ray.remote(_Actor).options(**settings)
+        needed = {"num_cpus": needs["CPU"], "num_gpus": needs["GPU"], "max_concurrency": 2}  # `run` and `stop`
+        actor = ray.remote(_Actor).options(**needed)
         device = "cuda" if is_gpu else "cpu"  # a worker sees only the GPUs that Ray gives it
-        processes = [_Process(ray, actor, os.getcwd(), job, device) for _ in range(count)]
+        processes = [_Process(ray, actor, os.getcwd(), job, device) for _ in layout.devices]
         yield from dispatch(processes, units, stop, retries)
+    finally:
+        ray.shutdown()  # this also ends a cluster in this process
 
 
 class _Actor:
@@ -135,37 +143,17 @@ class _Process(ChildProcess):
             raise WorkerDied(f"with Ray's {type(error).__name__}") from error
 
 
-@contextmanager
-def _cluster(
-    ray: ModuleType, address: str | None, workers: int, needs: dict[str, float], num_gpus: int
-) -> Iterator[None]:
+def _connect(ray: ModuleType, settings: dict[str, Any]) -> None:
     """Connect to a cluster. `ray.init` replaces the handler of SIGTERM; we restore it."""
-    if ray.is_initialized():
-        yield
-        return
-    settings: dict[str, Any] = {"address": address}
-    if address is None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no reports to Ray's authors
-        settings = {
-            "address": "local",
-            "num_cpus": max(1, math.ceil(workers * needs["CPU"])),
-            "num_gpus": num_gpus,
-            "object_store_memory": _OBJECT_STORE_BYTES,
-            "include_dashboard": False,
-        }
     before = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(logging_level=logging.ERROR, **settings)
     except Exception as error:
-        where = "a Ray cluster in this process" if address is None else f"engine.address={address}"
-        raise CFlowError(f"cannot connect to {where}: {describe(error)}") from error
+        where = f"engine.address={settings['address']}"
+        raise CFlowError(f"{where}: cannot connect to a Ray cluster: {describe(error)}") from error
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, before)
-    try:
-        yield
-    finally:
-        ray.shutdown()  # this also ends a cluster in this process
 
 
 def _check_room(ray: ModuleType, needs: dict[str, float]) -> None:
@@ -178,11 +166,3 @@ def _check_room(ray: ModuleType, needs: dict[str, float]) -> None:
             f"no node of the Ray cluster has room for a worker of {need} (they have {has}): "
             "give fewer engine.num_cpus or engine.num_gpus, or start such a node first"
         )
-
-
-def _number(name: str, value: Any, default: float) -> float:
-    if value == AUTO:
-        return default
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < math.inf:
-        raise CFlowError(f"engine.{name}={value!r}: give a number of at least 0, or {AUTO}")
-    return value

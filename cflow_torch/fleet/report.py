@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from contextlib import suppress
-from typing import Any, Sequence
+from typing import Any, Iterable, Iterator, Sequence
 
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.paths import as_path
@@ -17,38 +16,28 @@ from cflow_torch.fleet.work import describe, source_name
 _SHOWN = 20  # failures that the table lists; JSON has them all
 
 
-def forecast(job: Job, units: Sequence[Unit]) -> str:
-    """Count the frames that a run would compute: a table with a row per log.
+def count_frames(job: Job, units: Iterable[Unit]) -> Iterator[tuple[str, int, int]]:
+    """Yield the name of each unit's log, the number of its frames, and how many of them are not complete.
 
-    Cost: opens all logs and lists the files in the output. Nothing is written.
+    A log that cannot be opened has none. Cost: opens the log and lists its files in the output. Nothing is written.
     """
-    lines = ["  frames    to do  log"]
-    total = left = 0
     for unit in units:
         try:
-            log_id, frames, todo = _count(job, unit)
-            total, left = total + frames, left + todo
-            lines.append(f"{frames:8} {todo:8}  {log_id}")
+            with open_log(job.reader, unit.source, **{**job.settings, "check": False, "odometry": False}) as log:
+                stamps = {int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
+                complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
+                yield log.log_id, len(stamps), len(stamps - complete)
         except Exception as error:
-            lines.append(f"{'?':>8} {'?':>8}  {source_name(unit.source)}: cannot be opened: {describe(error)}")
-    return "\n".join([*lines, f"{total:8} {left:8}  in total; dry run: nothing was written to {job.output}"])
+            yield f"{source_name(unit.source)}: cannot be opened: {describe(error)}", 0, 0
 
 
-def count_todo(job: Job, units: Sequence[Unit], enough: int) -> int:
-    """Count the frames that a run would compute, until there are enough. Logs that cannot be opened have none."""
-    count = 0
-    for unit in units:
-        with suppress(Exception):
-            count += _count(job, unit)[2] if count < enough else 0
-    return count
-
-
-def _count(job: Job, unit: Unit) -> tuple[str, int, int]:
-    """Return the name of a unit's log, the number of its frames, and how many of them are not complete."""
-    with open_log(job.reader, unit.source, **{**job.settings, "check": False, "odometry": False}) as log:
-        stamps = {int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
-        complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
-        return log.log_id, len(stamps), len(stamps - complete)
+def forecast(job: Job, units: Sequence[Unit]) -> str:
+    """Count the frames that a run would compute: a table with a row per log."""
+    rows = list(count_frames(job, units))
+    total, left = sum(frames for _, frames, _ in rows), sum(todo for _, _, todo in rows)
+    lines = [f"{frames:8} {todo:8}  {name}" for name, frames, todo in rows]
+    end = f"{total:8} {left:8}  in total; dry run: nothing was written to {job.output}"
+    return "\n".join(["  frames    to do  log", *lines, end])
 
 
 class Counters:

@@ -13,7 +13,7 @@ from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.files import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.dispatch import dispatch
-from cflow_torch.fleet.job import Event, Failed, Job, Noted, Shard, Unit, split
+from cflow_torch.fleet.job import Event, Failed, Job, Noted, Shard, Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import SIGNALS, ChildProcess
 from cflow_torch.fleet.progress import Progress, log_line
@@ -44,9 +44,6 @@ def run_local(
         memory: bytes of address space that each worker process may use, of which Python and torch need about 3e9;
             None = no limit. Use it on a CPU only: the driver of a GPU reserves far more than it uses.
     """
-    for name, value in (("timeout", timeout), ("memory", 1 if memory is None else memory)):
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
-            raise CFlowError(f"engine.{name}={value!r}: give a number above 0")
     if len(layout.devices) > 1 or memory is not None:
         processes = [ChildProcess(make_worker, job, device, memory, timeout=timeout) for device in layout.devices]
         yield from dispatch(processes, units, stop, _RETRIES)
@@ -81,7 +78,7 @@ def run_fleet(
     """
     if engine not in ENGINES:
         raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")
-    units = split(shard.units(sources), len(layout.devices))
+    units = shard.units(sources, len(layout.devices))
     counters = Counters(units)
     start = time.perf_counter()
     with StopSignal() as stop, closing(ENGINES[engine](job, units, layout, stop, **engine_settings)) as events:

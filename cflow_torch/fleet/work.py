@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice, takewhile
 from pathlib import Path
-from typing import Any, Callable, Iterator, Sequence
+from typing import Any, Callable, Generator, Iterable, Iterator
 
 import pyarrow
 import torch
@@ -24,7 +26,7 @@ from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Unit
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
 from cflow_torch.fleet.progress import log_line, show_warnings_as_lines
-from cflow_torch.stages import FlowModel, stage_seconds
+from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.inspection import inactive_is_an_error, repeats
 
@@ -47,21 +49,16 @@ class _Frame:
 
 
 class Worker:
-    """Computes units with one method, None = that of the job, and keeps the log of the last one open.
+    """Computes units and keeps the log of the last one open. A device that cannot be used is a `CFlowError`."""
 
-    A device that cannot be used is a `CFlowError`.
-    """
-
-    def __init__(self, job: Job, device: str, model: FlowModel | None = None) -> None:
+    def __init__(self, job: Job, device: str) -> None:
         try:
             torch.zeros(1, device=device)  # fails now, not at every frame
         except (RuntimeError, AssertionError) as error:
             raise CFlowError(f"no worker can start on {device}: {describe(error)}") from error
         self._job, self._device, self._ahead = job, device, _AHEAD
-        self._model: Any = model
-        if model is None:
-            self._model = make_model(job.config, device)
-            self._model.inspect = None  # the log is checked instead
+        self._model: Any = make_model(job.config, device)
+        self._model.inspect = None  # the log is checked instead
         self._source: Any = None
         self._log: Any = None
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
@@ -99,7 +96,7 @@ class Worker:
             with suppress(Exception):  # the frames of a sweep that cannot be read will fail
                 for text in find_problems(log):
                     yield Noted(unit.number, log.log_id, text)
-        for frame in self._pass(log, folder, list(todo), stop):
+        for frame in self._pass(log, folder, todo, stop):
             name = f"{log.log_id}/{frame.timestamp}"
             if checks and frame.is_repetition:
                 yield Noted(unit.number, name, "the next sweep has the same points")
@@ -112,42 +109,27 @@ class Worker:
         """Close the log. Reads and writes that hang are not waited for."""
         self._reader.shutdown(wait=False)
         self._writer.shutdown(wait=False)
-        self._close_log()
-
-    def _close_log(self) -> None:
-        log, self._log = self._log, None
-        if log is not None:
-            log.close()
+        if self._log is not None:
+            self._log.close()
 
     def _open(self, source: Any) -> Log:
         if self._log is None or self._source != source:
-            self._close_log()
+            before, self._log = self._log, None
+            if before is not None:
+                before.close()
             log = open_log(self._job.reader, source, **{**self._job.settings, "check": False})
             self._source, self._log = source, CachedLog(log, self._job.config.num_sweeps)
         return self._log  # type: ignore[no-any-return]
 
-    def _pass(self, log: Log, folder: Path, todo: Sequence[int], stop: Callable[[], bool]) -> Iterator[_Frame]:
+    def _pass(self, log: Log, folder: Path, todo: Iterable[int], stop: Callable[[], bool]) -> Iterator[_Frame]:
         """Pass frames through the reading thread, this thread and the writing thread."""
-        size = self._job.batch
-        batches = iter([todo[i : i + size] for i in range(0, len(todo), size)])
-        reading: deque[list[Future[_Frame]]] = deque()
-        writing: deque[Future[_Frame]] = deque()
-        while True:
-            while len(reading) <= self._ahead and not stop():
-                batch = next(batches, None)
-                if batch is None:
-                    break
-                reading.append([self._reader.submit(self._read, log, index) for index in batch])
-            if reading and not stop():
-                frames = [future.result() for future in reading.popleft()]
-                self._compute(frames)
-                writing.extend(self._writer.submit(self._write, folder, frame) for frame in frames)
-            elif not writing:
-                break
-            # This bounds the results in memory. At the end, and after a stop, all of them are waited for.
-            most = self._ahead * size if reading and not stop() else 0
-            while writing and (len(writing) > most or writing[0].done()):
-                yield writing.popleft().result()
+        size, ahead = self._job.batch, self._ahead * self._job.batch
+        begun = takewhile(lambda _: not stop(), todo)
+        frames = (future.result() for future in run_ahead(self._reader, partial(self._read, log), begun, ahead))
+        batches = takewhile(lambda _: not stop(), iter(lambda: list(islice(frames, size)), []))
+        computed = (frame for batch in batches for frame in self._compute(batch))
+        for future in run_ahead(self._writer, partial(self._write, folder), computed, ahead):
+            yield future.result()
 
     def _read(self, log: Log, index: int) -> _Frame:
         frame = _Frame(int(log.timestamps[index]))
@@ -156,15 +138,13 @@ class Worker:
             frame.is_repetition = repeats(sweeps.pc0, sweeps.pc1)
         return frame
 
-    def _compute(self, frames: list[_Frame]) -> None:
+    def _compute(self, frames: list[_Frame]) -> list[_Frame]:
         """Turn windows into results, as a batch. If that fails, compute them one by one, so that only bad ones fail."""
         good = [frame for frame in frames if isinstance(frame.content, Window)]
-        if not good:
-            return
         start, results = time.perf_counter(), None
         try:
             with stage_seconds() as stages, inactive_is_an_error():
-                results = self._model([frame.content for frame in good])  # type: ignore[misc]
+                results = self._model([frame.content for frame in good]) if good else []
         except Exception as error:
             if len(good) == 1:
                 good[0].content = error.with_traceback(None)
@@ -173,11 +153,12 @@ class Worker:
             # Only now, after the except block: until then the traceback keeps the memory of the batch on the GPU.
             for frame in good if len(good) > 1 else []:
                 self._compute([frame])
-            return
+            return frames
         seconds = {"compute": time.perf_counter() - start, **{f"compute/{name}": s for name, s in stages.items()}}
         for frame, result in zip(good, results):
             frame.content = result
             frame.seconds.update({name: value / len(good) for name, value in seconds.items()})
+        return frames
 
     def _check_device(self) -> None:
         """Find out if CUDA still works: after an error inside a kernel it refuses all later work of the process."""
@@ -220,6 +201,23 @@ def make_worker(
             os._exit(_LOST_DEVICE)
 
     return run
+
+
+def run_ahead(
+    executor: Executor, function: Callable[[Any], Any], items: Iterable[Any], count: int
+) -> Generator[Future[Any], None, None]:
+    """Call a function with each item in other threads, `count` items ahead, and yield the futures in order."""
+    waiting: deque[Future[Any]] = deque()
+    try:
+        for item in items:
+            waiting.append(executor.submit(function, item))
+            while waiting and (len(waiting) > count or waiting[0].done()):
+                yield waiting.popleft()
+        while waiting:
+            yield waiting.popleft()
+    finally:
+        for future in waiting:
+            future.cancel()
 
 
 @contextmanager

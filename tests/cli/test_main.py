@@ -55,18 +55,24 @@ CHEAP = (
     ("eval -m hydra/launcher=joblib data.seed=1,2", "pip install hydra-joblib-launcher hydra-submitit-launcher"),
     ("eval model.pixel_sizes=[0.2", "cannot read 'model.pixel_sizes=[0.2'"),
     ("eval model.method=dense", "is a setting of method verified"),
+    ("eval data.step=0", "data.step=0: give a whole number of at least 1"),
+    ("eval overwrite=maybe", "overwrite='maybe': give True or False"),
+    ("bench batches=[0]", "batches=0: give a whole number of at least 1"),
+    ("plot picture=animation width=abc", "width='abc': give a whole number of at least 1"),
+    ("plot truth=maybe", "truth='maybe': give one of True, False, 'auto'"),
+    ("view format=pdf", "format='pdf': give one of 'html', 'rerun'"),
+    ("flow shard.index=one shard.count=3", "shard.index='one': give a whole number of at least 0"),
+    ("flow engine.workers=0", "engine.workers=0: give a whole number of at least 1"),
+    ("flow engine.memory=true", "engine.memory=True: give a number above 0"),
+    ("flow engine=ray engine.retries=-1", "engine.retries=-1: give a whole number of at least 0"),
     ("eval model.max_object=1", f"setting max_object was removed: {REMOVED['max_object']}"),
     ("eval +model.thorough=1", f"setting thorough was removed: {REMOVED['thorough']}"),
 )
 OTHERS = (
     ("submit version=1 masks=none data.num_sweeps=2", "none"),
-    ("bench repeats=0", "repeats=0: give a whole number of at least 1"),
-    ("bench batches=[0]", "batches=[0]: give whole numbers of at least 1"),
-    ("eval data.step=0", "data.step=0: give a whole number of at least 1"),
     ("eval definition=mine data.num_sweeps=2", "mine"),
     ("demo pair=99 data.num_sweeps=2", "has pairs 0 to 0"),
     ("plot log=1e5 data.num_sweeps=2", "log=1e5: there is no such log"),
-    ("plot picture=animation width=abc", "width=abc: Value 'abc'"),
     ("flow contents=[confidence] model=paper", "only model=default and offline have a confidence"),
 )
 

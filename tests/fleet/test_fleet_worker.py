@@ -21,7 +21,6 @@ from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import ChildProcess
 from cflow_torch.fleet.report import Counters, format_missing, format_report
-from cflow_torch.fleet.run import run_local
 from cflow_torch.fleet.work import Worker
 from cflow_torch.simulator import make_drive
 
@@ -48,8 +47,9 @@ class FailingModel:
 @pytest.mark.parametrize("error", [CFlowError("too odd"), MemoryError(), RuntimeError("CUDA: no memory"), KeyError(3)])
 def test_a_bad_frame_does_not_spoil_its_batch(source, single, tmp_path, error):
     stamps = AV2Log(source).timestamps
-    model = FailingModel([stamps[1], stamps[3]], lambda: error)
-    events = list(Worker(make_job(tmp_path, batch=3), "cpu", model=model).run(Unit(0, source)))
+    worker = Worker(make_job(tmp_path, batch=3), "cpu")
+    worker._model = FailingModel([stamps[1], stamps[3]], lambda: error)
+    events = list(worker.run(Unit(0, source)))
     failed = [event for event in events if isinstance(event, Failed)]
     assert [event.timestamp for event in failed] == [stamps[1], stamps[3]]
     assert all(type(error).__name__ in event.message or "too odd" in event.message for event in failed)
@@ -83,8 +83,8 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
 
 
 def test_a_lost_gpu_ends_its_worker(source, tmp_path, monkeypatch):
-    model = FailingModel(AV2Log(source).timestamps, lambda: RuntimeError("assert"))
-    worker = Worker(make_job(tmp_path, batch=1), "cpu", model=model)
+    worker = Worker(make_job(tmp_path, batch=1), "cpu")
+    worker._model = FailingModel(AV2Log(source).timestamps, lambda: RuntimeError("assert"))
 
     def refuse(*_: Any, **__: Any) -> Any:
         raise RuntimeError("device-side assert")
@@ -274,12 +274,6 @@ def test_the_report_lists_what_is_missing():
     assert missing[-2:] == ["  and 10 more, all of them in the report", "  1 logs or parts of logs: not begun"]
     assert "interrupted by SIGTERM" in format_report(report) and "  read" not in format_report(report)
     assert "  read" in format_report(report, verbose=True)
-
-
-def test_settings_of_the_engine_are_checked(source, tmp_path):
-    for settings in ({"timeout": 0}, {"timeout": "long"}, {"memory": -1}, {"memory": True}):
-        with pytest.raises(CFlowError, match=f"engine.{next(iter(settings))}=.*above 0"):
-            list(run_local(make_job(tmp_path), units_of([source]), Layout(("cpu",), 1), lambda: False, **settings))
 
 
 def test_a_stop_lets_started_frames_finish(fleet, tmp_path):

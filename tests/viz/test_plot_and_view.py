@@ -85,7 +85,7 @@ def test_an_animation_has_a_picture_for_every_pair(cflow, tmp_path, capsys):
     ("arguments", "message"),
     [
         (["pair=3"], "pair=3"),
-        (["truth=perhaps"], "truth=perhaps"),
+        (["truth=perhaps"], "truth='perhaps'"),
         (["picture=keypoints", "model=paper"], "model=keypoints"),
         (["picture=correlation", "cluster=100000"], "cluster=100000"),
         (["picture=animation", "first=9"], "first=9"),
@@ -124,8 +124,8 @@ def test_a_view_of_estimated_and_of_stored_flow(form, package, ending, cflow, tm
 
 def test_a_view_that_cannot_be_made_is_reported_before_the_work(cflow, monkeypatch, capsys):
     monkeypatch.setattr(run, "open_logs", lambda cfg: pytest.fail("work"))
-    assert cflow("view", "format=pdf") == 2 and "format=pdf: give one of html, rerun" in capsys.readouterr().err
+    assert cflow("view", "format=pdf") == 2 and "format='pdf': give one of 'html', 'rerun'" in capsys.readouterr().err
     if find_spec("k3d"):
-        assert cflow("view", "voxel=0") == 2 and "voxel=0.0: give a positive length" in capsys.readouterr().err
+        assert cflow("view", "voxel=0") == 2 and "voxel=0: give a number above 0" in capsys.readouterr().err
     monkeypatch.setattr(page, "find_spec", lambda name: None)
     assert cflow("view") == 2 and "pip install 'k3d>=3.2'" in capsys.readouterr().err
