@@ -6,7 +6,7 @@ import re
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Iterable
+from typing import Any, Iterable, Iterator, Mapping
 
 import yaml  # type: ignore[import-untyped]
 
@@ -30,12 +30,18 @@ def files(group: str) -> list[Path]:
 
 def settings(command: str) -> list[str]:
     """Return the names of all settings of a command in dotted form, those of every choice of its groups included."""
-    found = [*own_settings(CONFIGS / f"{command}.yaml")]
-    found += [f"model.{name}" for preset in PRESETS for name in make_config(preset).as_dict()]
+    of_methods = [f"model.{name}" for preset in PRESETS for name in make_config(preset).as_dict()]
+    return list(dict.fromkeys([*(name for name, _, _ in defaults(command)), *of_methods]))
+
+
+def defaults(command: str, chosen: Mapping[str, Any] | None = None) -> Iterator[tuple[str, str, Any]]:
+    """Yield the dotted name, the file and the default of each setting in configs/; `chosen` limits the choices."""
+    found = [("", CONFIGS / f"{command}.yaml")]
     for group in groups(command):
         if group in PREFIXES:
-            found += [f"{PREFIXES[group]}{name}" for file in files(group) for name in own_settings(file)]
-    return list(dict.fromkeys(found))
+            found += [(PREFIXES[group], f) for f in files(group) if chosen is None or chosen[group] == f.stem]
+    for prefix, file in found:
+        yield from ((prefix + name, file.stem, default) for name, default in own_settings(file).items())
 
 
 def own_settings(file: Path) -> dict[str, Any]:

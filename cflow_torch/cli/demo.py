@@ -18,8 +18,8 @@ from omegaconf import DictConfig
 
 from cflow_torch.applications.tracking import track
 from cflow_torch.cli import run
+from cflow_torch.cli.eval import Scores
 from cflow_torch.cli.pairs import for_each_pair
-from cflow_torch.cli.record import Scores
 from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log

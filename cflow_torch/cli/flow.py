@@ -47,12 +47,11 @@ from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Shard, find_shard
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
 from cflow_torch.fleet.manifest import check_folder, claim_folder, complete_frames, frame_file, make_identity
-from cflow_torch.fleet.report import count_frames, forecast, format_missing, format_report
-from cflow_torch.fleet.run import report_file, run_fleet
+from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
 from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError
 
-_FOR_TRACKS = {"residual", "cluster_id", "is_valid"}  # contents
+_FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
 _TRACK_FORMATS = {"mot": write_mot, "kitti": write_kitti}
 
 
@@ -145,19 +144,19 @@ def _check_results(cfg: DictConfig, flow: FlowRun) -> None:
 
 
 def _contents(cfg: DictConfig, has_confidence: bool) -> tuple[str, ...]:
-    allowed = (*CONTENTS, *ON_REQUEST)
+    allowed = (*CONTENTS, *ON_REQUEST) if has_confidence else CONTENTS
     if cfg.contents == "auto":
-        return allowed if has_confidence else CONTENTS
+        return allowed
     given = list(cfg.contents) if OmegaConf.is_list(cfg.contents) else [cfg.contents]
     if not given or set(given) - set(allowed):
-        raise CFlowError(f"contents={given}: give auto, or some of {', '.join(allowed)}")
-    if "confidence" in given and not has_confidence:
-        raise CFlowError(f"contents={given}: only model=default and offline have a confidence")
-    if cfg.result_name is not None and not set(given) >= set(CONTENTS):
-        raise CFlowError("result_name= reads the flow files: it needs all contents")
-    needed = _FOR_TRACKS | {"confidence"} if has_confidence else _FOR_TRACKS
-    if cfg.tracks and not set(given) >= needed:
-        raise CFlowError(f"tracks=true reads the flow files: contents needs {', '.join(sorted(needed))}")
+        why = "" if has_confidence else "; only model=default and offline have a confidence"
+        raise CFlowError(f"contents={given}: give auto, or some of {', '.join(allowed)}{why}")
+    needed = set(CONTENTS) if cfg.result_name is not None else set()
+    if cfg.tracks:
+        needed |= _FOR_TRACKS & set(allowed)
+    missing = sorted(needed - set(given))
+    if missing:
+        raise CFlowError(f"contents={given}: result_name= and tracks= read the flow files: add {', '.join(missing)}")
     return tuple(name for name in allowed if name in given)
 
 

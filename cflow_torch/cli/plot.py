@@ -33,6 +33,7 @@ from cflow_torch.cli import run
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import Log, window
+from cflow_torch.fleet.work import source_name
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -70,17 +71,15 @@ def task(cfg: DictConfig) -> None:
 def find_log(cfg: DictConfig) -> Log:
     """Open the log `cfg.log` of `cfg.data`, or the first one."""
     sources = run.find_logs(cfg)
-    if cfg.log is None:
-        return sources.open(sources.logs[0])
-    # Most logs are named after their file or folder. Then we open no other one.
-    names = [getattr(source, "stem", source.name) for source in sources.logs]
-    chosen = [source for source, name in zip(sources.logs, names) if name == cfg.log]
-    for source in chosen or sources.logs:
-        with suppress(*(() if chosen else (CFlowError, OSError))):
+    named = {source_name(source): source for source in sources.logs}
+    if cfg.log is None or cfg.log in named:
+        return sources.open(named.get(cfg.log, sources.logs[0]))
+    for source in sources.logs:  # few logs are not named after their file or folder
+        with suppress(CFlowError, OSError):
             log = sources.open(source)
             if log.log_id == cfg.log:
                 return log
-    raise CFlowError(f"log={cfg.log}: there is no such log; give one of {', '.join(sorted(names))}")
+    raise CFlowError(f"log={cfg.log}: there is no such log; give one of {', '.join(sorted(named))}")
 
 
 def _from_above(cfg: DictConfig, model: SceneFlowModel, log: Log, sweeps: Window) -> Any:

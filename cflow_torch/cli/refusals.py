@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Iterator, Mapping
+from typing import Any, Mapping
 
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 
-from cflow_torch.cli.choices import CONFIGS, PREFIXES, files, groups, near, own_settings, settings
-from cflow_torch.config import CONFIGS as METHODS
-from cflow_torch.config import REMOVED_PRESETS, config_from, removed_preset
+from cflow_torch.cli.choices import defaults, files, groups, near, own_settings, settings
+from cflow_torch.config import CONFIGS, REMOVED_PRESETS, config_from, removed_preset
 from cflow_torch.errors import CFlowError
 from cflow_torch.setting import bounds, checked
 
@@ -44,7 +43,7 @@ class UnfinishedJob(RuntimeError):
 def check_settings(cfg: Any, command: str, choices: Mapping[str, Any]) -> None:
     """Check settings and the path of the data, before torch is imported. `choices` are those of the groups."""
     config_from(OmegaConf.to_container(cfg.model, resolve=True))  # type: ignore[arg-type]
-    for name, file, default in _defaults(command, choices):
+    for name, file, default in defaults(command, choices):
         value = OmegaConf.select(cfg, name, default=default)
         own = name.rpartition(".")[2]
         limits = _ALLOWED.get(f"{file}.{own}") or _ALLOWED.get(own) or _TYPES.get(type(default))
@@ -60,14 +59,6 @@ def check_settings(cfg: Any, command: str, choices: Mapping[str, Any]) -> None:
     root = cfg.data.get("root")
     if isinstance(root, str) and "://" not in root and not Path(root).exists():
         raise CFlowError(f"{root}: there is no such file or folder; settings are NAME=VALUE")
-
-
-def _defaults(command: str, choices: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
-    """Yield the name, file and default of all settings of a command, except those of the method."""
-    chosen = [(prefix, CONFIGS / group / f"{choices.get(group)}.yaml") for group, prefix in PREFIXES.items()]
-    for prefix, file in [("", CONFIGS / f"{command}.yaml"), *chosen]:
-        if file.exists():
-            yield from ((prefix + name, file.stem, default) for name, default in own_settings(file).items())
 
 
 def explain(error: Exception, command: str) -> str:
@@ -87,7 +78,7 @@ def explain(error: Exception, command: str) -> str:
     message = " ".join((f"{error}: {error.__cause__}" if error.__cause__ else str(error)).split())
     unknown = re.search(r"Key '.*?' (?:is )?not in .*full_key: (\S+) object_type=(\w+)", message)
     if unknown:
-        methods = {config.__name__: method for method, config in METHODS.items()}
+        methods = {config.__name__: method for method, config in CONFIGS.items()}
         return _unknown_setting(unknown[1], methods.get(unknown[2]), command)
     message = message.partition(" full_key:")[0].replace("Error merging override ", "")
     return f"{message}; `cflow {command} --help` has examples"
@@ -98,7 +89,7 @@ def _unknown_setting(key: str, method: str | None, command: str) -> str:
     group, _, name = key.rpartition(".")
     if group == "model" and method is not None and name != "pixel_size":
         try:
-            METHODS[method]().replace(**{name: None})
+            CONFIGS[method]().replace(**{name: None})
         except CFlowError as error:
             if not str(error).startswith("unknown"):
                 return str(error)

@@ -15,7 +15,6 @@ examples:
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
@@ -64,7 +63,7 @@ def task(cfg: DictConfig) -> None:
     archive.pack(folder, [frame.name for frame, _ in plan], file)
     try:
         _check(file, version, plan)
-    except SystemExit:  # the archive stays only if it passes
+    except BaseException:  # the archive stays only if it passes
         file.unlink()
         raise
     print(f"version {version.number}, for {version.server}: {file}, {file.stat().st_size:,} bytes")
@@ -108,11 +107,6 @@ def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Ma
 def _check(path: Any, version: SubmissionVersion, plan: Plan) -> None:
     """Print what was checked. If there are problems, list them all and exit with status 1."""
     problems = archive.check_submission(path, version, {frame.name: rows for frame, rows in plan})
-    if problems:
-        print(f"{path} is not a valid version {version.number} submission for this data:", file=sys.stderr)
-        for problem in problems:
-            print(f"  {problem}", file=sys.stderr)
-        print(f"problems: {len(problems)}", file=sys.stderr)
-        raise SystemExit(1)
+    run.finish([(str(path), problem) for problem in problems])
     rows = sum(rows for _, rows in plan)
     print(f"{path}: passes as version {version.number}, frames: {len(plan)}, rows: {rows:,}")

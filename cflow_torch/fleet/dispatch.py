@@ -1,18 +1,20 @@
-"""Distribute units among worker processes and repeat what is lost when one of them dies."""
+"""Engine `local`: distribute units among worker processes and repeat what is lost when one of them dies."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
+from contextlib import closing
 from dataclasses import replace
 from queue import Empty, Queue
 from threading import Thread
 from typing import Any, Callable, Iterator, Sequence
 
-from cflow_torch.fleet.job import Done, Event, Failed, Noted, Opened, Unit
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Unit
+from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.progress import log_line
-from cflow_torch.fleet.work import describe, source_name
+from cflow_torch.fleet.work import Worker, describe, make_worker, source_name
 from cflow_torch.types import CFlowError
 
 _POLL_S = 0.2  # how soon a signal is noticed
@@ -23,8 +25,37 @@ _MAX_FAILED_STARTS = 3  # in a row; then a worker is given up
 _MAX_DEATHS = 10
 
 
+def run_local(
+    job: Job,
+    units: Sequence[Unit],
+    layout: Layout,
+    stop: Callable[[], bool],
+    *,
+    timeout: float = 600.0,
+    memory: float | None = None,
+) -> Iterator[Event]:
+    """Do all units with processes of this machine, one per device, and yield events as they happen, see `dispatch`.
+
+    A single worker without a memory limit runs in this process.
+
+    Args:
+        timeout: seconds after which a worker process that has not answered is replaced.
+        memory: bytes of address space that each worker process may use, of which Python and torch need about 3e9;
+            None = no limit. Use it on a CPU only: the driver of a GPU reserves far more than it uses.
+    """
+    if len(layout.devices) > 1 or memory is not None:
+        processes = [ChildProcess(make_worker, job, device, memory, timeout=timeout) for device in layout.devices]
+        yield from dispatch(processes, units, stop)
+        return
+    with closing(Worker(job, layout.devices[0])) as worker:
+        for unit in units:
+            if stop():
+                break
+            yield from worker.run(unit, stop)
+
+
 def dispatch(
-    processes: Sequence[ChildProcess], units: Sequence[Unit], stop: Callable[[], bool], retries: int
+    processes: Sequence[ChildProcess], units: Sequence[Unit], stop: Callable[[], bool], retries: int = 1
 ) -> Iterator[Event]:
     """Do all units, and yield events as they happen. If no worker can start, that is a `CFlowError`.
 

@@ -86,20 +86,19 @@ def run_ray(
 class _Actor:
     """A worker of the job in a process of Ray, perhaps on another machine; `folder` is the driver's working folder."""
 
-    def __init__(self, folder: str, job: Job, device: str) -> None:
-        self._folder, self._job, self._device, self._stops = folder, job, device, False
+    _stops = False
 
-    def start(self) -> None:
+    def start(self, folder: str, job: Job, device: str) -> None:
         import ray
 
-        job, node = self._job, ray.util.get_node_ip_address()
+        node = ray.util.get_node_ip_address()
         if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
             raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than the driver")
         if not (as_path(job.output) / MANIFEST).exists():
             raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
         with suppress(OSError):  # relative paths of data must mean the same as in the driver
-            os.chdir(self._folder)
-        self._run = make_worker(job, self._device)
+            os.chdir(folder)
+        self._run = make_worker(job, device)
 
     def run(self, unit: Unit) -> Iterator[Event]:
         yield from self._run(unit, lambda: self._stops)
@@ -117,8 +116,8 @@ class _Process(ChildProcess):
         self._actor: Any = None
 
     def start(self) -> None:
-        self._actor = self._make(*self._arguments)
-        self._get(self._actor.start.remote())
+        self._actor = self._make()
+        self._get(self._actor.start.remote(*self._arguments))
 
     def call(self, *arguments: Any) -> Iterator[Event]:
         for event in self._actor.run.options(num_returns="streaming").remote(*arguments):

@@ -1,60 +1,30 @@
-"""A whole run: start the engine, count its events, react to signals, write the report."""
+"""A whole run: start the engine, count its events, write the report; or count what a run would do."""
 
 from __future__ import annotations
 
-import os
+import platform
 import signal
-import threading
 import time
-from contextlib import closing, suppress
-from typing import Any, Callable, Iterator, Sequence
+from collections import Counter
+from contextlib import closing
+from typing import Any, Iterable, Iterator, Sequence
 
 from cflow_torch.data.atomic import remove_stale
+from cflow_torch.data.catalog import open_log
 from cflow_torch.data.files import write_json
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.dispatch import dispatch
-from cflow_torch.fleet.job import Event, Failed, Job, Noted, Shard, Unit
+from cflow_torch.fleet.dispatch import run_local
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Shard, Unit
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.processes import SIGNALS, ChildProcess
+from cflow_torch.fleet.manifest import complete_frames
+from cflow_torch.fleet.processes import StopSignal
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.ray_engine import run_ray
-from cflow_torch.fleet.report import Counters
-from cflow_torch.fleet.work import Worker, make_worker
+from cflow_torch.fleet.work import describe, source_name
 from cflow_torch.types import CFlowError
 
-_SHOWN = 3  # how often a message is shown; the report names all logs that it is about
-_RETRIES = 1  # of a unit after a worker process died on it
-
-
-def run_local(
-    job: Job,
-    units: Sequence[Unit],
-    layout: Layout,
-    stop: Callable[[], bool],
-    *,
-    timeout: float = 600.0,
-    memory: float | None = None,
-) -> Iterator[Event]:
-    """Do all units with processes of this machine, one per device, and yield events as they happen, see `dispatch`.
-
-    A single worker without a memory limit runs in this process.
-
-    Args:
-        timeout: seconds after which a worker process that has not answered is replaced.
-        memory: bytes of address space that each worker process may use, of which Python and torch need about 3e9;
-            None = no limit. Use it on a CPU only: the driver of a GPU reserves far more than it uses.
-    """
-    if len(layout.devices) > 1 or memory is not None:
-        processes = [ChildProcess(make_worker, job, device, memory, timeout=timeout) for device in layout.devices]
-        yield from dispatch(processes, units, stop, _RETRIES)
-        return
-    with closing(Worker(job, layout.devices[0])) as worker:
-        for unit in units:
-            if stop():
-                break
-            yield from worker.run(unit, stop)
-
-
+_SHOWN_NOTES = 3  # how often a message is shown; the report names all logs that it is about
+_SHOWN_FAILURES = 20  # that are listed at the end; the report has them all
 ENGINES: dict[str, Any] = {"local": run_local, "ray": run_ray}
 
 
@@ -117,41 +87,152 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
                 progress.total = round(counters.total * max(1, num_units / counters.num_opened))
             if isinstance(event, Failed):
                 log_line(f"failed: {event.name}: {event.message}")
-            elif isinstance(event, Noted) and counters.times_noted(event.message) <= _SHOWN:
+            elif isinstance(event, Noted) and counters.times_noted(event.message) <= _SHOWN_NOTES:
                 log_line(f"warning: {event.name}: {event.message}")
             progress.update(settled)
         progress.total = progress.n
 
 
-class StopSignal:
-    """A context in which the first of `SIGNALS` only sets `received`, and the second one raises KeyboardInterrupt.
+def count_frames(job: Job, units: Iterable[Unit]) -> Iterator[tuple[str, int, int]]:
+    """Yield the name of each unit's log, the number of its frames, and how many of them are not complete.
 
-    Schedulers send SIGTERM some seconds before they kill (preemption, time limit). Python handles signals in the main
-    thread only; in other threads this does nothing.
+    A log that cannot be opened has none. Cost: opens the log and lists its files in the output. Nothing is written.
     """
+    for unit in units:
+        try:
+            with open_log(job.reader, unit.source, **{**job.settings, "check": False, "odometry": False}) as log:
+                stamps = {int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
+                complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
+                yield log.log_id, len(stamps), len(stamps - complete)
+        except Exception as error:
+            yield f"{source_name(unit.source)}: cannot be opened: {describe(error)}", 0, 0
 
-    def __init__(self) -> None:
-        self.received: int | None = None
-        self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> StopSignal:
-        if threading.current_thread() is threading.main_thread():
-            for number in SIGNALS:
-                if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
-                    self._before[number] = signal.signal(number, self._receive)
-        return self
+def forecast(job: Job, units: Sequence[Unit]) -> str:
+    """Count the frames that a run would compute: a table with a row per log."""
+    rows = list(count_frames(job, units))
+    total, left = sum(frames for _, frames, _ in rows), sum(todo for _, _, todo in rows)
+    lines = [f"{frames:8} {todo:8}  {name}" for name, frames, todo in rows]
+    end = f"{total:8} {left:8}  in total; dry run: nothing was written to {job.output}"
+    return "\n".join(["  frames    to do  log", *lines, end])
 
-    def __exit__(self, *_: Any) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
 
-    def __call__(self) -> bool:
-        return self.received is not None
+class Counters:
+    """Counts the frames of a run, from all its units."""
 
-    def _receive(self, number: int, _: Any) -> None:
-        if self.received is not None:
-            raise KeyboardInterrupt
-        self.received = number
-        name = signal.Signals(number).name
-        with suppress(OSError):  # `print` is not safe here: the signal may interrupt another one
-            os.write(2, f"\n{name}: finishing the frames that have begun; repeat the signal to end at once\n".encode())
+    def __init__(self, units: Sequence[Unit]) -> None:
+        self.failures: list[tuple[str, str]] = []  # (frame or log, message)
+        self.notes: Counter[tuple[str, str]] = Counter()  # (log, message)
+        self.num_opened = self.total = self.num_before = self.num_failed = 0  # units; frames
+        self._waiting: dict[tuple[int, int], str] = {}  # (unit number, time stamp) -> frame, neither on disk nor failed
+        self._unopened = {unit.number for unit in units}
+        self._seconds: Counter[str] = Counter()  # by stage, of all workers together
+
+    @property
+    def waiting(self) -> list[str]:
+        """Frames of opened units that are neither on disk nor failed, in order."""
+        return [self._waiting[key] for key in sorted(self._waiting)]
+
+    @property
+    def is_complete(self) -> bool:
+        return not (self.failures or self._unopened or self._waiting)
+
+    def times_noted(self, message: str) -> int:
+        """Count how often a message was noted, for any log."""
+        return sum(count for (_, text), count in self.notes.items() if text == message)
+
+    def add(self, event: Event) -> int:
+        """Count an event. Returns the number of frames that it settles: they are on disk, or have failed."""
+        if isinstance(event, Noted):
+            self.notes[event.name, event.message] += 1
+            return 0
+        self._unopened.discard(event.unit)
+        if isinstance(event, Opened):
+            num_before = len(event.frames) - len(event.todo)
+            self.num_opened += 1
+            self.total += len(event.frames)
+            self.num_before += num_before
+            self._waiting.update({(event.unit, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
+            return num_before
+        if isinstance(event, Done):
+            self._seconds.update(event.seconds)
+        else:
+            self.failures.append((event.name, event.message))
+            self.num_failed += event.timestamp is not None
+        if event.timestamp is not None:
+            self._waiting.pop((event.unit, event.timestamp), None)
+        return int(event.timestamp is not None)
+
+    def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
+        """Return all figures of a run that took `seconds`. `signal_name` is the signal that stopped it, "" = none.
+
+        Returns:
+            "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": the counts
+            "total", "complete_before", "computed", "failed" and "waiting" (of opened logs, not done), and the counts of
+            logs or parts of logs "failed_logs" and "unopened_units"; "frames_per_s" of those computed; "stages":
+            seconds per computed frame, summed over the workers, although these work at the same time; lists of
+            "failures" and of "waiting" frames; "notes": log, message and how often.
+        """
+        computed = self.total - self.num_before - self.num_failed - len(self._waiting)
+        return {
+            "status": "interrupted" if signal_name else "complete" if self.is_complete else "incomplete",
+            "stopped_by": signal_name or None,
+            "engine": engine,
+            "shard": {"index": shard.index, "count": shard.count},
+            "devices": list(layout.devices),
+            "batch": layout.batch,
+            "machine": platform.platform(),
+            "frames": {
+                "total": self.total,
+                "complete_before": self.num_before,
+                "computed": computed,
+                "failed": self.num_failed,
+                "failed_logs": len(self.failures) - self.num_failed,
+                "waiting": len(self._waiting),
+                "unopened_units": len(self._unopened),
+            },
+            "seconds": seconds,
+            "frames_per_s": computed / seconds if seconds > 0 else 0.0,
+            "stages": {name: total / max(1, computed) for name, total in self._seconds.items()},
+            "failures": [list(failure) for failure in self.failures],
+            "waiting": self.waiting,
+            "notes": [[*note, count] for note, count in self.notes.items()],
+        }
+
+
+def format_report(report: dict[str, Any], verbose: bool = False) -> str:
+    """Return the report as a table. With `verbose`, the table has the times of the stages, too."""
+    frames, shard, devices = report["frames"], report["shard"], report["devices"]
+    workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
+    rows = {
+        "status": report["status"] + (f" by {report['stopped_by']}" if report["stopped_by"] else ""),
+        "engine": f"{report['engine']}, {workers}, shard {shard['index']} of {shard['count']}",
+        "frames": frames["total"],
+        "  complete before": frames["complete_before"],
+        "  computed": frames["computed"],
+        "  failed": frames["failed"],
+        "  not done": frames["waiting"],
+    }
+    seldom = {
+        "warnings": sum(count for *_, count in report["notes"]),
+        "logs or parts of logs that failed": frames["failed_logs"],
+        "logs or parts of logs not begun": frames["unopened_units"],
+    }
+    rows.update({name: count for name, count in seldom.items() if count})
+    rows.update({"seconds": f"{report['seconds']:.1f}", "frames/s": f"{report['frames_per_s']:.2f}"})
+    if verbose and report["stages"]:
+        rows["ms per frame and worker (stages overlap)"] = ""
+        rows.update({f"  {name}": f"{1e3 * seconds:.1f}" for name, seconds in report["stages"].items()})
+    width = max(map(len, rows))
+    return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows.items())
+
+
+def format_missing(report: dict[str, Any]) -> str:
+    """List what is missing, a line each; "" if nothing is."""
+    failures = [f"  {name}: {message}" for name, message in report["failures"]]
+    lines = [*dict.fromkeys(failures), *(f"  {name}: not done" for name in report["waiting"])]  # parts of a log repeat
+    if len(lines) > _SHOWN_FAILURES:
+        lines[_SHOWN_FAILURES:] = [f"  and {len(lines) - _SHOWN_FAILURES} more, all of them in the report"]
+    if report["frames"]["unopened_units"]:
+        lines.append(f"  {report['frames']['unopened_units']} logs or parts of logs: not begun")
+    return "\n".join(lines)

@@ -319,7 +319,7 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
     capsys.readouterr()
     assert call("flow", "small", *run, "contents=[residual,cluster_id,is_valid]") == 2
-    assert "contents needs cluster_id, confidence" in capsys.readouterr().err
+    assert "add confidence" in capsys.readouterr().err
 
 
 def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from small_logs import write_small_log
 from cflow_torch import make_config
 from cflow_torch.cli import pairs, run
 from cflow_torch.cli.comparison import summary
-from cflow_torch.cli.record import objective
+from cflow_torch.cli.eval import objective
 from cflow_torch.config import config_from
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet.machine import Layout

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import CONFIGS
 from cflow_torch.cli.comparison import compare
-from cflow_torch.cli.record import objective
+from cflow_torch.cli.eval import objective
 from cflow_torch.cli.run import make_model
 
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)

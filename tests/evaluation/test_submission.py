@@ -268,7 +268,7 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
     two.unlink()
     assert cflow(*call, f"archive={tmp_path / 'v3'}") == 1
     error = capsys.readouterr().err
-    assert f"{two.name}: missing" in error and "problems: 1" in error
+    assert f"{two.name}: missing" in error and "1 failed:" in error
     (tmp_path / "v3" / "notes.txt").write_text("mine")
     assert cflow(*call) == 1, "an unknown file is reported"
     assert "notes.txt" in capsys.readouterr().err

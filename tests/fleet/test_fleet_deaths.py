@@ -16,7 +16,7 @@ import pytest
 from small_fleet import COMMAND, PAIRS, TWO, command, flow_files, frames, run, tree
 
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.fleet import run as running
+from cflow_torch.fleet import dispatch as running
 from cflow_torch.fleet import work
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")

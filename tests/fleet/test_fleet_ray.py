@@ -14,7 +14,7 @@ from small_fleet import PAIRS, TWO, make_job, run, tree
 
 from cflow_torch import CFlowError
 from cflow_torch.fleet import ray_engine
-from cflow_torch.fleet.job import Unit
+from cflow_torch.fleet.job import Job, Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.ray_engine import run_ray
 
@@ -34,8 +34,12 @@ def test_equals_the_local_engine_byte_for_byte(fleet, single, tmp_path):
 class LethalActor(ray_engine._Actor):
     """A worker whose process is killed at each call of a unit that still has a file next to the output."""
 
+    def start(self, folder: str, job: Job, device: str) -> None:
+        self.folder = Path(job.output).parent
+        super().start(folder, job, device)
+
     def run(self, unit: Unit) -> Any:
-        file = Path(self._job.output).parent / f"kills-{unit.number}"
+        file = self.folder / f"kills-{unit.number}"
         count = int(file.read_text()) if file.exists() else 0
         if count > 0:
             file.write_text(str(count - 1))

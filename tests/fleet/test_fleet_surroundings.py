@@ -18,8 +18,8 @@ from cflow_torch import CFlowError, make_config
 from cflow_torch.fleet import machine, progress
 from cflow_torch.fleet.job import Shard, find_shard
 from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
+from cflow_torch.fleet.processes import StopSignal
 from cflow_torch.fleet.progress import Progress, log_line
-from cflow_torch.fleet.run import StopSignal
 
 
 @settings(deadline=None)  # the first call imports

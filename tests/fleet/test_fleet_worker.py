@@ -20,7 +20,7 @@ from cflow_torch.fleet.dispatch import WorkerDied, dispatch
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Shard, Unit
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.processes import ChildProcess
-from cflow_torch.fleet.report import Counters, format_missing, format_report
+from cflow_torch.fleet.run import Counters, format_missing, format_report
 from cflow_torch.fleet.work import Worker
 from cflow_torch.simulator import make_drive
 
