@@ -22,6 +22,7 @@ from cflow_torch.config import Config
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.files import write_json
 from cflow_torch.data.log import Log, window
+from cflow_torch.evaluation.tables import markdown
 from cflow_torch.stages import FlowModel, TimedModel
 from cflow_torch.types import Window
 from cflow_torch.windows.memory import peak_memory
@@ -80,7 +81,7 @@ def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: 
 def format_report(report: dict[str, Any]) -> str:
     seconds, model = report["seconds"], report["model"]
     peak = "unknown" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
-    rows = {"total, median": seconds["median"], "min": seconds["min"], "max": seconds["max"], **seconds["stages"]}
+    times = {"total, median": seconds["median"], "min": seconds["min"], "max": seconds["max"], **seconds["stages"]}
     lines = [
         f"method {model['method']}, num_history {model.get('num_history', 0)}, pixel_sizes {model['pixel_sizes']}",
         f"device {report['device']}; {report['machine']['cpu']}, one thread",
@@ -88,14 +89,11 @@ def format_report(report: dict[str, Any]) -> str:
         f"{report['repeats']} times; torch {report['versions']['torch']}",
         f"peak memory (CPU: of the process, GPU: allocated): {peak}",
         "",
-        "| one window | ms |",
-        "|---|---:|",
-        *(f"| {name} | {1000 * value:.1f} |" for name, value in rows.items()),
+        *markdown(["one window", "ms"], [[name, f"{1000 * value:.1f}"] for name, value in times.items()]),
     ]
-    if report["batches"]:
-        lines += ["", "| windows in a batch | ms | windows per second |", "|---|---:|---:|"]
-    for size, figures in report["batches"].items():
-        lines.append(f"| {size} | {1000 * figures['median']:.1f} | {figures['windows_per_s']:.1f} |")
+    batches = [[n, f"{1000 * b['median']:.1f}", f"{b['windows_per_s']:.1f}"] for n, b in report["batches"].items()]
+    if batches:
+        lines += ["", *markdown(["windows in a batch", "ms", "windows per second"], batches)]
     return "\n".join(lines)
 
 

@@ -39,7 +39,7 @@ def defaults(command: str, chosen: Mapping[str, Any] | None = None) -> Iterator[
     found = [("", CONFIGS / f"{command}.yaml")]
     for group in groups(command):
         if group in PREFIXES:
-            found += [(PREFIXES[group], f) for f in files(group) if chosen is None or chosen[group] == f.stem]
+            found += [(PREFIXES[group], f) for f in files(group) if chosen is None or chosen.get(group) == f.stem]
     for prefix, file in found:
         yield from ((prefix + name, file.stem, default) for name, default in own_settings(file).items())
 
@@ -66,13 +66,10 @@ def _load(file: Path) -> dict[str, Any]:
 
 
 def near(word: str, known: Iterable[str]) -> str:
-    """The hint " (did you mean X?)" with the most similar known word; "" if none is similar."""
-    names = list(known)
+    """The hint " (did you mean X?)" with the most similar name, with or without its group; "" if none is similar."""
+    names = {form: name for name in known for form in (name.rpartition(".")[2], name)}
     found = get_close_matches(word, names, 1)
-    if not found:  # `pixel_sizes` instead of `model.pixel_sizes`
-        full = {name.rpartition(".")[2]: name for name in names}
-        found = [full[name] for name in get_close_matches(word, full, 1)]
-    return f" (did you mean {found[0]}?)" if found else ""
+    return f" (did you mean {names[found[0]]}?)" if found else ""
 
 
 def settings_help(command: str) -> str:

@@ -15,7 +15,6 @@ examples:
 from __future__ import annotations
 
 import hashlib
-import json
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -29,7 +28,7 @@ from cflow_torch.cli import run
 from cflow_torch.cli.comparison import RESULTS, headline, summary
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.files import describe_changes, json_ready, write_json
+from cflow_torch.data.files import describe_changes, json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
@@ -91,21 +90,18 @@ class Scores:
         The seconds are those of `TimedModel.report`.
         """
         results = self.metrics.compute()
-        data = {
-            "label": self._cfg.data.label,
-            "generator": _generator(self._cfg),
-            "logs": [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs],
-            "digest": self._digest.hexdigest()[:16],
-        }
         record = {
             "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-            "versions": run.versions(),
             "machine": run.machine(),
             "num_pairs": results["num_frames"],
-            "failures": [list(failure) for failure in failures],
+            "failures": failures,
             "seconds_per_pair": seconds,
-            "data": data,
-            "config": _plain(self._cfg),
+            "data": {
+                "label": self._cfg.data.label,
+                "logs": [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs],
+                "digest": self._digest.hexdigest()[:16],
+            },
+            **_origin(self._cfg),
             "definition": asdict(self.metrics.definition),
             "results": results,
         }
@@ -123,15 +119,9 @@ def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
     file = folder / RESULTS
     if cfg.overwrite or not file.exists():
         return None
-    try:
-        record: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-        objective(record["results"])
-        before = {"versions": record["versions"], "generator": record["data"]["generator"], "config": record["config"]}
-    except (ValueError, KeyError, TypeError) as error:
-        hint = "give output=FOLDER, or overwrite=true"
-        raise CFlowError(f"{file} is not a results file of this version ({error!r}): {hint}") from None
-    now = {"versions": run.versions(), "generator": _generator(cfg), "config": _plain(cfg)}
-    changed = describe_changes(before, now, _PATHS)
+    record: dict[str, Any] = read_json(file)
+    now = _origin(cfg)
+    changed = describe_changes({key: record.get(key) for key in now}, now, _PATHS)
     if changed:
         raise CFlowError(f"{folder} has results of another run ({changed}): give output=FOLDER, or overwrite=true")
     return record
@@ -146,9 +136,8 @@ def objective(results: dict[str, Any]) -> float:
     return float("nan") if value is None else float(value)
 
 
-def _generator(cfg: DictConfig) -> str | None:
-    return generator_key() if cfg.data.get("name") == "benchmark" else None
-
-
-def _plain(cfg: DictConfig) -> Any:
-    return json_ready(OmegaConf.to_container(cfg, resolve=True))
+def _origin(cfg: DictConfig) -> dict[str, Any]:
+    """What determines the results, as JSON holds it."""
+    generator = generator_key() if cfg.data.get("name") == "benchmark" else None
+    settings = json_ready(OmegaConf.to_container(cfg, resolve=True))
+    return {"versions": run.versions(), "generator": generator, "config": settings}

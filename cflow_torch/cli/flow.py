@@ -117,7 +117,7 @@ def compute(
             count += todo
             if count >= least * len(layout.devices):
                 break
-        layout = choose_layout(cfg.device, workers, batch, os.environ, count // least)
+        layout = layout._replace(devices=layout.devices[: max(1, count // least)])
     about = {"config": settings, "versions": run.versions()}
     report = run_fleet(job, sources.logs, layout, shard, name, about, **engine)
     failures = [] if report["stopped_by"] else use(cfg, flow, report)  # a signal leaves no time for this

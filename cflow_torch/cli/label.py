@@ -80,9 +80,7 @@ def _label(cfg: DictConfig, flow: FlowRun, report: dict[str, Any]) -> Failures:
             write_hdf5_labels(scene, labels, flow.job.identity, overwrite=flow.job.redo)
             labelled.append(scene.name)
     print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
-    if scenes:
-        file = scenes[0].parent / f"cflow_label-{flow.shard.index}-of-{flow.shard.count}.json"
-        kept = {"labelled": labelled, "waiting": waiting, "not_labelled": [list(failure) for failure in failures]}
-        write_json(file, {**report, **kept})
-        print(f"report: {file}")
+    file = scenes[0].parent / f"cflow_label-{flow.shard.index}-of-{flow.shard.count}.json"
+    write_json(file, {**report, "labelled": labelled, "waiting": waiting, "not_labelled": failures})
+    print(f"report: {file}")
     return failures

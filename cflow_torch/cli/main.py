@@ -7,7 +7,6 @@ import os
 import re
 import sys
 import traceback
-from difflib import get_close_matches
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -83,12 +82,11 @@ def _run(arguments: list[str]) -> None:
         return print(HELP)
     if command in ("-V", "--version"):
         return print(f"cflow_torch {__version__}")
-    if command not in COMMANDS:
-        near = get_close_matches(command, COMMANDS, 1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        _exit_wrong(f"unknown command {command!r}{hint}: give one of {', '.join(COMMANDS)}")
+    from cflow_torch.cli.choices import near
     from cflow_torch.errors import CFlowError
 
+    if command not in COMMANDS:
+        _exit_wrong(f"unknown command {command!r}{near(command, COMMANDS)}: give one of {', '.join(COMMANDS)}")
     has_settings = command not in _WITHOUT_SETTINGS
     if "-h" in rest or "--help" in rest:
         return print(_help(command, has_settings), end="")
@@ -113,8 +111,7 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
     import hydra
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    from cflow_torch.cli import presets  # noqa: F401 (registers them)
-    from cflow_torch.cli.refusals import UnfinishedJob, explain
+    from cflow_torch.cli.checks import UnfinishedJob, explain
 
     overrides, options = split(rest)
     for option in unknown_options(options):
@@ -180,7 +177,7 @@ def _run_job(command: str, cfg: Any) -> Any:
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from cflow_torch.cli.refusals import UnfinishedJob, check_settings, explain
+    from cflow_torch.cli.checks import UnfinishedJob, check_settings, explain
     from cflow_torch.errors import CFlowError
 
     try:

@@ -17,7 +17,7 @@ from cflow_torch.cli.run import Failures, collect_failures
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
 from cflow_torch.fleet.processes import ChildProcess, WorkerDied
-from cflow_torch.fleet.progress import frames, show_warnings_as_lines
+from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
 from cflow_torch.fleet.work import run_ahead
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
@@ -56,10 +56,10 @@ def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, A
             recent = CachedLog(log, config.num_sweeps)
         return window(recent, index, config.num_history, config.num_future)
 
-    devices = choose_layout(method.device, AUTO, AUTO, os.environ, len(pairs) // frames_per_worker(config)).devices
-    count = len(devices) if devices[0] == "cpu" else 1
+    devices = choose_layout(method.device, AUTO, AUTO, os.environ).devices
+    count = min(len(devices), len(pairs) // frames_per_worker(config)) if devices[0] == "cpu" else 1
     if count < 2:
-        for pair in frames(pairs):
+        for pair in Progress(pairs):
             yield pair, lambda pair=pair: _estimate(model, read(*pair))  # type: ignore[misc]
         return
     processes = [ChildProcess(_make_estimate, method) for _ in range(count)]
@@ -89,7 +89,7 @@ def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, A
     with ThreadPoolExecutor(count) as threads:
         try:
             with closing(run_ahead(threads, compute, map(try_to_read, pairs), _AHEAD * count)) as futures:
-                for pair, future in zip(frames(pairs), futures):
+                for pair, future in zip(Progress(pairs), futures):
                     yield pair, future.result
         finally:
             for process in processes:

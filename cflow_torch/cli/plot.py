@@ -45,8 +45,6 @@ from cflow_torch.viz.keypoints import plot_keypoints
 from cflow_torch.viz.scales import plot_scales
 from cflow_torch.viz.style import blank_figure
 
-_PAIR = 3  # default; some history precedes it
-
 
 def task(cfg: DictConfig) -> None:
     output = run.local_folder(cfg)
@@ -57,7 +55,7 @@ def task(cfg: DictConfig) -> None:
     else:
         log = find_log(cfg)
         if cfg.pair is None:
-            cfg.pair = min(_PAIR, len(log.timestamps) - 2)
+            cfg.pair = min(3, len(log.timestamps) - 2)  # some history precedes it
         pair = cfg.pair
         run.check_pair(pair, log)
         sweeps = window(log, pair, model.config.num_history, model.config.num_future)

@@ -16,9 +16,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from cflow_torch import __version__, estimate
+from cflow_torch.cli.checks import UnfinishedJob as UnfinishedJob
 from cflow_torch.cli.choices import CONFIGS, own_settings
 from cflow_torch.cli.info import processor
-from cflow_torch.cli.refusals import UnfinishedJob as UnfinishedJob
 from cflow_torch.config import config_from
 from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.data.catalog import AUTO, find_sources, find_user_sources, open_log, recognise
@@ -33,8 +33,6 @@ from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.types import CFlowError, FlowResult
 
 Failures = List[Tuple[str, str]]
-# Settings of `data` that are not passed to the reader.
-_NOT_OF_READER = ("label", "first", "step")
 
 
 def versions() -> dict[str, str]:
@@ -140,7 +138,7 @@ def find_logs(cfg: DictConfig) -> Sources:
     """Find the logs of `cfg.data`; make simulated ones that are not cached. If there is none, raise a `CFlowError`."""
     data = cfg.data
     given: dict[str, Any] = OmegaConf.to_container(data, resolve=True)  # type: ignore[assignment]
-    settings = {str(key): value for key, value in given.items() if key not in _NOT_OF_READER}
+    settings = {str(key): value for key, value in given.items() if key not in ("label", "first", "step")}
     if "_target_" in data:
         target = settings.pop("_target_")
         return Sources(target, settings, find_user_sources(target, settings))

@@ -27,7 +27,7 @@ from cflow_torch.data.log import Log
 from cflow_torch.evaluation.submission import archive, frames
 from cflow_torch.evaluation.submission.archive import SubmissionVersion
 from cflow_torch.evaluation.submission.frames import Frame, MaskArchive
-from cflow_torch.fleet.progress import frames as counted
+from cflow_torch.fleet.progress import Progress
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
@@ -79,7 +79,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
         print("no masks given: the official rule is applied, which can differ by a point from the server's masks")
     plan: Plan = []
     failures: Failures = []
-    for frame in counted(wanted, "rows"):
+    for frame in Progress(wanted, "rows"):
         with run.collect_failures(failures, frame.name):
             plan.append((frame, frame.count_rows(version, masks)))
     return plan, failures

@@ -32,7 +32,7 @@ from cflow_torch.cli.run import Failures
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.progress import frames as counted
+from cflow_torch.fleet.progress import Progress
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.page import load_k3d, save_page
 from cflow_torch.viz.recording import load_rerun, record_log
@@ -100,20 +100,15 @@ def _flow(cfg: DictConfig) -> tuple[Callable[[Log, int], FlowResult], int]:
     if cfg.flow is not None:
         return run.stored_flow(cfg.flow, ("residual_flow", "pose_flow", "cluster_id", "is_valid")), 2
     model = run.make_model(cfg)
-    config = model.config
-
-    def estimate(log: Log, index: int) -> FlowResult:
-        (result,) = model([window(log, index, config.num_history, config.num_future)])
-        return result
-
-    return estimate, config.num_sweeps
+    num_history, num_future = model.config.num_history, model.config.num_future
+    return lambda log, index: model([window(log, index, num_history, num_future)])[0], model.config.num_sweeps
 
 
 def _results(
     log: Log, pairs: range, flow: Callable[[Log, int], FlowResult], failures: Failures
 ) -> Iterator[tuple[int, FlowResult]]:
     """Yield the flow of each pair. A bad frame is reported and skipped."""
-    for index in counted(pairs, log.log_id):
+    for index in Progress(pairs, log.log_id):
         result = None
         with run.collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
             window(log, index)  # reads both sweeps, which the file needs

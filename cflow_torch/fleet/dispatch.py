@@ -36,12 +36,7 @@ def run_local(
 ) -> Iterator[Event]:
     """Do all units with processes of this machine, one per device, and yield events as they happen, see `dispatch`.
 
-    A single worker without a memory limit runs in this process.
-
-    Args:
-        timeout: seconds after which a worker process that has not answered is replaced.
-        memory: bytes of address space that each worker process may use, of which Python and torch need about 3e9;
-            None = no limit. Use it on a CPU only: the driver of a GPU reserves far more than it uses.
+    configs/engine/local.yaml explains the settings. A single worker without a memory limit runs in this process.
     """
     if len(layout.devices) > 1 or memory is not None:
         processes = [ChildProcess(make_worker, job, device, memory, timeout=timeout) for device in layout.devices]
@@ -65,14 +60,11 @@ def dispatch(
     Args:
         processes: one per worker, not started yet, whose calls take a unit and yield its events. Each is used by a
             thread of its own, except for `stop` and `close`.
-        units: numbered as in `split`.
+        units: numbered from 0.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
     """
-    processes = processes[: len(units)]
-    todo: Queue[Unit | None] = Queue()
+    processes, todo = processes[: len(units)], iter(units)
     answers: Queue[Event | Exception | None] = Queue()  # None: a unit has ended; an exception: a worker has ended
-    for unit in units:
-        todo.put(unit)
     for process in processes:
         Thread(target=_work, args=(process, todo, answers, stop, retries), daemon=True).start()
     num_units, num_workers, deadline = len(units), len(processes), float("inf")
@@ -97,16 +89,17 @@ def dispatch(
                 yield answer
     finally:
         for process in processes:
-            todo.put(None)
             process.close()
 
 
-def _work(process: ChildProcess, todo: Queue[Any], answers: Queue[Any], stop: Callable[[], bool], retries: int) -> None:
-    """Do units until None comes. After a stop, units that have not begun are taken and left undone."""
+def _work(
+    process: ChildProcess, todo: Iterator[Unit], answers: Queue[Any], stop: Callable[[], bool], retries: int
+) -> None:
+    """Do units until none is left. After a stop, units that have not begun are taken and left undone."""
     unit = None
     try:
         _start(process)
-        for unit in iter(todo.get, None):
+        for unit in todo:  # all threads share the iterator
             for event in _do(process, unit, stop, retries):
                 answers.put(event)
             answers.put(None)

@@ -92,9 +92,8 @@ class Shard:
     count: int = 1
 
     def __post_init__(self) -> None:
-        if self.count < 1 or not 0 <= self.index < self.count:
-            allowed = "a count of at least 1 and an index of 0 ... count - 1"
-            raise CFlowError(f"shard.index={self.index} of shard.count={self.count}: give {allowed}")
+        if not 0 <= self.index < self.count:
+            raise CFlowError(f"shard.index={self.index} of shard.count={self.count}: give 0 ... count - 1")
 
     def units(self, sources: Sequence[Any], workers: int = 1) -> list[Unit]:
         """Return this shard's share of the logs, in units that are enough for all workers, numbered from 0.

@@ -35,7 +35,7 @@ def frames_per_worker(config: Config) -> int:
     return 20 if config.method == "verified" else 100
 
 
-def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, str], most: int | None = None) -> Layout:
+def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, str]) -> Layout:
     """Replace "auto" by numbers and devices.
 
     Args:
@@ -44,7 +44,6 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
         batch: windows, or "auto".
         environ: environment variables. LOCAL_RANK or SLURM_LOCALID choose the GPU where several processes share a
             machine; LOCAL_WORLD_SIZE and SLURM_CPUS_PER_TASK limit the cores.
-        most: limit of "auto" on a CPU, for a run with few frames; None = no limit.
     """
     gpus = _gpus(device, environ)
     if workers != AUTO:
@@ -52,9 +51,9 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
     elif gpus:
         count = len(gpus)
     else:
-        cores, memory = usable_cores(environ), available_memory(environ)
-        limits = [cores, *([] if memory is None else [memory // WORKER_MEMORY]), *([] if most is None else [most])]
-        count = max(1, min(limits))
+        count, memory = usable_cores(environ), available_memory(environ)
+        if memory is not None:
+            count = max(1, min(count, memory // WORKER_MEMORY))
     size = (GPU_BATCH if gpus else CPU_BATCH) if batch == AUTO else batch
     devices = tuple(gpus[k % len(gpus)] for k in range(count)) if gpus else ("cpu",) * count
     return Layout(devices, size)

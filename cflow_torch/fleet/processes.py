@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import threading
 import traceback
 from contextlib import suppress
 from typing import Any, Callable, Iterator
@@ -15,8 +14,8 @@ from cflow_torch.errors import CFlowError
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]  # end a run
 
 
-class WorkerDied(Exception):
-    """A worker process has ended before it answered. The text says how, for example "with status 70"."""
+class WorkerDied(CFlowError):
+    """A worker process has ended before it answered, or must be replaced. The text says how, as in "with status 70"."""
 
 
 class ChildProcess:
@@ -35,11 +34,12 @@ class ChildProcess:
         self._pipe: Any = None
 
     def start(self) -> None:
-        """Start the process and wait until `make` has returned; `WorkerDied` if it has ended, or cannot be started.
+        """Start a new process and wait until `make` has returned; `WorkerDied` if it has ended or cannot be started.
 
         `CFlowError` and OSError of `make` are raised here. Any other error is a RuntimeError with the child's
         traceback.
         """
+        self.close()
         context = multiprocessing.get_context("spawn")  # threads and CUDA do not survive a fork
         self._pipe, pipe = context.Pipe()
         self._process = context.Process(target=_serve, args=(pipe, self._make, self._arguments), daemon=True)
@@ -144,7 +144,7 @@ class StopSignal:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignal:
-        if threading.current_thread() is threading.main_thread():
+        with suppress(ValueError):  # in another thread
             for number in SIGNALS:
                 if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
                     self._before[number] = signal.signal(number, self._receive)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from contextlib import suppress
-from typing import Any, Iterable, Iterator, Sized
+from typing import Any, Iterable
 
 from tqdm import tqdm
 
@@ -35,17 +35,17 @@ class _Stderr:
 
 
 class Progress(tqdm):  # type: ignore[type-arg]
-    """Counts frames and shows the count on stderr. It is a context manager, as every bar of tqdm.
+    """Counts frames and shows the count on stderr. It is a context manager and iterates over frames, as any tqdm bar.
 
     The `total` is None while it is not known, and may be set later. The `name` is shown before the count.
     """
 
-    def __init__(self, total: int | None = None, name: str = "") -> None:
+    def __init__(self, frames: Iterable[Any] | None = None, name: str = "", total: int | None = None) -> None:
         form: dict[str, Any] = {"bar_format": _BAR}
         if not sys.stderr.isatty():  # a short run prints nothing
             form = {"bar_format": _LINE, "mininterval": EVERY, "miniters": 1, "delay": EVERY}
         desc = f"{name}: " if name else ""
-        super().__init__(total=total, file=_Stderr(), unit=" frames", smoothing=0.05, desc=desc, **form)
+        super().__init__(frames, desc, total, file=_Stderr(), unit=" frames", smoothing=0.05, **form)
 
 
 def log_line(text: str) -> None:
@@ -56,11 +56,3 @@ def log_line(text: str) -> None:
 def show_warnings_as_lines() -> None:
     """Show warnings as lines for people, without the path of a source file, from now on."""
     warnings.showwarning = lambda message, *_, **__: log_line(f"warning: {message}")
-
-
-def frames(items: Iterable[Any], name: str = "") -> Iterator[Any]:
-    """Yield the items, a frame each, and show the progress."""
-    with Progress(len(items) if isinstance(items, Sized) else None, name) as progress:
-        for item in items:
-            yield item
-            progress.update()

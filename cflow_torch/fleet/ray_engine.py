@@ -6,7 +6,6 @@ import logging
 import math
 import os
 import signal
-import threading
 from contextlib import suppress
 from dataclasses import replace
 from types import ModuleType
@@ -40,14 +39,7 @@ def run_ray(
     The driver and the workers exchange units and events, a few kB each; workers read and write files themselves. On a
     cluster, all machines must reach data and output under the same names (a shared file system, an object store) and
     have the same versions of cflow_torch, torch and numpy. A node that differs is refused. Workers that do not fit into
-    the cluster start when there is room. Ray chooses the GPUs.
-
-    Args:
-        address: None = start a cluster in this process, and end it; "auto" or "HOST:PORT" = join the cluster that this
-            machine is part of.
-        num_cpus: CPUs of the cluster that a worker takes; "auto" = 1 without a GPU, 0 with one.
-        num_gpus: GPUs that a worker takes, may be a fraction; "auto" = 1 if the device is a GPU.
-        retries: how often a unit, and then each of its frames by itself, is repeated after a worker died on it.
+    the cluster start when there is room. Ray chooses the GPUs. configs/engine/ray.yaml explains the settings.
     """
     ray = import_optional("ray", "engine=ray needs Ray: pip install ray")
     is_gpu = layout.devices[0].startswith("cuda")
@@ -116,6 +108,7 @@ class _Process(ChildProcess):
         self._actor: Any = None
 
     def start(self) -> None:
+        self.close()
         self._actor = self._make()
         self._get(self._actor.start.remote(*self._arguments))
 
@@ -151,7 +144,7 @@ def _connect(ray: ModuleType, settings: dict[str, Any]) -> None:
         where = f"engine.address={settings['address']}"
         raise CFlowError(f"{where}: cannot connect to a Ray cluster: {describe(error)}") from error
     finally:
-        if threading.current_thread() is threading.main_thread():
+        with suppress(ValueError):  # in another thread
             signal.signal(signal.SIGTERM, before)
 
 

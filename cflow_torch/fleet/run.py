@@ -82,14 +82,14 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
     """Count the events and show the progress. The total is an estimate until all logs are open."""
     with Progress() as progress:
         for event in events:
-            settled = counters.add(event)
+            counters.add(event)
             if counters.num_opened:
                 progress.total = round(counters.total * max(1, num_units / counters.num_opened))
             if isinstance(event, Failed):
                 log_line(f"failed: {event.name}: {event.message}")
             elif isinstance(event, Noted) and counters.times_noted(event.message) <= _SHOWN_NOTES:
                 log_line(f"warning: {event.name}: {event.message}")
-            progress.update(settled)
+            progress.update(counters.total - len(counters.waiting) - progress.n)
         progress.total = progress.n
 
 
@@ -124,44 +124,36 @@ class Counters:
         self.failures: list[tuple[str, str]] = []  # (frame or log, message)
         self.notes: Counter[tuple[str, str]] = Counter()  # (log, message)
         self.num_opened = self.total = self.num_before = self.num_failed = 0  # units; frames
-        self._waiting: dict[tuple[int, int], str] = {}  # (unit number, time stamp) -> frame, neither on disk nor failed
+        # (unit number, time stamp) -> name of a frame that is neither on disk nor failed, of opened units
+        self.waiting: dict[tuple[int, int | None], str] = {}
         self._unopened = {unit.number for unit in units}
         self._seconds: Counter[str] = Counter()  # by stage, of all workers together
 
     @property
-    def waiting(self) -> list[str]:
-        """Frames of opened units that are neither on disk nor failed, in order."""
-        return [self._waiting[key] for key in sorted(self._waiting)]
-
-    @property
     def is_complete(self) -> bool:
-        return not (self.failures or self._unopened or self._waiting)
+        return not (self.failures or self._unopened or self.waiting)
 
     def times_noted(self, message: str) -> int:
         """Count how often a message was noted, for any log."""
         return sum(count for (_, text), count in self.notes.items() if text == message)
 
-    def add(self, event: Event) -> int:
-        """Count an event. Returns the number of frames that it settles: they are on disk, or have failed."""
+    def add(self, event: Event) -> None:
         if isinstance(event, Noted):
             self.notes[event.name, event.message] += 1
-            return 0
+            return
         self._unopened.discard(event.unit)
         if isinstance(event, Opened):
-            num_before = len(event.frames) - len(event.todo)
             self.num_opened += 1
             self.total += len(event.frames)
-            self.num_before += num_before
-            self._waiting.update({(event.unit, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
-            return num_before
+            self.num_before += len(event.frames) - len(event.todo)
+            self.waiting.update({(event.unit, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
+            return
+        self.waiting.pop((event.unit, event.timestamp), None)
         if isinstance(event, Done):
             self._seconds.update(event.seconds)
         else:
             self.failures.append((event.name, event.message))
             self.num_failed += event.timestamp is not None
-        if event.timestamp is not None:
-            self._waiting.pop((event.unit, event.timestamp), None)
-        return int(event.timestamp is not None)
 
     def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
         """Return all figures of a run that took `seconds`. `signal_name` is the signal that stopped it, "" = none.
@@ -173,7 +165,7 @@ class Counters:
             seconds per computed frame, summed over the workers, although these work at the same time; lists of
             "failures" and of "waiting" frames; "notes": log, message and how often.
         """
-        computed = self.total - self.num_before - self.num_failed - len(self._waiting)
+        computed = self.total - self.num_before - self.num_failed - len(self.waiting)
         return {
             "status": "interrupted" if signal_name else "complete" if self.is_complete else "incomplete",
             "stopped_by": signal_name or None,
@@ -188,14 +180,14 @@ class Counters:
                 "computed": computed,
                 "failed": self.num_failed,
                 "failed_logs": len(self.failures) - self.num_failed,
-                "waiting": len(self._waiting),
+                "waiting": len(self.waiting),
                 "unopened_units": len(self._unopened),
             },
             "seconds": seconds,
             "frames_per_s": computed / seconds if seconds > 0 else 0.0,
             "stages": {name: total / max(1, computed) for name, total in self._seconds.items()},
-            "failures": [list(failure) for failure in self.failures],
-            "waiting": self.waiting,
+            "failures": self.failures,
+            "waiting": [name for _, name in sorted(self.waiting.items())],
             "notes": [[*note, count] for note, count in self.notes.items()],
         }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -25,17 +24,13 @@ from cflow_torch.data.paths import as_path, safe_name
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Unit
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
-from cflow_torch.fleet.progress import log_line, show_warnings_as_lines
+from cflow_torch.fleet.processes import WorkerDied
+from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.inspection import inactive_is_an_error, repeats
 
 _AHEAD = 2  # batches that are read ahead, and that wait to be written
-_LOST_DEVICE = 70  # exit status
-
-
-class DeviceLost(CFlowError):
-    """This process can no longer use the GPU."""
 
 
 @dataclass
@@ -64,7 +59,7 @@ class Worker:
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
 
     def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
-        """Do those frames of a unit that are not complete. `DeviceLost` if the GPU can no longer be used.
+        """Do those frames of a unit that are not complete. `WorkerDied` if the GPU can no longer be used.
 
         Once `stop`, which is called before each batch, returns True, computed frames are written and no others begin.
 
@@ -74,7 +69,7 @@ class Worker:
         """
         try:
             yield from self._run(unit, stop)
-        except DeviceLost:
+        except WorkerDied:
             raise
         except Exception as error:
             yield Failed(unit.number, source_name(unit.source), describe(error))
@@ -165,7 +160,7 @@ class Worker:
         try:
             torch.zeros(1, device=self._device).item()
         except RuntimeError as error:
-            raise DeviceLost(f"{self._device} can no longer be used: {describe(error)}") from error
+            raise WorkerDied(f"because {self._device} can no longer be used: {describe(error)}") from error
 
     def _write(self, folder: Path, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
@@ -179,7 +174,7 @@ class Worker:
 def make_worker(
     job: Job, device: str, memory: float | None = None
 ) -> Callable[[Unit, Callable[[], bool]], Iterator[Event]]:
-    """Make a worker in its own process, and return its `run`, which ends the process if its GPU is lost.
+    """Make a worker in its own process, and return its `run`.
 
     On a CPU it computes on one thread: other workers use the other cores. `memory` limits the bytes of address space.
     """
@@ -191,16 +186,7 @@ def make_worker(
         torch.set_num_threads(1)
         pyarrow.set_cpu_count(1)
     show_warnings_as_lines()
-    worker = Worker(job, device)
-
-    def run(unit: Unit, stop: Callable[[], bool]) -> Iterator[Event]:
-        try:
-            yield from worker.run(unit, stop)
-        except DeviceLost as error:  # a new process can use the GPU again
-            log_line(f"a worker ends: {error}")
-            os._exit(_LOST_DEVICE)
-
-    return run
+    return Worker(job, device).run
 
 
 def run_ahead(

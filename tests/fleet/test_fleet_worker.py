@@ -157,7 +157,7 @@ def test_after_a_death_the_unit_is_repeated_then_each_frame_by_itself(fleet, sin
     counters = count(dispatch(processes, units, lambda: False, retries=1), units)
     assert 1000 - deadly[names[3]] == 3, "once with the unit, then twice by itself"
     assert counters.failures == [(names[3], "2 workers died on it, the last one by SIGSEGV")]
-    assert (counters.total, counters.waiting) == (PAIRS, [])
+    assert (counters.total, counters.waiting) == (PAIRS, {})
     assert counters.times_noted("a worker died by SIGSEGV; another one goes on with the frames that are missing") == 4
     found = {name: content for name, content in tree(tmp_path).items() if name != "manifest.json"}
     assert found == {n: c for n, c in single.items() if n not in ("manifest.json", f"{names[3]}.feather")}
@@ -254,17 +254,19 @@ def test_a_child_process_passes_answers_and_errors():
         process.stop()
     finally:
         process.close()
+    died = "__import__('cflow_torch.fleet.processes', fromlist=['']).WorkerDied('because it lost its GPU')"
+    with pytest.raises(WorkerDied, match="because it lost its GPU"):
+        list(ChildProcess(eval, f"lambda stop: (_ for _ in ()).throw({died})", timeout=60).call())
 
 
 def test_the_report_lists_what_is_missing():
     units = units_of(["a", "b", "c"])
     counters = Counters(units)
     stamps = tuple(range(40))
-    assert counters.add(Opened(0, "a", stamps, stamps[10:])) == 10
-    assert counters.add(Done(0, 10, {"read": 2.0})) == 1
-    assert counters.add(Failed(0, "a/11", "odd", 11)) == 1
-    assert counters.add(Failed(1, "b", "no log")) == 0
-    assert [counters.add(Noted(2, name, "odd")) for name in "cca"] == [0, 0, 0] and counters.times_noted("odd") == 3
+    events = [Opened(0, "a", stamps, stamps[10:]), Done(0, 10, {"read": 2.0}), Failed(0, "a/11", "odd", 11)]
+    for event in [*events, Failed(1, "b", "no log"), *(Noted(2, name, "odd") for name in "cca")]:
+        counters.add(event)
+    assert counters.times_noted("odd") == 3 and len(counters.waiting) == 28
     report = counters.report(4.0, Layout(("cpu",), 1), Shard(), "local", "SIGTERM")
     assert report["status"] == "interrupted" and report["stopped_by"] == "SIGTERM"
     assert list(report["frames"].values()) == [40, 10, 1, 1, 1, 28, 1]

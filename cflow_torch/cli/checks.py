@@ -1,4 +1,7 @@
-"""Explain in one line what a command or Hydra rejects and what to do. This module does not import torch."""
+"""Settings as Hydra gets them: register the presets, check values, and explain in one line what is rejected and why.
+
+This module does not import torch.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ import re
 from pathlib import Path
 from typing import Any, Mapping
 
+from hydra.core.config_store import ConfigStore
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import defaults, files, groups, near, own_settings, settings
-from cflow_torch.config import CONFIGS, REMOVED_PRESETS, config_from, removed_preset
+from cflow_torch.config import CONFIGS, PRESETS, REMOVED_PRESETS, Config, config_from, make_config, removed_preset
 from cflow_torch.errors import CFlowError
 from cflow_torch.setting import bounds, checked
 
@@ -34,6 +38,18 @@ _ALLOWED = {
 }
 _TYPES = {kind: bounds(kind) for kind in (bool, int, float)}
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
+
+
+def _register(name: str, config: Config) -> None:
+    node = OmegaConf.structured(config)
+    OmegaConf.set_readonly(node, None)  # the fields of a frozen dataclass can be overridden
+    ConfigStore.instance().store(name, node, "model")
+
+
+for _method, _kind in CONFIGS.items():
+    _register(f"base_{_method}", _kind())
+for _preset in PRESETS:
+    _register(_preset, make_config(_preset))
 
 
 class UnfinishedJob(RuntimeError):
