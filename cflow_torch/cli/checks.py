@@ -66,9 +66,9 @@ def check_settings(cfg: Any, command: str, choices: Mapping[str, Any]) -> None:
         if limits is not None and value != default:
             for one in value if isinstance(default, list) and OmegaConf.is_list(value) else [value]:
                 checked(name, one, limits)
-    if "_target_" in cfg.data:  # your own reader; `first` and `step` are ours
-        for name in ("first", "step"):
-            checked(f"data.{name}", cfg.data.get(name, 1), _ALLOWED[name])
+    for name in ("first", "step"):  # also with your own reader, of which we know no other setting
+        checked(f"data.{name}", cfg.data.get(name, 1), _ALLOWED[name])
+    if "_target_" in cfg.data:
         return
     if OmegaConf.is_missing(cfg.data, "root"):
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")

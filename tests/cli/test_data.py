@@ -96,6 +96,8 @@ def test_your_own_reader_by_configuration_only(mine, cflow, capsys):
         assert np.allclose(read_flow(mine / "flow" / log / "0.feather").residual_flow[:, 0], speed)
     assert cflow("eval", *own, f"output={mine / 'eval'}", "data.step=2") == 2
     assert "give +data.step=VALUE" in capsys.readouterr().err
+    assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=0") == 2
+    assert "data.step=0: give a whole number of at least 1" in capsys.readouterr().err
     assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=2") == 0
     record: Any = json.loads((mine / "eval" / "results.json").read_text())
     assert record["num_pairs"] == 2 and record["results"]["three_way"]["epe_fd"] < 1e-6
