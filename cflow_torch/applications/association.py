@@ -10,7 +10,6 @@ from torch import Tensor
 from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.ops.indices import lookup
-from cflow_torch.ops.segments import first_of_segment
 
 _MIN_SHARE = 0.1  # of common voxels, for a match of two groups
 _MIN_CLAIM = 0.5  # share of a track's points that a group has in its box, from which the track claims the group
@@ -30,41 +29,44 @@ class Matches(NamedTuple):
     track_of_static: Tensor  # (P,) int64 for each static point the stopped track whose box holds it, -1 = none
 
 
-def divide(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
-    """Divide moving groups that hold several confirmed objects, such as two cars side by side.
-
-    An object claims a group if the box in which we expect it holds half as many points of the group as the object had.
-    A group with several claims is divided: points go to the box that holds them, all others to one of the claims.
-    """
-    moves = groups.group >= 0
-    known = tracks.is_confirmed.nonzero()[:, 0]
-    box = box_of_point(groups.point[moves], tracks.box[known], tracks.size[known] + _MARGIN, tracks.heading[known])
-    pairs = torch.stack([groups.group[moves], box])
-    (group, box), pair_of_point, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)
-    least = lookup(_MIN_CLAIM * tracks.num_points[known], torch.where(box < 0, len(known), box), torch.inf)
-    claims = count >= least
-    piece = torch.where(claims, box + 1, 0)
-    last = torch.zeros_like(groups.count).scatter_reduce(0, group, piece, "amax")
-    is_divided = torch.bincount(group[claims], minlength=len(groups.count)) > 1
-    piece = torch.where(is_divided[group], torch.where(claims, piece, last[group]), 0)
-    return groups.divide(piece[pair_of_point])
+def regroup(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
+    """Correct the moving groups of a sweep by the boxes in which we expect the confirmed objects."""
+    known = tracks.take(tracks.is_confirmed)
+    box = box_of_point(groups.point, known.box, known.size + _MARGIN, known.heading)
+    return _divide(_settle(groups, box, len(known.id)), box, known.num_points)
 
 
-def settle(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
+def _settle(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:
     """Take a moving group as static if it is a small piece of a confirmed object that has stopped.
 
     While the vehicle passes a stopped object, the visible outline of the object changes. A piece of it then seems to
     move, and the track would follow the piece. A group is such a piece if the box of the object holds most of its
     points, and more static points than the group has points.
     """
-    known = tracks.is_confirmed.nonzero()[:, 0]
-    box = box_of_point(groups.point, tracks.box[known], tracks.size[known] + _MARGIN, tracks.heading[known])
     moves, is_inside = groups.group >= 0, box >= 0
-    num_static = torch.bincount(box[is_inside & ~moves], minlength=len(known))
+    num_static = torch.bincount(box[is_inside & ~moves], minlength=num_boxes)
     pairs = torch.stack([groups.group, box])[:, is_inside & moves]
     (group, box), count = torch.unique(pairs, dim=1, return_counts=True)
     is_piece = (count > groups.count[group] / 2) & (groups.count[group] < num_static[box])
-    return groups.without(group[is_piece])
+    return groups.divide(torch.where(torch.isin(groups.group, group[is_piece]), -1, 0))
+
+
+def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGroups:
+    """Divide moving groups that hold several confirmed objects, such as two cars side by side.
+
+    An object claims a group if its box holds half as many points of the group as the object had, `num_points`. A group
+    with several claims is divided: points go to the box that holds them, all others to one of the claims.
+    """
+    moves = groups.group >= 0
+    pairs = torch.stack([groups.group, box])[:, moves]
+    (group, box), pair_of_point, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)
+    least = lookup(_MIN_CLAIM * num_points, torch.where(box < 0, len(num_points), box), torch.inf)
+    claims = count >= least
+    piece = torch.where(claims, box + 1, 0)
+    last = torch.zeros_like(groups.count).scatter_reduce(0, group, piece, "amax")
+    is_divided = torch.bincount(group[claims], minlength=len(groups.count)) > 1
+    piece = torch.where(is_divided[group], torch.where(claims, piece, last[group]), 0)
+    return groups.divide(torch.zeros_like(groups.group).masked_scatter(moves, piece[pair_of_point]))
 
 
 def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> Matches:
@@ -84,52 +86,44 @@ def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: Moving
 
 
 def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
-    """Match groups of two sweeps in small voxels, then the remaining groups in larger voxels, see `link_in_voxels`."""
-    earlier, current = (torch.zeros(0, dtype=torch.int64, device=points0.device) for _ in range(2))
-    for side in VOXELS:
-        rest0, rest1 = ~torch.isin(group0, earlier), ~torch.isin(group1, current)
-        more = link_in_voxels(points0[rest0], group0[rest0], points1[rest1], group1[rest1], min_share, side)
-        earlier, current = torch.cat([earlier, more[0]]), torch.cat([current, more[1]])
-    return earlier, current
-
-
-def link_in_voxels(
-    points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float, side: float
-) -> tuple[Tensor, Tensor]:
-    """Match groups of two sweeps that share voxels, one to one.
+    """Match groups of two sweeps that share small voxels, one to one, then the remaining groups in larger voxels.
 
     Points are (N, 3) float64 in metres; those of the earlier sweep are already moved to where they should be now. The
     group of each point is (N,) int64, counted from 0. `min_share` is the smallest overlap of a match: the number of
-    common voxels over the number of voxels of either group (intersection over union). `side` is that of a voxel, in
-    metres. Returns the matched groups of the earlier sweep, (K,) int64, and those of the current sweep, (K,) int64.
+    common voxels over the number of voxels of either group (intersection over union). Returns the matched groups of the
+    earlier sweep, (K,) int64, and those of the current sweep, (K,) int64.
 
     Convention: greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
-    Cost: three sorts of the points, and as many rounds as it takes to match all groups, mostly two or three.
+    Cost: for each size of voxel, a sort of the points and a product of two tables with a row per group and a column per
+        voxel.
     """
-    voxel0, voxel1 = _voxels(points0, points1, side)
-    own0, size0 = _distinct(group0, voxel0)
-    own1, size1 = _distinct(group1, voxel1)
-    own1 = own1[:, own1[1].argsort(stable=True)]
-    begin, end = (torch.searchsorted(own1[1], own0[1].contiguous(), right=right) for right in (False, True))
-    count = end - begin
-    first = count.cumsum(0) - count
-    row = torch.arange(int(count.sum()), device=count.device) + (begin - first).repeat_interleave(count)
-    pairs = torch.stack([own0[0].repeat_interleave(count), own1[0].index_select(0, row)])
-    pairs, shared = torch.unique(pairs, dim=1, return_counts=True)
-    share = shared / (size0[pairs[0]] + size1[pairs[1]] - shared)
-    order = share.argsort(descending=True, stable=True)
-    earlier, current = pairs[:, order[share[order] >= min_share]]
-    matches = [pairs[:, :0]]
-    while earlier.numel():  # take all pairs that are the best of both their groups, then go on with the other groups
-        position = torch.arange(len(earlier), device=earlier.device)
-        is_best = (first_of_segment(earlier, int(earlier.max()) + 1) == position) & (
-            first_of_segment(current, int(current.max()) + 1) == position
-        )
-        matches.append(torch.stack([earlier[is_best], current[is_best]]))
-        is_left = ~(torch.isin(earlier, earlier[is_best]) | torch.isin(current, current[is_best]))
-        earlier, current = earlier[is_left], current[is_left]
-    matched = torch.cat(matches, 1)
-    return matched[0], matched[1]
+    matches: dict[int, int] = {}
+    for side in VOXELS:
+        for earlier, current in _by_overlap(points0, group0, points1, group1, min_share, side):
+            if earlier not in matches and current not in matches.values():
+                matches[earlier] = current
+    matched = torch.tensor([*matches.items()], dtype=torch.int64, device=points0.device).view(-1, 2)
+    return matched[:, 0], matched[:, 1]
+
+
+def _by_overlap(
+    points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float, side: float
+) -> list[list[int]]:
+    """Pairs of groups (earlier, current) that share voxels of `side` metres, the largest overlap first."""
+    if not len(points0) or not len(points1):
+        return []
+    both = torch.cat([points0, points1])
+    voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
+    voxels, voxel = torch.unique(voxel, dim=0, return_inverse=True)
+    tables = []  # (groups, voxels), 1 where a group has a point in a voxel
+    for group, index in ((group0, voxel[: len(group0)]), (group1, voxel[len(group0) :])):
+        tables.append(torch.zeros(int(group.max()) + 1, len(voxels), device=both.device))
+        tables[-1][group, index] = 1
+    shared = tables[0] @ tables[1].t()
+    share = shared / (tables[0].sum(1)[:, None] + tables[1].sum(1) - shared)
+    pairs = (share >= min_share).nonzero()
+    order = share[pairs[:, 0], pairs[:, 1]].argsort(descending=True, stable=True)
+    return pairs[order].tolist()  # type: ignore[no-any-return]
 
 
 def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Tensor:
@@ -165,17 +159,3 @@ def rotate(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     """Rotate x, y by `angle` radians to the left."""
     cos, sin = angle.cos(), angle.sin()
     return cos * x - sin * y, sin * x + cos * y
-
-
-def _voxels(points0: Tensor, points1: Tensor, side: float) -> tuple[Tensor, Tensor]:
-    """(N0,), (N1,) int64: index of the voxel of each point, shared by both sets."""
-    both = torch.cat([points0, points1])
-    voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
-    index = torch.unique(voxel, dim=0, return_inverse=True)[1]
-    return index[: len(points0)], index[len(points0) :]
-
-
-def _distinct(group: Tensor, voxel: Tensor) -> tuple[Tensor, Tensor]:
-    """(2, V) int64 distinct pairs (group, voxel), sorted; number of voxels of each group."""
-    own = torch.unique(torch.stack([group, voxel]), dim=1)
-    return own, torch.bincount(own[0])

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import lookup
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
 MOVING = 0.05  # metres per sweep: least residual flow of a moving point, as in evaluation
@@ -52,23 +51,13 @@ class MovingGroups:
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
     def divide(self, piece: Tensor) -> MovingGroups:
-        """Divide the groups by the piece of each moving point, from 0; pieces keep cluster and confidence."""
-        moves = self.group >= 0
-        pairs = torch.stack([self.group[moves], piece])
+        """Divide the groups by the piece of each point, (M,) int64; pieces keep cluster and confidence, -1 = static."""
+        moves = (self.group >= 0) & (piece >= 0)
+        pairs = torch.stack([self.group, piece])[:, moves]
         (origin, _), index, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)
-        group = self.group.clone()
-        group[moves] = index
+        group = torch.full_like(self.group, -1).masked_scatter(moves, index)
         confidence = self.confidence[origin]
         return replace(self, group=group, cluster=self.cluster[origin], count=count, confidence=confidence)
-
-    def without(self, group: Tensor) -> MovingGroups:
-        """Return the groups without some of them, (K,) indices. The points of those become static."""
-        is_kept = torch.ones_like(self.count, dtype=torch.bool)
-        is_kept[group] = False
-        index = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)
-        kept = {name: getattr(self, name)[is_kept] for name in ("cluster", "count", "confidence")}
-        group = lookup(index, torch.where(self.group < 0, len(index), self.group), -1)
-        return replace(self, group=group, **kept)
 
     def mean(self, values: Tensor) -> Tensor:
         """(G, C) means over the groups, of values (M, C) per point."""

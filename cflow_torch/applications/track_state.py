@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Callable, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 # A track is confirmed by the motion that it has shown, because most short-lived groups are noise of the static world.
@@ -18,50 +19,49 @@ _LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres, and at least 
 _JUMP, _SMALL = 1.5, 1.5  # factor of its length, plus metres, from which a box shows another part of its object
 
 
+_NUMBER, _FLAG = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
+_SCALAR = torch.zeros(0, dtype=torch.float64)
+_VECTOR, _MATRIX = _SCALAR.new_zeros(0, 3), _SCALAR.new_zeros(0, 2, 2)
+
+
 class Tracks(NamedTuple):
-    """K tracks in the world frame; float64 unless another type is named.
+    """K tracks in the world frame; float64 unless another type is named. `Tracks()` has no tracks.
 
     Position and velocity are states of a constant-velocity Kalman filter. The noise is equal along all axes, so one 2x2
     covariance of (position, velocity) serves all three.
     """
 
-    id: Tensor  # (K,) int64
-    position: Tensor  # (K, 3) metres, filtered
-    velocity: Tensor  # (K, 3) m/s, filtered
-    covariance: Tensor  # (K, 2, 2) of position and velocity
-    box: Tensor  # (K, 3) centre of the box; after a sweep, predicted for the next one
-    size: Tensor  # (K, 3) length, width, height of the box
-    heading: Tensor  # (K,) radians, of the box
-    begin: Tensor  # (K,) seconds, time of the first sweep
-    start: Tensor  # (K, 3) centre of the box in the first sweep
-    start_length: Tensor  # (K,) length of the box in the first sweep
-    travel: Tensor  # (K, 3) metres, sum of the flow since then
-    confidence: Tensor  # (K,) of the flow when it last moved
-    evidence: Tensor  # (K,) sum of the log-odds of the confidence
-    num_points: Tensor  # (K,) int64
-    num_moving: Tensor  # (K,) int64 sweeps in which it moved
-    missed: Tensor  # (K,) int64 sweeps since it was last seen
-    cluster: Tensor  # (K,) int64 cluster_id, -1 = static
-    is_moving: Tensor  # (K,) bool
-    is_confirmed: Tensor  # (K,) bool
+    id: Tensor = _NUMBER  # (K,) int64
+    position: Tensor = _VECTOR  # (K, 3) metres, filtered
+    velocity: Tensor = _VECTOR  # (K, 3) m/s, filtered
+    covariance: Tensor = _MATRIX  # (K, 2, 2) of position and velocity
+    box: Tensor = _VECTOR  # (K, 3) centre of the box; after a sweep, predicted for the next one
+    size: Tensor = _VECTOR  # (K, 3) length, width, height of the box
+    heading: Tensor = _SCALAR  # (K,) radians, of the box
+    begin: Tensor = _SCALAR  # (K,) seconds, time of the first sweep
+    start: Tensor = _VECTOR  # (K, 3) centre of the box in the first sweep
+    start_length: Tensor = _SCALAR  # (K,) length of the box in the first sweep
+    travel: Tensor = _VECTOR  # (K, 3) metres, sum of the flow since then
+    confidence: Tensor = _SCALAR  # (K,) of the flow when it last moved
+    evidence: Tensor = _SCALAR  # (K,) sum of the log-odds of the confidence
+    num_points: Tensor = _NUMBER  # (K,) int64
+    num_moving: Tensor = _NUMBER  # (K,) int64 sweeps in which it moved
+    missed: Tensor = _NUMBER  # (K,) int64 sweeps since it was last seen
+    cluster: Tensor = _NUMBER  # (K,) int64 cluster_id, -1 = static
+    is_moving: Tensor = _FLAG  # (K,) bool
+    is_confirmed: Tensor = _FLAG  # (K,) bool
 
-    @classmethod
-    def none(cls, device: torch.device) -> Tracks:
-        """No tracks."""
-        scalar = torch.zeros(0, dtype=torch.float64, device=device)
-        vector, flag = scalar.new_zeros(0, 3), torch.zeros(0, dtype=torch.bool, device=device)
-        number = torch.zeros(0, dtype=torch.int64, device=device)
-        states = (vector, vector, scalar.new_zeros(0, 2, 2))
-        boxes = (vector, vector, scalar, scalar, vector, scalar, vector)
-        return cls(number, *states, *boxes, scalar, scalar, number, number, number, number, flag, flag)
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> Tracks:
+    def map(self, function: Callable[[Tensor], Any]) -> Tracks:
         """The tracks with a function applied to each tensor."""
         return Tracks(*map(function, self))
 
     def take(self, index: Tensor) -> Tracks:
         """Select tracks by index or mask."""
         return self.map(lambda values: values[index])
+
+    def extend(self, count: int) -> Tracks:
+        """Append tracks whose values are all 0."""
+        return self.map(lambda values: F.pad(values, (0, 0) * (values.dim() - 1) + (0, count)))
 
     def add_evidence(self, index: Tensor, confidence: Tensor) -> None:
         """Add the log-odds of the (K,) confidence of this sweep's flow; NaN = the method has none."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Iterable, NamedTuple
+from typing import Any, Iterable, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import Matches, boxes, divide, match, settle
+from cflow_torch.applications.association import Matches, boxes, match, regroup
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import confirmed, join_tables
@@ -65,7 +65,7 @@ class Tracker:
         self._interval = sweep_interval
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
         self._num_sweeps, self._num_tracks = 0, 0
-        self._tracks = Tracks.none(torch.device("cpu"))
+        self._tracks = Tracks()
         # Points of the tracks, where the next sweep should have them, and the track of each.
         self._points, self._track_index = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
 
@@ -89,7 +89,7 @@ class Tracker:
         times = self._times(sweeps)
         groups = MovingGroups.of(sweeps, result)
         tracks, points, track_index = self._predict(groups.point.device, times)
-        groups = divide(settle(groups, tracks), tracks)
+        groups = regroup(groups, tracks)
         matches = match(tracks, points, track_index, groups)
         flow = groups.mean(groups.step)
         tracks, track_of_group = self._update(tracks, groups, flow, matches, times)
@@ -122,12 +122,12 @@ class Tracker:
 
     def _times(self, sweeps: Window) -> _Times:
         begin, end = sweeps.pc0.timestamp_ns, sweeps.pc1.timestamp_ns
-        has_times = begin is not None and end is not None
-        interval = (end - begin) * 1e-9 if has_times else self._interval  # type: ignore[operator]
-        last, due = self._clock or (None, None)
-        now = begin * 1e-9 if has_times else 0.0 if due is None else due  # type: ignore[operator]
+        last, due = self._clock or (None, 0.0)
+        now, interval = due, self._interval
+        if begin is not None and end is not None:
+            now, interval = begin * 1e-9, (end - begin) * 1e-9
         self._clock = now, now + interval
-        if last is None or due is None:
+        if last is None:
             return _Times(now, interval, interval, 0.0)
         if now <= last:
             raise CFlowError(f"this sweep is {last - now:.3f} s before the last one: push sweeps in the order of time")
@@ -167,17 +167,15 @@ class Tracker:
 
         is_new = torch.ones_like(groups.count, dtype=torch.bool)
         is_new[matches.group] = False
-        track_of_group = len(tracks.id) + is_new.cumsum(0) - 1
+        number = is_new.cumsum(0) - 1  # of each new track
+        track_of_group = len(tracks.id) + number
         track_of_group[matches.group] = matches.track
-        num_new = int(is_new.sum())
-        new = tracks.map(lambda values: values.new_zeros(num_new, *values.shape[1:]))
-        new.id.add_(self._num_tracks + torch.arange(num_new, device=box.device))
-        new.covariance.add_(torch.diag(noise**2))
-        new.begin.add_(times.now)
-        new = new._replace(start=box[is_new], start_length=size[is_new, 0])
-        new = new._replace(position=box[is_new], velocity=flow[is_new] / interval)
-        self._num_tracks += num_new
-        tracks = Tracks(*map(torch.cat, zip(tracks, new)))
+        new = track_of_group[is_new]
+        tracks = tracks.extend(len(new))
+        tracks.write(new, id=self._num_tracks + number[is_new], begin=times.now, covariance=torch.diag(noise**2))
+        tracks.write(new, position=box[is_new], velocity=flow[is_new] / interval)
+        tracks.write(new, start=box[is_new], start_length=size[is_new, 0])
+        self._num_tracks += len(new)
 
         length = tracks.size[matches.track, 0]
         tracks.missed.add_(1)
@@ -198,15 +196,13 @@ class Tracker:
         return tracks, track_of_group
 
     def _table(self, tracks: Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:
-        seen = tracks.take(tracks.missed == 0).map(lambda values: values.cpu())
-        rows = Tracks(*(values.numpy() for values in seen))  # type: ignore[arg-type]  # the same fields, as arrays
-        axes = {"": rows.position, "v": rows.velocity}
-        columns = {f"{name}{axis}": values[:, k] for name, values in axes.items() for k, axis in enumerate("xyz")}
+        rows: Any = tracks.take(tracks.missed == 0).map(lambda values: values.cpu().numpy())
         return {
             "sweep": np.full(len(rows.id), self._num_sweeps),
             "timestamp_ns": np.full(len(rows.id), self._num_sweeps if stamp is None else stamp),
             "id": rows.id,
-            **columns,
+            **dict(zip("xyz", rows.position.T)),
+            **dict(zip(("vx", "vy", "vz"), rows.velocity.T)),
             "velocity_std": np.sqrt(rows.covariance[:, 1, 1]),
             **dict(zip(("length", "width", "height"), rows.size.T)),
             "heading": rows.heading,

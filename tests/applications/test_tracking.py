@@ -235,7 +235,7 @@ def test_boxes_are_tight_around_their_points() -> None:
 def test_the_filter_equals_the_textbook_equations() -> None:
     one = torch.ones(1, 3, dtype=torch.float64)
     covariance = torch.tensor([[[0.2, 0.05], [0.05, 0.1]]], dtype=torch.float64)
-    before = Tracks.none(torch.device("cpu"))._replace(position=0 * one, velocity=5 * one, covariance=covariance)
+    before = Tracks()._replace(position=0 * one, velocity=5 * one, covariance=covariance)
     after = before.predict(0.1, 2.0)
     after.measure(torch.tensor([0]), 0.55 * one, 5.1 * one, torch.tensor([0.3, 0.2], dtype=torch.float64))
     F, P = np.array([[1, 0.1], [0, 1]]), covariance[0].numpy()
