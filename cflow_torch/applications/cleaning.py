@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Callable
 
 import numpy as np
@@ -54,17 +54,14 @@ class CleanLog(Log):
         model: SceneFlowModel | None = None,
         flow: Callable[[int], FlowResult] | None = None,
         remove_stopped: bool = False,
-        standing: None = None,
     ) -> None:
-        if standing is not None:
-            raise CFlowError("standing= is now remove_stopped=")
         self.log_id, self.timestamps = log.log_id, log.timestamps
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
         if flow is None and model is None:
             model = make_model(make_config("offline"))
         self._log = CachedLog(log, 2 if model is None else model.config.num_sweeps)
-        self._flow: Any = lru_cache(2)(flow if flow is not None else lambda index: self._estimate(model, index))
+        self._flow: Any = lru_cache(2)(flow or partial(self._estimate, model))
         self._bits: list[np.ndarray] | None = None
         self.num_stopped: int | None = None
         self._tracks_objects = remove_stopped
@@ -72,16 +69,9 @@ class CleanLog(Log):
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index` without its moving points; pose and time as in the log."""
         sweep, is_kept = self._log.sweep(index), ~self.moving(index)
-
-        def rows(values: Any) -> Any:
-            return None if values is None else as_numpy(values)[is_kept]
-
-        return replace(
-            sweep,
-            points=rows(sweep.points),
-            is_ground=rows(sweep.is_ground),
-            point_times=rows(sweep.point_times),
-        )
+        given = {name: getattr(sweep, name) for name in ("points", "is_ground", "point_times")}
+        kept = {name: as_numpy(values)[is_kept] for name, values in given.items() if values is not None}
+        return replace(sweep, **kept)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """The log's other columns of sweep `index`, such as intensity, without the rows of its moving points."""

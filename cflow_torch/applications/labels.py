@@ -171,8 +171,6 @@ def _seconds(sweep: Sweep) -> float:
 def _is_confirmed(dynamic: Sequence[DynamicPoints], trees: Sequence[Any], index: int) -> np.ndarray:
     """(M,) bool: the dynamic points of one sweep whose group reaches `AGREEMENT`."""
     own = dynamic[index]
-    if len(own.rows) == 0:
-        return np.zeros(0, bool)
     score = own.confidence.copy()
     neighbours = [other for other in (index - 1, index + 1) if 0 <= other < len(dynamic)]
     for other in neighbours:

@@ -121,18 +121,16 @@ class FlowStream:
         if not self._accepts(given.timestamp_ns):
             return None
         sweep = self._prepare(given)
+        result = None
         if self._sweeps:
             before, *history = self._sweeps
             window = Window(before, sweep, tuple(history))
             (result,) = self._model([window])
             self.window = window
-        else:
-            alone = replace(sweep, timestamp_ns=None)  # check it now, so that errors do not wait for the next sweep
-            grid = self._model.grid(self.config.pixel_sizes[-1])
-            make_batch(
-                [Window(alone, alone)], self.config, grid, torch.as_tensor(sweep.points).device, needs_times=True
-            )
-            result = None
+        else:  # check it now, so that errors do not wait for the next sweep
+            alone, grid = replace(sweep, timestamp_ns=None), self._model.grid(self.config.pixel_sizes[-1])
+            windows, device = [Window(alone, alone)], torch.as_tensor(sweep.points).device
+            make_batch(windows, self.config, grid, device, needs_times=True)
         self._sweeps.appendleft(sweep)
         return result
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from io import StringIO
 from typing import Dict, Sequence
 
 import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
 
+from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.data.atomic import atomic_file, write_text
 from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.types import as_numpy
 
 Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # next to the flow files of a log
@@ -62,12 +63,8 @@ def write_mot(path: PathLike, table: Table, log: Log) -> None:
     Frames and ids count from 1; x, y, z is the centre of the box, metres in the world; confidence is 1 where the method
     has none. The log is not used.
     """
-    confidence = np.where(np.isnan(table["confidence"]), 1.0, table["confidence"])
-    rows = zip(table["sweep"] + 1, table["id"] + 1, confidence, *(table[axis] for axis in "xyz"))
-    lines = (
-        f"{frame},{number},-1,-1,-1,-1,{sure:.3f},{x:.3f},{y:.3f},{z:.3f}" for frame, number, sure, x, y, z in rows
-    )
-    write_text(as_path(path), "".join(line + "\n" for line in lines))
+    columns = (table["sweep"] + 1, table["id"] + 1, np.nan_to_num(table["confidence"], nan=1.0))
+    _write_lines(path, "%d,%d,-1,-1,-1,-1,%.3f,%.3f,%.3f,%.3f", *columns, table["x"], table["y"], table["z"])
 
 
 def write_kitti(path: PathLike, table: Table, log: Log) -> None:
@@ -79,24 +76,26 @@ def write_kitti(path: PathLike, table: Table, log: Log) -> None:
 
     Source: development kit of the KITTI tracking benchmark (2012).
     """
-    lines = []
-    for index in np.unique(table["sweep"]).tolist():
-        rows = {name: values[table["sweep"] == index] for name, values in table.items()}
-        pose = log.sweep(index).pose
-        T_ego_world = np.eye(4) if pose is None else np.linalg.inv(as_numpy(pose, np.float64))
-        centre = np.stack([rows[axis] for axis in "xyz"], 1) @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
-        ahead = np.stack([np.cos(rows["heading"]), np.sin(rows["heading"])]).T @ T_ego_world[:2, :2].T
-        x, y, z = -centre[:, 1], rows["height"] / 2 - centre[:, 2], centre[:, 0]
-        rotation = _wrapped(-np.arctan2(ahead[:, 1], ahead[:, 0]) - np.pi / 2)
-        alpha = _wrapped(rotation - np.arctan2(x, z))
-        score = np.where(np.isnan(rows["confidence"]), 1.0, rows["confidence"])
-        size = (rows["height"], rows["width"], rows["length"])
-        for number, angle, *numbers in zip(rows["id"], alpha, *size, x, y, z, rotation, score):
-            box = " ".join(f"{value:.6f}" for value in numbers)
-            lines.append(f"{index} {number} Misc -1 -1 {angle:.6f} -1 -1 -1 -1 {box}\n")
-    write_text(as_path(path), "".join(lines))
+    sweeps, row = np.unique(table["sweep"], return_inverse=True)
+    T_ego_world = np.reshape([np.linalg.inv(pose_of(log.sweep(k))) for k in sweeps.tolist()], (-1, 4, 4))[row]
+    place = np.stack([table["x"], table["y"], table["z"], np.ones(len(row))], 1)
+    direction = np.stack([np.cos(table["heading"]), np.sin(table["heading"])], 1)
+    centre = np.einsum("nij,nj->ni", T_ego_world, place)
+    ahead = np.einsum("nij,nj->ni", T_ego_world[:, :2, :2], direction)
+    x, y, z = -centre[:, 1], table["height"] / 2 - centre[:, 2], centre[:, 0]
+    rotation = _wrapped(-np.arctan2(ahead[:, 1], ahead[:, 0]) - np.pi / 2)
+    alpha, score = _wrapped(rotation - np.arctan2(x, z)), np.nan_to_num(table["confidence"], nan=1.0)
+    columns = (table["sweep"], table["id"], alpha, table["height"], table["width"], table["length"])
+    form = "%d %d Misc -1 -1 %.6f -1 -1 -1 -1" + 8 * " %.6f"
+    _write_lines(path, form, *columns, x, y, z, rotation, score)
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
     """Angles in -pi ... pi."""
     return np.arctan2(np.sin(angle), np.cos(angle))
+
+
+def _write_lines(path: PathLike, form: str, *columns: np.ndarray) -> None:
+    text = StringIO()
+    np.savetxt(text, np.stack(columns, 1), form)
+    write_text(as_path(path), text.getvalue())
