@@ -40,9 +40,7 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.animation import Frame, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.clusters import plot_clusters
-from cflow_torch.viz.correlation import plot_correlation
-from cflow_torch.viz.keypoints import plot_keypoints
-from cflow_torch.viz.scales import plot_scales
+from cflow_torch.viz.stage_pictures import plot_correlation, plot_keypoints, plot_scales
 from cflow_torch.viz.style import blank_figure
 
 

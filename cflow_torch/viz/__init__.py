@@ -3,11 +3,9 @@
 from cflow_torch.viz.animation import Frame, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, plot_map, save_picture
 from cflow_torch.viz.clusters import plot_clusters
-from cflow_torch.viz.correlation import plot_correlation
-from cflow_torch.viz.keypoints import plot_keypoints
 from cflow_torch.viz.page import Page, save_page, show
 from cflow_torch.viz.recording import record_log
-from cflow_torch.viz.scales import plot_scales
+from cflow_torch.viz.stage_pictures import plot_correlation, plot_keypoints, plot_scales
 from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 
 __all__ = [

@@ -54,13 +54,12 @@ def flow_figures(
         corners.append(view)
         longest.append(longest_flow(point_rows("residual flow", frame.result.residual_flow, len(position))[drawn]))
     low, high = np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]
-    heights = (-np.inf, np.inf) if point_cloud_range is None else (point_cloud_range[2], point_cloud_range[5])
     for frame in frames:
         figure = plot_flow(
             frame.points,
             frame.result,
             is_ground=frame.is_ground,
-            point_cloud_range=(*low, heights[0], *high, heights[1]),
+            point_cloud_range=(*low, *high),
             max_flow=max(longest) if max_flow is None else max_flow,
             title=frame.title,
             legend=legend,

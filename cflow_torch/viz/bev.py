@@ -14,7 +14,6 @@ from cflow_torch.viz import style
 from cflow_torch.viz.panel import MOVING, dot_area, draw_error, draw_flow, draw_ground, new_figure
 from cflow_torch.viz.style import Figure
 
-_SIDE, _GAP, _HEAD, _FOOT = 9.6, 0.2, 0.5, 0.42  # inches: longest side of the panel, and the space around it
 _OUTLIERS = 0.2  # per cent of the points on each side that the view may leave out
 _HEIGHTS = (2, 98)  # per cent of the points, ends of the colours
 
@@ -88,9 +87,9 @@ def plot_flow(
 def plot_map(points: Array, title: str | None = None) -> Figure:
     """Draw the points of a map from above, coloured by height; higher points are darker and cover lower ones.
 
-    The points are (N, 3+) metres in the world, for example of `static_map`. The figure, for `save_picture`, is at most
-    1000 pixels wide; x points right, y up, with equal scales. The title is one line above the picture. The view leaves
-    out the outermost 0.2 % of the points on each side.
+    The points are (N, 3+) metres in the world, for example of `static_map`. The figure, for `save_picture`, is 1000
+    pixels wide; x points right, y up, with equal scales. The title is one line above the picture. The view leaves out
+    the outermost 0.2 % of the points on each side.
 
     Raises:
         CFlowError: matplotlib is not installed, or the points have another shape.
@@ -100,23 +99,14 @@ def plot_map(points: Array, title: str | None = None) -> Figure:
     position = point_rows("points", points)
     position = position[np.isfinite(position).all(axis=1)]
     shown = position if len(position) else np.zeros((1, 3))
-    low, high = np.percentile(shown[:, :2], (_OUTLIERS, 100 - _OUTLIERS), axis=0) + np.array([[-1.0], [1.0]])
-    extent = np.maximum(high - low, (high - low).max() / 3)  # a road gets empty space along its sides
-    low, high = (low + high - extent) / 2, (low + high + extent) / 2
-    width, height = _SIDE * extent / extent.max()
-    figure = style.blank_figure((width + 2 * _GAP, height + _HEAD + _FOOT), 100)
-    axes = style.add_panel(figure, _GAP, _FOOT, width, height)
-    style.set_view(axes, low, high)
-    order = np.argsort(position[:, 2], kind="stable")
-    x, y, z = position[order].T
+    view = np.percentile(shown, (_OUTLIERS, 100 - _OUTLIERS), axis=0) + np.array([[-1.0], [1.0]])
+    figure, (axes,) = new_figure(("",), view, title, f"{len(position)} points from above", has_rings=False)
+    x, y, z = position[np.argsort(position[:, 2], kind="stable")].T
     lowest, highest = np.percentile(shown[:, 2], _HEIGHTS)
     dots = axes.scatter(x, y, s=dot_area(axes), c=z, cmap="viridis_r", vmin=lowest, vmax=highest, linewidths=0)
     style.draw_scale(axes)
     bar = style.color_bar(axes, dots, "height, m", position, np.zeros(len(position), bool))
     bar.ax.locator_params(nbins=4)
-    if title:
-        style.add_heading(figure, _HEAD / 2, title)
-    style.add_caption(figure, f"{len(position)} points from above")
     return figure
 
 
@@ -145,7 +135,7 @@ def split_sweep(
 
 
 def view_of(position: np.ndarray, point_cloud_range: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The view, (2, 2) low and high corner (x, y), and (N,) bool, the points inside the range."""
+    """The view, (2, 3) low and high corner, and (N,) bool, the points inside the range."""
     default = DenseConfig().point_cloud_range
     bounds = np.asarray(default if point_cloud_range is None else point_cloud_range, np.float64)
     if bounds.shape != (6,) or not (bounds[:3] < bounds[3:]).all():
@@ -158,7 +148,7 @@ def view_of(position: np.ndarray, point_cloud_range: Sequence[float] | None) -> 
         seen = position[is_inside] if is_inside.any() else np.zeros((1, 3))
         low = np.where(np.isfinite(low), low, np.minimum(seen.min(axis=0) - 1, high - 1))
         high = np.where(np.isfinite(high), high, np.maximum(seen.max(axis=0) + 1, low + 1))
-    return np.stack([low[:2], high[:2]]), is_inside
+    return np.stack([low, high]), is_inside
 
 
 def longest_flow(flow: np.ndarray) -> float:

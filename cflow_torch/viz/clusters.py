@@ -30,11 +30,8 @@ def plot_clusters(
     """Draw sweep t from above, coloured by cluster.
 
     Args:
-        points: (N, 3+), metres, ego frame of sweep t.
-        result_or_cluster_id: the `FlowResult` of these points, or their clusters (N,), integers, negative = none.
-        is_ground: (N,) bool; ground is drawn very faintly. None = no point is ground.
-        point_cloud_range: (x0, y0, z0, x1, y1, z1), metres; points outside are not drawn. None = that of `Config`.
-        title: one line above the picture.
+        result_or_cluster_id: the `FlowResult` of the points, or their clusters (N,), integers, negative = none.
+        points, is_ground, point_cloud_range, title: as for `plot_flow`.
 
     Returns:
         Figure, 1000 pixels wide at its own dpi, for `save_picture`.

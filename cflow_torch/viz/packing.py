@@ -1,4 +1,7 @@
-"""Points, colours, arrows and boxes of a drive, thinned and packed for a page."""
+"""Points, colours, arrows and boxes of a drive, thinned and packed for a page.
+
+Each colouring of a page has a palette, and a point has one byte, the entry of its colour.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,21 @@ from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.viz import colorings
-from cflow_torch.viz.clusters import PALETTE
-from cflow_torch.viz.colorings import FIRST, GROUND, STATIC, UNKNOWN, ramp_entry, wheel_entry
+from cflow_torch.viz.clusters import PALETTE, cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_ERROR, MOVING
 from cflow_torch.viz.scene import Scene, ViewerFrame
+from cflow_torch.viz.wheel import flow_to_rgb
 
 _UNIT = 0.01  # metres; 16 bits reach to 327 m
 _REACH = 32000 * _UNIT
 _SORT = 2.0  # metres; points of a cell are stored together, which compresses better
 _FLOOR_RADIUS = 15.0  # metres; the ground near the vehicle has the height of the rings
+STATIC, GROUND, UNKNOWN, FIRST = 0, 1, 2, 3  # greys, which the page chooses; the colours of a palette begin at FIRST
+_HUES, _LEVELS = 36, 6  # the wheel in the page; one more level is for flow longer than max_flow
+_PALEST = 0.35  # saturation of slow motion, which would be white on a light page
+_FADED, _GREY = 0.15, 140  # static objects: share of their colour, the rest is this grey, which both themes show
+_STEPS = 64  # colours of a ramp
+_RAMP = np.array([(66, 125, 245), (38, 190, 205), (112, 205, 80), (250, 200, 40), (235, 60, 45)], float)
 
 
 class PackedDrive:
@@ -43,22 +51,22 @@ class PackedDrive:
         moving = ~ground & (speed > MOVING)
         cluster = np.where(ground, -1, scene.cluster)
         entries = {
-            "flow": np.where(moving, wheel_entry(scene.residual, self.max_flow), static),
-            "speed": np.where(moving, ramp_entry(speed, self.max_flow), static),
-            "object": colorings.object_entry(position, cluster, moving, ground),
+            "flow": np.where(moving, _wheel_entry(scene.residual, self.max_flow), static),
+            "speed": np.where(moving, _ramp_entry(speed, self.max_flow), static),
+            "object": _object_entry(position, cluster, moving, static),
         }
         important = moving
         if scene.confidence is not None:
-            entries["confidence"] = np.where(ground, GROUND, ramp_entry(1 - scene.confidence, 1.0))
+            entries["confidence"] = np.where(ground, GROUND, _ramp_entry(1 - scene.confidence, 1.0))
         if scene.truth is not None:
             length = np.linalg.norm(scene.truth, axis=1)
             error = np.linalg.norm(scene.residual - scene.truth, axis=1)
             unknown = np.where(ground, GROUND, UNKNOWN)
             known = ~ground & np.isfinite(length)
             moves, wrong = known & (length > MOVING), known & (error > MIN_ERROR)
-            entry = np.where(moves, wheel_entry(scene.truth, self.max_flow), STATIC)
+            entry = np.where(moves, _wheel_entry(scene.truth, self.max_flow), STATIC)
             entries["truth"] = np.where(known, entry, unknown)
-            entries["error"] = np.where(known, np.where(wrong, ramp_entry(error, MAX_ERROR), STATIC), unknown)
+            entries["error"] = np.where(known, np.where(wrong, _ramp_entry(error, MAX_ERROR), STATIC), unknown)
             important = moving | moves | wrong
         kept = self._thin(position, important, ground)
         units = np.rint(position[kept] / _UNIT).astype(np.int16)
@@ -70,7 +78,7 @@ class PackedDrive:
         self.floor += [float(np.median(height))] if len(height) else []
 
         number, start, flow = scene.arrows()
-        colors = wheel_entry(flow, self.max_flow).tolist()
+        colors = _wheel_entry(flow, self.max_flow).tolist()
         speeds = np.round(np.linalg.norm(flow, axis=1) / scene.interval, 1).tolist()
         pose = np.eye(4) if scene.pose is None else self.frame.move(scene.pose)
         self.frames.append(
@@ -103,7 +111,7 @@ class PackedDrive:
         """The input of the page's script: frames, colourings, and the points of each frame, compressed."""
         interval = float(np.median([frame["interval"] for frame in self.frames]))
         present = set().union(*(entries for _, entries, _ in self.points))
-        chosen = [row for row in colorings.make_colorings(self.max_flow, interval) if row["name"] in present]
+        chosen = [row for row in _colorings(self.max_flow, interval) if row["name"] in present]
         for frame, (units, entries, _) in zip(self.frames, self.points):
             missing = np.where(entries["flow"] == GROUND, GROUND, UNKNOWN).astype(np.uint8)
             frame["data"] = packed(_planes(units, [entries.get(c["name"], missing) for c in chosen]))
@@ -113,7 +121,7 @@ class PackedDrive:
             "frames": self.frames,
             "colorings": chosen,
             "unit": _UNIT,
-            "levels": colorings.LEVELS,
+            "levels": _LEVELS,
             "floor": float(np.median(self.floor)) if self.floor else 0.0,
             "ego": EGO_OUTLINE,
             "north": None if T is None else float(np.arctan2(T[1, 1], T[1, 0])),  # of the world's y axis, viewer frame
@@ -149,3 +157,58 @@ def packed(content: bytes) -> str:
 
 def _rounded(values: np.ndarray) -> list[Any]:
     return np.round(values, 2).tolist()
+
+
+def _colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
+    """All colourings of the page, with palettes and legends; the rim of the wheel is `max_flow`, metres per sweep."""
+    speed = max_flow / interval
+    rim = f"right: ahead of the vehicle; rim: {max_flow:.4g} m per sweep, {speed:.3g}\u00a0m/s"
+    faded = np.rint(_FADED * PALETTE + (1 - _FADED) * _GREY).astype(np.uint8)
+    wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), np.concatenate([PALETTE, faded]).tolist()
+    likely = "probability of an error below 0.1 m"
+    rows = (
+        # name, text, palette, scale, note, meaning of the greys
+        ("flow", "residual flow", wheel, None, rim, ("static", "ground", "")),
+        ("speed", "speed over ground", ramp, (0, speed, "m/s"), "", ("static", "ground", "")),
+        ("object", "object", objects, None, "bright: moving or tracked; pale: static", ("no object", "ground", "")),
+        ("confidence", "confidence", ramp, (1, 0, ""), likely, ("", "ground", "unknown")),
+        ("truth", "true flow", wheel, None, rim, ("static", "ground", "unknown")),
+        ("error", "end-point error", ramp, (0, MAX_ERROR, "m"), "", (f"below {MIN_ERROR:g} m", "ground", "unknown")),
+    )
+    return [dict(zip(("name", "text", "palette", "scale", "note", "keys"), row)) for row in rows]
+
+
+def _wheel() -> np.ndarray:
+    """(_HUES * (_LEVELS + 1), 3) uint8 colours of the wheel: direction by direction, each from slow to too fast."""
+    angle = (np.arange(_HUES) + 0.5) * (2 * np.pi / _HUES)
+    length = np.append(np.maximum(np.arange(1, _LEVELS + 1) / _LEVELS, _PALEST), 1.3)
+    flow = np.stack([np.cos(angle)[:, None] * length, np.sin(angle)[:, None] * length], axis=-1)
+    return flow_to_rgb(flow, 1.0).reshape(-1, 3)
+
+
+def _wheel_entry(flow: np.ndarray, max_flow: float) -> np.ndarray:
+    """(N,) int64 entries of `_wheel`."""
+    flow = np.nan_to_num(flow)
+    hue = np.floor(np.arctan2(flow[:, 1], flow[:, 0]) % (2 * np.pi) * (_HUES / (2 * np.pi))).astype(np.int64)
+    level = np.ceil(np.hypot(flow[:, 0], flow[:, 1]) / max_flow * _LEVELS).astype(np.int64)
+    return FIRST + hue.clip(0, _HUES - 1) * (_LEVELS + 1) + (level - 1).clip(0, _LEVELS)
+
+
+def _ramp() -> np.ndarray:
+    """(_STEPS, 3) uint8, from low to high."""
+    at = np.linspace(0, len(_RAMP) - 1, _STEPS)
+    return np.stack([np.interp(at, np.arange(len(_RAMP)), c) for c in _RAMP.T], axis=1).astype(np.uint8)
+
+
+def _ramp_entry(value: np.ndarray, most: float) -> np.ndarray:
+    """(N,) int64 entries of `_ramp`."""
+    return FIRST + (np.nan_to_num(value) / most * _STEPS).clip(0, _STEPS - 1).astype(np.int64)
+
+
+def _object_entry(position: np.ndarray, cluster: np.ndarray, moving: np.ndarray, static: np.ndarray) -> np.ndarray:
+    """(N,) int64 entries; `static` for points in no cluster. Clusters of which less than half moves are pale."""
+    colors = cluster_colors(position, cluster, (0, 0, 0))
+    _, number, size = np.unique(cluster, return_inverse=True, return_counts=True)
+    is_pale = 2 * np.bincount(number, moving) < size
+    entry = FIRST + (colors[:, None] == PALETTE).all(axis=2).argmax(axis=1) + len(PALETTE) * is_pale[number]
+    return np.where(cluster >= 0, entry, static)

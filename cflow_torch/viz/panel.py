@@ -31,20 +31,20 @@ _SLATE = (80 / 255, 90 / 255, 110 / 255)  # background of errors: black (none) a
 
 
 def new_figure(
-    names: Sequence[str], view: np.ndarray, title: str | None, caption: str = FLOW_CAPTION
+    names: Sequence[str], view: np.ndarray, title: str | None, caption: str = FLOW_CAPTION, has_rings: bool = True
 ) -> tuple[Figure, list[Axes]]:
     """Create a figure with one framed panel per name, in a row, and range rings around the ego vehicle.
 
-    The name "" makes a panel without a heading. The view is (2, 2) float64, metres: its low and its high corner (x, y).
-    A view that is too long and thin for a panel gets empty space along its long sides. The caption is one line below
-    the panels. It explains the colours; the distance of the rings is added.
+    The name "" makes a panel without a heading. The view is (2, 2+) float64, metres: its low and its high corner. A
+    view that is too long and thin for a panel gets empty space along its long sides. The caption is one line below the
+    panels. It explains the colours; the distance of the rings is added.
     """
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
     width = full / len(names) - gap * (1 + 1 / len(names))
-    extent = view[1] - view[0]
+    extent = view[1, :2] - view[0, :2]
     wanted = np.maximum(extent, (extent[1] / _HIGHEST, extent[0] * 2 * style.WHEEL_INCHES[1] / width))
-    view = view + np.array([[-0.5], [0.5]]) * (wanted - extent)
+    view = view[:, :2] + np.array([[-0.5], [0.5]]) * (wanted - extent)
     height = float(width * wanted[1] / wanted[0])
     head = (0.5 if title else 0) + (0.42 if any(names) else 0) or gap
     figure = style.blank_figure((full, height + head + foot), dpi)
@@ -52,18 +52,19 @@ def new_figure(
 
     farthest = float(np.abs(view).max())
     step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding removes up to three fifths
+    radii = np.arange(step, farthest + 1e-9, step).tolist() if has_rings else []
     panels = []
     for i, name in enumerate(names):
         axes = style.add_panel(figure, gap + i * (width + gap), foot, width, height)
         style.set_view(axes, *view)
-        for radius in np.arange(step, farthest + 1e-9, step).tolist():
+        for radius in radii:
             axes.add_patch(Circle((0, 0), radius, fill=False, color=style.FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
         if name:
             axes.set_title(name, fontsize=14, color=style.INK, pad=7)
         panels.append(axes)
     if title:
         style.add_heading(figure, 0.3, title)
-    style.add_caption(figure, f"{caption}   rings: every {step:g} m")
+    style.add_caption(figure, f"{caption}   rings: every {step:g} m" if has_rings else caption)
     return figure, panels
 
 

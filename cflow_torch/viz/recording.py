@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import uuid
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Iterable, Mapping
+from typing import Any, Iterable, Mapping
 
 import numpy as np
 
@@ -17,9 +18,6 @@ from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MOVING
 from cflow_torch.viz.scene import MAX_FLOW, Scene, ViewerFrame
 from cflow_torch.viz.style import checked_path
 from cflow_torch.viz.wheel import flow_to_rgb
-
-if TYPE_CHECKING:
-    import rerun
 
 EGO = "world/ego_vehicle"
 ESTIMATE, TRUTH = f"{EGO}/lidar/cflow", f"{EGO}/lidar/ground_truth"
@@ -45,9 +43,7 @@ def record_log(
     """Save a drive as .rrd for the viewer rerun. The file appears complete or not at all.
 
     Args:
-        log: the drive. We read its sweeps again, and its labels if it has any.
-        results: (index, flow of sweep `index` to `index + 1`) in ascending order. They are taken one by one, so a
-            generator that estimates them needs the memory of one.
+        log, results: as for `save_page`.
         path: ends in .rrd. Its folder is created if it does not exist; an older file is replaced.
         max_flow: residual flow with the full colour, metres per sweep, for the whole drive. Faster flow is darker.
         tracks: table of `cflow_torch.track`; the boxes at sweep t are shown with ids and speeds.
@@ -100,8 +96,9 @@ def load_rerun() -> Any:
 class _Drive:
     """Log one drive to a `stream` of rerun, the package `rr`. Flow of `max_flow` metres per sweep has full colour."""
 
-    def __init__(self, rr: Any, stream: rerun.RecordingStream, max_flow: float) -> None:
+    def __init__(self, rr: Any, stream: Any, max_flow: float) -> None:
         self.rr, self.stream, self.max_flow = rr, stream, max_flow
+        self.log = partial(stream.log, strict=True)
         self.count = 0
         self.has_truth = False
         self.frame = ViewerFrame()
@@ -110,9 +107,16 @@ class _Drive:
     def add(self, scene: Scene, pc1: Sweep) -> None:
         """Log one pair. Args: pc1: sweep t+1."""
         rr, position, is_ground = self.rr, scene.position, scene.is_ground
+        self.stream.set_time("sweep", sequence=scene.index)
+        if scene.timestamp_ns is not None and scene.timestamp_ns >= _CALENDAR:
+            self.stream.set_time("time", timestamp=np.datetime64(int(scene.timestamp_ns), "ns"))
+        elif scene.timestamp_ns is not None:
+            self.stream.set_time("time", duration=np.timedelta64(int(scene.timestamp_ns), "ns"))
+        if scene.pose is not None:
+            moved = self.frame.move(scene.pose)
+            self.trajectory.append(moved[:3, 3])
+            self.log(EGO, rr.Transform3D(translation=moved[:3, 3], mat3x3=moved[:3, :3]))
         shown = position[~is_ground]
-        self._set_time(scene.index, scene.timestamp_ns)
-        self._move(scene.pose)
         self._points(ESTIMATE, shown, self._color(scene.residual[~is_ground]))
         self._points(CLUSTERS, shown, cluster_colors(shown, scene.cluster[~is_ground], _NO_CLUSTER))
         self._points(GROUND, position[is_ground], _GROUND_COLOR, _FINE_DOT)
@@ -133,7 +137,7 @@ class _Drive:
             labels=[f"cluster {n}: {np.linalg.norm(v):.2f} m per sweep" for n, v in zip(numbers, vector)],
             show_labels=False,
         )
-        self.stream.log(ARROWS, arrows, strict=True)
+        self.log(ARROWS, arrows)
         self.count += 1
 
     def add_tracks(self, rows: Mapping[str, np.ndarray]) -> None:
@@ -148,41 +152,23 @@ class _Drive:
             colors=cluster_colors(centre, rows["id"], _NO_CLUSTER),
             labels=[f"{n}: {np.hypot(x, y):.1f} m/s" for n, x, y in zip(rows["id"], rows["vx"], rows["vy"])],
         )
-        self.stream.log(TRACKS, boxes, strict=True)
+        self.log(TRACKS, boxes)
 
     def end(self, log_id: str) -> None:
         """Log the trajectory and the layout of the viewer."""
         if not self.count:
             raise CFlowError(f"{log_id}: there is no pair to record")
         rr = self.rr
-        self.stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True, strict=True)
+        self.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         outline = np.pad(EGO_OUTLINE + EGO_OUTLINE[:1], ((0, 0), (0, 1)))
-        vehicle = rr.LineStrips3D([outline], colors=_EGO_COLOR, radii=0.05)
-        self.stream.log(f"{EGO}/outline", vehicle, static=True, strict=True)
+        self.log(f"{EGO}/outline", rr.LineStrips3D([outline], colors=_EGO_COLOR, radii=0.05), static=True)
         if len(self.trajectory) > 1:
             path = rr.LineStrips3D([np.stack(self.trajectory)], colors=_GROUND_COLOR, radii=0.05)
-            self.stream.log("world/trajectory", path, static=True, strict=True)
+            self.log("world/trajectory", path, static=True)
         self.stream.send_blueprint(self._layout())
 
-    def _set_time(self, index: int, timestamp_ns: int | None) -> None:
-        self.stream.set_time("sweep", sequence=index)
-        if timestamp_ns is not None and timestamp_ns >= _CALENDAR:
-            self.stream.set_time("time", timestamp=np.datetime64(int(timestamp_ns), "ns"))
-        elif timestamp_ns is not None:
-            self.stream.set_time("time", duration=np.timedelta64(int(timestamp_ns), "ns"))
-
-    def _move(self, pose: Any) -> None:
-        """Log the ego frame of t+1."""
-        if pose is None:
-            return
-        moved = self.frame.move(pose)
-        self.trajectory.append(moved[:3, 3])
-        transform = self.rr.Transform3D(translation=moved[:3, 3], mat3x3=moved[:3, :3])
-        self.stream.log(EGO, transform, strict=True)
-
     def _points(self, entity: str, position: np.ndarray, colors: Any, radius: float = _DOT) -> None:
-        cloud = self.rr.Points3D(position.astype(np.float32), colors=colors, radii=radius)
-        self.stream.log(entity, cloud, strict=True)
+        self.log(entity, self.rr.Points3D(position.astype(np.float32), colors=colors, radii=radius))
 
     def _color(self, flow: np.ndarray) -> np.ndarray:
         color = flow_to_rgb(flow, self.max_flow)

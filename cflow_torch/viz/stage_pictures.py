@@ -1,0 +1,347 @@
+"""Pictures of the stages of the paper's methods: coarse to fine, the correlation of one cluster, key points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from cflow_torch.config import Config, make_config
+from cflow_torch.types import FlowResult, Window, point_rows
+from cflow_torch.viz import style
+from cflow_torch.viz.bev import longest_flow, view_of
+from cflow_torch.viz.panel import FLOW_CAPTION, MOVING, draw_flow
+from cflow_torch.viz.stages import (
+    ClusterCorrelation,
+    KeyPointMatches,
+    Scale,
+    choose_cluster,
+    cluster_correlation,
+    keypoint_matches,
+    scales,
+    sweep_marks,
+)
+from cflow_torch.viz.style import Axes, Figure
+from cflow_torch.viz.wheel import flow_to_rgb
+
+_MARGIN = 2.0  # metres around the object in the close-up
+_SMALLEST = 4.0  # metres, half a side of the close-up
+_COLORMAP = "viridis"
+_PEAK = "#e6194b"
+_MOST_LINES = 160  # of the surface, a side
+_HALF_VIEW = np.array((5.0, 3.6))  # metres, half width and height of the view
+_CELL = 4.0  # metres, side of the cells in which matches are added up to choose the view
+_POINT_COLOR = "#ffb000"
+_ALONG = 9  # points of a line that a legend should not cover
+_FADE = 0.72  # of the pixels behind the matches
+
+
+def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int | None = None) -> Figure:
+    """Draw coarse to fine, one column per pixel size.
+
+    Args:
+        window: sweeps.
+        config: of one of the paper's methods; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, without
+            older sweeps.
+        cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
+
+    Returns:
+        Figure, 1600 pixels wide. Above, close up on one cluster: sweep t moved by the flow of the coarser scales, and
+        t+1; in the last column t moved by the whole flow. Below: the flow so far, in the colours of the wheel; in the
+        last column the flow of the finest pixels alone.
+
+    Convention: metres, frame of t+1.
+
+    Raises:
+        CFlowError: matplotlib is not installed, there is no such cluster, the method does not process one scale after
+            the other (presets default and offline), or the input is invalid.
+
+    Source: the paper's multi-scale strategy and its figure.
+    """
+    if config is None:
+        config, window = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1)), replace(window, pch=(), pcf=())
+    found, result = scales(window, config)
+    of_point = result.cluster_id.numpy()
+    cluster_id = choose_cluster(of_point, found[-1].flow, cluster_id)
+    shown = np.full(len(of_point), False) if cluster_id is None else of_point == cluster_id
+    _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
+    count = len(found) + 1
+    left, gap, side = 0.8, 0.22, 1.75  # inches; `side` is for the legends
+    width = (16.0 - left - gap * count - side) / count
+    lines = 1 if count <= 4 else 2  # of the panels' names
+    more = 0.2 * (lines - 1)  # inches
+    below_y, above_y = 0.5, width + 1.2 + more
+    figure = style.blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
+    above, below = (
+        [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
+        for bottom in (above_y, below_y)
+    )
+    title = "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
+    style.add_heading(figure, 0.32, title if cluster_id is None else f"{title}; cluster {cluster_id}")
+    position = point_rows("points", window.pc0.points) + result.pose_flow.numpy()
+    _draw_close_up(above, position, found, shown)
+    max_flow = _draw_flows(below, config, position, found, result, alone)
+    for axes in (*above, *below):
+        name = axes.get_title().replace(": ", ":\n", lines - 1)
+        axes.set_title(name, fontsize=min(12, 8 * width), color=style.INK, pad=6)
+
+    marks = style.add_panel(figure, 16.0 - side, above_y, side, width)
+    marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=style.INK)
+    wheel, high = style.WHEEL_INCHES
+    box = style.add_panel(figure, 16.0 - wheel, below_y + (width - high) / 2, wheel, high)
+    style.fill_wheel(box, max_flow)
+    for axes in (marks, box):
+        axes.axis("off")
+    style.add_caption(figure, FLOW_CAPTION)
+    return figure
+
+
+def _square(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high corner of a square around points and a margin."""
+    ends = position[:, :2] if len(position) else np.zeros((1, 2))
+    middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
+    half = max(float(np.ptp(ends, axis=0).max()) / 2 + _MARGIN, _SMALLEST)
+    return middle - half, middle + half
+
+
+def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale], shown: np.ndarray) -> None:
+    """Draw one object in the input of each scale, and in the last panel in the result. Args: shown: (N,) bool."""
+    low, high = _square(np.concatenate([position[shown], (position + found[-1].flow)[shown]]))
+    images = [scale.seen() for scale in found] + [found[-1].result()]
+    moved = ["not moved"]
+    for scale in found:
+        flow = np.median(scale.flow[shown], axis=0) if shown.any() else 0.0
+        moved.append(f"moved by {np.linalg.norm(flow):.2f} m")
+    names = [f"{image.pixel_size:g} m pixels" for image in images[:-1]] + ["result"]
+    for axes, image, name, words in zip(panels, images, names, moved):
+        image.draw(axes)
+        style.set_view(axes, low, high, has_ticks=True)
+        axes.set_title(f"{name}: t {words}")
+        style.name_axes(axes, "x, m", "y, m" if axes is panels[0] else "")
+        axes.tick_params(labelleft=axes is panels[0])
+
+
+def _draw_flows(
+    panels: list[Axes],
+    config: Config,
+    position: np.ndarray,
+    found: list[Scale],
+    result: FlowResult,
+    alone: FlowResult,
+) -> float:
+    """Draw the flow after each scale, and that of the finest alone; return the metres per sweep of full colour."""
+    view, is_inside = view_of(position, config.point_cloud_range)
+    keep = is_inside & result.is_valid.numpy()
+    flows = [scale.flow[keep] for scale in found]
+    flows.append(alone.residual_flow.numpy()[keep].astype(np.float64))
+    max_flow = longest_flow(np.concatenate(flows))
+    names = [f"flow after {size:g} m" for size in config.pixel_sizes]
+    names[-1] += ": the result"
+    names.append(f"for comparison: {config.pixel_sizes[-1]:g} m alone")
+    for axes, name, flow in zip(panels, names, flows):
+        style.set_view(axes, *view)
+        draw_flow(axes, position[keep], flow, None, max_flow)
+        axes.set_title(name)
+    return max_flow
+
+
+def plot_correlation(window: Window, config: Config | None = None, *, cluster_id: int | None = None) -> Figure:
+    """Draw the pixels of one cluster at t and t+1 and their normalised cross-correlation.
+
+    Args:
+        window: sweeps.
+        config: a `DenseConfig` with `clustering="components"`; None = the preset "paper", without older sweeps.
+        cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
+
+    Returns:
+        Figure, 1600 pixels wide: the cluster at t, at t+1, and both with t moved by the chosen shift, in metres, frame
+        of t+1; the scores of all shifts as an image and as a surface, in pixels, with the chosen shift marked in both.
+
+    Raises:
+        CFlowError: matplotlib is not installed, there is no such cluster, or the method has no such map.
+
+    Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
+    """
+    if config is None:
+        config, window = make_config("paper"), replace(window, pch=(), pcf=())
+    found = cluster_correlation(window, config, cluster_id)
+    figure, panels = _lay_out(found.images.t.shape)
+    style.add_heading(figure, 0.35, _title(found, config))
+    images, nothing = found.images, np.zeros_like(found.images.t)
+    height, width = nothing.shape
+    # A shift is shorter than the box, so with this margin pixels that leave the box do not wrap around.
+    padded = np.pad(images.t, ((0, height), (0, width)))
+    moved = np.roll(padded, tuple(found.shift), (0, 1))[:height, :width]
+    names = (
+        "template: t moved by the coarser scales" if len(config.pixel_sizes) > 1 else "template: sweep t",
+        "target: sweep t+1",
+        "t moved by the chosen shift, and t+1",
+    )
+    for axes, name, t, t1 in zip(panels, names, (images.t, nothing, moved), (nothing, images.t1, images.t1)):
+        replace(images, t=t, t1=t1).draw(axes, aspect="auto")
+        _name(axes, name, "x, m", "y, m")
+    _draw_map(panels[3], panels[4], found)
+    _draw_surface(panels[5], found)
+    return figure
+
+
+def _title(found: ClusterCorrelation, config: Config) -> str:
+    size = found.images.pixel_size
+    dy, dx = found.shift
+    title = f"cluster {found.cluster_id}: moves by {_pair(dx, dy)} pixels of {size:g} m = "
+    title += f"{_pair(dx * size, dy * size)} m, score {found.score:.2f}"
+    others = ["coarser scales"] * (len(config.pixel_sizes) > 1) + ["older sweeps"] * (config.num_history > 0)
+    return f"{title}; with {' and '.join(others)} {_pair(*found.flow[:2])} m" if others else title
+
+
+def _lay_out(shape: tuple[int, int]) -> tuple[Figure, list[Any]]:
+    """Create the figure and its axes: four images, colour bar, surface."""
+    left, right = 0.7, 5.25
+    # Pixels are square, unless the box is so long and thin that nothing would be visible.
+    height, width = np.maximum(3.35 * np.array(shape) / max(shape), 1.2)
+    total = max(2 * height + 2.9, 6.4)
+    lower = 0.65 + (total - 2 * height - 2.9) / 2
+    upper = lower + height + 1.2
+    figure = style.blank_figure((16.0, total), 100)
+    corners = [(left, upper), (right, upper), (left, lower), (right, lower)]
+    panels = [style.add_panel(figure, x, y, width, height) for x, y in corners]
+    panels.append(style.add_panel(figure, right + width + 0.2, lower, 0.13, height))
+    panels.append(style.add_panel(figure, 9.6, 0.2, 6.1, total - 0.9, projection="3d"))
+    return figure, panels
+
+
+def _name(axes: Axes, title: str, x: str, y: str) -> None:
+    axes.set_title(title, fontsize=12, color=style.INK, pad=8)
+    style.name_axes(axes, x, y)
+    style.thin_ticks(axes)
+    style.thin_frame(axes)
+
+
+def _draw_map(axes: Axes, colors: Axes, found: ClusterCorrelation) -> None:
+    """Draw the scores as an image with its colour bar; shifts in pixels, those outside the search range in grey."""
+    height, width = found.ncc.shape
+    low_y, low_x = -(height // 2) - 0.5, -(width // 2) - 0.5
+    axes.set_facecolor("#d5d9de")
+    extent = (low_x, low_x + width, low_y, low_y + height)
+    options: Any = {"origin": "lower", "interpolation": "nearest", "aspect": "auto"}
+    image = axes.imshow(found.ncc, extent=extent, cmap=_COLORMAP, vmin=0, **options)
+    dy, dx = found.shift
+    axes.plot(0, 0, "+", color="white", markersize=9, markeredgewidth=1.2)
+    axes.plot(dx, dy, "o", markersize=13, markeredgewidth=2.2, markerfacecolor="none", markeredgecolor=_PEAK)
+    _name(axes, "score of every shift (+: no shift)", *_shift_names(found))
+    bar: Any = axes.figure.colorbar(image, cax=colors)
+    bar.ax.tick_params(labelsize=9, labelcolor=style.INK, color=style.INK, length=2)
+    bar.outline.set_visible(False)
+
+
+def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
+    """Draw the scores as a surface. Args: axes: three-dimensional."""
+    axes.patch.set_visible(False)  # it would cover the numbers next to it
+    # A margin of zeros makes a surface of a map that has a single row or column.
+    scores = np.pad(np.nan_to_num(found.ncc), 1)
+    y, x = (np.arange(n) - 1 - (n - 2) // 2 for n in scores.shape)
+    axes.plot_surface(
+        *np.meshgrid(x, y), scores, cmap=_COLORMAP, linewidth=0, vmin=0, rcount=_MOST_LINES, ccount=_MOST_LINES
+    )
+    dy, dx = found.shift
+    top = max(float(scores.max()), found.score, 0.1)
+    axes.plot([dx, dx], [dy, dy], [found.score, 1.12 * top], color=_PEAK, linewidth=1.6, zorder=10)
+    axes.plot([dx], [dy], [1.12 * top], "o", color=_PEAK, markersize=7, zorder=10)
+    size = found.images.pixel_size
+    axes.text(dx, dy, 1.18 * top, f"{_pair(dx * size, dy * size)} m", fontsize=12, color=_PEAK, ha="center")
+    stretch = np.array(found.ncc.shape[::-1]) / max(found.ncc.shape)
+    axes.set_box_aspect((*np.maximum(stretch, 0.45), 0.6), zoom=0.9)
+    axes.set_zlim(0, 1.15 * top)
+    axes.view_init(elev=32, azim=-62)
+    names = (*_shift_names(found), "score (NCC)")
+    for axis, name in zip((axes.xaxis, axes.yaxis, axes.zaxis), names):
+        axis.set_label_text(name, fontsize=10, color=style.INK)
+        axis.labelpad = 8
+    axes.locator_params(axis="both", nbins=5)
+    axes.tick_params(labelsize=9, labelcolor=style.INK)
+
+
+def _shift_names(found: ClusterCorrelation) -> list[str]:
+    return [f"shift in {axis}, pixels of {found.images.pixel_size:g} m" for axis in "xy"]
+
+
+def _pair(x: float, y: float) -> str:
+    """Two numbers with their signs, to three digits."""
+    return "({}, {})".format(*(f"{value:+.3g}" if abs(value) > 1e-9 else "0" for value in (x, y)))
+
+
+def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
+    """Draw a close-up of the key points of a pair of sweeps and their matches, where the matches move most.
+
+    The config is of the key-point method; None = the preset "keypoints", without older sweeps.
+
+    Returns:
+        Figure, 1600 pixels wide. Left: the pixels of both sweeps, and the key points of t as dots. Right: moving
+        matches as lines from t to t+1, coloured as the wheel shows, and static ones as grey dots. The axes are metres,
+        frame of t+1; a key point lies in the middle of its pixel.
+
+    Raises:
+        CFlowError: matplotlib is not installed, the config is of another method, or the input is invalid.
+    """
+    figure = style.blank_figure((16.0, 6.9), 100)
+    if config is None:
+        config, window = make_config("keypoints"), replace(window, pch=(), pcf=())
+    found = keypoint_matches(window, config)
+    low, high = _busiest_view(found.start, found.end)
+    title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; the view shows a part"
+    style.add_heading(figure, 0.31, title)
+    panels = [style.add_panel(figure, left, 0.9, 7.12, 5.1) for left in (0.64, 8.56)]
+    for axes, fade, name in zip(panels, (0.0, _FADE), ("occupancy and key points", "matches")):
+        found.images.draw(axes, fade)
+        style.set_view(axes, low, high, has_ticks=True)
+        axes.set_title(name, fontsize=14, color=style.INK, pad=7)
+        style.name_axes(axes, "x, m (forward)", "y, m (left)" if axes is panels[0] else "", 10)
+    pixel = 72 * 7.12 * found.images.pixel_size / (2 * _HALF_VIEW[0])  # in typographic points
+    dot = max(0.45 * pixel, 1.5)
+    panels[0].plot(*found.key_points.T, "o", color=_POINT_COLOR, markersize=dot, markeredgewidth=0, zorder=3)
+    _draw_matches(panels[1], found, low, high)
+    _draw_legend(figure)
+    return figure
+
+
+def _busiest_view(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the view around the cell with the largest sum of match vectors, or around the vehicle."""
+    flow = end - start
+    middle = np.zeros(2)
+    moves = np.linalg.norm(flow, axis=1) > MOVING
+    if moves.any():
+        _, cell = np.unique(np.floor(start[moves] / _CELL).astype(np.int64), axis=0, return_inverse=True)
+        cell = cell.reshape(-1)  # NumPy 2.0 gives it another shape
+        sums = np.hypot(*(np.bincount(cell, weights=values) for values in flow[moves].T))
+        middle = np.median((start + end)[moves][cell == sums.argmax()] / 2, axis=0)
+    return middle - _HALF_VIEW, middle + _HALF_VIEW
+
+
+def _draw_matches(axes: Axes, found: KeyPointMatches, low: np.ndarray, high: np.ndarray) -> None:
+    from matplotlib.collections import LineCollection
+
+    inside = ((found.start > low) & (found.start < high)).all(axis=1)
+    start, end = found.start[inside], found.end[inside]
+    flow = end - start
+    max_flow = longest_flow(flow)
+    color = flow_to_rgb(flow, max_flow) / 255
+    moves = np.linalg.norm(flow, axis=1) > MOVING
+    axes.plot(*start[~moves].T, "o", color=style.FAINT, markersize=2.5, markeredgewidth=0, zorder=3)
+    lines = np.stack([start, end], axis=1)[moves]
+    axes.add_collection(LineCollection(lines, colors=style.INK, linewidths=1.9, alpha=0.5, zorder=4))
+    axes.add_collection(LineCollection(lines, colors=color[moves], linewidths=1.1, zorder=5))
+    axes.scatter(end[moves, 0], end[moves, 1], s=14, c=color[moves], linewidths=0.6, edgecolors=style.INK, zorder=6)
+    along = np.concatenate([start + share * flow for share in np.linspace(0, 1, _ALONG)])
+    style.draw_wheel(axes, along, np.tile(moves, _ALONG), max_flow)
+
+
+def _draw_legend(figure: Figure) -> None:
+    """Explain the marks, one line below the panels."""
+    from matplotlib.lines import Line2D
+
+    marks = sweep_marks()
+    marks.append(Line2D([], [], marker="o", linestyle="", markersize=7, color=_POINT_COLOR, label="key point of t"))
+    marks.append(Line2D([], [], linewidth=2.5, color="#00a0b0", label="moving match, dot at t+1"))
+    marks.append(Line2D([], [], marker="o", linestyle="", markersize=4, color=style.FAINT, label="static match"))
+    figure.legend(handles=marks, loc="lower center", ncol=len(marks), frameon=False, fontsize=11, labelcolor=style.INK)
