@@ -131,14 +131,12 @@ def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) 
 
     The (K, 3) sizes are length along the heading (K,), width and height. Cost: K * N comparisons.
     """
-    none = torch.full((len(points),), -1, device=points.device)
-    if not len(centre) or not len(points):
-        return none
     offset = points[None] - centre[:, None]
     along, across = rotate(offset[..., 0], offset[..., 1], -heading[:, None])
     is_inside = (along.abs() <= size[:, None, 0] / 2) & (across.abs() <= size[:, None, 1] / 2)
     is_inside &= offset[..., 2].abs() <= size[:, None, 2] / 2
-    return torch.where(is_inside.any(0), is_inside.to(torch.uint8).argmax(0), none)
+    is_outside = ~is_inside.any(0, keepdim=True)
+    return torch.cat([is_outside, is_inside]).to(torch.uint8).argmax(0) - 1
 
 
 def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,8 +47,8 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
         raise CFlowError(f"t+1 is {interval} s after t: give time stamps in order, or a positive sweep_interval")
     flow = result.residual_flow.double().t()
     if before.pose is not None:  # from the axes of t+1 into those of t
-        rotation = np.eye(4)
-        rotation[:3, :3] = relative_transform(before.pose, after.pose)[:3, :3]
+        rotation = relative_transform(before.pose, after.pose)
+        rotation[:3, 3] = 0
         flow = compensate(flow, rotation)
     times = torch.as_tensor(before.point_times).to(flow.device, torch.float64)
     return (read_positions([before], flow.device) - flow * (times / interval)).t()

@@ -93,8 +93,9 @@ def find_labels(
     log = CachedLog(log, 3)
     dynamic: list[DynamicPoints] = []
     groups: list[np.ndarray] = []
+    neighbours = [*range(1, len(log)), len(log) - 2]  # the sweep that the flow of each sweep leads to
     for index, result in enumerate(_with_last(log, flows, model)):
-        sweep, other = log.sweep(index), log.sweep(_neighbour(log, index))
+        sweep, other = log.sweep(index), log.sweep(neighbours[index])
         if result.confidence is None or len(result.cluster_id) != len(sweep.points):
             raise CFlowError(
                 f"flow {index} of log {log.log_id} has no confidence, or rows of another sweep: labels need the flow "
@@ -117,7 +118,7 @@ def find_labels(
                 "dufo": moves.astype(np.uint8),
                 "cluster": cluster,
                 "dufocluster": np.where(moves, cluster, np.int16(0)),
-                "nnd": _has_moved_by_nearest(tree, sweep, log.sweep(_neighbour(log, index)), workers),
+                "nnd": _has_moved_by_nearest(tree, sweep, log.sweep(neighbours[index]), workers),
             },
         )
 
@@ -146,11 +147,6 @@ def _with_last(log: Log, flows: Iterable[FlowResult], model: FlowModel) -> Itera
     if count != len(log) - 1:
         raise CFlowError(f"log {log.log_id} of {len(log)} sweeps has {count} flows: give one for every pair, in order")
     yield flow_back(log, model)
-
-
-def _neighbour(log: Log, index: int) -> int:
-    """Index of the sweep that a sweep's flow leads to: the next one, or the one before for the last."""
-    return index + 1 if index < len(log) - 1 else index - 1
 
 
 def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult) -> DynamicPoints:

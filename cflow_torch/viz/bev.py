@@ -58,16 +58,15 @@ def plot_flow(
     Cost: linear in the points; about a second for 100,000.
     """
     view, position, is_floor, rest = split_sweep(points, is_ground, point_cloud_range)
-    given = result_or_residual.residual_flow if isinstance(result_or_residual, FlowResult) else result_or_residual
+    given, cluster = result_or_residual, None
+    if isinstance(given, FlowResult):
+        cluster, given = as_numpy(given.cluster_id)[rest], given.residual_flow
     residual = point_rows("residual flow", given, len(position))
     true_flow = None if truth is None else point_rows("truth", truth, len(position))[rest]
     if legend is not None and legend not in style.CORNERS:
         raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(style.CORNERS)}")
 
     floor, position, residual = position[is_floor], position[rest], residual[rest]
-    cluster = None
-    if isinstance(result_or_residual, FlowResult):
-        cluster = as_numpy(result_or_residual.cluster_id)[rest]
     if max_flow is None:
         max_flow = longest_flow(residual if true_flow is None else np.concatenate([residual, true_flow]))
 

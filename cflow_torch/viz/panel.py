@@ -7,6 +7,7 @@ from typing import Any, Sequence
 import numpy as np
 import torch
 
+from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.viz import style
 from cflow_torch.viz.style import Axes, Figure
@@ -143,14 +144,13 @@ def _objects(position: np.ndarray) -> np.ndarray:
     """(N,) int64, object of each moving point: points in touching pixels belong together."""
     if not len(position):
         return np.zeros(0, np.int64)
-    low = position[:, :2].min(axis=0)
-    side = max(OBJECT_PIXEL, float((position[:, :2] - low).max()) / _MAX_PIXELS)
-    column, row = np.floor((position[:, :2] - low) / side).astype(np.int64).T
+    corner = position[:, :2] - position[:, :2].min(axis=0)
+    side = max(OBJECT_PIXEL, float(corner.max()) / _MAX_PIXELS)
+    column, row = np.floor(corner / side).astype(np.int64).T
     occupancy = torch.zeros(1, int(row.max()) + 1, int(column.max()) + 1, dtype=torch.bool)
     occupancy[0, row, column] = True
-    pixels = occupancy.flatten().nonzero()[:, 0]
     object_at = torch.zeros(occupancy.shape, dtype=torch.int64)
-    object_at[occupancy] = connected_components(occupancy, pixels)
+    object_at[occupancy] = connected_components(occupancy, flat_nonzero(occupancy))
     return object_at[0, row, column].numpy()
 
 

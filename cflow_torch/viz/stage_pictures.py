@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.types import FlowResult, Window, point_rows
+from cflow_torch.types import Window, point_rows
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow, view_of
 from cflow_torch.viz.panel import FLOW_CAPTION, MOVING, draw_flow
@@ -66,6 +66,7 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
     cluster_id = choose_cluster(of_point, found[-1].flow, cluster_id)
     shown = np.full(len(of_point), False) if cluster_id is None else of_point == cluster_id
     _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
+    flows = [*(scale.flow for scale in found), alone.residual_flow.double().numpy()]
     count = len(found) + 1
     left, gap, side = 0.8, 0.22, 1.75  # inches; `side` is for the legends
     width = (16.0 - left - gap * count - side) / count
@@ -81,7 +82,7 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
     style.add_heading(figure, 0.32, title if cluster_id is None else f"{title}; cluster {cluster_id}")
     position = point_rows("points", window.pc0.points) + result.pose_flow.numpy()
     _draw_close_up(above, position, found, shown)
-    max_flow = _draw_flows(below, config, position, found, result, alone)
+    max_flow = _draw_flows(below, config, position, flows, result.is_valid.numpy())
     for axes in (*above, *below):
         name = axes.get_title().replace(": ", ":\n", lines - 1)
         axes.set_title(name, fontsize=min(12, 8 * width), color=style.INK, pad=6)
@@ -97,17 +98,12 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
     return figure
 
 
-def _square(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high corner of a square around points and a margin."""
-    ends = position[:, :2] if len(position) else np.zeros((1, 2))
-    middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
-    half = max(float(np.ptp(ends, axis=0).max()) / 2 + _MARGIN, _SMALLEST)
-    return middle - half, middle + half
-
-
 def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale], shown: np.ndarray) -> None:
     """Draw one object in the input of each scale, and in the last panel in the result. Args: shown: (N,) bool."""
-    low, high = _square(np.concatenate([position[shown], (position + found[-1].flow)[shown]]))
+    ends = np.concatenate([position, position + found[-1].flow])[np.tile(shown, 2), :2]
+    ends = ends if len(ends) else np.zeros((1, 2))
+    middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
+    half = max(float(np.ptp(ends, axis=0).max()) / 2 + _MARGIN, _SMALLEST)
     images = [scale.seen() for scale in found] + [found[-1].result()]
     moved = ["not moved"]
     for scale in found:
@@ -116,32 +112,25 @@ def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale],
     names = [f"{image.pixel_size:g} m pixels" for image in images[:-1]] + ["result"]
     for axes, image, name, words in zip(panels, images, names, moved):
         image.draw(axes)
-        style.set_view(axes, low, high, has_ticks=True)
+        style.set_view(axes, middle - half, middle + half, has_ticks=True)
         axes.set_title(f"{name}: t {words}")
         style.name_axes(axes, "x, m", "y, m" if axes is panels[0] else "")
         axes.tick_params(labelleft=axes is panels[0])
 
 
 def _draw_flows(
-    panels: list[Axes],
-    config: Config,
-    position: np.ndarray,
-    found: list[Scale],
-    result: FlowResult,
-    alone: FlowResult,
+    panels: list[Axes], config: Config, position: np.ndarray, flows: list[np.ndarray], is_valid: np.ndarray
 ) -> float:
     """Draw the flow after each scale, and that of the finest alone; return the metres per sweep of full colour."""
     view, is_inside = view_of(position, config.point_cloud_range)
-    keep = is_inside & result.is_valid.numpy()
-    flows = [scale.flow[keep] for scale in found]
-    flows.append(alone.residual_flow.numpy()[keep].astype(np.float64))
-    max_flow = longest_flow(np.concatenate(flows))
+    keep = is_inside & is_valid
+    max_flow = longest_flow(np.concatenate([flow[keep] for flow in flows]))
     names = [f"flow after {size:g} m" for size in config.pixel_sizes]
     names[-1] += ": the result"
     names.append(f"for comparison: {config.pixel_sizes[-1]:g} m alone")
     for axes, name, flow in zip(panels, names, flows):
         style.set_view(axes, *view)
-        draw_flow(axes, position[keep], flow, None, max_flow)
+        draw_flow(axes, position[keep], flow[keep], None, max_flow)
         axes.set_title(name)
     return max_flow
 
