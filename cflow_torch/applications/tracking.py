@@ -147,13 +147,9 @@ class Tracker:
     def _update(
         self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: _Times
     ) -> tuple[Tracks, Tensor]:
-        """Begin tracks for groups without a match, and update all tracks with this sweep.
+        """Begin tracks for groups without a match, and update all tracks by the mean flow (G, 3) of each group.
 
-        Args:
-            flow: (G, 3) mean of each group, metres per sweep.
-
-        Returns:
-            The tracks, new ones last; (G,) int64 track of each group.
+        Returns the tracks, new ones last, and the (G,) int64 track of each group.
         """
         interval, stopped = times.interval, matches.stopped
         velocity = tracks.velocity[matches.track]

@@ -68,8 +68,6 @@ def record_log(
     Cost: on disk about 20 bytes per point and pair for each entity that shows the point.
     """
     path = checked_path(path, ".rrd")
-    if not 0 < max_flow < np.inf:
-        raise CFlowError(f"max_flow={max_flow}: give a positive length in metres per sweep")
     rr = load_rerun()
     with atomic_name(path) as temporary:
         stream = rr.RecordingStream("cflow_torch", recording_id=f"{log.log_id}-{uuid.uuid4().hex}")

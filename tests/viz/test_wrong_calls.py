@@ -39,7 +39,7 @@ CALLS: dict[str, list[tuple[Callable[[Path], Any], str]]] = {
     ],
     "rerun": [
         (lambda folder: record_log(Street(), [], folder / "a.bag"), "does not end in .rrd"),
-        (lambda folder: record_log(Street(), [], folder / "a.rrd", max_flow=0), "max_flow=0"),
+        (lambda folder: record_log(Street(), [(0, result_of())], folder / "a.rrd", max_flow=0), "max_flow=0"),
         (lambda folder: record_log(Street(), [], folder / "a.rrd"), "no pair to record"),
         (lambda folder: record_log(Street(), failing((0, result_of())), folder / "a.rrd"), "a bad sweep"),
         (
