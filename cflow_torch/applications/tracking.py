@@ -88,7 +88,13 @@ class Tracker:
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
         times = self._times(sweeps)
         groups = MovingGroups.of(sweeps, result)
-        tracks, points, track_index = self._predict(groups.point.device, times)
+        device = groups.point.device
+        tracks = self._tracks.map(lambda values: values.to(device))
+        points, track_index = self._points.to(device), self._track_index.to(device)
+        # Boxes and points are already where the last flow brings them. If the sweep is late, they move on by velocity.
+        points = points + times.late * tracks.velocity[track_index]
+        tracks = tracks._replace(box=tracks.box + times.late * tracks.velocity)
+        tracks = tracks.predict(times.elapsed, _ACCELERATION)
         groups = regroup(groups, tracks)
         matches = match(tracks, points, track_index, groups)
         flow = groups.mean(groups.step)
@@ -100,7 +106,7 @@ class Tracker:
         track_of_point[~moves] = matches.track_of_static
         has_track = track_of_point >= 0
         track_of_point = track_of_point[has_track]
-        track_id = torch.full((len(result.residual_flow),), -1, device=track_index.device)
+        track_id = torch.full((len(result.residual_flow),), -1, device=device)
         track_id[groups.row[has_track]] = tracks.id[track_of_point]
 
         # Move everything to the next sweep: moving points by their own flow, all others by the velocity of their track.
@@ -132,17 +138,6 @@ class Tracker:
         if now <= last:
             raise CFlowError(f"this sweep is {last - now:.3f} s before the last one: push sweeps in the order of time")
         return _Times(now, interval, now - last, now - due)
-
-    def _predict(self, device: torch.device, times: _Times) -> tuple[Tracks, Tensor, Tensor]:
-        """Tracks, their points and the track of each point, as expected now.
-
-        Boxes and points are already where the last flow brings them. If the sweep is late, they move on by velocity.
-        """
-        tracks = self._tracks.map(lambda values: values.to(device))
-        points, track_index = self._points.to(device), self._track_index.to(device)
-        points = points + times.late * tracks.velocity[track_index]
-        tracks = tracks._replace(box=tracks.box + times.late * tracks.velocity)
-        return tracks.predict(times.elapsed, _ACCELERATION), points, track_index
 
     def _update(
         self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: _Times

@@ -11,6 +11,7 @@ from typing import Any, Mapping, Sequence
 
 import numpy as np
 
+from cflow_torch.types import CFlowError
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_ERROR, MOVING
 from cflow_torch.viz.scene import Scene, ViewerFrame
@@ -36,6 +37,9 @@ class PackedDrive:
     """
 
     def __init__(self, max_flow: float, voxel: float) -> None:
+        for name, value in {"max_flow": max_flow, "voxel": voxel}.items():
+            if not 0 < value < np.inf:
+                raise CFlowError(f"{name}={value}: give a positive length in metres")
         self.max_flow, self.voxel = max_flow, voxel
         self.frame = ViewerFrame()
         self.frames: list[dict[str, Any]] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
 from importlib.util import find_spec
@@ -25,16 +26,12 @@ _TEMPLATE = Path(__file__).parent / "page.html"
 Tracks = Mapping[str, np.ndarray]
 
 
+@dataclass(frozen=True, repr=False)
 class Page:
-    """A page with a drive. A notebook shows it inline.
+    """A page with a drive. A notebook shows it inline."""
 
-    Args:
-        html: text of the whole page.
-        num_pairs: number of pairs in it.
-    """
-
-    def __init__(self, html: str, num_pairs: int) -> None:
-        self.html, self.num_pairs = html, num_pairs
+    html: str  # text of the whole page
+    num_pairs: int  # number of pairs in it
 
     def save(self, path: str | Path) -> Path:
         """Write the page to an .html file. It appears complete or not at all, and replaces an older one."""
@@ -78,7 +75,7 @@ def show(
     if not len(sweeps) == len(flows) == len(given):
         raise CFlowError(f"{len(sweeps)} windows, {len(flows)} results, {len(given)} labels: give one of each per pair")
     scenes = (Scene.of(i, w.pc0, w.pc1, r, t) for i, (w, r, t) in enumerate(zip(sweeps, flows, given)))
-    return _page(scenes, lambda: tracks, title, preset, max_flow, voxel)
+    return _page(scenes, PackedDrive(max_flow, voxel), lambda: tracks, title, preset)
 
 
 def save_page(
@@ -111,7 +108,7 @@ def save_page(
     """
     checked_path(path, ".html")
     scenes = (Scene.of(i, log.sweep(i), log.sweep(i + 1), result, log.labels(i)) for i, result in results)
-    page = _page(scenes, tracks, log.log_id, preset, max_flow, voxel)
+    page = _page(scenes, PackedDrive(max_flow, voxel), tracks, log.log_id, preset)
     page.save(path)
     return page.num_pairs
 
@@ -131,19 +128,10 @@ def _packed_file(path: Path) -> str:
 
 
 def _page(
-    scenes: Iterable[Scene],
-    tracks: Callable[[], Tracks | None],
-    title: str,
-    preset: str | None,
-    max_flow: float,
-    voxel: float,
+    scenes: Iterable[Scene], drive: PackedDrive, tracks: Callable[[], Tracks | None], title: str, preset: str | None
 ) -> Page:
-    """Pack the scenes and fill in the template."""
-    for name, value in {"max_flow": max_flow, "voxel": voxel}.items():
-        if not 0 < value < np.inf:
-            raise CFlowError(f"{name}={value}: give a positive length in metres")
+    """Pack the scenes into an empty drive, and fill in the template."""
     library = load_k3d()
-    drive = PackedDrive(max_flow, voxel)
     for scene in scenes:
         drive.add(scene)
     if not drive.frames:

@@ -95,19 +95,10 @@ def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.nd
 
     group = _objects(position) if cluster is None else cluster
     _, middle, count = group_medians(group, np.concatenate([position[:, :2], flow[:, :2]], axis=1))
-    shape: Any = {"width": 0.0047, "headwidth": 3.6, "headlength": 4.5, "headaxislength": 4, "minlength": 0.5}
-    axes.quiver(
-        *middle[count >= MIN_ARROW_POINTS].T,
-        angles="xy",
-        scale_units="xy",
-        scale=1 / ARROW_STEPS,
-        units="width",
-        color=style.INK,
-        edgecolor="white",
-        linewidth=0.7,
-        zorder=6,
-        **shape,
-    )
+    length: Any = {"angles": "xy", "scale_units": "xy", "scale": 1 / ARROW_STEPS, "minlength": 0.5}
+    shape: Any = {"units": "width", "width": 0.0047, "headwidth": 3.6, "headlength": 4.5, "headaxislength": 4}
+    colors: Any = {"color": style.INK, "edgecolor": "white", "linewidth": 0.7}
+    axes.quiver(*middle[count >= MIN_ARROW_POINTS].T, zorder=6, **length, **shape, **colors)
     draw_ego(axes)
 
 
