@@ -22,15 +22,6 @@ _ACCELERATION = 3.0  # m/s², standard deviation
 _BOX_NOISE, _FLOW_NOISE = 0.4, 0.02  # standard deviations: metres of a box's centre, metres per sweep of a group's flow
 
 
-class _Times(NamedTuple):
-    """Seconds."""
-
-    now: float  # time of sweep t
-    interval: float  # from t to t+1
-    elapsed: float  # from the sweep before to t
-    late: float  # from the end of the last flow to t; more than 0 if a sweep is missing
-
-
 class Tracked(NamedTuple):
     """Tracks of one sweep.
 
@@ -86,19 +77,18 @@ class Tracker:
         sweeps = sweeps if isinstance(sweeps, Window) else Window(*sweeps)
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
-        times = self._times(sweeps)
+        now, interval, elapsed, late = self._times(sweeps)
         groups = MovingGroups.of(sweeps, result)
         device = groups.point.device
         tracks = self._tracks.map(lambda values: values.to(device))
         points, track_index = self._points.to(device), self._track_index.to(device)
         # Boxes and points are already where the last flow brings them. If the sweep is late, they move on by velocity.
-        points = points + times.late * tracks.velocity[track_index]
-        tracks = tracks._replace(box=tracks.box + times.late * tracks.velocity)
-        tracks = tracks.predict(times.elapsed, _ACCELERATION)
+        points = points + late * tracks.velocity[track_index]
+        tracks = tracks._replace(box=tracks.box + late * tracks.velocity).predict(elapsed, _ACCELERATION)
         groups = regroup(groups, tracks)
         matches = match(tracks, points, track_index, groups)
         flow = groups.mean(groups.step)
-        tracks, track_of_group = self._update(tracks, groups, flow, matches, times)
+        tracks, track_of_group = self._update(tracks, groups, flow, matches, now, interval)
 
         moves = groups.group >= 0
         track_of_point = torch.full_like(groups.group, -1)
@@ -110,13 +100,13 @@ class Tracker:
         track_id[groups.row[has_track]] = tracks.id[track_of_point]
 
         # Move everything to the next sweep: moving points by their own flow, all others by the velocity of their track.
-        step = tracks.velocity * times.interval
+        step = tracks.velocity * interval
         step[track_of_group] = flow
         is_missing = tracks.missed[track_index] > 0
         missing = points[is_missing] + step[track_index[is_missing]]
         seen = groups.point[has_track]
         seen = seen + torch.where(moves[has_track, None], groups.step[has_track], step[track_of_point])
-        table = self._table(tracks, times.now, sweeps.pc0.timestamp_ns)
+        table = self._table(tracks, now, sweeps.pc0.timestamp_ns)
         track_index = torch.cat([track_index[is_missing], track_of_point])
         points, tracks = torch.cat([missing, seen]), tracks._replace(box=tracks.box + step)
         is_kept = tracks.missed <= _MAX_MISSED
@@ -126,7 +116,11 @@ class Tracker:
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
 
-    def _times(self, sweeps: Window) -> _Times:
+    def _times(self, sweeps: Window) -> tuple[float, float, float, float]:
+        """Time of sweep t, and seconds from t to t+1, from the sweep before to t, and from the end of its flow to t.
+
+        The last is more than 0 if a sweep is missing.
+        """
         begin, end = sweeps.pc0.timestamp_ns, sweeps.pc1.timestamp_ns
         last, due = self._clock or (None, 0.0)
         now, interval = due, self._interval
@@ -134,19 +128,18 @@ class Tracker:
             now, interval = begin * 1e-9, (end - begin) * 1e-9
         self._clock = now, now + interval
         if last is None:
-            return _Times(now, interval, interval, 0.0)
+            return now, interval, interval, 0.0
         if now <= last:
             raise CFlowError(f"this sweep is {last - now:.3f} s before the last one: push sweeps in the order of time")
-        return _Times(now, interval, now - last, now - due)
+        return now, interval, now - last, now - due
 
     def _update(
-        self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: _Times
+        self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, now: float, interval: float
     ) -> tuple[Tracks, Tensor]:
         """Begin tracks for groups without a match, and update all tracks by the mean flow (G, 3) of each group.
 
         Returns the tracks, new ones last, and the (G,) int64 track of each group.
         """
-        interval, stopped = times.interval, matches.stopped
         velocity = tracks.velocity[matches.track]
         is_fast = velocity[:, :2].norm(dim=1) >= MOVING / interval
         heading = torch.atan2(flow[:, 1], flow[:, 0])
@@ -163,7 +156,7 @@ class Tracker:
         track_of_group[matches.group] = matches.track
         new = track_of_group[is_new]
         tracks = tracks.extend(len(new))
-        tracks.write(new, id=self._num_tracks + number[is_new], begin=times.now, covariance=torch.diag(noise**2))
+        tracks.write(new, id=self._num_tracks + number[is_new], begin=now, covariance=torch.diag(noise**2))
         tracks.write(new, position=box[is_new], velocity=flow[is_new] / interval)
         tracks.write(new, start=box[is_new], start_length=size[is_new, 0])
         self._num_tracks += len(new)
@@ -174,6 +167,7 @@ class Tracker:
         tracks.cluster.fill_(-1)
         tracks.write(track_of_group, box=box, size=size, heading=heading, is_moving=True, missed=0)
         tracks.write(track_of_group, num_points=groups.count, cluster=groups.cluster, confidence=groups.confidence)
+        stopped = matches.stopped
         tracks.write(stopped, missed=0, num_points=torch.maximum(matches.num_points, tracks.num_points[stopped]))
         tracks.num_moving[track_of_group] += 1
         tracks.start_again(matches.track, length)
