@@ -35,6 +35,7 @@ class FlowStream:
         **overrides: any field of the settings.
 
     Attributes:
+        config: the settings of the method.
         window: the sweeps of the last result, None before the first one. Rows of the result belong to `window.pc0`.
 
     Convention:
@@ -70,15 +71,11 @@ class FlowStream:
         config = (config or make_config(preset)).replace(**overrides)
         if config.num_future > 0:
             raise CFlowError(f"num_future={config.num_future}: a stream does not know later sweeps; give num_future=0")
-        self._model, self._ground, self._max_gap = make_model(config, device), ground, max_gap
+        self.config, self._model = config, make_model(config, device)
+        self._ground, self._max_gap = ground, max_gap
         self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
         self._odometry: Odometry | None = None
         self.window: Window | None = None
-
-    @property
-    def config(self) -> Config:
-        """The settings of the method."""
-        return self._model.config  # type: ignore[no-any-return]
 
     def reset(self) -> None:
         """Start again: forget all sweeps and the poses of the odometry."""
