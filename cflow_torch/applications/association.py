@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups
 from cflow_torch.applications.track_state import Tracks
-from cflow_torch.ops.indices import lookup
+from cflow_torch.ops.indices import concat_ranges, lookup
 
 _MIN_SHARE = 0.1  # of common voxels, for a match of two groups
 _MIN_CLAIM = 0.5  # share of a track's points that a group has in its box, from which the track claims the group
@@ -94,8 +94,7 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_s
     earlier sweep, (K,) int64, and those of the current sweep, (K,) int64.
 
     Convention: greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
-    Cost: for each size of voxel, a sort of the points and a product of two tables with a row per group and a column per
-        voxel.
+    Cost: for each size of voxel, three sorts of the points.
     """
     matches: dict[int, int] = {}
     for side in VOXELS:
@@ -110,20 +109,22 @@ def _by_overlap(
     points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float, side: float
 ) -> list[list[int]]:
     """Pairs of groups (earlier, current) that share voxels of `side` metres, the largest overlap first."""
-    if not len(points0) or not len(points1):
-        return []
     both = torch.cat([points0, points1])
     voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
-    voxels, voxel = torch.unique(voxel, dim=0, return_inverse=True)
-    tables = []  # (groups, voxels), 1 where a group has a point in a voxel
-    for group, index in ((group0, voxel[: len(group0)]), (group1, voxel[len(group0) :])):
-        tables.append(torch.zeros(int(group.max()) + 1, len(voxels), device=both.device))
-        tables[-1][group, index] = 1
-    shared = tables[0] @ tables[1].t()
-    share = shared / (tables[0].sum(1)[:, None] + tables[1].sum(1) - shared)
-    pairs = (share >= min_share).nonzero()
-    order = share[pairs[:, 0], pairs[:, 1]].argsort(descending=True, stable=True)
-    return pairs[order].tolist()  # type: ignore[no-any-return]
+    voxel = torch.unique(voxel, dim=0, return_inverse=True)[1]
+    # A number, voxel * num_groups + group or earlier * num_groups + current, sorts faster than a pair.
+    num_groups = 1 + int(torch.cat([group0, group1]).amax()) if len(both) else 1
+    own0 = torch.unique(voxel[: len(group0)] * num_groups + group0)
+    own1 = torch.unique(voxel[len(group0) :] * num_groups + group1)
+    voxel1, voxel0 = own1 // num_groups, own0 // num_groups
+    begin, end = (torch.searchsorted(voxel1, voxel0, right=right) for right in (False, True))
+    own0, own1 = own0 % num_groups, own1 % num_groups
+    pairs = own0.repeat_interleave(end - begin) * num_groups + own1[concat_ranges(begin, end - begin)]
+    pairs, shared = torch.unique(pairs, return_counts=True)
+    earlier, current = pairs // num_groups, pairs % num_groups
+    share = shared / (torch.bincount(own0)[earlier] + torch.bincount(own1)[current] - shared)
+    order = share.argsort(descending=True, stable=True)
+    return torch.stack([earlier, current], 1)[order[share[order] >= min_share]].tolist()  # type: ignore[no-any-return]
 
 
 def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Tensor:
