@@ -11,7 +11,7 @@ from typing import Any, Callable, Sequence
 import numpy as np
 from numpy.lib import format as npy
 
-from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, make_boxes
+from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.files import file_errors, read_json, shortened
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
 from cflow_torch.data.pickles import load_array
@@ -143,7 +143,7 @@ class AevaScenesLog(BoxLog):
             frames = [box.get("reference_frame", "VEHICLE") for box in boxes]
             if set(frames) - {"VEHICLE"}:
                 raise CFlowError(f"boxes must be in VEHICLE, got {shortened(sorted(set(frames)))}")
-            return make_boxes(
+            return Boxes(
                 [str(box["id"]) for box in boxes],
                 category_indices([box["class"] for box in boxes], CATEGORY_NAME),
                 [[box["dimensions"][axis] for axis in "xyz"] for box in boxes],

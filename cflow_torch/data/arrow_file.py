@@ -11,6 +11,13 @@ from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
 
+# Kind of a NumPy type -> its name, and the test for the types of Arrow.
+_KINDS = {
+    "f": ("floating point", pa.types.is_floating),
+    "i": ("integer", pa.types.is_integer),
+    "b": ("bool", pa.types.is_boolean),
+}
+
 
 class FeatherFile:
     """A feather file in memory: `table`, `names` of its columns, and `num_rows`. A damaged file is a `CFlowError`.
@@ -28,34 +35,20 @@ class FeatherFile:
         self.names: list[str] = self.table.column_names
         self.num_rows: int = self.table.num_rows
 
-    def floats(self, columns: Sequence[str], dtype: type = np.float64) -> np.ndarray:
-        """Return K floating-point columns as (rows, K); another type or an empty entry is a `CFlowError`."""
-        check_columns(self.file, self.names, columns)
-        values = [self._column(name, "floating point", pa.types.is_floating).to_numpy() for name in columns]
-        return np.stack(values, axis=1).astype(dtype, copy=False)
+    def matrix(self, columns: Sequence[str], dtype: Any = np.float64) -> np.ndarray:
+        """Return K columns as (rows, K) of `dtype`, which is a float, np.int64 or bool.
 
-    def integers(self, column: str) -> np.ndarray:
-        """Return an integer column as (rows,) int64."""
-        return self._column(column, "integer", pa.types.is_integer).to_numpy().astype(np.int64)
+        A column of another kind, or with an empty entry, is a `CFlowError`.
+        """
+        kind, is_kind = _KINDS[np.dtype(dtype).kind]
+        stored = dict(zip(columns, self.read(columns).columns))
+        for name, values in stored.items():
+            if not is_kind(values.type):
+                raise CFlowError(f"{self.file}: column {name} must be {kind}, got {values.type}")
+            if values.null_count:
+                raise CFlowError(f"{self.file} has {values.null_count} empty entries in {name}; copy it again")
+        return np.stack([values.to_numpy() for values in stored.values()], axis=1).astype(dtype, copy=False)
 
-    def bools(self, column: str) -> np.ndarray:
-        """Return a column as (rows,) bool."""
-        return self._column(column, "bool", pa.types.is_boolean).to_numpy().astype(bool)
-
-    def texts(self, column: str) -> np.ndarray:
-        """Return a text column, plain or dictionary-encoded, as (rows,) objects (str)."""
-        return np.array([*self._column(column, "text", _is_text).to_pylist(), None], object)[:-1]
-
-    def _column(self, column: str, kind: str, is_kind: Any) -> pa.ChunkedArray:
-        check_columns(self.file, self.names, [column])
-        values = self.table.column(column)
-        if not is_kind(values.type):
-            raise CFlowError(f"{self.file}: column {column} must be {kind}, got {values.type}")
-        if values.null_count:
-            raise CFlowError(f"{self.file} has {values.null_count} empty entries in {column}; copy it again")
-        return values
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
-    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+    def vector(self, column: str, dtype: Any = np.float64) -> np.ndarray:
+        """Return one column as (rows,). The rest is as in `matrix`."""
+        return self.matrix([column], dtype)[:, 0]

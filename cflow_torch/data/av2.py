@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import read_columns
 from cflow_torch.data.arrow_file import FeatherFile
-from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, make_boxes
+from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.files import file_errors, read_json, read_npy
 from cflow_torch.data.log import FlowLabels
@@ -124,9 +124,9 @@ class AV2Log(BoxLog):
         """Read sweep `index`, with a ground mask if the log has a raster."""
         timestamp = self._timestamp(index)
         stored, pose, is_ground = FeatherFile(self._files[timestamp]), self._poses[index], None
-        points = stored.floats("xyz", np.float32)
+        points = stored.matrix("xyz", np.float32)
         # Logs of other writers may lack the times.
-        times = stored.integers("offset_ns") * 1e-9 if "offset_ns" in stored.names else None
+        times = stored.vector("offset_ns", np.int64) * 1e-9 if "offset_ns" in stored.names else None
         if self._raster is not None and self._rule is not None:
             is_ground = self._raster.is_ground(transform_points(points, pose), self._rule)
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
@@ -146,12 +146,12 @@ class AV2Log(BoxLog):
         return read_columns(self._files[self._timestamp(index)])
 
     def _points(self, index: int) -> np.ndarray:
-        return FeatherFile(self._files[self.timestamps[index]]).floats("xyz", np.float32)
+        return FeatherFile(self._files[self.timestamps[index]]).matrix("xyz", np.float32)
 
     def _read_poses(self) -> np.ndarray:
         file = self.folder / "city_SE3_egovehicle.feather"
         stored = FeatherFile(file)
-        row_of = {time: row for row, time in enumerate(stored.integers("timestamp_ns").tolist())}
+        row_of = {time: row for row, time in enumerate(stored.vector("timestamp_ns", np.int64).tolist())}
         missing = [time for time in self.timestamps if time not in row_of]
         if missing:
             raise CFlowError(f"{file} has no pose at exactly the time of sweep {missing[0]} ({len(missing)} missing)")
@@ -159,7 +159,7 @@ class AV2Log(BoxLog):
 
     def _stored_labels(self, file: Path, index: int) -> FlowLabels:
         stored = FeatherFile(file)
-        flow, category = stored.floats(_FLOW, np.float32), stored.integers("classes")
+        flow, category = stored.matrix(_FLOW, np.float32), stored.vector("classes", np.int64)
         rows = len(self._points(index))
         if stored.num_rows != rows:
             raise CFlowError(f"{file} has {stored.num_rows} rows but sweep {self.timestamps[index]} has {rows} points")
@@ -167,7 +167,7 @@ class AV2Log(BoxLog):
             raise CFlowError(
                 f"{file}: classes are 0 ... {len(CATEGORIES) - 1}, got {category.min()} ... {category.max()}"
             )
-        is_valid = stored.bools("is_valid") if "is_valid" in stored.names else np.ones(rows, dtype=bool)
+        is_valid = stored.vector("is_valid", bool) if "is_valid" in stored.names else np.ones(rows, dtype=bool)
         return FlowLabels(flow, category.astype(np.uint8), is_valid)
 
     @cached_property
@@ -179,19 +179,19 @@ class AV2Log(BoxLog):
     def _boxes(self, index: int) -> Boxes | None:
         """Read the boxes of a sweep, in the order of the file; None outside the annotated time."""
         stored, time = self._annotations, self.timestamps[index]
-        times = np.zeros(0) if stored is None else stored.integers("timestamp_ns")
+        times = np.zeros(0) if stored is None else stored.vector("timestamp_ns", np.int64)
         if stored is None or not times.size or not times.min() <= time <= times.max():
             return None
         is_used = times == time
         if "num_interior_pts" in stored.names:
-            is_used &= stored.integers("num_interior_pts") >= MIN_INTERIOR_POINTS
+            is_used &= stored.vector("num_interior_pts", np.int64) >= MIN_INTERIOR_POINTS
         rows = np.flatnonzero(is_used)
-        tracks, names = (stored.texts(column)[rows].tolist() for column in ("track_uuid", "category"))
+        tracks, names = stored.read(("track_uuid", "category")).take(rows).to_pydict().values()
         with file_errors(stored.file):
             category = category_indices(names, {name: name for name in CATEGORIES[1:]})
-            return make_boxes(tracks, category, stored.floats(_SIZE)[rows], _poses(stored, rows, tracks))
+            return Boxes(tracks, category, stored.matrix(_SIZE)[rows], _poses(stored, rows, tracks))
 
 
 def _poses(stored: FeatherFile, rows: np.ndarray, names: Sequence[int | str]) -> np.ndarray:
-    values = stored.floats(_POSE)[rows]
+    values = stored.matrix(_POSE)[rows]
     return poses_from_quaternions(values[:, 4:], values[:, :4], lambda row: f"{stored.file}: the pose of {names[row]}")

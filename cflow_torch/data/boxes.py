@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from typing import Any, Mapping, Sequence
 
 import numpy as np
@@ -19,28 +18,26 @@ _LISTED = 20  # names in a message
 _MARGIN = (0.2, 0.2, 0.0)
 
 
-@dataclass(frozen=True)
 class Boxes:
-    """The K oriented boxes of one sweep."""
+    """The K oriented boxes of one sweep; K may be 0.
 
-    track_id: Sequence[str]  # K names; an object keeps its name over time, and no name occurs twice
-    category: np.ndarray  # (K,) uint8, Argoverse 2 index
-    size: np.ndarray  # (K, 3) float64, metres: length (x), width (y), height (z)
-    # (K, 4, 4) float64 `T_ego_box`, box coordinates (origin at the centre) to the ego frame of the sweep.
-    pose: np.ndarray
+    Attributes:
+        track_id: K names; an object keeps its name over time, and no name occurs twice.
+        category: (K,) uint8, Argoverse 2 index.
+        size: (K, 3) float64, metres: length (x), width (y), height (z).
+        pose: (K, 4, 4) float64 `T_ego_box`, box coordinates (origin at the centre) to the ego frame of the sweep.
+    """
 
-    def __post_init__(self) -> None:
+    def __init__(self, track_id: Sequence[str], category: Any, size: Any, pose: Any) -> None:
+        self.track_id = track_id
+        self.category = np.array(category, dtype=np.uint8)
+        self.size = np.array(size, dtype=np.float64).reshape(-1, 3)
+        self.pose = np.array(pose, dtype=np.float64).reshape(-1, 4, 4)
         if not (np.isfinite(self.size).all() and np.isfinite(self.pose).all()):
             raise CFlowError("a box has numbers that are not finite; copy the annotations again")
-        if len(set(self.track_id)) < len(self.track_id):
-            twice = sorted(name for name, times in Counter(self.track_id).items() if times > 1)
+        twice = sorted(name for name, times in Counter(track_id).items() if times > 1)
+        if twice:
             raise CFlowError(f"a track may have only one box per sweep; these have more: {twice[:_LISTED]}")
-
-
-def make_boxes(track_id: Sequence[str], category: Sequence[int], size: Any, pose: Any) -> Boxes:
-    """Build `Boxes` from lists of K values each; K may be 0."""
-    sizes, poses = np.array(size, dtype=np.float64), np.array(pose, dtype=np.float64)
-    return Boxes(track_id, np.array(category, dtype=np.uint8), sizes.reshape(-1, 3), poses.reshape(-1, 4, 4))
 
 
 def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int]:

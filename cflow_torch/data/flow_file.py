@@ -16,6 +16,7 @@ from cflow_torch.types import VECTORS, CFlowError, FlowResult, vector_columns
 
 CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
 ON_REQUEST = ("confidence",)  # written only if you name it
+_COLUMNS = {name: vector_columns(name) if name in VECTORS else [name] for name in (*CONTENTS, *ON_REQUEST)}
 
 
 def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CONTENTS) -> None:
@@ -33,9 +34,9 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
         Asking for a confidence that the result lacks is a `CFlowError`.
     """
     columns = result.columns()
-    names = [column for name in contents for column in (vector_columns(name) if name in VECTORS else [name])]
-    lacking = ", ".join(sorted(set(names) - columns.keys()))
-    if lacking:
+    names = [column for name in contents for column in _COLUMNS.get(name, [name])]
+    if not columns.keys() >= set(names):
+        lacking = ", ".join(sorted(set(names) - columns.keys()))
         raise CFlowError(f"this result has no {lacking}: estimate it with preset default or offline, or leave it out")
     with atomic_file(path) as file:
         feather.write_feather(pa.table({name: columns[name] for name in names}), file)
@@ -50,19 +51,12 @@ def read_flow(path: PathLike) -> FlowResult:
     fields = {}
     try:
         file = FeatherFile(path)
-        for name in (*CONTENTS, *ON_REQUEST):
-            columns = vector_columns(name) if name in VECTORS else [name]
-            if not set(columns) & set(file.names):
-                continue
-            if name == "cluster_id":
-                fields[name] = file.integers(name)
-            elif name == "is_valid":
-                fields[name] = file.bools(name)
-            else:
-                values = file.floats(columns, np.float32)
-                fields[VECTORS.get(name, name)] = values if name in VECTORS else values[:, 0]
+        for name, columns in _COLUMNS.items():
+            if set(columns) & set(file.names):
+                values = file.matrix(columns, {"cluster_id": np.int64, "is_valid": bool}.get(name, np.float32))
+                fields[VECTORS.get(name, name)] = torch.from_numpy(values if name in VECTORS else values[:, 0])
         if not fields:
             raise CFlowError(f"its columns are {', '.join(file.names)}")
     except CFlowError as error:
         raise CFlowError(f"{path} is not a flow file ({error}): pass one that `cflow flow` wrote") from error
-    return FlowResult.of({name: torch.from_numpy(np.array(array)) for name, array in fields.items()})
+    return FlowResult.of(fields)

@@ -9,7 +9,7 @@ from typing import Sequence
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, upright_poses
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, upright_poses
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.files import check_columns, file_errors, read_json
 from cflow_torch.data.log import FlowLabels, Log
@@ -144,7 +144,7 @@ class PandaSetLog(Log):
             rows = np.flatnonzero(np.isin(cuboids["cuboids.sensor_id"], (_EVERY_LIDAR, lidar)))
             heading_centre = np.stack([cuboids[name][rows] for name in ("yaw", *_POSITION)], axis=1)
             world = upright_poses(heading_centre + (np.pi / 2, 0, 0, 0))
-            return make_boxes(
+            return Boxes(
                 cuboids["uuid"][rows].tolist(),
                 category_indices(cuboids["label"][rows].tolist(), CATEGORY_NAME),
                 np.stack([cuboids[name][rows] for name in _SIZE], axis=1),

@@ -7,7 +7,7 @@ from typing import ClassVar, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, make_boxes, points_in_box
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, points_in_box
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
@@ -149,7 +149,7 @@ class NuScenesLog(Log):
         tracks, is_known = self._tracks.at(time) or (None, None)
         assert tracks is not None and is_known is not None
         rows = [row for row, name in enumerate(tracks.category) if name != OWN_TRAILER]
-        return make_boxes(
+        return Boxes(
             [tracks.track[row] if is_known[row] else f"{tracks.track[row]} guessed in {index}" for row in rows],
             category_indices([tracks.category[row] for row in rows], self._categories),
             tracks.size[rows],

@@ -42,6 +42,14 @@ class Component:
             check_columns(self.file, parquet.schema_arrow.names, columns, self._hint)
             return list(parquet.read(list(columns), use_threads=False).to_pylist())
 
+    def rows_by(self, key: str, wanted: Sequence[int], columns: Sequence[str]) -> dict[int, list[Any]]:
+        """Read some columns of the rows with the wanted values of a key column, by that value."""
+        rows = {row[key]: [row[name] for name in columns] for row in self.rows((key, *columns))}
+        missing = [value for value in wanted if value not in rows]
+        if missing:
+            raise CFlowError(f"{self.file} has no row with {key} {missing[0]}; copy it again")
+        return {value: rows[value] for value in wanted}
+
     def frame_lasers(self) -> Collection[Key]:
         """Return the frame time (microseconds) and laser of every row."""
         if not self._row_of:
@@ -57,21 +65,18 @@ class Component:
         missing = [key for key in keys if key not in self.frame_lasers()]
         if missing:
             raise CFlowError(f"{self.file} has no row for frame {missing[0][0]}, laser {missing[0][1]}; copy it again")
-        wanted = {self._row_of[key]: key for key in keys}
-        columns = [f"{column}.values", f"{column}.shape"]
+        rows, columns = [self._row_of[key] for key in keys], [TIME, LASER, f"{column}.values", f"{column}.shape"]
         images: dict[Key, np.ndarray | None] = {}
         with file_errors(self.file, self._hint):
-            parquet, end = pq.ParquetFile(source_for_mmap(self.file)), 0
+            parquet = pq.ParquetFile(source_for_mmap(self.file))
             check_columns(self.file, parquet.schema_arrow.names, columns, self._hint)
-            for group in range(parquet.num_row_groups):
-                row, end = end, end + parquet.metadata.row_group(group).num_rows
-                if not any(row <= index < end for index in wanted):
-                    continue
-                for batch in parquet.iter_batches(_BATCH, [group], columns, use_threads=False):
-                    for values, shape in zip(*(batch.column(name) for name in columns)):
-                        if row in wanted:
-                            images[wanted[row]] = _image(values, shape, channels)
-                        row += 1
+            ends = np.cumsum([parquet.metadata.row_group(k).num_rows for k in range(parquet.num_row_groups)])
+            groups = np.unique(np.searchsorted(ends, rows, side="right")).tolist()
+            for batch in parquet.iter_batches(_BATCH, groups, columns, use_threads=False):
+                for time, laser, values, shape in zip(*(batch.column(name) for name in columns)):
+                    key = (time.as_py(), laser.as_py())
+                    if key in keys:
+                        images[key] = _image(values, shape, channels)
         return images
 
 

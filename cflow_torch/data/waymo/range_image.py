@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Sequence
 
 import numpy as np
 import torch
@@ -23,16 +23,17 @@ class LaserCalibration(NamedTuple):
     """Mounting of one laser and the inclinations of its rows."""
 
     T_ego_sensor: np.ndarray  # (4, 4) float64, laser coordinates to the vehicle's
-    # (H,) float64 radians, ascending; None = evenly spaced between `low` and `high`.
-    inclinations: np.ndarray | None = None
-    low: float = 0.0  # radians, outer edge of the lowest row, used if `inclinations` is None
-    high: float = 0.0  # radians, outer edge of the highest row, used if `inclinations` is None
+    # (H,) radians, ascending; None = evenly spaced between `low` and `high`.
+    inclinations: Sequence[float] | np.ndarray | None = None
+    low: float | None = None  # radians, outer edge of the lowest row, used if `inclinations` is None
+    high: float | None = None  # radians, outer edge of the highest row, used if `inclinations` is None
 
     def row_inclinations(self, num_rows: int) -> np.ndarray:
         """Return (H,) float64 radians above the laser's xy plane; row 0 is the highest. Another H is a `CFlowError`."""
-        ascending = self.inclinations
-        if ascending is None:
-            ascending = self.low + (np.arange(num_rows) + 0.5) / num_rows * (self.high - self.low)
+        ascending = np.array(self.inclinations, np.float64)
+        if self.inclinations is None:
+            low, high = np.array([self.low, self.high], np.float64)
+            ascending = low + (np.arange(num_rows) + 0.5) / num_rows * (high - low)
         if ascending.shape != (num_rows,) or not np.isfinite(ascending).all():
             raise CFlowError(
                 f"a range image of {num_rows} rows needs {num_rows} finite beam inclinations, but the calibration has "

@@ -6,11 +6,11 @@ from collections import defaultdict
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Sequence
+from typing import Any, Sequence
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, make_boxes, upright_poses
+from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, upright_poses
 from cflow_torch.data.files import file_errors, find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, as_path, remote_errors
@@ -23,6 +23,8 @@ SEARCH_DEPTH = 2  # <root>/<data set>/<split>
 BOX_CATEGORY = {0: "NONE", 1: "REGULAR_VEHICLE", 2: "PEDESTRIAN", 3: "SIGN", 4: "BICYCLIST"}
 """Waymo's box type -> Argoverse 2 name. Trucks, buses and motorcycles have type 1, too; 0 is unknown."""
 
+_KIND, _SIZE = f"{BOX}type", tuple(f"{BOX}box.size.{axis}" for axis in "xyz")
+_HEADING_CENTRE = (f"{BOX}box.heading", *(f"{BOX}box.center.{axis}" for axis in "xyz"))
 _KEPT_FRAMES = 2  # the labels of a pair are read after both of its sweeps
 
 
@@ -68,9 +70,6 @@ class WaymoLog(BoxLog):
 
     def __init__(self, file: PathLike, lasers: Sequence[str] = tuple(LASERS), both_returns: bool = False) -> None:
         self.file = as_path(file)
-        unknown = sorted(set(lasers) - set(LASERS))
-        if unknown or not lasers:
-            raise CFlowError(f"lasers={list(lasers)}: choose some of {', '.join(LASERS)}")
         if self.file.parent.name != "lidar":
             raise CFlowError(f"{self.file} is not in a folder lidar; pass <split>/lidar/<segment>.parquet")
         self.log_id = self.file.stem
@@ -80,11 +79,15 @@ class WaymoLog(BoxLog):
         self.timestamps = [time * 1000 for time in times]
         self._check_count(self.file)
         present = {laser for _, laser in self._images.frame_lasers()}
-        self._lasers = [LASERS[name] for name in LASERS if name in lasers and LASERS[name] in present]
-        if not self._lasers:
-            raise CFlowError(f"{self.file} has lasers {sorted(present)}, none of {list(lasers)} ({LASERS})")
+        names = [name for name, laser in LASERS.items() if laser in present]
+        self._lasers = [LASERS[name] for name in names if name in lasers]
+        if not self._lasers or not set(lasers) <= set(LASERS):
+            raise CFlowError(f"{self.file}: lasers={list(lasers)}: choose some of {', '.join(names)}")
         self._calibration = self._read_calibration()
-        self._poses = self._read_poses(times)
+        component = Component(self.file, "vehicle_pose")
+        stored = component.rows_by(TIME, times, (parquet.VEHICLE_POSE,)).items()
+        poses = [matrix_of(values, f"{component.file}: the pose of frame {time}") for time, (values,) in stored]
+        self._poses = np.stack(poses)
         if TOP in self._lasers:
             self._pixel_poses.frame_lasers()
         self._frame = lru_cache(_KEPT_FRAMES)(self._read_frame)
@@ -100,79 +103,55 @@ class WaymoLog(BoxLog):
         labels = super()._labels(index)
         return labels and replace(labels, is_valid=labels.is_valid & ~self._frame(index)[1])
 
-    def _boxes(self, index: int) -> Boxes | None:
-        boxes = self._boxes_of_frames
-        return boxes.get(self.timestamps[index] // 1000, make_boxes([], [], [], [])) if boxes else None
-
     def _read_frame(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Read the (N, 3) float32 points in the vehicle frame, and (N,) bool whether each lies in a no-label zone."""
         time = self.timestamps[index] // 1000
         keys = [(time, laser) for laser in self._lasers]
         images = [self._images.images(keys, f"{parquet.LIDAR}{number}", 4) for number in self._returns]
-        pixel_pose = None
-        if TOP in self._lasers:
-            pixel_pose = self._pixel_poses.images([(time, TOP)], parquet.PIXEL_POSE, 6)[time, TOP]
-            if pixel_pose is None:
-                raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
+        pixel_poses = self._pixel_poses.images([(time, TOP)], parquet.PIXEL_POSE, 6) if TOP in self._lasers else {}
+        if any(poses is None for poses in pixel_poses.values()):
+            raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
         points, zone = [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
         for key in keys:
             for image in (of_return[key] for of_return in images):
                 if image is None:  # a laser, or a second return, without any data
                     continue
-                poses = pixel_pose if key[1] == TOP else None
+                calibration, poses = self._calibration[key[1]], pixel_poses.get(key)
                 with file_errors(f"{self.file}, frame {time}, laser {key[1]}"):
-                    found, pixels = range_image_points(image, self._calibration[key[1]], poses, self._poses[index])
+                    found, pixels = range_image_points(image, calibration, poses, self._poses[index])
                 points.append(found)
                 zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
         return np.concatenate(points).astype(np.float32), np.concatenate(zone)
 
     def _read_calibration(self) -> dict[int, LaserCalibration]:
         component = Component(self.file, "lidar_calibration")
-        names = [f"{CALIBRATION}beam_inclination.{name}" for name in ("values", "min", "max")]
-        rows = {row[LASER]: row for row in component.rows((LASER, f"{CALIBRATION}extrinsic.transform", *names))}
-        missing = [laser for laser in self._lasers if laser not in rows]
-        if missing:
-            raise CFlowError(f"{component.file} has lasers {sorted(rows)}; lasers {missing} are missing, copy it again")
+        inclinations = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
+        columns = [f"{CALIBRATION}{name}" for name in ("extrinsic.transform", *inclinations)]
         calibration = {}
-        for laser in self._lasers:
-            row, where = rows[laser], f"{component.file}: laser {laser}"
-            with file_errors(where):
-                mount = matrix_of(row[f"{CALIBRATION}extrinsic.transform"], f"{where}: extrinsic")
-                values, low, high = (row[name] for name in names)
-                table = np.array(values, dtype=np.float64) if values else None
-                ends = (0.0, 0.0) if values else (float(low), float(high))
-                calibration[laser] = LaserCalibration(mount, table, *ends)
+        for laser, (transform, table, low, high) in component.rows_by(LASER, self._lasers, columns).items():
+            mount = matrix_of(transform, f"{component.file}: laser {laser}: extrinsic")
+            calibration[laser] = LaserCalibration(mount, table or None, low, high)
         return calibration
 
-    def _read_poses(self, times: Sequence[int]) -> np.ndarray:
-        component = Component(self.file, "vehicle_pose")
-        stored = {row[TIME]: row[parquet.VEHICLE_POSE] for row in component.rows((TIME, parquet.VEHICLE_POSE))}
-        missing = [time for time in times if time not in stored]
-        if missing:
-            raise CFlowError(f"{component.file} has no pose for frame {missing[0]}; copy it again")
-        return np.stack([matrix_of(stored[time], f"{component.file}: the pose of frame {time}") for time in times])
-
     @cached_property
-    def _boxes_of_frames(self) -> dict[int, Boxes]:
-        """Read frame time -> boxes; empty if the segment has no labels (the testing split)."""
-        component = Component(self.file, "lidar_box")
-        file = component.file
-        with remote_errors(file):
-            if not file.exists():
+    def _box_rows(self) -> dict[int, list[dict[str, Any]]]:
+        """Read frame time -> rows of its boxes; empty if the segment has no labels (the testing split)."""
+        component, by_frame = Component(self.file, "lidar_box"), defaultdict(list)
+        with remote_errors(component.file):
+            if not component.file.exists():
                 return {}
-        size = [f"{BOX}box.size.{axis}" for axis in "xyz"]
-        heading_centre = [f"{BOX}box.heading", *(f"{BOX}box.center.{axis}" for axis in "xyz")]
-        kind, by_frame = f"{BOX}type", defaultdict(list)
-        for row in component.rows((TIME, TRACK, kind, *size, *heading_centre)):
+        for row in component.rows((TIME, TRACK, _KIND, *_SIZE, *_HEADING_CENTRE)):
             by_frame[row[TIME]].append(row)
-        boxes = {}
-        for time, rows in by_frame.items():
-            with file_errors(file):
-                known = [row for row in rows if row[kind] != 0]
-                boxes[time] = make_boxes(
-                    [str(row[TRACK]) for row in known],
-                    category_indices([row[kind] for row in known], BOX_CATEGORY),
-                    [[row[name] for name in size] for row in known],
-                    upright_poses([[row[name] for name in heading_centre] for row in known]),
-                )
-        return boxes
+        return by_frame
+
+    def _boxes(self, index: int) -> Boxes | None:
+        if not self._box_rows:
+            return None
+        rows = [row for row in self._box_rows[self.timestamps[index] // 1000] if row[_KIND] != 0]
+        with file_errors(Component(self.file, "lidar_box").file):
+            return Boxes(
+                [str(row[TRACK]) for row in rows],
+                category_indices([row[_KIND] for row in rows], BOX_CATEGORY),
+                [[row[name] for name in _SIZE] for row in rows],
+                upright_poses([[row[name] for name in _HEADING_CENTRE] for row in rows]),
+            )
