@@ -6,68 +6,50 @@ import numpy as np
 
 from cflow_torch.types import CFlowError
 
-CATEGORIES: tuple[str, ...] = (
-    "NONE",
-    "ANIMAL",
-    "ARTICULATED_BUS",
-    "BICYCLE",
-    "BICYCLIST",
-    "BOLLARD",
-    "BOX_TRUCK",
-    "BUS",
-    "CONSTRUCTION_BARREL",
-    "CONSTRUCTION_CONE",
-    "DOG",
-    "LARGE_VEHICLE",
-    "MESSAGE_BOARD_TRAILER",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN",
-    "MOTORCYCLE",
-    "MOTORCYCLIST",
-    "OFFICIAL_SIGNALER",
-    "PEDESTRIAN",
-    "RAILED_VEHICLE",
-    "REGULAR_VEHICLE",
-    "SCHOOL_BUS",
-    "SIGN",
-    "STOP_SIGN",
-    "STROLLER",
-    "TRAFFIC_LIGHT_TRAILER",
-    "TRUCK",
-    "TRUCK_CAB",
-    "VEHICULAR_TRAILER",
-    "WHEELCHAIR",
-    "WHEELED_DEVICE",
-    "WHEELED_RIDER",
-)
+# Category -> its meta class. Signs, cones, trailers of signs and animals have none and are not scored.
+_META_CLASS = {
+    "NONE": "BACKGROUND",
+    "ANIMAL": "",
+    "ARTICULATED_BUS": "OTHER_VEHICLES",
+    "BICYCLE": "WHEELED_VRU",
+    "BICYCLIST": "WHEELED_VRU",
+    "BOLLARD": "",
+    "BOX_TRUCK": "OTHER_VEHICLES",
+    "BUS": "OTHER_VEHICLES",
+    "CONSTRUCTION_BARREL": "",
+    "CONSTRUCTION_CONE": "",
+    "DOG": "",
+    "LARGE_VEHICLE": "OTHER_VEHICLES",
+    "MESSAGE_BOARD_TRAILER": "",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "",
+    "MOTORCYCLE": "WHEELED_VRU",
+    "MOTORCYCLIST": "WHEELED_VRU",
+    "OFFICIAL_SIGNALER": "PEDESTRIAN",
+    "PEDESTRIAN": "PEDESTRIAN",
+    "RAILED_VEHICLE": "OTHER_VEHICLES",
+    "REGULAR_VEHICLE": "CAR",
+    "SCHOOL_BUS": "OTHER_VEHICLES",
+    "SIGN": "",
+    "STOP_SIGN": "",
+    "STROLLER": "PEDESTRIAN",
+    "TRAFFIC_LIGHT_TRAILER": "",
+    "TRUCK": "OTHER_VEHICLES",
+    "TRUCK_CAB": "OTHER_VEHICLES",
+    "VEHICULAR_TRAILER": "OTHER_VEHICLES",
+    "WHEELCHAIR": "PEDESTRIAN",
+    "WHEELED_DEVICE": "WHEELED_VRU",
+    "WHEELED_RIDER": "WHEELED_VRU",
+}
+CATEGORIES = tuple(_META_CLASS)
 """Names of the categories, in the order of their indices in labels (0 = background)."""
 
-CATEGORY_INDEX: dict[str, int] = {name: index for index, name in enumerate(CATEGORIES)}
+CATEGORY_INDEX = {name: index for index, name in enumerate(CATEGORIES)}
 
-META_CLASSES: dict[str, tuple[str, ...]] = {
-    "BACKGROUND": ("NONE",),
-    "CAR": ("REGULAR_VEHICLE",),
-    "OTHER_VEHICLES": (
-        "ARTICULATED_BUS",
-        "BOX_TRUCK",
-        "BUS",
-        "LARGE_VEHICLE",
-        "RAILED_VEHICLE",
-        "SCHOOL_BUS",
-        "TRUCK",
-        "TRUCK_CAB",
-        "VEHICULAR_TRAILER",
-    ),
-    "PEDESTRIAN": ("OFFICIAL_SIGNALER", "PEDESTRIAN", "STROLLER", "WHEELCHAIR"),
-    "WHEELED_VRU": ("BICYCLE", "BICYCLIST", "MOTORCYCLE", "MOTORCYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"),
-}
-"""Meta class -> its categories. Signs, cones, trailers of signs and animals have none and are not scored."""
+META_NAMES = ("BACKGROUND", "CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
+META_CLASSES = {meta: tuple(name for name in CATEGORIES if _META_CLASS[name] == meta) for meta in META_NAMES}
+"""Meta class -> its categories."""
 
-META_NAMES: tuple[str, ...] = tuple(META_CLASSES)
-
-
-_META_OF_CATEGORY = np.array(
-    [next((index for index, names in enumerate(META_CLASSES.values()) if name in names), -1) for name in CATEGORIES]
-)
+_META_OF_CATEGORY = np.array([META_NAMES.index(meta) if meta else -1 for meta in _META_CLASS.values()])
 
 
 def meta_class(category: np.ndarray) -> np.ndarray:
