@@ -70,6 +70,11 @@ def transform_points(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
 
 
+def transform_each(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Return (N, 3) float64 points, each transformed by its own rigid motion; `T` is (N, 4, 4) float64."""
+    return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+
+
 def to_quaternions(rotations: np.ndarray) -> np.ndarray:
     """Convert rotation matrices (M, 3, 3) to unit quaternions (M, 4) float64, scalar first and not negative."""
     from kornia.geometry.conversions import rotation_matrix_to_quaternion

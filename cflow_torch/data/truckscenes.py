@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Mapping, Sequence
 
 import numpy as np
 
@@ -32,38 +31,18 @@ def find_truckscenes_scenes(root: PathLike) -> list[SceneSource]:
 class TruckScenesLog(NuScenesLog):
     """One TruckScenes scene. Experimental: tested on simulated scenes only.
 
-    Args:
-        source: the scene, from `find_truckscenes_scenes`.
-        sweep_step: 1 = all sweeps (10 Hz); n = every key frame, and every n-th sweep after it.
-        lidars: channels to merge; None = every LiDAR of the scene (six).
-        own_vehicle: rectangle of the vehicle seen from above. We remove its points, and those in boxes of
-            `vehicle.ego_trailer`, if there are annotations. None = keep both.
-        deskew: move each point with the pose that the vehicle had when it was measured; False: with the pose of its
-            LiDAR's sweep.
-
     Attributes:
-        timestamps: times of the reference LiDAR's sweeps (LIDAR_LEFT, else the first), in microseconds.
+        timestamps: times of the reference LiDAR's sweeps (LIDAR_LEFT, else the first), in microseconds, at 10 Hz.
 
     Convention: points are in the ego frame at the reference's time stamp. From every other LiDAR we take the sweep
         closest in time; none if it is more than 60 ms off. The world is UTM, with coordinates of some 1e6 m. Between
-        the reference's sweeps, poses are interpolated. All else is as in `NuScenesLog`.
+        the reference's sweeps, poses are interpolated. With `own_vehicle`, points in boxes of `vehicle.ego_trailer` are
+        removed, too. All else is as in `NuScenesLog`.
     """
 
-    _categories: ClassVar[Mapping[str, str]] = TRUCKSCENES_CATEGORIES
-    _reference: ClassVar[str] = "LIDAR_LEFT"
-    # |x| < 7 m and |y| < 2 m, as in OpenSceneFlow.
-    OWN_VEHICLE: ClassVar[Footprint] = Footprint(rear=-7.0, front=7.0, half_width=2.0)
-
-    def __init__(
-        self,
-        source: SceneSource,
-        sweep_step: int = 1,
-        lidars: Sequence[str] | None = None,
-        own_vehicle: Footprint | None = OWN_VEHICLE,
-        deskew: bool = True,
-    ) -> None:
-        super().__init__(source, sweep_step, lidars, own_vehicle)
-        self._deskew = deskew
+    _categories = TRUCKSCENES_CATEGORIES
+    _reference = "LIDAR_LEFT"
+    OWN_VEHICLE = Footprint(rear=-7.0, front=7.0, half_width=2.0)  # as in OpenSceneFlow
 
     def _points_of(self, content: bytes, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
         with file_errors(file, "copy it again"):

@@ -13,7 +13,7 @@ from cflow_torch.data.bags.messages import Frames, Sample, other_columns, points
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
-from cflow_torch.data.rigid_motion import poses_at, transform_points
+from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.types import Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
@@ -120,8 +120,7 @@ class BagLog(Log):
         if times is not None and self.deskew:
             shots, group = np.unique(np.round(times / _SLICE).astype(np.int64), return_inverse=True)
             at = poses_at(time + shots * round(_SLICE * 1e9), self._known_times, self._known_poses)
-            T = (np.linalg.inv(self.poses[index]) @ at)[group]
-            points = np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+            points = transform_each(points, (np.linalg.inv(self.poses[index]) @ at)[group])
         return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Mapping, NamedTuple, Sequence
+from typing import ClassVar, Literal, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
-from cflow_torch.data.rigid_motion import poses_at, transform_points
+from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 MAX_UNIT_LAG = 60_000  # microseconds from another LiDAR's sweep to the reference's: a bit more than half a revolution
@@ -71,8 +71,10 @@ class NuScenesLog(Log):
         sweep_step: 1 = all sweeps (20 Hz); 2 = every second one after each key frame, and every key frame (10 Hz, as
             OpenSceneFlow thins nuScenes).
         lidars: channels to merge; None = every LiDAR of the scene.
-        own_vehicle: points above it are removed; None = keep them. Points at the sensor itself mean "no return" and
-            are always removed.
+        own_vehicle: points above it are removed; "auto" = `OWN_VEHICLE`, None = keep them. Points at the sensor itself
+            mean "no return" and are always removed.
+        deskew: move each point with the pose that the vehicle had when it was measured; False: with the pose of its
+            LiDAR's sweep. Ignored if the format has no times of points, as that of nuScenes.
 
     Attributes:
         log_id: name of the scene.
@@ -96,11 +98,13 @@ class NuScenesLog(Log):
         source: SceneSource,
         sweep_step: int = 1,
         lidars: Sequence[str] | None = None,
-        own_vehicle: Footprint | None = OWN_VEHICLE,
+        own_vehicle: Footprint | Literal["auto"] | None = "auto",
+        deskew: bool = True,
     ) -> None:
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: pass 1 for all sweeps, 2 for every second one")
-        self.log_id, self._root, self._own_vehicle = source.name, as_path(source.root), own_vehicle
+        self.log_id, self._root, self._deskew = source.name, as_path(source.root), deskew
+        self._own_vehicle = self.OWN_VEHICLE if own_vehicle == "auto" else own_vehicle
         folder = self._root / source.version
         sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.name)
         with file_errors(folder / "category.json"):
@@ -174,26 +178,23 @@ class NuScenesLog(Log):
         with file_errors(file, f"copy the sensor data of scene {self.log_id} next to the tables"):
             content = read_bytes(file)
         local, times = self._points_of(content, file)
-        returned = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1)
         points = transform_points(local, chain.mount[row])
-        kept = returned & ~self._is_own(points, index)  # before compensation, because the vehicle moves with its LiDARs
-        points = points[kept]
+        # We remove the own vehicle before compensation, because it moves with its LiDARs.
+        kept = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1) & ~self._is_own(points, index)
+        points, T_ego_world = points[kept], self._T_ego_world[index]
         if times is None:
-            at = np.broadcast_to(self._T_ego_world[index] @ chain.ego[row], (len(points), 4, 4))
-            since = np.zeros(len(points), dtype=np.int64)
-        else:
-            times = times[kept]
-            lag = np.abs(times - float(chain.times[row])).max(initial=0)
-            if lag > MAX_SHOT_LAG:
-                raise CFlowError(
-                    f"{file}: time stamps of points differ by up to {lag:.0f} microseconds from the sweep's; they must "
-                    "be microseconds since 1970. Pass deskew=False to ignore them"
-                )
-            distinct, group = np.unique(times, return_inverse=True)
-            at = (self._T_ego_world[index] @ poses_at(distinct, *self._odometry))[group]
-            since = times - self.timestamps[index]
-        points = np.einsum("nij,nj->ni", at[:, :3, :3], points) + at[:, :3, 3]
-        return points.astype(np.float32), since
+            at = np.broadcast_to(T_ego_world @ chain.ego[row], (len(points), 4, 4))
+            return transform_each(points, at).astype(np.float32), np.zeros(len(points), dtype=np.int64)
+        times = times[kept]
+        lag = np.abs(times - float(chain.times[row])).max(initial=0)
+        if lag > MAX_SHOT_LAG:
+            raise CFlowError(
+                f"{file}: time stamps of points differ by up to {lag:.0f} microseconds from the sweep's; they must be "
+                "microseconds since 1970. Pass deskew=False to ignore them"
+            )
+        distinct, group = np.unique(times, return_inverse=True)
+        at = (T_ego_world @ poses_at(distinct, *self._odometry))[group]
+        return transform_each(points, at).astype(np.float32), times - self.timestamps[index]
 
     def _points_of(self, content: bytes, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
         """Return (N, 3) points in the frame of the LiDAR, and the (N,) int64 microseconds of shots; None = unknown."""
