@@ -5,7 +5,7 @@ from __future__ import annotations
 import weakref
 from functools import partial
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -82,23 +82,23 @@ class HDF5Log(Log):
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: float32 points, float64 pose of their frame; ground mask and times if stored."""
         rows, timestamp = self._rows(index), self.timestamps[index]
-        points: Any = self._values(index, "lidar", dtype=np.float32)
-        is_ground = self._column(index, "ground_mask", rows, np.bool_)
+        points = self._values(index, "lidar", None, np.float32)
+        is_ground = self._values(index, "ground_mask", rows, np.bool_)
         pose = self._stored_pose(index)
         if pose is not None and not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
-        times = self._column(index, "lidar_dt", rows, np.float32)
+        times = self._values(index, "lidar_dt", rows, np.float32)
         return Sweep(points[:, :3], is_ground, pose, nanoseconds, times)
 
     def labels(self, index: int) -> FlowLabels | None:
         """Read the truth of the pair (index, index + 1); None if the sweep has no `flow`."""
         rows = self._rows(index)
-        flow = self._values(index, "flow", [(rows, 3)], np.float32)
+        flow = self._values(index, "flow", (*rows, 3), np.float32)
         if flow is None:
             return None
-        category = self._column(index, "flow_category_indices", rows)
-        is_valid = self._column(index, "flow_is_valid", rows, np.bool_)
+        category = self._values(index, "flow_category_indices", rows)
+        is_valid = self._values(index, "flow_is_valid", rows, np.bool_)
         where = f"{self.file}: sweep {self.timestamps[index]}"
         if category is None or is_valid is None:
             raise CFlowError(f"{where} has flow without flow_category_indices or flow_is_valid")
@@ -109,7 +109,7 @@ class HDF5Log(Log):
 
     def eval_mask(self, index: int) -> np.ndarray | None:
         """Read which points are scored, (N,) bool; None if the sweep has no `eval_mask`."""
-        return self._column(index, "eval_mask", self._rows(index), np.bool_)
+        return self._values(index, "eval_mask", self._rows(index), np.bool_)
 
     def stored_motion(self, index: int) -> StoredMotion:
         """Compute the ego motion that the harness uses for the pair (index, index + 1), from the stored poses."""
@@ -146,16 +146,16 @@ class HDF5Log(Log):
 
     def _stored_pose(self, index: int, dtype: Any = np.float64) -> Any:
         """Read a pose, or compute it from the ego motion of all sweeps before; None if poses are not needed."""
-        pose = self._values(index, "pose", [(4, 4)], dtype)
+        pose = self._values(index, "pose", (4, 4), dtype)
         if pose is not None:
             return pose
-        while len(self._chain) <= index:
-            motion = self._values(len(self._chain) - 1, "ego_motion", [(4, 4)], np.float64)
+        while len(self._chain) <= max(index, 1):
+            motion = self._values(len(self._chain) - 1, "ego_motion", (4, 4), np.float64)
             if motion is None:
                 break
             name = f"ego_motion of sweep {self.timestamps[len(self._chain) - 1]} in {self.file}"
             self._chain.append(self._chain[-1] @ np.linalg.inv(rigid_transform(motion, name)))
-        if index < len(self._chain) > 1 or (index == 0 and self._values(0, "ego_motion") is not None):
+        if index < len(self._chain) > 1:
             return self._chain[index]
         if not self._needs_poses:
             return None
@@ -172,39 +172,31 @@ class HDF5Log(Log):
         points = self._values(0, "lidar") if is_argoverse2(self.timestamps[0]) else None
         if points is None:
             return np.eye(4)
-        is_ground = self._column(0, "ground_mask", len(points), np.bool_)
+        is_ground = self._values(0, "ground_mask", (len(points),), np.bool_)
         return recognized_extrinsics(self.timestamps[0], points, is_ground)
 
     def _group(self, index: int) -> Any:
         return member(self._scene, str(self._timestamp(index)), self.file)
 
-    def _rows(self, index: int) -> int:
-        """Return the number of points of a sweep without reading them."""
+    def _rows(self, index: int) -> tuple[int]:
+        """Return the number of points of a sweep without reading them, as the shape of a column."""
         stored = member(self._group(index), "lidar", f"{self.file}: sweep {self.timestamps[index]}")
         shape: tuple[int, ...] = () if stored is None else stored.shape
         if len(shape) != 2 or shape[1] < 3:
             raise CFlowError(f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, not (N, 3+)")
-        return int(shape[0])
+        return (shape[0],)
 
-    def _values(
-        self, index: int, key: str, shapes: Sequence[tuple[int, ...]] = (), dtype: Any = None
-    ) -> np.ndarray | None:
-        """Read the values of a key in one of the given shapes; None if there are none."""
-        group = self._group(index)
-        what = f"{self.file}: {key} of sweep {self.timestamps[index]}"
+    def _values(self, index: int, key: str, shape: tuple[int, ...] | None = None, dtype: Any = None) -> Any:
+        """Read the values of a key in a shape, to which an axis of length 1 may follow; None if there are none."""
+        group, what = self._group(index), f"{self.file}: {key} of sweep {self.timestamps[index]}"
         stored = member(group, key, what)
         if stored is None:
             return None
         with scene_errors(what), np.errstate(over="ignore"):  # float64 beyond float32 becomes infinite, "no return"
-            if shapes and stored.shape not in shapes:
-                raise CFlowError(f"{what} has shape {stored.shape}, expected {shapes[0]}")
-            values: np.ndarray = stored[()]
-            return values if dtype is None else values.astype(dtype, copy=False)
-
-    def _column(self, index: int, key: str, rows: int, dtype: Any = None) -> np.ndarray | None:
-        """Read the (N,) values of a key that is stored as (N,) or (N, 1); None if there are none."""
-        values = self._values(index, key, [(rows,), (rows, 1)], dtype)
-        return None if values is None else values.reshape(rows)
+            shape = stored.shape if shape is None else shape
+            if stored.shape not in (shape, (*shape, 1)):
+                raise CFlowError(f"{what} has shape {stored.shape}, expected {shape}")
+            return stored[()].reshape(shape).astype(dtype or stored.dtype, copy=False)
 
 
 _HINT = "write the scene again, as groups with arrays of plain numbers in the file itself"
@@ -229,8 +221,6 @@ def member(group: Any, name: str, where: PathLike) -> Any | None:
     with `where`.
     """
     h5py = import_h5py()
-    if not name or "/" in name or name == ".":
-        return None
     with scene_errors(f"{where}: {name}"):
         link = group.get(name, getlink=True)
         if link is None:
