@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-import math
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Callable, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 from numpy.lib import format as npy
@@ -16,7 +15,7 @@ from cflow_torch.data.files import file_errors, read_json, shortened
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
 from cflow_torch.data.pickles import load_array
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.types import CFlowError, Sweep, check_array
 
 _HINT = "copy the sequence from the data set again"
 
@@ -99,7 +98,7 @@ class AevaScenesLog(BoxLog):
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`; a ground mask or times that one of its clouds lacks are None."""
         names = self._column(index, "semantic_labels", np.str_) if self._ground else None
-        times = self._column(index, "time_offset_ns", np.integer)
+        times = self._column(index, "time_offset_ns", np.int64)
         is_ground = None if names is None else np.isin(names, GROUND)
         seconds = None if times is None else times * 1e-9
         return Sweep(self._points(index), is_ground, self._poses[index].copy(), self.timestamps[index], seconds)
@@ -110,16 +109,16 @@ class AevaScenesLog(BoxLog):
         In compensated clouds the motion of the vehicle is removed, so static points have about 0. Third parties
         measured the sign, which contradicts a comment in the SDK.
         """
-        return np.concatenate([cloud.column("velocity", np.floating) for cloud in self._clouds_of(index)])
+        return np.concatenate([cloud.column("velocity", np.float32) for cloud in self._clouds_of(index)])
 
     def _points(self, index: int) -> np.ndarray:
         pairs = zip(self._clouds_of(index), self._mounts)
         return np.concatenate([transform_points(cloud.points, mount) for cloud, mount in pairs]).astype(np.float32)
 
-    def _column(self, index: int, key: str, kind: Any) -> np.ndarray | None:
+    def _column(self, index: int, key: str, dtype: Any) -> np.ndarray | None:
         """Read one value per point of a sweep, (N,); None if one of its clouds has no such array."""
         clouds = self._clouds_of(index)
-        return np.concatenate([c.column(key, kind) for c in clouds]) if all(key in c.keys for c in clouds) else None
+        return np.concatenate([c.column(key, dtype) for c in clouds]) if all(key in c.keys for c in clouds) else None
 
     def _open_clouds(self, index: int) -> list[Cloud]:
         where, clouds = f"{self._file}, frame {self._timestamp(index)}", []
@@ -166,28 +165,23 @@ class Cloud:
         with file_errors(file, _HINT):
             self._arrays = np.load(io.BytesIO(read_bytes(file)), allow_pickle=False)
             self.keys: list[str] = list(self._arrays.files)
-        self.points = self._array("xyz", np.floating, lambda shape: len(shape) == 2 and shape[1] == 3)
+        with file_errors(f"{file}: xyz", _HINT):
+            points = self._arrays["xyz"]
+            check_array(points, "xyz", (None, 3), "f", "(N, 3) floats, metres")
+        self.points = points.astype(np.float32, copy=False)
 
-    def column(self, key: str, kind: Any) -> np.ndarray:
-        """Return one value per point, (N,): float32 if `kind` is `np.floating`, `np.str_` for texts, else integers."""
-        rows = len(self.points)
-        return self._array(key, kind, lambda shape: shape in ((rows,), (rows, 1))).reshape(rows)
-
-    def _array(self, key: str, kind: Any, is_shape: Callable[[tuple[int, ...]], bool]) -> np.ndarray:
-        if key not in self.keys:
-            raise CFlowError(f"{self.file} has no array {key}; it has {self.keys[:20]}")
+    def column(self, key: str, dtype: Any) -> np.ndarray:
+        """Return one value per point, (N,) of `dtype`; np.str_ = texts as objects."""
         with file_errors(f"{self.file}: {key}", _HINT):
-            array = self._texts(key) if kind is np.str_ else self._arrays[key]
-            if not is_shape(array.shape) or not (kind is np.str_ or np.issubdtype(array.dtype, kind)):
-                raise CFlowError(f"{self.file}: {key} has shape {array.shape} and dtype {array.dtype}; {_HINT}")
-            return array.astype(np.float32, copy=False) if kind is np.floating else array
+            values = self._texts(key) if dtype is np.str_ else self._arrays[key].astype(dtype)
+            return values.reshape(len(self.points))
 
     def _texts(self, key: str) -> np.ndarray:
         """Return an array of strings, also of pickled ones, which are decoded without executing anything."""
         with self._arrays.zip.open(f"{key}.npy") as member:
             npy.read_magic(member)
-            shape, _, dtype = npy.read_array_header_1_0(member)
+            _, _, dtype = npy.read_array_header_1_0(member)
             array: np.ndarray = load_array(member) if dtype.hasobject else self._arrays[key]
-        if {type(text) for text in array.ravel().tolist()} - {str} or array.size != math.prod(shape):
-            raise ValueError(f"it must hold {math.prod(shape)} strings")
+        if not all(isinstance(text, str) for text in array.ravel().tolist()):
+            raise ValueError("it must hold strings")
         return array

@@ -122,10 +122,10 @@ def test_class_names_of_every_pickle_protocol_are_read(tmp_path: Path, protocol:
     ("damage", "message"),
     [
         (lambda file: file.unlink(), "is missing; copy"),
-        (lambda file: save(file, points=np.zeros((3, 3))), "no array xyz.*points"),
+        (lambda file: save(file, points=np.zeros((3, 3))), "xyz is not a file in the archive"),
         (lambda file: save(file, xyz=np.zeros((3, 2))), r"xyz has shape \(3, 2\)"),
-        (lambda file: save(file, xyz=np.zeros((3, 3), int)), "xyz has .* dtype int64"),
-        (lambda file: save(file, xyz=np.zeros((3, 3)), semantic_labels=np.full(4, "car")), r"shape \(4,\)"),
+        (lambda file: save(file, xyz=np.zeros((3, 3), int)), "xyz has dtype int64"),
+        (lambda file: save(file, xyz=np.zeros((3, 3)), semantic_labels=np.full(4, "car")), "cannot reshape"),
     ],
 )
 def test_a_bad_cloud_costs_one_sweep(folder: Path, damage: Any, message: str) -> None:
