@@ -16,33 +16,17 @@ _UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
 _SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 1000, so that only one unit fits
 
 
-def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points of a PointCloud2, (N, 3) float64 metres in its frame, and their times (see `seconds_after`).
+def cloud_columns(message: Any) -> dict[str, np.ndarray]:
+    """Return the fields of the points of a PointCloud2, x, y, z and others: name -> (N,) numbers as stored.
 
     Points that are not finite or at the origin are left out: they mean "no return". A cloud without x, y or z, or with
     less data than it states, is a ValueError.
     """
-    fields = {field.name: field for field in message.fields}
-    names = [*"xyz", *[name for name in _TIME_FIELDS if name in fields][:1]]
-    missing = [name for name in names if name not in fields]
+    fields = {field.name: field for field in message.fields if field.count <= 1 and field.datatype in _TYPES}
+    names = [name for name in fields if name]
+    missing = [axis for axis in "xyz" if axis not in names]
     if missing:
-        raise ValueError(f"the cloud lacks the fields {missing}; it has {list(fields)}")
-    table, points, kept = _returns(message, names)
-    times = seconds_after(table[names[3]][kept], stamp_ns) if len(names) > 3 else None
-    return points[kept], times
-
-
-def other_columns(message: Any) -> dict[str, np.ndarray]:
-    """Return the fields besides x, y, z of the points of `points_and_times`: name -> (N,) numbers as stored."""
-    single = [field.name for field in message.fields if field.count <= 1 and field.datatype in _TYPES]
-    names = [name for name in single if name not in ("", "x", "y", "z")]
-    table, _, kept = _returns(message, [*"xyz", *names])
-    return {name: table[name][kept].astype(table[name].dtype.newbyteorder("=")) for name in names}
-
-
-def _returns(message: Any, names: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the structured (N,) rows of a cloud, their (N, 3) float64 points, and (N,) bool, False = no return."""
-    fields = {field.name: field for field in message.fields}
+        raise ValueError(f"the cloud lacks the fields {missing}; it has {names}")
     order = ">" if message.is_bigendian else "<"
     kinds = [order + _TYPES[fields[name].datatype] for name in names]
     offsets, step = [fields[name].offset for name in names], message.point_step
@@ -50,8 +34,17 @@ def _returns(message: Any, names: list[str]) -> tuple[np.ndarray, np.ndarray, np
     row_step = message.row_step or message.width * step
     rows = np.frombuffer(message.data, np.uint8, message.height * row_step).reshape(message.height, row_step)
     table = np.ascontiguousarray(rows[:, : message.width * step]).view(kind).reshape(-1)
-    points = np.stack([table[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    return table, points, np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    points = np.stack([table[axis] for axis in "xyz"], axis=1)
+    table = table[np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)]
+    return {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
+
+
+def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the points of `cloud_columns`, (N, 3) float64 metres in the frame of the cloud, and `seconds_after`."""
+    columns = cloud_columns(message)
+    times = next((columns[name] for name in _TIME_FIELDS if name in columns), None)
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    return points, None if times is None else seconds_after(times, stamp_ns)
 
 
 def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:

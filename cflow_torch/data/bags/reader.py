@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.arrays.poses_text import Trajectory, covered_poses
-from cflow_torch.data.bags.messages import Frames, Sample, other_columns, points_and_times, sample, sorted_poses
+from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, points_and_times, sample, sorted_poses
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
@@ -97,13 +97,11 @@ class BagLog(Log):
                 poses = self._chosen(topics, _POSE_TYPES, poses, "poses")
             self.timestamps = sorted(self._arrival)
             if poses is not None:
-                self._known_times, self._known_poses = self._trajectory(poses, tracks)
-                first, last = self._known_times[[0, -1]]
-                self.timestamps = [time for time in self.timestamps if first <= time <= last]
+                self._odometry = times, matrices = self._trajectory(poses, tracks)
+                self.timestamps = [time for time in self.timestamps if times[0] <= time <= times[-1]]
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             if poses is not None:
-                known = Trajectory(self._known_poses, self._known_times, "bag", poses)
-                self.poses = covered_poses(known, self.timestamps)
+                self.poses = covered_poses(Trajectory(matrices, times, "bag"), self.timestamps, poses)
             if self._mount is None:
                 self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
 
@@ -119,7 +117,7 @@ class BagLog(Log):
             return Sweep(points.astype(np.float32), None, None, time, times)
         if times is not None and self.deskew:
             shots, group = np.unique(np.round(times / _SLICE).astype(np.int64), return_inverse=True)
-            at = poses_at(time + shots * round(_SLICE * 1e9), self._known_times, self._known_poses)
+            at = poses_at(time + shots * round(_SLICE * 1e9), *self._odometry)
             points = transform_each(points, (np.linalg.inv(self.poses[index]) @ at)[group])
         return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
 
@@ -127,7 +125,8 @@ class BagLog(Log):
         """Read the fields besides x, y, z, such as intensity and ring, of the points of sweep `index`."""
         time = self._timestamp(index)
         with file_errors(f"{self.path}, {self.topic} at {time} ns"):
-            return other_columns(self._cloud(time))
+            columns = cloud_columns(self._cloud(time))
+        return {name: values for name, values in columns.items() if name not in ("x", "y", "z")}
 
     def _reader(self) -> Any:
         """Return the bag, opened by this process: after a fork or unpickling it is opened again."""
@@ -158,7 +157,10 @@ class BagLog(Log):
         return found[0]
 
     def _scan(self) -> tuple[dict[int, int], dict[str, list[Sample]]]:
-        """Read the arrival time of each cloud and the pose samples of each topic, and set the frames."""
+        """Read the arrival time of each cloud and the pose samples of each topic, and set the frames.
+
+        Names of frames lose the leading slash that ROS 1 allows.
+        """
         self._lidar = ""
         self._child: dict[str, str] = {}
         arrival: dict[int, int] = {}
@@ -171,17 +173,17 @@ class BagLog(Log):
             message = reader.deserialize(data, connection.msgtype)
             if connection.topic == self.topic:
                 arrival.setdefault(_stamp(message, arrived), arrived)
-                self._lidar = self._lidar or _name(message.header.frame_id)
+                self._lidar = self._lidar or message.header.frame_id.lstrip("/")
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
-                    child, T = _name(link.child_frame_id), link.transform
-                    parents[child] = _name(link.header.frame_id)
+                    child, T = link.child_frame_id.lstrip("/"), link.transform
+                    parents[child] = link.header.frame_id.lstrip("/")
                     links.setdefault(child, []).append(sample(_stamp(link, arrived), T.translation, T.rotation))
             else:
                 pose = getattr(message.pose, "pose", message.pose)
                 at = sample(_stamp(message, arrived), pose.position, pose.orientation)
                 tracks.setdefault(connection.topic, []).append(at)
-                self._child[connection.topic] = _name(getattr(message, "child_frame_id", ""))
+                self._child[connection.topic] = getattr(message, "child_frame_id", "").lstrip("/")
         self._frames = Frames(parents, links)
         return arrival, tracks
 
@@ -213,11 +215,6 @@ def _stamp(message: Any, arrived: int) -> int:
     """Return the nanoseconds of a header; where it is 0, the time of arrival."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
-
-
-def _name(frame: str) -> str:
-    """Remove the leading slash that ROS 1 allows."""
-    return frame.lstrip("/")
 
 
 def _bags_in(folder: Path) -> list[Path]:
