@@ -10,7 +10,7 @@ from cflow_torch.data.arrays.cloud_file import pcd_fields
 from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES, OWN_TRAILER, Footprint, NuScenesLog
 from cflow_torch.data.nuscenes.tables import SceneSource, find_scenes
-from cflow_torch.data.paths import PathLike
+from cflow_torch.data.paths import PathLike, read_bytes
 
 TRUCKSCENES_CATEGORIES: dict[str, str] = {
     **NUSCENES_CATEGORIES,
@@ -44,9 +44,9 @@ class TruckScenesLog(NuScenesLog):
     _reference = "LIDAR_LEFT"
     OWN_VEHICLE = Footprint(rear=-7.0, front=7.0, half_width=2.0)  # as in OpenSceneFlow
 
-    def _points_of(self, content: bytes, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    def _points_of(self, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
         with file_errors(file, "copy it again"):
-            fields = pcd_fields(content)
+            fields = pcd_fields(read_bytes(file))
         needed = ("x", "y", "z", "timestamp") if self._deskew else ("x", "y", "z")
         check_columns(file, list(fields), needed, "is it a sweep of TruckScenes?")
         points = np.stack([fields[axis].astype(np.float32) for axis in "xyz"], axis=1)

@@ -7,19 +7,19 @@ from typing import ClassVar, Literal, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
+from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, points_in_box
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
-from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, path_inside
 from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 MAX_UNIT_LAG = 60_000  # microseconds from another LiDAR's sweep to the reference's: a bit more than half a revolution
 _TIME_SLICE = 10_000  # microseconds during which we use one position of a moving box: 0.15 m off at most at 30 m/s
 MAX_SHOT_LAG = 1_000_000  # microseconds from a shot to its sweep; larger values mean another unit or clock
-_ROW = np.dtype("<f4")
-_COLUMNS = 5  # x, y, z, intensity, ring
+_COLUMNS = 5  # float32 numbers per point: x, y, z, intensity, ring
 OWN_TRAILER = "vehicle.ego_trailer"  # the trailer of the recording truck of TruckScenes
 
 NUSCENES_CATEGORIES: dict[str, str] = {
@@ -175,9 +175,7 @@ class NuScenesLog(Log):
 
     def _unit_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
         file = path_inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
-        with file_errors(file, f"copy the sensor data of scene {self.log_id} next to the tables"):
-            content = read_bytes(file)
-        local, times = self._points_of(content, file)
+        local, times = self._points_of(file)
         points = transform_points(local, chain.mount[row])
         # We remove the own vehicle before compensation, because it moves with its LiDARs.
         kept = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1) & ~self._is_own(points, index)
@@ -196,9 +194,12 @@ class NuScenesLog(Log):
         at = (T_ego_world @ poses_at(distinct, *self._odometry))[group]
         return transform_each(points, at).astype(np.float32), times - self.timestamps[index]
 
-    def _points_of(self, content: bytes, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    def _points_of(self, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
         """Return (N, 3) points in the frame of the LiDAR, and the (N,) int64 microseconds of shots; None = unknown."""
-        return pcd_bin_points(content, file), None
+        points = read_cloud(file, _COLUMNS)
+        if len(points) == 0:
+            raise CFlowError(f"{file} is empty; copy it again")
+        return points, None
 
     def _is_own(self, points: np.ndarray, index: int) -> np.ndarray:
         """Return (N,) bool: above the recording vehicle or in the box of its trailer; points in the ego frame."""
@@ -213,14 +214,3 @@ class NuScenesLog(Log):
                 if name == OWN_TRAILER:
                     own |= points_in_box(points, size, self._T_ego_world[index] @ pose)
         return own
-
-
-def pcd_bin_points(content: bytes, file: PathLike) -> np.ndarray:
-    """Return the (N, 3) float32 points of a `.pcd.bin`, whose rows are float32 x, y, z, intensity and ring."""
-    if not content or len(content) % (_COLUMNS * _ROW.itemsize):
-        raise CFlowError(f"{file} has {len(content)} bytes, not a multiple of a row of five float32; copy it again")
-    rows = np.frombuffer(content, dtype=_ROW).reshape(-1, _COLUMNS)
-    ring = rows[:, 4]
-    if not (np.isfinite(ring) & (ring >= 0) & (ring < 256) & (ring == np.floor(ring))).all():
-        raise CFlowError(f"{file}: column 5 is not a ring index (0 ... 255); is it a .pcd.bin of nuScenes?")
-    return rows[:, :3].astype(np.float32)
