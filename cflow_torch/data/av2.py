@@ -16,7 +16,7 @@ from cflow_torch.data.files import file_errors, read_json, read_npy
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_errors
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.types import CFlowError, Sweep, check_array
 
 # Each rule has the largest distance of a ground point from the surface, metres, and the function that rounds grid
 # positions to cells (towards zero, or half to even).
@@ -64,27 +64,20 @@ class GroundRaster(NamedTuple):
 
 def read_ground_raster(map_folder: Path) -> GroundRaster | None:
     """Read the ground raster in the folder `map` of a log; None = it has none. Several are a `CFlowError`."""
-    rasters = sorted(map_folder.glob("*_ground_height_surface____*.npy"))
+    names = ("*_ground_height_surface____*.npy", "*___img_Sim2_city.json")
+    rasters, alignments = (sorted(map_folder.glob(name)) for name in names)
     if not rasters:
         return None
-    alignments = sorted(map_folder.glob("*___img_Sim2_city.json"))
     if len(rasters) > 1 or len(alignments) != 1:
-        raise CFlowError(
-            f"{map_folder} must hold one *_ground_height_surface____*.npy and one *___img_Sim2_city.json, "
-            f"found {len(rasters)} and {len(alignments)}"
-        )
+        found = f"found {len(rasters)} and {len(alignments)}"
+        raise CFlowError(f"{map_folder} must hold one {names[0]} and one {names[1]}, {found}")
     heights = read_npy(rasters[0], "copy the map folder again")
-    if heights.ndim != 2 or heights.dtype.kind not in "fiu":
-        raise CFlowError(f"{rasters[0]} must hold (H, W) numbers, got shape {heights.shape} and dtype {heights.dtype}")
+    check_array(heights, str(rasters[0]), (None, None), "fiu", "a file of (H, W) numbers")
     with file_errors(alignments[0], "copy the map folder again"):
         alignment = read_json(alignments[0])
-        raster = GroundRaster(
-            heights=heights.astype(np.float64),
-            rotation=np.array(alignment["R"], dtype=np.float64).reshape(2, 2),
-            translation=np.array(alignment["t"], dtype=np.float64).reshape(2),
-            scale=float(alignment["s"]),
-        )
-    if not all(np.isfinite(value).all() for value in (raster.rotation, raster.translation, raster.scale)):
+        rotation, translation, scale = (np.array(alignment[key], dtype=np.float64) for key in "Rts")
+        raster = GroundRaster(heights.astype(np.float64), rotation.reshape(2, 2), translation.reshape(2), float(scale))
+    if not all(np.isfinite(value).all() for value in raster[1:]):
         raise CFlowError(f"{alignments[0]} has numbers that are not finite; copy the map folder again")
     return raster
 
@@ -114,11 +107,9 @@ class AV2Log(BoxLog):
         self.timestamps = sorted(self._files)
         self._check_count(f"{self.folder}: sensors/lidar/<nanoseconds>.feather")
         self._poses = self._read_poses()
-        self._rule, self._raster = ground, None
-        if ground is not None:
-            if ground not in GROUND_RULES:
-                raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
-            self._raster = read_ground_raster(self.folder / "map")
+        if ground is not None and ground not in GROUND_RULES:
+            raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
+        self._rule, self._raster = ground, read_ground_raster(self.folder / "map") if ground else None
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`, with a ground mask if the log has a raster."""
@@ -127,7 +118,7 @@ class AV2Log(BoxLog):
         points = stored.matrix("xyz", np.float32)
         # Logs of other writers may lack the times.
         times = stored.vector("offset_ns", np.int64) * 1e-9 if "offset_ns" in stored.names else None
-        if self._raster is not None and self._rule is not None:
+        if self._raster is not None and self._rule:
             is_ground = self._raster.is_ground(transform_points(points, pose), self._rule)
         return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
 
@@ -164,9 +155,8 @@ class AV2Log(BoxLog):
         if stored.num_rows != rows:
             raise CFlowError(f"{file} has {stored.num_rows} rows but sweep {self.timestamps[index]} has {rows} points")
         if category.size and not 0 <= category.min() <= category.max() < len(CATEGORIES):
-            raise CFlowError(
-                f"{file}: classes are 0 ... {len(CATEGORIES) - 1}, got {category.min()} ... {category.max()}"
-            )
+            found = f"{category.min()} ... {category.max()}"
+            raise CFlowError(f"{file}: classes are 0 ... {len(CATEGORIES) - 1}, got {found}")
         is_valid = stored.vector("is_valid", bool) if "is_valid" in stored.names else np.ones(rows, dtype=bool)
         return FlowLabels(flow, category.astype(np.uint8), is_valid)
 
@@ -179,8 +169,10 @@ class AV2Log(BoxLog):
     def _boxes(self, index: int) -> Boxes | None:
         """Read the boxes of a sweep, in the order of the file; None outside the annotated time."""
         stored, time = self._annotations, self.timestamps[index]
-        times = np.zeros(0) if stored is None else stored.vector("timestamp_ns", np.int64)
-        if stored is None or not times.size or not times.min() <= time <= times.max():
+        if stored is None:
+            return None
+        times = stored.vector("timestamp_ns", np.int64)
+        if not times.size or not times.min() <= time <= times.max():
             return None
         is_used = times == time
         if "num_interior_pts" in stored.names:

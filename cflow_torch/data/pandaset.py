@@ -67,11 +67,11 @@ class PandaSetLog(Log):
         self.log_id = self.folder.resolve().name
         lidar = self.folder / "lidar"
         self._files = sorted(lidar.glob("*.pkl.gz"))
-        with file_errors(lidar / "timestamps.json"):
-            self.timestamps = [round(float(seconds) * 1e9) for seconds in read_json(lidar / "timestamps.json")]
-        with file_errors(lidar / "poses.json"):
-            stored = read_json(lidar / "poses.json")
-            self._poses = poses_from_json(stored, "position", "heading", f"{lidar / 'poses.json'}: pose")
+        times, poses = lidar / "timestamps.json", lidar / "poses.json"
+        with file_errors(times):
+            self.timestamps = [round(float(seconds) * 1e9) for seconds in read_json(times)]
+        with file_errors(poses):
+            self._poses = poses_from_json(read_json(poses), "position", "heading", f"{poses}: pose")
         self._check_count(self.folder)
         if not len(self._files) == len(self._poses) == len(self.timestamps):
             counts = f"{len(self._files)} sweeps, {len(self._poses)} poses and {len(self.timestamps)} time stamps"

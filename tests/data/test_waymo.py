@@ -72,7 +72,7 @@ def test_world_coordinates_of_kilometres_keep_millimetres() -> None:
     image, poses, T = np.full((2, 4, 4), 30.0), np.zeros((2, 4, 6), np.float32), np.eye(4)
     poses[..., 3:] = T[:3, 3] = 11_000, -9_000, 50
     laser = LaserCalibration(np.eye(4), None, -0.3, 0.1)
-    (plain, _), (far, _) = range_image_points(image, laser), range_image_points(image, laser, poses, T)
+    (plain, _), (far, _) = range_image_points(image, laser, T), range_image_points(image, laser, T, poses)
     assert np.abs(far - plain).max() < 1e-9 and len(far) == 8
 
 

@@ -9,7 +9,6 @@ import torch
 
 from cflow_torch.data.rigid_motion import to_rotations, transform_points
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.ego_motion import rigid_transform
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
 """Laser name -> number in the files; 0 is unknown."""
@@ -65,8 +64,8 @@ def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
 def range_image_points(
     image: np.ndarray,
     calibration: LaserCalibration,
+    T_world_ego: np.ndarray,
     pixel_poses: np.ndarray | None = None,
-    T_world_ego: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the points of all pixels with a return, (N, 3) float64, and the index of each pixel, (N,) int64.
 
@@ -76,9 +75,9 @@ def range_image_points(
     Args:
         image: (H, W, 4) float: range (metres), intensity, elongation, no-label-zone flag.
         calibration: of the laser.
+        T_world_ego: (4, 4) float64 vehicle pose of the frame, used with `pixel_poses`.
         pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of `T_world_ego` at the time of each pixel. Only the TOP laser
             has them; the images of the others are made for the vehicle pose of the frame.
-        T_world_ego: (4, 4) float64 vehicle pose of the frame; needed with `pixel_poses`.
     """
     num_rows, num_columns = image.shape[:2]
     pixels = np.flatnonzero(image[..., RANGE] > 0)
@@ -89,12 +88,8 @@ def range_image_points(
     points = transform_points(in_laser, calibration.T_ego_sensor)
     if pixel_poses is None:
         return points, pixels
-    if pixel_poses.shape != (num_rows, num_columns, 6) or T_world_ego is None:
-        raise CFlowError(
-            f"pixel poses have shape {pixel_poses.shape}, they must have ({num_rows}, {num_columns}, 6), and need the "
-            "pose of the frame"
-        )
+    if pixel_poses.shape != (num_rows, num_columns, 6):
+        raise CFlowError(f"pixel poses have shape {pixel_poses.shape}, they must have ({num_rows}, {num_columns}, 6)")
     poses = pixel_poses.reshape(-1, 6)[pixels].astype(np.float64)
     world = np.einsum("nij,nj->ni", rotations_from_angles(poses[:, :3]), points) + poses[:, 3:]
-    T_ego_world = np.linalg.inv(rigid_transform(T_world_ego, "T_world_ego"))
-    return transform_points(world, T_ego_world), pixels
+    return transform_points(world, np.linalg.inv(T_world_ego)), pixels

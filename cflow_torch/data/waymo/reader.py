@@ -118,7 +118,7 @@ class WaymoLog(BoxLog):
                     continue
                 calibration, poses = self._calibration[key[1]], pixel_poses.get(key)
                 with file_errors(f"{self.file}, frame {time}, laser {key[1]}"):
-                    found, pixels = range_image_points(image, calibration, poses, self._poses[index])
+                    found, pixels = range_image_points(image, calibration, self._poses[index], poses)
                 points.append(found)
                 zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
         return np.concatenate(points).astype(np.float32), np.concatenate(zone)
