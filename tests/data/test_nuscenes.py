@@ -67,7 +67,7 @@ def test_an_object_that_one_sample_lacks_is_a_guess():
     alone, _ = tracks_of((1, "a", 5.0, 0, 4), (2, "b", 1.0, 0, 4)).at(750_000)
     np.testing.assert_allclose(alone.pose[:, 0, 3], [5.0, 1.0])  # their motion is unknown
     assert tracks.at(500_000)[0].track == ["a"] and tracks.at(500_000)[1].all()
-    assert tracks.at(-1) is None and tracks.at(1_500_001) is None and tracks_of().at(0) is None
+    assert not tracks.at(-1)[0].track and not tracks.at(1_500_001)[0].track and not tracks_of().at(0)[0].track
 
 
 def test_points_of_a_half_known_object_are_not_valid(tmp_path):

@@ -132,7 +132,7 @@ class NuScenesLog(Log):
 
     def _labels(self, index: int) -> FlowLabels | None:
         time0, time1 = self.timestamps[index : index + 2]
-        if None in (self._tracks.at(time0), self._tracks.at(time1)):
+        if time0 < self._tracks.start or time1 > self._tracks.end:
             return None
         points, lag = self._cloud(index)
         T_ego1_ego0 = self._T_ego_world[index + 1] @ self._poses[index]
@@ -150,8 +150,7 @@ class NuScenesLog(Log):
 
     def _boxes(self, time: int, index: int) -> Boxes:
         """Return the boxes at a time in the ego frame of sweep `index`; a guessed box is renamed, so its track ends."""
-        tracks, is_known = self._tracks.at(time) or (None, None)
-        assert tracks is not None and is_known is not None
+        tracks, is_known = self._tracks.at(time)
         rows = [row for row, name in enumerate(tracks.category) if name != OWN_TRAILER]
         return Boxes(
             [tracks.track[row] if is_known[row] else f"{tracks.track[row]} guessed in {index}" for row in rows],
@@ -203,14 +202,13 @@ class NuScenesLog(Log):
 
     def _is_own(self, points: np.ndarray, index: int) -> np.ndarray:
         """Return (N,) bool: above the recording vehicle or in the box of its trailer; points in the ego frame."""
-        own = np.zeros(len(points), dtype=bool)
         if self._own_vehicle is None:
-            return own
+            return np.zeros(len(points), dtype=bool)
         rear, front, half_width = self._own_vehicle
-        own |= (points[:, 0] > rear) & (points[:, 0] < front) & (np.abs(points[:, 1]) < half_width)
-        tracks = self._tracks.at(self.timestamps[index]) if OWN_TRAILER in self._categories else None
-        if tracks is not None:
-            for name, size, pose in zip(tracks[0].category, tracks[0].size, tracks[0].pose):
+        own = (points[:, 0] > rear) & (points[:, 0] < front) & (np.abs(points[:, 1]) < half_width)
+        if OWN_TRAILER in self._categories:
+            tracks, _ = self._tracks.at(self.timestamps[index])
+            for name, size, pose in zip(tracks.category, tracks.size, tracks.pose):
                 if name == OWN_TRAILER:
                     own |= points_in_box(points, size, self._T_ego_world[index] @ pose)
         return own

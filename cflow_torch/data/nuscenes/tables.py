@@ -210,18 +210,19 @@ def _times(rows: Sequence[Row]) -> np.ndarray:
 class Tracks:
     """The boxes of a scene at any time from its first to its last sample, interpolated between samples.
 
-    `sample_times` are (S,), microseconds, ascending. The attributes `start` and `end` are the first and the last one.
+    `sample_times` are (S,), microseconds, ascending. The attributes `start` and `end` are the first and the last one;
+    without boxes, `end` is before `start`.
     """
 
     def __init__(self, sample_times: np.ndarray, annotations: Annotations) -> None:
         self._times, self._annotations = sample_times, annotations
-        self.start, self.end = (int(sample_times[0]), int(sample_times[-1])) if len(sample_times) else (0, 0)
+        self.start, self.end = (int(sample_times[0]), int(sample_times[-1])) if len(annotations.time) else (0, -1)
         self._rows: list[dict[str, int]] = [{} for _ in sample_times]  # per sample: track -> row
         for row, sample in enumerate(np.searchsorted(sample_times, annotations.time)):
             self._rows[int(sample)][annotations.track[row]] = row
 
-    def at(self, time: int) -> tuple[Annotations, np.ndarray] | None:
-        """Return the K boxes at a time, and whether each is known, (K,) bool; None outside the annotated time.
+    def at(self, time: int) -> tuple[Annotations, np.ndarray]:
+        """Return the K boxes at a time, and whether each is known, (K,) bool; K is 0 outside the annotated time.
 
         A box is not known, but a guess, if only one of the two samples around the time has the object. Guesses come
         first.
@@ -230,9 +231,9 @@ class Tracks:
             and the rotation at a constant rate. If only one of the two samples has an object, we continue its motion
             between that sample and the next one beyond; if that one lacks it too, the object stays where it is.
         """
+        if not self.start <= time <= self.end:
+            return self._boxes(time, [])
         times = self._times
-        if not len(self._annotations.time) or not times[0] <= time <= times[-1]:
-            return None
         left = int(np.searchsorted(times, time, side="right")) - 1
         rows = dict(enumerate(self._rows))
         if times[left] == time:
