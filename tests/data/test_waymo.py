@@ -15,9 +15,17 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cflow_torch.data.waymo.parquet import LIDAR, TIME, TRACK, VEHICLE_POSE, Component, matrix_of
 from cflow_torch.data.waymo.range_image import LaserCalibration, range_image_points, rotations_from_angles
-from cflow_torch.data.waymo.reader import WaymoLog, find_waymo_segments
+from cflow_torch.data.waymo.reader import (
+    LIDAR,
+    TIME,
+    TRACK,
+    VEHICLE_POSE,
+    Component,
+    WaymoLog,
+    find_waymo_segments,
+    matrix_of,
+)
 from cflow_torch.simulator.drive import Drive, make_drive
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.writers.waymo import write_waymo_segment
@@ -172,9 +180,9 @@ def test_a_real_component_is_read(data_root: Path, tmp_path: Path) -> None:
     (tmp_path / "vehicle_pose").mkdir()
     (tmp_path / "vehicle_pose" / name).write_bytes(files[0].read_bytes())
     rows = Component(tmp_path / "lidar" / name, "vehicle_pose").rows((TIME, VEHICLE_POSE))
-    poses = [matrix_of(row[VEHICLE_POSE], "pose") for row in rows]
+    poses = [matrix_of(values, "pose") for _, values in rows]
     assert poses and all(abs(np.linalg.det(pose[:3, :3]) - 1) < 1e-5 for pose in poses)
-    assert all(1.4e15 < row[TIME] < 1.7e15 for row in rows)
+    assert all(1.4e15 < time < 1.7e15 for time, _ in rows)
 
 
 def test_real_frames_of_version_1_are_refused(data_root: Path) -> None:

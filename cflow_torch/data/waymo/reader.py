@@ -6,26 +6,40 @@ from collections import defaultdict
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any, Collection, Sequence, Tuple
 
 import numpy as np
+import pyarrow.parquet as pq
 
 from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, upright_poses
-from cflow_torch.data.files import file_errors, find_folders
+from cflow_torch.data.files import check_columns, file_errors, find_folders
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import PathLike, as_path, remote_errors
-from cflow_torch.data.waymo import parquet
-from cflow_torch.data.waymo.parquet import BOX, CALIBRATION, LASER, TIME, TRACK, Component, matrix_of
+from cflow_torch.data.paths import PathLike, as_path, remote_errors, source_for_mmap, source_for_random_access
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.ego_motion import rigid_transform
+
+SEGMENT, TIME, LASER, TRACK = (
+    f"key.{name}" for name in ("segment_context_name", "frame_timestamp_micros", "laser_name", "laser_object_id")
+)
+"""Key columns."""
+
+LIDAR, PIXEL_POSE = "[LiDARComponent].range_image_return", "[LiDARPoseComponent].range_image_return1"
+CALIBRATION, BOX = "[LiDARCalibrationComponent].", "[LiDARBoxComponent]."
+VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
+"""Prefixes of the columns that we read, and one complete name."""
 
 SEARCH_DEPTH = 2  # <root>/<data set>/<split>
 BOX_CATEGORY = {0: "NONE", 1: "REGULAR_VEHICLE", 2: "PEDESTRIAN", 3: "SIGN", 4: "BICYCLIST"}
 """Waymo's box type -> Argoverse 2 name. Trucks, buses and motorcycles have type 1, too; 0 is unknown."""
 
-_KIND, _SIZE = f"{BOX}type", tuple(f"{BOX}box.size.{axis}" for axis in "xyz")
-_HEADING_CENTRE = (f"{BOX}box.heading", *(f"{BOX}box.center.{axis}" for axis in "xyz"))
+_BOX_COLUMNS = (
+    *("type", "box.size.x", "box.size.y", "box.size.z"),
+    *("box.heading", "box.center.x", "box.center.y", "box.center.z"),
+)
+_BATCH = 8  # rows of range images in memory at once during the search for one
 _KEPT_FRAMES = 2  # the labels of a pair are read after both of its sweeps
+Key = Tuple[int, int]  # frame time in microseconds, laser
 
 
 def find_waymo_segments(root: PathLike) -> list[Path]:
@@ -85,7 +99,7 @@ class WaymoLog(BoxLog):
             raise CFlowError(f"{self.file}: lasers={list(lasers)}: choose some of {', '.join(names)}")
         self._calibration = self._read_calibration()
         component = Component(self.file, "vehicle_pose")
-        stored = component.rows_by(TIME, times, (parquet.VEHICLE_POSE,)).items()
+        stored = component.rows_by(TIME, times, (VEHICLE_POSE,)).items()
         poses = [matrix_of(values, f"{component.file}: the pose of frame {time}") for time, (values,) in stored]
         self._poses = np.stack(poses)
         if TOP in self._lasers:
@@ -107,8 +121,8 @@ class WaymoLog(BoxLog):
         """Read the (N, 3) float32 points in the vehicle frame, and (N,) bool whether each lies in a no-label zone."""
         time = self.timestamps[index] // 1000
         keys = [(time, laser) for laser in self._lasers]
-        images = [self._images.images(keys, f"{parquet.LIDAR}{number}", 4) for number in self._returns]
-        pixel_poses = self._pixel_poses.images([(time, TOP)], parquet.PIXEL_POSE, 6) if TOP in self._lasers else {}
+        images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
+        pixel_poses = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6) if TOP in self._lasers else {}
         if any(poses is None for poses in pixel_poses.values()):
             raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
         points, zone = [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
@@ -134,24 +148,92 @@ class WaymoLog(BoxLog):
         return calibration
 
     @cached_property
-    def _box_rows(self) -> dict[int, list[dict[str, Any]]]:
+    def _box_rows(self) -> dict[int, list[list[Any]]]:
         """Read frame time -> rows of its boxes; empty if the segment has no labels (the testing split)."""
         component, by_frame = Component(self.file, "lidar_box"), defaultdict(list)
         with remote_errors(component.file):
             if not component.file.exists():
                 return {}
-        for row in component.rows((TIME, TRACK, _KIND, *_SIZE, *_HEADING_CENTRE)):
-            by_frame[row[TIME]].append(row)
+        for time, *row in component.rows((TIME, TRACK, *(f"{BOX}{name}" for name in _BOX_COLUMNS))):
+            by_frame[time].append(row)
         return by_frame
 
     def _boxes(self, index: int) -> Boxes | None:
         if not self._box_rows:
             return None
-        rows = [row for row in self._box_rows[self.timestamps[index] // 1000] if row[_KIND] != 0]
+        rows = [row for row in self._box_rows[self.timestamps[index] // 1000] if row[1] != 0]
         with file_errors(Component(self.file, "lidar_box").file):
-            return Boxes(
-                [str(row[TRACK]) for row in rows],
-                category_indices([row[_KIND] for row in rows], BOX_CATEGORY),
-                [[row[name] for name in _SIZE] for row in rows],
-                upright_poses([[row[name] for name in _HEADING_CENTRE] for row in rows]),
-            )
+            category = category_indices([row[1] for row in rows], BOX_CATEGORY)
+            pose = upright_poses([row[5:] for row in rows])
+            return Boxes([str(row[0]) for row in rows], category, [row[2:5] for row in rows], pose)
+
+
+class Component:
+    """The file `<split>/<tag>/<segment>.parquet` of a segment, opened when it is needed."""
+
+    def __init__(self, segment: Path, tag: str) -> None:
+        self.file = segment.parent.parent / tag / segment.name
+        self._hint = f"download component {tag} of this segment"
+        self._row_of: dict[Key, int] = {}
+
+    def rows(self, columns: Sequence[str]) -> list[tuple[Any, ...]]:
+        """Read some columns, in the given order, of all rows."""
+        with file_errors(self.file, self._hint):
+            parquet = pq.ParquetFile(source_for_random_access(self.file))
+            check_columns(self.file, parquet.schema_arrow.names, columns, self._hint)
+            table = parquet.read(list(columns), use_threads=False)
+            return list(zip(*(table.column(name).to_pylist() for name in columns)))
+
+    def rows_by(self, key: str, wanted: Sequence[int], columns: Sequence[str]) -> dict[int, list[Any]]:
+        """Read some columns of the rows with the wanted values of a key column, by that value."""
+        rows = {value: row for value, *row in self.rows((key, *columns))}
+        missing = [value for value in wanted if value not in rows]
+        if missing:
+            raise CFlowError(f"{self.file} has no row with {key} {missing[0]}; copy it again")
+        return {value: rows[value] for value in wanted}
+
+    def frame_lasers(self) -> Collection[Key]:
+        """Return the frame time (microseconds) and laser of every row."""
+        if not self._row_of:
+            self._row_of = {(time, laser): row for row, (time, laser) in enumerate(self.rows((TIME, LASER)))}
+        return self._row_of
+
+    def images(self, keys: Sequence[Key], column: str, channels: int) -> dict[Key, np.ndarray | None]:
+        """Read range images, (H, W, channels), by frame time and laser; None if the cell is null or empty.
+
+        Give `column` without `.values` or `.shape`. Cost: decodes every row group that holds a wanted row, a few rows
+        at a time.
+        """
+        missing = [key for key in keys if key not in self.frame_lasers()]
+        if missing:
+            raise CFlowError(f"{self.file} has no row for frame {missing[0][0]}, laser {missing[0][1]}; copy it again")
+        rows, columns = [self._row_of[key] for key in keys], [TIME, LASER, f"{column}.values", f"{column}.shape"]
+        images: dict[Key, np.ndarray | None] = {}
+        with file_errors(self.file, self._hint):
+            parquet = pq.ParquetFile(source_for_mmap(self.file))
+            check_columns(self.file, parquet.schema_arrow.names, columns, self._hint)
+            ends = np.cumsum([parquet.metadata.row_group(k).num_rows for k in range(parquet.num_row_groups)])
+            groups = np.unique(np.searchsorted(ends, rows, side="right")).tolist()
+            for batch in parquet.iter_batches(_BATCH, groups, columns, use_threads=False):
+                for time, laser, values, shape in zip(*(batch.column(name) for name in columns)):
+                    key = (time.as_py(), laser.as_py())
+                    if key in keys:
+                        images[key] = _image(values, shape, channels)
+        return images
+
+
+def matrix_of(values: Any, where: str) -> np.ndarray:
+    """Return a (4, 4) float64 rigid motion from 16 numbers, row by row."""
+    if values is None or len(values) != 16:
+        raise CFlowError(f"{where} must have 16 numbers, row by row, got {0 if values is None else len(values)}")
+    return rigid_transform(np.reshape(values, (4, 4)), where)
+
+
+def _image(values: Any, shape: Any, channels: int) -> np.ndarray | None:
+    """Return the (H, W, channels) image of a list cell; None if the cell is null or empty."""
+    if not values.is_valid or not shape.is_valid or not len(values.values) or not len(shape.values):
+        return None
+    size, flat = shape.as_py(), values.values
+    if len(size) != 3 or size[2] != channels or flat.null_count:
+        raise ValueError(f"a range image must be (H, W, {channels}) without nulls, got {size}, {flat.null_count} nulls")
+    return np.asarray(flat.to_numpy().reshape(size))

@@ -15,7 +15,8 @@ import pyarrow.parquet as pq
 
 from cflow_torch.data.categories import META_CLASSES
 from cflow_torch.data.paths import safe_name
-from cflow_torch.data.waymo.parquet import (
+from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
+from cflow_torch.data.waymo.reader import (
     BOX,
     CALIBRATION,
     LASER,
@@ -26,7 +27,6 @@ from cflow_torch.data.waymo.parquet import (
     TRACK,
     VEHICLE_POSE,
 )
-from cflow_torch.data.waymo.range_image import LASERS, TOP, LaserCalibration
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
 from cflow_torch.types import CFlowError
