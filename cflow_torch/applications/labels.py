@@ -16,7 +16,7 @@ import numpy as np
 
 from cflow_torch.applications.moving_groups import MOVING, pose_of
 from cflow_torch.data.catalog import open_log
-from cflow_torch.data.hdf5.results import write_hdf5_labels
+from cflow_torch.data.hdf5.writer import write_hdf5_labels
 from cflow_torch.data.log import CachedLog, Log, windows
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.errors import import_optional

@@ -42,7 +42,7 @@ from cflow_torch.cli import run
 from cflow_torch.cli.run import Failures, Sources
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
-from cflow_torch.data.hdf5.results import check_result_name, check_writable, write_hdf5_results
+from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Shard, find_shard
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker

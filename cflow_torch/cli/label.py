@@ -29,7 +29,7 @@ from cflow_torch.cli.flow import FlowRun, compute
 from cflow_torch.cli.run import Failures
 from cflow_torch.data.files import write_json
 from cflow_torch.data.flow_file import read_flow
-from cflow_torch.data.hdf5.results import check_writable, labelled_by, write_hdf5_labels
+from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file

@@ -183,13 +183,13 @@ def test_a_killed_run_leaves_whole_scenes_and_resumes(scenes: Path, tmp_path: Pa
     before = {file.name: file.read_bytes() for file in scenes.iterdir()}
     output = f"output={tmp_path / 'out'}"
     code = (
-        "import os, signal\nfrom cflow_torch.cli.main import main\nfrom cflow_torch.data.hdf5 import results\n"
-        "write, count = results._store_label, []\n"
+        "import os, signal\nfrom cflow_torch.cli.main import main\nfrom cflow_torch.data.hdf5 import writer\n"
+        "write, count = writer._store_label, []\n"
         "def die(*arguments):\n"
         "    count.append(1)\n"
         "    write(*arguments)\n"
         "    if len(count) == 27: os.kill(os.getpid(), signal.SIGKILL)\n"
-        f"results._store_label = die\nmain({[*CALL, str(scenes), output]!r})\n"
+        f"writer._store_label = die\nmain({[*CALL, str(scenes), output]!r})\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr

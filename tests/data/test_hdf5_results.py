@@ -13,7 +13,7 @@ from hdf5_scene import STAMPS, write_scene
 
 from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
-from cflow_torch.data.hdf5.results import write_hdf5_labels, write_hdf5_results
+from cflow_torch.data.hdf5.writer import write_hdf5_labels, write_hdf5_results
 
 h5py = pytest.importorskip("h5py")
 
