@@ -76,10 +76,7 @@ def read_ground_raster(map_folder: Path) -> GroundRaster | None:
     with file_errors(alignments[0], "copy the map folder again"):
         alignment = read_json(alignments[0])
         rotation, translation, scale = (np.array(alignment[key], dtype=np.float64) for key in "Rts")
-        raster = GroundRaster(heights.astype(np.float64), rotation.reshape(2, 2), translation.reshape(2), float(scale))
-    if not all(np.isfinite(value).all() for value in raster[1:]):
-        raise CFlowError(f"{alignments[0]} has numbers that are not finite; copy the map folder again")
-    return raster
+        return GroundRaster(heights.astype(np.float64), rotation.reshape(2, 2), translation.reshape(2), float(scale))
 
 
 class AV2Log(BoxLog):

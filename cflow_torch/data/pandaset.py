@@ -131,12 +131,12 @@ class PandaSetLog(Log):
             if not (file.exists() and table.exists()):
                 return None
         classes = _columns(file, ("class",))["class"]
-        with file_errors(table):
-            name_of = {int(number): str(name) for number, name in read_json(table).items()}
         if classes.shape != (num_points,):
             raise CFlowError(f"{file} has {len(classes)} classes for {num_points} points; copy the sequence again")
         numbers, number_of_point = np.unique(classes, return_inverse=True)
-        return np.array([name_of.get(number, "") for number in numbers.tolist()])[number_of_point]
+        with file_errors(table):
+            names = read_json(table)
+            return np.array([str(names.get(str(number), "")) for number in numbers.tolist()])[number_of_point]
 
     def _boxes(self, cuboids: dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
         """Return the cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""

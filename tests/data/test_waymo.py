@@ -15,17 +15,9 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cflow_torch.data.catalog import find_sources
 from cflow_torch.data.waymo.range_image import LaserCalibration, range_image_points, rotations_from_angles
-from cflow_torch.data.waymo.reader import (
-    LIDAR,
-    TIME,
-    TRACK,
-    VEHICLE_POSE,
-    Component,
-    WaymoLog,
-    find_waymo_segments,
-    matrix_of,
-)
+from cflow_torch.data.waymo.reader import LIDAR, TIME, TRACK, VEHICLE_POSE, Component, WaymoLog, matrix_of
 from cflow_torch.simulator.drive import Drive, make_drive
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.writers.waymo import write_waymo_segment
@@ -191,4 +183,4 @@ def test_real_frames_of_version_1_are_refused(data_root: Path) -> None:
         pytest.skip(f"no frame of version 1 at {file}")
     for place in (file, file.parent):
         with pytest.raises(CFlowError, match="version 1.*download the parquet files"):
-            find_waymo_segments(place)
+            find_sources("waymo", place)

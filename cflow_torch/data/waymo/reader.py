@@ -6,7 +6,7 @@ from collections import defaultdict
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Collection, Sequence, Tuple
+from typing import Any, Sequence, Tuple
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -89,21 +89,21 @@ class WaymoLog(BoxLog):
         self.log_id = self.file.stem
         self._returns = (1, 2) if both_returns else (1,)
         self._images, self._pixel_poses = Component(self.file, "lidar"), Component(self.file, "lidar_pose")
-        times = sorted({time for time, _ in self._images.frame_lasers()})
+        times = sorted({time for time, _ in self._images.row_of})
         self.timestamps = [time * 1000 for time in times]
         self._check_count(self.file)
-        present = {laser for _, laser in self._images.frame_lasers()}
+        present = {laser for _, laser in self._images.row_of}
         names = [name for name, laser in LASERS.items() if laser in present]
         self._lasers = [LASERS[name] for name in names if name in lasers]
         if not self._lasers or not set(lasers) <= set(LASERS):
             raise CFlowError(f"{self.file}: lasers={list(lasers)}: choose some of {', '.join(names)}")
+        if TOP in self._lasers and not self._pixel_poses.row_of:
+            raise CFlowError(f"{self._pixel_poses.file} is empty; copy it again")
         self._calibration = self._read_calibration()
         component = Component(self.file, "vehicle_pose")
         stored = component.rows_by(TIME, times, (VEHICLE_POSE,)).items()
         poses = [matrix_of(values, f"{component.file}: the pose of frame {time}") for time, (values,) in stored]
         self._poses = np.stack(poses)
-        if TOP in self._lasers:
-            self._pixel_poses.frame_lasers()
         self._frame = lru_cache(_KEPT_FRAMES)(self._read_frame)
 
     def sweep(self, index: int) -> Sweep:
@@ -174,7 +174,6 @@ class Component:
     def __init__(self, segment: Path, tag: str) -> None:
         self.file = segment.parent.parent / tag / segment.name
         self._hint = f"download component {tag} of this segment"
-        self._row_of: dict[Key, int] = {}
 
     def rows(self, columns: Sequence[str]) -> list[tuple[Any, ...]]:
         """Read some columns, in the given order, of all rows."""
@@ -192,11 +191,10 @@ class Component:
             raise CFlowError(f"{self.file} has no row with {key} {missing[0]}; copy it again")
         return {value: rows[value] for value in wanted}
 
-    def frame_lasers(self) -> Collection[Key]:
-        """Return the frame time (microseconds) and laser of every row."""
-        if not self._row_of:
-            self._row_of = {(time, laser): row for row, (time, laser) in enumerate(self.rows((TIME, LASER)))}
-        return self._row_of
+    @cached_property
+    def row_of(self) -> dict[Key, int]:
+        """Frame time and laser of every row -> its number."""
+        return {(time, laser): row for row, (time, laser) in enumerate(self.rows((TIME, LASER)))}
 
     def images(self, keys: Sequence[Key], column: str, channels: int) -> dict[Key, np.ndarray | None]:
         """Read range images, (H, W, channels), by frame time and laser; None if the cell is null or empty.
@@ -204,10 +202,10 @@ class Component:
         Give `column` without `.values` or `.shape`. Cost: decodes every row group that holds a wanted row, a few rows
         at a time.
         """
-        missing = [key for key in keys if key not in self.frame_lasers()]
+        missing = [key for key in keys if key not in self.row_of]
         if missing:
             raise CFlowError(f"{self.file} has no row for frame {missing[0][0]}, laser {missing[0][1]}; copy it again")
-        rows, columns = [self._row_of[key] for key in keys], [TIME, LASER, f"{column}.values", f"{column}.shape"]
+        rows, columns = [self.row_of[key] for key in keys], [TIME, LASER, f"{column}.values", f"{column}.shape"]
         images: dict[Key, np.ndarray | None] = {}
         with file_errors(self.file, self._hint):
             parquet = pq.ParquetFile(source_for_mmap(self.file))
