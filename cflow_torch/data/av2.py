@@ -103,7 +103,12 @@ class AV2Log(BoxLog):
         self._files = {int(file.stem): file for file in sweeps.glob("*.feather") if is_timestamp(file.stem)}
         self.timestamps = sorted(self._files)
         self._check_count(f"{self.folder}: sensors/lidar/<nanoseconds>.feather")
-        self._poses = self._read_poses()
+        stored = FeatherFile(self.folder / "city_SE3_egovehicle.feather")
+        row_of = {time: row for row, time in enumerate(stored.vector("timestamp_ns", np.int64).tolist())}
+        missing = [time for time in self.timestamps if time not in row_of]
+        if missing:
+            raise CFlowError(f"{stored.file} has no pose at the time of sweep {missing[0]} ({len(missing)} missing)")
+        self._poses = _poses(stored, np.array([row_of[time] for time in self.timestamps]), self.timestamps)
         if ground is not None and ground not in GROUND_RULES:
             raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
         self._rule, self._raster = ground, read_ground_raster(self.folder / "map") if ground else None
@@ -135,15 +140,6 @@ class AV2Log(BoxLog):
 
     def _points(self, index: int) -> np.ndarray:
         return FeatherFile(self._files[self.timestamps[index]]).matrix("xyz", np.float32)
-
-    def _read_poses(self) -> np.ndarray:
-        file = self.folder / "city_SE3_egovehicle.feather"
-        stored = FeatherFile(file)
-        row_of = {time: row for row, time in enumerate(stored.vector("timestamp_ns", np.int64).tolist())}
-        missing = [time for time in self.timestamps if time not in row_of]
-        if missing:
-            raise CFlowError(f"{file} has no pose at exactly the time of sweep {missing[0]} ({len(missing)} missing)")
-        return _poses(stored, np.array([row_of[time] for time in self.timestamps]), self.timestamps)
 
     def _stored_labels(self, file: Path, index: int) -> FlowLabels:
         stored = FeatherFile(file)

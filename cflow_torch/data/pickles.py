@@ -48,12 +48,12 @@ class _Unpickler(pickle.Unpickler):
 
 def load_array(stream: IO[bytes]) -> np.ndarray:
     """Load a pickled array of numbers, texts or truth values. Another pickle raises nearly any exception."""
-    return _array(_load(stream))
+    return _array(_Unpickler(stream).load())
 
 
 def load_columns(stream: IO[bytes]) -> dict[str, np.ndarray]:
     """Load the columns of a data frame that pandas pickled, by name, without pandas. Errors as in `load_array`."""
-    frame = _load(stream).state
+    frame = _Unpickler(stream).load().state
     manager = frame["_mgr"] if "_mgr" in frame else frame["_data"]
     if manager.state is None:
         blocks, axes = [block.arguments[:2] for block in manager.arguments[0]], manager.arguments[1]
@@ -69,10 +69,6 @@ def load_columns(stream: IO[bytes]) -> dict[str, np.ndarray]:
     return columns
 
 
-def _load(stream: IO[bytes]) -> Any:
-    return _Unpickler(stream, encoding="ascii").load()
-
-
 def _array(stored: Placeholder) -> np.ndarray:
     if stored.state is None:  # `_frombuffer`, of pickles of protocol 5
         data, dtype, shape, order = stored.arguments
@@ -82,11 +78,6 @@ def _array(stored: Placeholder) -> np.ndarray:
     kind = np.dtype(dtype.state[1] + dtype.arguments[0])
     if not kind.hasobject:
         return np.frombuffer(data, kind).reshape(shape, order=order)
-    values = [_text(value) if isinstance(value, Placeholder) else value for value in data]
-    return np.array([*values, None], object)[:-1].reshape(shape, order=order)
-
-
-def _text(scalar: Placeholder) -> str:
-    """Decode a NumPy string scalar."""
-    data: bytes = scalar.arguments[1]
-    return data.decode("utf-32-le").rstrip("\0")
+    # In arrays of objects, a placeholder is a string scalar of NumPy.
+    texts = [v.arguments[1].decode("utf-32-le").rstrip("\0") if isinstance(v, Placeholder) else v for v in data]
+    return np.array([*texts, None], object)[:-1].reshape(shape, order=order)

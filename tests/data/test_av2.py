@@ -140,7 +140,7 @@ SWEEP, POSES, LABELS = "sensors/lidar/100.feather", "city_SE3_egovehicle.feather
 @pytest.mark.parametrize(
     ("file", "columns", "message"),
     [
-        (POSES, pose_columns((100, 300)), "no pose at exactly the time of sweep 200"),
+        (POSES, pose_columns((100, 300)), "no pose at the time of sweep 200"),
         (POSES, {**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is not a rigid motion"),
         (POSES, {**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns must be integer"),
         (POSES, {key: value for key, value in pose_columns().items() if key != "qz"}, r"lacks the columns \['qz'\]"),

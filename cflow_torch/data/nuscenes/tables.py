@@ -107,10 +107,6 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
         return [row for row in rows if row is not None]
 
 
-def _by_token(rows: Sequence[Row]) -> dict[str, Row]:
-    return {row["token"]: row for row in rows}
-
-
 class Tables:
     """The tables of one version, `<data root>/<version>`, each read once when it is needed, with rows of LiDARs only.
 
@@ -149,13 +145,13 @@ class Tables:
     def _load(self) -> None:
         by_token = self._by_token
         for table in ("sensor", "category", "instance", "sample"):
-            by_token[table] = _by_token(read_table(self.folder, table))
+            by_token[table] = {row["token"]: row for row in read_table(self.folder, table)}
         lidars = [token for token, row in by_token["sensor"].items() if row["modality"] == "lidar"]
-        mounts = _by_token(read_table(self.folder, "calibrated_sensor", "sensor_token", lidars))
-        by_token["calibrated_sensor"] = mounts
-        sweeps = read_table(self.folder, "sample_data", "calibrated_sensor_token", mounts)
-        poses = {row["ego_pose_token"] for row in sweeps}
-        by_token["ego_pose"] = _by_token(read_table(self.folder, "ego_pose", "token", poses))
+        mounts = read_table(self.folder, "calibrated_sensor", "sensor_token", lidars)
+        by_token["calibrated_sensor"] = {row["token"]: row for row in mounts}
+        sweeps = read_table(self.folder, "sample_data", "calibrated_sensor_token", by_token["calibrated_sensor"])
+        poses = read_table(self.folder, "ego_pose", "token", {row["ego_pose_token"] for row in sweeps})
+        by_token["ego_pose"] = {row["token"]: row for row in poses}
         rows = {"sample_data": sweeps, "sample_annotation": read_table(self.folder, "sample_annotation")}
         for table, content in (*rows.items(), ("sample", list(by_token["sample"].values()))):
             grouped: dict[str, list[Row]] = defaultdict(list)
