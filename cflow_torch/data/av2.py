@@ -16,7 +16,7 @@ from cflow_torch.data.files import file_errors, read_json, read_npy
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_errors
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
-from cflow_torch.types import CFlowError, Sweep, check_array
+from cflow_torch.types import CFlowError, Sweep, check_array, vector_columns
 
 # Each rule has the largest distance of a ground point from the surface, metres, and the function that rounds grid
 # positions to cells (towards zero, or half to even).
@@ -25,11 +25,8 @@ GROUND_RULES: dict[str, tuple[float, Callable[[np.ndarray], Any]]] = {
     "bsfe": (0.4, np.round),
 }
 
-MIN_INTERIOR_POINTS = 1  # av2-api's data loader drops boxes that hold no point, so their track ends
-
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
-_FLOW = ("flow_tx_m", "flow_ty_m", "flow_tz_m")
 
 
 class GroundRaster(NamedTuple):
@@ -143,7 +140,7 @@ class AV2Log(BoxLog):
 
     def _stored_labels(self, file: Path, index: int) -> FlowLabels:
         stored = FeatherFile(file)
-        flow, category = stored.matrix(_FLOW, np.float32), stored.vector("classes", np.int64)
+        flow, category = stored.matrix(vector_columns("flow"), np.float32), stored.vector("classes", np.int64)
         rows = len(self._points(index))
         if stored.num_rows != rows:
             raise CFlowError(f"{file} has {stored.num_rows} rows but sweep {self.timestamps[index]} has {rows} points")
@@ -168,8 +165,8 @@ class AV2Log(BoxLog):
         if not times.size or not times.min() <= time <= times.max():
             return None
         is_used = times == time
-        if "num_interior_pts" in stored.names:
-            is_used &= stored.vector("num_interior_pts", np.int64) >= MIN_INTERIOR_POINTS
+        if "num_interior_pts" in stored.names:  # av2-api's data loader drops boxes without points, so their track ends
+            is_used &= stored.vector("num_interior_pts", np.int64) > 0
         rows = np.flatnonzero(is_used)
         tracks, names = stored.read(("track_uuid", "category")).take(rows).to_pydict().values()
         with file_errors(stored.file):
