@@ -14,7 +14,7 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog
-from cflow_torch.data.bags.messages import points_and_times, seconds_after
+from cflow_torch.data.bags.messages import cloud_columns, seconds_after
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import window
 from cflow_torch.data.log_check import check_log
@@ -114,10 +114,10 @@ def test_broken_bags_are_refused(recording: TinyRecording, tmp_path: Path) -> No
     cloud = message.make("sensor_msgs/msg/PointCloud2", *message.cloud(0, np.ones((5, 3)), None))
     cloud.data = cloud.data[:-1]
     with pytest.raises(ValueError, match="buffer"):
-        points_and_times(cloud, 0)
+        cloud_columns(cloud)
     cloud.fields = cloud.fields[:2]
     with pytest.raises(ValueError, match=r"lacks the fields \['x', 'z'\]"):
-        points_and_times(cloud, 0)
+        cloud_columns(cloud)
 
 
 STAMP = 1_700_000_000_123_456_789

@@ -11,7 +11,7 @@ from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions
 from cflow_torch.types import CFlowError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
-_TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp")
+TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp")
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
 _SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 1000, so that only one unit fits
 
@@ -37,14 +37,6 @@ def cloud_columns(message: Any) -> dict[str, np.ndarray]:
     points = np.stack([table[axis] for axis in "xyz"], axis=1)
     table = table[np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)]
     return {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
-
-
-def points_and_times(message: Any, stamp_ns: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points of `cloud_columns`, (N, 3) float64 metres in the frame of the cloud, and `seconds_after`."""
-    columns = cloud_columns(message)
-    times = next((columns[name] for name in _TIME_FIELDS if name in columns), None)
-    points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
-    return points, None if times is None else seconds_after(times, stamp_ns)
 
 
 def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:

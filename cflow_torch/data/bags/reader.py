@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.arrays.poses_text import Trajectory, covered_poses
-from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, points_and_times, sample, sorted_poses
+from cflow_torch.data.bags.messages import TIME_FIELDS, Frames, cloud_columns, sample, seconds_after, sorted_poses
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
@@ -107,12 +107,11 @@ class BagLog(Log):
 
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
-        with file_errors(f"{self.path}, {self.topic} at {time} ns"):
-            points, times = points_and_times(self._cloud(time), time)
-            mount = self._mount
-            if mount is None:
-                mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
-            points = transform_points(points, mount)
+        columns, mount = self._cloud(time), self._mount
+        times = next((seconds_after(columns[name], time) for name in TIME_FIELDS if name in columns), None)
+        if mount is None:
+            mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
+        points = transform_points(np.stack([columns[axis] for axis in "xyz"], axis=1), mount)
         if self.poses is None:
             return Sweep(points.astype(np.float32), None, None, time, times)
         if times is not None and self.deskew:
@@ -123,9 +122,7 @@ class BagLog(Log):
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the fields besides x, y, z, such as intensity and ring, of the points of sweep `index`."""
-        time = self._timestamp(index)
-        with file_errors(f"{self.path}, {self.topic} at {time} ns"):
-            columns = cloud_columns(self._cloud(time))
+        columns = self._cloud(self._timestamp(index))
         return {name: values for name, values in columns.items() if name not in ("x", "y", "z")}
 
     def _reader(self) -> Any:
@@ -156,7 +153,7 @@ class BagLog(Log):
             )
         return found[0]
 
-    def _scan(self) -> tuple[dict[int, int], dict[str, list[Sample]]]:
+    def _scan(self) -> tuple[dict[int, int], dict[str, list[Any]]]:
         """Read the arrival time of each cloud and the pose samples of each topic, and set the frames.
 
         Names of frames lose the leading slash that ROS 1 allows.
@@ -165,8 +162,8 @@ class BagLog(Log):
         self._child: dict[str, str] = {}
         arrival: dict[int, int] = {}
         parents: dict[str, str] = {}
-        links: dict[str, list[Sample]] = {}
-        tracks: dict[str, list[Sample]] = {}
+        links: dict[str, list[Any]] = {}
+        tracks: dict[str, list[Any]] = {}
         reader = self._reader()
         wanted = [c for c in reader.connections if c.topic == self.topic or c.msgtype in (*_POSE_TYPES, *_TF_TYPES)]
         for connection, arrived, data in reader.messages(wanted):
@@ -187,7 +184,7 @@ class BagLog(Log):
         self._frames = Frames(parents, links)
         return arrival, tracks
 
-    def _trajectory(self, poses: str, tracks: dict[str, list[Sample]]) -> tuple[np.ndarray, np.ndarray]:
+    def _trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:
         """Return (M,) int64 times of transforms or messages, and (M, 4, 4) `T_world_ego` at these times."""
         if poses == "tf":
             times = self._frames.change_times(self.frame)
@@ -201,14 +198,16 @@ class BagLog(Log):
             raise CFlowError(f"poses={poses}: fewer than two poses of {self.frame}; choose others, or poses=null")
         return times, matrices
 
-    def _cloud(self, time: int) -> Any:
-        reader, arrived = self._reader(), self._arrival[time]
-        clouds = [connection for connection in reader.connections if connection.topic == self.topic]
-        for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
-            message = reader.deserialize(data, connection.msgtype)
-            if _stamp(message, arrived) == time:
-                return message
-        raise CFlowError("the cloud is gone; was the bag changed?")
+    def _cloud(self, time: int) -> dict[str, np.ndarray]:
+        """Read the `cloud_columns` of the cloud at a time."""
+        with file_errors(f"{self.path}, {self.topic} at {time} ns"):
+            reader, arrived = self._reader(), self._arrival[time]
+            clouds = [connection for connection in reader.connections if connection.topic == self.topic]
+            for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
+                message = reader.deserialize(data, connection.msgtype)
+                if _stamp(message, arrived) == time:
+                    return cloud_columns(message)
+            raise CFlowError("the cloud is gone; was the bag changed?")
 
 
 def _stamp(message: Any, arrived: int) -> int:
