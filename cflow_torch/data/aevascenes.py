@@ -19,6 +19,9 @@ from cflow_torch.types import CFlowError, Sweep, check_array
 
 _HINT = "copy the sequence from the data set again"
 
+GROUND = ("road", "lane_boundary", "road_marking", "reflective_marker", "sidewalk", "other_ground")
+"""Classes of ground points."""
+
 CATEGORY_NAME: dict[str, str] = {
     **dict.fromkeys(("unknown", "pole_trunk", "building", "other_structure", "vegetation"), "NONE"),
     "car": "REGULAR_VEHICLE",
@@ -35,12 +38,9 @@ CATEGORY_NAME: dict[str, str] = {
     "animal": "ANIMAL",
     "traffic_item": "CONSTRUCTION_CONE",
     "traffic_sign": "SIGN",
+    **dict.fromkeys(GROUND, "NONE"),
 }
 """Class of AevaScenes -> Argoverse 2 name. The data set publishes no such map; this one is ours."""
-
-GROUND = ("road", "lane_boundary", "road_marking", "reflective_marker", "sidewalk", "other_ground")
-"""Classes of ground points."""
-CATEGORY_NAME.update(dict.fromkeys(GROUND, "NONE"))
 
 _PATHS = {"compensated": ("point_cloud_compensated_path", "point_cloud_path"), "raw": ("point_cloud_raw_path",)}
 

@@ -20,9 +20,7 @@ from cflow_torch.types import CFlowError, Sweep
 
 _LIDARS = (0, 1)  # Pandar64, which rotates, and PandarGT, which looks forward
 _EVERY_LIDAR = -1  # of a cuboid; an object at different positions for both LiDARs has a cuboid for each
-_POSITION, _SIZE = (
-    tuple(f"{what}.{axis}" for axis in axes) for what, axes in (("position", "xyz"), ("dimensions", "yxz"))
-)
+_POSITION, _SIZE = ("position.x", "position.y", "position.z"), ("dimensions.y", "dimensions.x", "dimensions.z")
 
 _LABELS = {
     "ANIMAL": ("Animals - Bird", "Animals - Other"),
@@ -81,7 +79,7 @@ class PandaSetLog(Log):
         time = self._timestamp(index)
         points, shots, _ = self._cloud(index)
         classes = self._classes(index, len(points))
-        is_ground = None if classes is None else np.isin(classes, _GROUND)
+        is_ground = None if classes is None else np.isin(classes[0], _GROUND)[classes[1]]
         return Sweep(points, is_ground, self._poses[index].copy(), time, shots - time * 1e-9)
 
     def _labels(self, index: int) -> FlowLabels | None:
@@ -102,10 +100,10 @@ class PandaSetLog(Log):
             flow[rows], category[rows], is_valid[rows] = found.flow, found.category, found.is_valid
         classes = self._classes(index, len(points))
         if classes is not None:
-            names, name_of_point = np.unique(classes, return_inverse=True)
-            index_of = [CATEGORY_INDEX[CATEGORY_NAME.get(name, "NONE")] for name in names.tolist()]
-            in_cuboid, category = category > 0, np.array(index_of, np.uint8)[name_of_point]
-            is_valid &= (in_cuboid == (category > 0)) & ~np.isin(classes, _WITHOUT_FLOW)
+            names, class_of_point = classes
+            index_of = [CATEGORY_INDEX[CATEGORY_NAME.get(name, "NONE")] for name in names]
+            in_cuboid, category = category > 0, np.array(index_of, np.uint8)[class_of_point]
+            is_valid &= (in_cuboid == (category > 0)) & ~np.isin(names, _WITHOUT_FLOW)[class_of_point]
         return FlowLabels(flow, category, is_valid)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
@@ -123,8 +121,8 @@ class PandaSetLog(Log):
         points = transform_points(table[:3].T, np.linalg.inv(self._poses[index]))
         return points.astype(np.float32), table[3], table[4]
 
-    def _classes(self, index: int, num_points: int) -> np.ndarray | None:
-        """Read (N,) names of the classes of points; None if the sequence has none."""
+    def _classes(self, index: int, num_points: int) -> tuple[list[str], np.ndarray] | None:
+        """Read the names of C classes, and the (N,) index of the class of each point; None if the sequence has none."""
         folder = self.folder / "annotations" / "semseg"
         file, table = folder / self._files[index].name, folder / "classes.json"
         with remote_errors(folder):
@@ -133,10 +131,10 @@ class PandaSetLog(Log):
         classes = _columns(file, ("class",))["class"]
         if classes.shape != (num_points,):
             raise CFlowError(f"{file} has {len(classes)} classes for {num_points} points; copy the sequence again")
-        numbers, number_of_point = np.unique(classes, return_inverse=True)
+        numbers, class_of_point = np.unique(classes, return_inverse=True)
         with file_errors(table):
             names = read_json(table)
-            return np.array([str(names.get(str(number), "")) for number in numbers.tolist()])[number_of_point]
+            return [str(names.get(str(number), "")) for number in numbers.tolist()], class_of_point
 
     def _boxes(self, cuboids: dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
         """Return the cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""

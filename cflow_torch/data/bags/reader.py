@@ -21,8 +21,7 @@ from cflow_torch.windows.ego_motion import rigid_transform
 SUFFIXES = (".bag", ".mcap", ".db3")
 SEARCH_DEPTH = 3
 _CLOUD = "sensor_msgs/msg/PointCloud2"
-_POSES = tuple(f"{name}Stamped" for name in ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseWithCovariance"))
-_POSE_TYPES = ("nav_msgs/msg/Odometry", *_POSES)
+_POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped" for name in ("", "WithCovariance")))
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _NEED = "bags need rosbags: pip install rosbags"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up

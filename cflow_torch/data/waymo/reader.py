@@ -19,9 +19,7 @@ from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, Laser
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
-SEGMENT, TIME, LASER, TRACK = (
-    f"key.{name}" for name in ("segment_context_name", "frame_timestamp_micros", "laser_name", "laser_object_id")
-)
+TIME, LASER, TRACK = "key.frame_timestamp_micros", "key.laser_name", "key.laser_object_id"
 """Key columns."""
 
 LIDAR, PIXEL_POSE = "[LiDARComponent].range_image_return", "[LiDARPoseComponent].range_image_return1"

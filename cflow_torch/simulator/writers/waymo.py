@@ -22,7 +22,6 @@ from cflow_torch.data.waymo.reader import (
     LASER,
     LIDAR,
     PIXEL_POSE,
-    SEGMENT,
     TIME,
     TRACK,
     VEHICLE_POSE,
@@ -43,7 +42,8 @@ del BOX_TYPE["RAILED_VEHICLE"]
 _XYZ = ("x", "y", "z")
 # Component -> the columns that the reader reads, as the official classes print them.
 _IMAGE, _SHAPE, _TRANSFORM = pa.list_(pa.float32()), pa.list_(pa.int32(), 3), pa.list_(pa.float64(), 16)
-_FRAME_KEYS: list[tuple[str, Any]] = [(SEGMENT, pa.string()), (TIME, pa.int64())]
+_SEGMENT = "key.segment_context_name"
+_FRAME_KEYS: list[tuple[str, Any]] = [(_SEGMENT, pa.string()), (TIME, pa.int64())]
 SCHEMAS: dict[str, pa.Schema] = {
     "lidar": pa.schema(
         [
@@ -54,7 +54,7 @@ SCHEMAS: dict[str, pa.Schema] = {
     ),
     "lidar_calibration": pa.schema(
         [
-            (SEGMENT, pa.string()),
+            (_SEGMENT, pa.string()),
             (LASER, pa.int8()),
             (f"{CALIBRATION}extrinsic.transform", _TRANSFORM),
             (f"{CALIBRATION}beam_inclination.min", pa.float64()),
@@ -133,7 +133,7 @@ def _write_components(log: Recording, folder: Path) -> None:
         }
         tables: dict[str, list[dict[str, Any]]] = {tag: [] for tag in SCHEMAS}  # written as one row group
         for index, time in enumerate(times):
-            key = {SEGMENT: log.log_id, TIME: time}
+            key = {_SEGMENT: log.log_id, TIME: time}
             pose, units = np.asarray(log.poses[index], np.float64), log.units(index)
             numbers = _laser_numbers([unit.name for unit in units])
             rows: list[dict[str, Any]] = []
