@@ -9,14 +9,10 @@ import pyarrow as pa
 
 from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.paths import read_bytes
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, check_array
 
-# Kind of a NumPy type -> its name, and the test for the types of Arrow.
-_KINDS = {
-    "f": ("floating point", pa.types.is_floating),
-    "i": ("integer", pa.types.is_integer),
-    "b": ("bool", pa.types.is_boolean),
-}
+# Kind of a NumPy type -> kinds of columns that become it, and their name.
+_KINDS = {"f": ("f", "floats"), "i": ("iu", "integers"), "b": ("b", "bool")}
 
 
 class FeatherFile:
@@ -40,14 +36,14 @@ class FeatherFile:
 
         A column of another kind, or with an empty entry, is a `CFlowError`.
         """
-        kind, is_kind = _KINDS[np.dtype(dtype).kind]
-        stored = dict(zip(columns, self.read(columns).columns))
-        for name, values in stored.items():
-            if not is_kind(values.type):
-                raise CFlowError(f"{self.file}: column {name} must be {kind}, got {values.type}")
+        kinds, wanted = _KINDS[np.dtype(dtype).kind]
+        arrays = []
+        for name, values in zip(columns, self.read(columns).columns):
             if values.null_count:
                 raise CFlowError(f"{self.file} has {values.null_count} empty entries in {name}; copy it again")
-        return np.stack([values.to_numpy() for values in stored.values()], axis=1).astype(dtype, copy=False)
+            arrays.append(values.to_numpy())
+            check_array(arrays[-1], f"{self.file}: column {name}", (self.num_rows,), kinds, f"a column of {wanted}")
+        return np.stack(arrays, axis=1).astype(dtype, copy=False)
 
     def vector(self, column: str, dtype: Any = np.float64) -> np.ndarray:
         """Return one column as (rows,). The rest is as in `matrix`."""

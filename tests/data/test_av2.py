@@ -142,12 +142,12 @@ SWEEP, POSES, LABELS = "sensors/lidar/100.feather", "city_SE3_egovehicle.feather
     [
         (POSES, pose_columns((100, 300)), "no pose at the time of sweep 200"),
         (POSES, {**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is not a rigid motion"),
-        (POSES, {**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns must be integer"),
+        (POSES, {**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns has dtype"),
         (POSES, {key: value for key, value in pose_columns().items() if key != "qz"}, r"lacks the columns \['qz'\]"),
         (SWEEP, {"x": [1.0, None], "y": [1.0, 2.0], "z": [1.0, 2.0]}, "1 empty entries in x"),
         (LABELS, label_columns(rows=2), "2 rows but sweep 100 has 3 points"),
         (LABELS, label_columns(classes=np.array([0, 31, 0], dtype=np.uint8)), "classes are 0 ... 30"),
-        (LABELS, label_columns(is_valid=np.ones(3)), "is_valid must be bool"),
+        (LABELS, label_columns(is_valid=np.ones(3)), "is_valid has dtype float64"),
     ],
 )
 def test_bad_columns_are_refused(folder: Path, file: str, columns: dict[str, Any], message: str) -> None:

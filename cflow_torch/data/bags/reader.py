@@ -153,10 +153,7 @@ class BagLog(Log):
         return found[0]
 
     def _scan(self) -> tuple[dict[int, int], dict[str, list[Any]]]:
-        """Read the arrival time of each cloud and the pose samples of each topic, and set the frames.
-
-        Names of frames lose the leading slash that ROS 1 allows.
-        """
+        """Read the arrival time of each cloud and the pose samples of each topic, and set the frames."""
         self._lidar = ""
         self._child: dict[str, str] = {}
         arrival: dict[int, int] = {}
@@ -172,7 +169,7 @@ class BagLog(Log):
                 self._lidar = self._lidar or message.header.frame_id.lstrip("/")
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
-                    child, T = link.child_frame_id.lstrip("/"), link.transform
+                    child, T = link.child_frame_id.lstrip("/"), link.transform  # ROS 1 allows a leading slash
                     parents[child] = link.header.frame_id.lstrip("/")
                     links.setdefault(child, []).append(sample(_stamp(link, arrived), T.translation, T.rotation))
             else:

@@ -160,10 +160,7 @@ class NuScenesLog(Log):
         )
 
     def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Read (N, 3) float32 points in the ego frame of the sweep, and (N,) int64 microseconds from its time stamp.
-
-        The latter are 0 if the format does not store them.
-        """
+        """Read (N, 3) float32 points in the ego frame, and (N,) int64 microseconds from the time stamp; 0 = unknown."""
         time = self._timestamp(index)
         clouds = []
         for chain in self._lidars.values():
