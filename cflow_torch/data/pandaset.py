@@ -134,7 +134,7 @@ class PandaSetLog(Log):
         numbers, class_of_point = np.unique(classes, return_inverse=True)
         with file_errors(table):
             names = read_json(table)
-            return [str(names.get(str(number), "")) for number in numbers.tolist()], class_of_point
+            return [str(names.get(str(int(number)), "")) for number in numbers.tolist()], class_of_point
 
     def _boxes(self, cuboids: dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
         """Return the cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""
