@@ -31,6 +31,11 @@ class FeatherFile:
         self.names: list[str] = self.table.column_names
         self.num_rows: int = self.table.num_rows
 
+    def read(self, columns: Sequence[str]) -> pa.Table:
+        """Return some columns, in the given order; a column that is missing or occurs twice is a `CFlowError`."""
+        check_columns(self.file, self.names, columns)
+        return self.table.select(list(columns))
+
     def matrix(self, columns: Sequence[str], dtype: Any = np.float64) -> np.ndarray:
         """Return K columns as (rows, K) of `dtype`, which is a float, np.int64 or bool.
 

@@ -240,7 +240,7 @@ def test_official_masks_take_precedence(log: AV2Log, tmp_path: Path) -> None:
     np.testing.assert_array_equal(point_mask(log, 3, sweep, masks), mask)
     short = MaskArchive(write_masks(tmp_path / "short.zip", log.log_id, stamp, mask[1:]))
     numbers = MaskArchive(write_masks(tmp_path / "numbers.zip", log.log_id, stamp, mask.astype(np.int8)))
-    for index, broken, message in ((3, short, "rows"), (3, numbers, "must be bool"), (2, masks, "cannot read")):
+    for index, broken, message in ((3, short, "rows"), (3, numbers, "column of bool"), (2, masks, "cannot read")):
         with pytest.raises(CFlowError, match=message):
             point_mask(log, index, sweep, broken)
     with pytest.raises(CFlowError, match="not a zip"):

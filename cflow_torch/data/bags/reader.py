@@ -100,7 +100,7 @@ class BagLog(Log):
                 self.timestamps = [time for time in self.timestamps if times[0] <= time <= times[-1]]
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             if poses is not None:
-                self.poses = covered_poses(Trajectory(matrices, times, "bag"), self.timestamps, poses)
+                self.poses = covered_poses(Trajectory(matrices, times, "bag", poses), self.timestamps)
             if self._mount is None:
                 self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
 

@@ -44,7 +44,7 @@ class MaskArchive:
             file = FeatherFile(f"{self.file}: {name}", self._zip.read(name))
         if len(file.names) != 1:
             raise CFlowError(f"{self.file}: {name} must have one bool column, it has {file.names}")
-        return file.bools(file.names[0])
+        return file.vector(file.names[0], bool)
 
 
 def log_mask(log: Log, index: int) -> np.ndarray | None:
