@@ -68,13 +68,6 @@ class VerifiedFlow(SceneFlowModel):
 
     def motion(self, batch: Batch) -> RotatingMotion:
         """Return the motion of all points of a batch, one per occupied pixel. Ids number the objects."""
-        if self.config.num_future == 0:
-            return self.estimate(batch)
-        sides, copied = batch.split_past_and_future()
-        return choose_side(sides, copied, self.estimate(sides))
-
-    def estimate(self, batch: Batch) -> RotatingMotion:
-        """Estimate the motion from all sweeps of each window, in seven steps."""
         config = self.config
         blocks = [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes]
         with stage("draw"):
@@ -101,4 +94,5 @@ class VerifiedFlow(SceneFlowModel):
         with stage("confidence"):
             confidence = confidence_of(sweeps, objects, apparent, margin.z)
         score, is_changed = lookup(candidates.score, node), lookup(nodes.level == components.num_levels, node)
-        return motion_by_pixel(sweeps, objects, rigid.only(margin.is_dynamic), score, confidence, is_changed)
+        result = motion_by_pixel(sweeps, objects, rigid.only(margin.is_dynamic), score, confidence, is_changed)
+        return choose_side(batch, result) if config.num_future > 0 else result

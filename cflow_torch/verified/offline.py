@@ -24,25 +24,13 @@ from cflow_torch.windows.collation import Batch
 _TIMES = 2
 
 
-def choose_side(sides: Batch, copied: Tensor, motion: RotatingMotion) -> RotatingMotion:
-    """Choose the motion from the past or from the future for each point.
-
-    Args:
-        sides: the result of `Batch.split_past_and_future`: the points, then copies of the points of t+1 and t in
-            windows of the future.
-        copied: (K,) int64, the points that have copies.
-        motion: motion of all points and copies.
-
-    Returns:
-        The motion, in which each point has the pixel of the chosen side.
-    """
-    num_points = sides.image.numel() - len(copied)
-    shown = _num_shown(sides, motion)
-    own, copy = shown.index_select(0, copied), shown[num_points:]
-    pixel = torch.where(
-        copy > _TIMES * own, motion.cell_of_point[num_points:], motion.cell_of_point.index_select(0, copied)
-    )
-    return replace(motion, cell_of_point=motion.cell_of_point.index_copy(0, copied, pixel))
+def choose_side(batch: Batch, motion: RotatingMotion) -> RotatingMotion:
+    """Return the motion in which each point of t has the pixel of the chosen side, of the past or of the future."""
+    shown, pixel = _num_shown(batch, motion), motion.cell_of_point
+    begin, end = batch.rows[0].start, batch.rows[-1].stop
+    past, future = slice(begin, end), slice(end, 2 * end - begin)  # the same points of t
+    chosen = torch.where(shown[future] > _TIMES * shown[past], pixel[future], pixel[past])
+    return replace(motion, cell_of_point=pixel.slice_scatter(chosen, 0, begin, end))
 
 
 def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, significance: float) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -43,12 +41,6 @@ class GroundHeights:
         height = torch.floor(positions[2] * 100).clamp_(-_HIGHEST, _HIGHEST).long()
         self._heights.view(-1).index_add_(0, block, height)
         self._counts.view(-1).index_add_(0, block, torch.ones_like(height))
-
-    def repeated(self) -> GroundHeights:
-        """The ground of 2 B windows: windows B ... 2 B - 1 have that of windows 0 ... B - 1."""
-        both = copy(self)
-        both._heights, both._counts = (torch.cat((of, of)) for of in (self._heights, self._counts))
-        return both
 
     def mean(self) -> Tensor:
         """Return the mean height over 3 x 3 blocks, (B, Y, X) int64, centimetres, rounded down. Where they hold fewer

@@ -31,8 +31,8 @@ class Source(NamedTuple):
 class Entry(NamedTuple):
     """One sweep of one window."""
 
-    step: int  # 0 = t+1, 1 = t, 2 = t-1, ..., then t+2, t+3, ...
-    window: int  # index of the window
+    step: int  # 0 = t+1, 1 = t, 2 = t-1 or t+2, ...
+    window: int  # index of the window in the batch
     name: str  # as users know it, for errors
     sweep: Sweep  # the sweep
     T_ego1_ego: np.ndarray | None  # (4, 4) float64; None = its points lie in the frame of t+1
@@ -41,7 +41,7 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Timeline:
-    """All sweeps of B windows: t+1 of every window first, then t of every window, then t-1, ..."""
+    """All sweeps of a batch: t+1 of every window, then t of every window, then t-1, ..."""
 
     entries: list[Entry]  # the sweeps
     table: np.ndarray  # (5, B, S) float64: `elapsed`, `seconds` and x, y, z of `origin`, as in `Batch`
@@ -50,24 +50,24 @@ class Timeline:
     def of(windows: Sequence[Window], config: Config, grid: Grid, needs_times: bool) -> Timeline:
         """Check everything but the points, and list the sweeps. Arguments and errors as in `make_batch`."""
         windows = [keep_nearest(window, config.num_history) for window in windows]
-        sources = [source_sweeps(window, config) for window in windows]
-        num_past = [sum(source.intervals > 0 for source in of_window) for of_window in sources]
-        first_future = 1 + max(num_past)
-        num_steps = first_future + max(len(of_window) - past for of_window, past in zip(sources, num_past))
-        table = np.zeros((5, len(windows), num_steps))
+        given = [source_sweeps(window, config) for window in windows]
+        sides = [[source for source in sources if source.intervals > 0] for sources in given]
+        if config.num_future > 0:
+            sides += [[sources[0], *(source for source in sources if source.intervals < 0)] for sources in given]
+        table = np.zeros((5, len(sides), 1 + max(map(len, sides))))
         farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
         entries: list[Entry] = []
-        for index, (window, of_window, past) in enumerate(zip(windows, sources, num_past)):
-            steps = [*range(1, 1 + past), *range(first_future, first_future + len(of_window) - past)]
-            times = elapsed_times(window, of_window, config)
-            table[:2, index, steps] = np.transpose(times)
+        for index, sources in enumerate(sides):
+            window = windows[index % len(windows)]
+            times = elapsed_times(window, sources, config)
+            table[:2, index, 1 : 1 + len(sources)] = np.transpose(times)
             # A sweep without point times would seem to be measured at other times than the rest.
-            has_times = all(s.point_times is not None for s in (window.pc1, *(source.sweep for source in of_window)))
+            has_times = all(sweep.point_times is not None for _, sweep in named_sweeps(window))
             interval = times[0][1] / times[0][0] if needs_times and has_times else None
             pose1, transform = window.pc1.pose, None
             T_ego1_world = None if pose1 is None else np.linalg.inv(rigid_transform(pose1, "pose1", farthest))
             entries.append(Entry(0, index, "pc1", window.pc1, None, interval))
-            for step, (name, sweep, _) in zip(steps, of_window):
+            for step, (name, sweep, _) in enumerate(sources, 1):
                 if T_ego1_world is not None:
                     transform = T_ego1_world @ rigid_transform(sweep.pose, f"pose of {name}", farthest)
                     _check_distance(transform, name)

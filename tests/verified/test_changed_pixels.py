@@ -15,7 +15,7 @@ from cflow_torch.verified import changed_pixels, method
 from cflow_torch.verified.changed_pixels import ChangedPixels, RangeImages, find_changed
 
 REGION = (-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)
-SETTINGS = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION, num_history=3, num_future=2, min_height=None)
+SETTINGS = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=REGION, num_history=3, min_height=None)
 
 
 def screen(distance: float, half: float = 2.0, top: float = 0.0) -> np.ndarray:
