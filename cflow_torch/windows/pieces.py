@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, Iterable, Iterator, NamedTuple, Sequence
+from typing import Any, Iterator, NamedTuple, Sequence
 
 import numpy as np
 import torch
@@ -34,52 +33,46 @@ class Piece(NamedTuple):
     pose_flow: Tensor | None
 
 
-@dataclass(frozen=True)
-class PieceReader:
-    """Reads the points of all sweeps of a timeline."""
+def read_pieces(
+    timeline: Timeline,
+    config: Config,
+    grid: Grid,
+    device: torch.device,
+    num_axes: int,
+    ground: GroundHeights | None,
+) -> Iterator[Piece]:
+    """Yield the pieces in the order of the timeline, and add the ground points of t to `ground`, if it is not None.
 
-    timeline: Timeline  # the sweeps
-    config: Config  # this and the next three as for `make_batch`
-    grid: Grid
-    device: torch.device
-    num_axes: int
-    ground: GroundHeights | None  # where the ground points of t are counted; None = nowhere
-
-    def pieces(self) -> Iterator[Piece]:
-        """Yield the pieces in the order of the timeline.
-
-        A CPU reads each sweep alone, in pieces that fit its cache. A GPU waits for operations rather than for memory,
-        so it reads all sweeps t+1 at once, then all sweeps t, then all others.
-        """
-        if self.device.type == "cpu":
-            for entry in self.timeline.entries:
-                num_points = entry.sweep.points.shape[0]
-                yield from self._read([entry], chunks(0, max(num_points, 1), self.device))  # an empty sweep is a piece
-        else:
-            for _, group in groupby(self.timeline.entries, lambda entry: min(entry.step, 2)):
-                yield from self._read(list(group), [slice(None)])
-
-    def _read(self, group: Sequence[Entry], parts: Iterable[slice]) -> Iterator[Piece]:
-        """Yield the given rows of a group of sweeps, counted through all of them."""
-        step, grid, num_axes = group[0].step, self.grid, self.num_axes
-        sweeps = [entry.sweep for entry in group]
-        window, image, matrix = self._of_points(group)
-        ground, times = self._ground(group), self._times(group)
-        region = Grid(grid.pixel_size, self.config.point_cloud_range[:3], self.config.point_cloud_range[3:])
+    The other arguments are as for `make_batch`. A CPU reads each sweep alone, in pieces that fit its cache. A GPU waits
+    for operations rather than for memory, so it reads all sweeps t+1 at once, then all sweeps t, then all others.
+    """
+    on_cpu, num_steps = device.type == "cpu", timeline.table.shape[2]
+    region = Grid(grid.pixel_size, config.point_cloud_range[:3], config.point_cloud_range[3:])
+    has_times = any(entry.interval is not None for entry in timeline.entries)
+    for _, entries in groupby(timeline.entries, lambda entry: entry[:2] if on_cpu else min(entry.step, 2)):
+        group = list(entries)
+        step, sweeps = group[0].step, [entry.sweep for entry in group]
+        window, image, matrix = _of_points(group, num_steps, device)
+        is_ground = None if all(sweep.is_ground is None for sweep in sweeps) else read_ground(sweeps, device)
+        times = None
+        if has_times:
+            times = torch.cat([read_point_times(entry.sweep, entry.name, entry.interval, device) for entry in group])
         # z matters where the region bounds it. A transform spreads a z that is not finite to x and y.
         is_flat = matrix is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
         checked_axes = 2 if is_flat else 3
-        for rows in parts:
-            raw = read_positions(sweeps, self.device, rows)
-            moved = raw if matrix is None else compensate(raw, matrix, 3 if step == 1 else max(num_axes, checked_axes))
+        moved_axes = 3 if step == 1 else max(num_axes, checked_axes)
+        # An empty sweep is a piece.
+        for rows in chunks(0, max(sweeps[0].points.shape[0], 1), device) if on_cpu else [slice(None)]:
+            raw = read_positions(sweeps, device, rows)
+            moved = raw if matrix is None else compensate(raw, matrix, moved_axes)
             is_active, pose_flow, row = grid.contains(moved[:checked_axes]), None, None
-            if ground is not None:
-                if self.ground is not None and step == 1:
-                    found = flat_nonzero(is_active & ground[rows])
-                    self.ground.add(_select(window, found), take_columns(moved, found))
-                is_active &= ~ground[rows]
-            if self.config.ego_box is not None:
-                x0, y0, x1, y1 = self.config.ego_box
+            if is_ground is not None:
+                if ground is not None and step == 1:
+                    found = flat_nonzero(is_active & is_ground[rows])
+                    ground.add(_select(window, found), take_columns(moved, found))
+                is_active &= ~is_ground[rows]
+            if config.ego_box is not None:
+                x0, y0, x1, y1 = config.ego_box
                 is_active &= (raw[0] < x0) | (raw[0] > x1) | (raw[1] < y0) | (raw[1] > y1)
             if step == 1:
                 has_result = is_active if region == grid else is_active & region.contains(moved)
@@ -96,31 +89,22 @@ class PieceReader:
             point_times = None if times is None else _select(times[rows], row).float()
             yield Piece(step, positions, is_active, has_result, of_point, point_times, pose_flow)
 
-    def _of_points(self, group: Sequence[Entry]) -> tuple[int | Tensor, int | Tensor, Tensor | None]:
-        """Window and image of each point, (N,) or one number for all, and its transform, (3, 4, N) or (3, 4, 1)."""
-        num_steps, matrix = self.timeline.table.shape[2], None
-        if any(entry.T_ego1_ego is not None for entry in group):
-            given = [np.eye(4) if entry.T_ego1_ego is None else entry.T_ego1_ego for entry in group]
-            matrix = torch.as_tensor(np.stack(given, 2)[:3], device=self.device)  # the last row is known
-        if len(group) == 1:
-            return group[0].window, group[0].window * num_steps + group[0].step, matrix
-        known = [(e.window, e.window * num_steps + e.step, e.sweep.points.shape[0]) for e in group]
-        window, image, count = torch.as_tensor(known, device=self.device).unbind(1)
-        entry = torch.repeat_interleave(count, output_size=sum(size for *_, size in known))
-        window, image = window.index_select(0, entry), image.int().index_select(0, entry)
-        return window, image, None if matrix is None else matrix.index_select(2, entry)
 
-    def _ground(self, group: Sequence[Entry]) -> Tensor | None:
-        """(N,) bool, False in sweeps without a mask; None = no sweep has one."""
-        if all(entry.sweep.is_ground is None for entry in group):
-            return None
-        return read_ground([entry.sweep for entry in group], self.device)
-
-    def _times(self, group: Sequence[Entry]) -> Tensor | None:
-        """(N,) float64 sweep intervals, 0 in windows whose times are not used; None = no window uses them."""
-        if all(entry.interval is None for entry in self.timeline.entries):
-            return None
-        return torch.cat([read_point_times(entry.sweep, entry.name, entry.interval, self.device) for entry in group])
+def _of_points(
+    group: Sequence[Entry], num_steps: int, device: torch.device
+) -> tuple[int | Tensor, int | Tensor, Tensor | None]:
+    """Window and image of each point, (N,) or one number for all, and its transform, (3, 4, N) or (3, 4, 1)."""
+    matrix = None
+    if any(entry.T_ego1_ego is not None for entry in group):
+        given = [np.eye(4) if entry.T_ego1_ego is None else entry.T_ego1_ego for entry in group]
+        matrix = torch.as_tensor(np.stack(given, 2)[:3], device=device)  # the last row is known
+    if len(group) == 1:
+        return group[0].window, group[0].window * num_steps + group[0].step, matrix
+    known = [(e.window, e.window * num_steps + e.step, e.sweep.points.shape[0]) for e in group]
+    window, image, count = torch.as_tensor(known, device=device).unbind(1)
+    entry = torch.repeat_interleave(count, output_size=sum(size for *_, size in known))
+    window, image = window.index_select(0, entry), image.int().index_select(0, entry)
+    return window, image, None if matrix is None else matrix.index_select(2, entry)
 
 
 def _select(values: Any, row: Tensor | None) -> Any:
