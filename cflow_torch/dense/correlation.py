@@ -30,16 +30,32 @@ _PER_CALL_GPU, _PER_RUN_GPU = 1 << 26, 1 << 26
 
 @dataclass(frozen=True)
 class Estimates:
-    """Motion of M clusters as estimated from each of K earlier sweeps, nearest sweep first."""
+    """Motion of M clusters as estimated from each of K other sweeps, nearest sweep first."""
 
-    displacement: Tensor  # (M, K, 3) float64, metres m -> t+1
+    # (M, K, A) float64, m -> t+1: x, y and z in metres, or, of the verified method, y and x in finest pixels.
+    displacement: Tensor
     score: Tensor  # (M, K) float32, NCC at the peak
     available: Tensor  # (M, K) bool, False = the cluster has no pixel in that sweep; displacement and score are 0 there
     intervals: Tensor  # (M, K) float64, sweep intervals from m to t+1
 
+    @classmethod
+    def of(cls, pairs: TemplatePairs, displacement: Tensor, score: Tensor, intervals: Tensor) -> Estimates:
+        """Make them from the estimates of J pairs, (J, A) and (J,)."""
+        (count, num_sources), num_axes = intervals.shape, displacement.shape[1]
+        slot = torch.add(pairs.source, pairs.cluster, alpha=num_sources)
+        displacements = displacement.new_zeros((count * num_sources, num_axes))
+        scores = score.new_zeros(count * num_sources)
+        available = torch.zeros_like(scores, dtype=torch.bool).index_fill_(0, slot, True)
+        return cls(
+            displacements.index_copy_(0, slot, displacement).view(count, num_sources, num_axes),
+            scores.index_copy_(0, slot, score).view_as(intervals),
+            available.view_as(intervals),
+            intervals,
+        )
+
     def per_interval(self) -> Tensor:
-        """Displacement per sweep interval, (M, K, 3) float64, metres."""
-        return self.displacement / self.intervals.clamp(min=1)[:, :, None]
+        """Displacement per sweep interval, (M, K, A) float64; undefined where it is not available."""
+        return self.displacement / self.intervals[:, :, None]
 
     def newest_score(self) -> Tensor:
         """(M,) float32, score with the nearest sweep that has the cluster."""
@@ -52,14 +68,8 @@ def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) 
     batch, pixel_size = sweeps.batch, sweeps.grid.pixel_size
     pairs = make_pairs(clusters, batch, pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
-    shape = (clusters.window.numel(), batch.num_steps - 1)
-    displacement = torch.zeros((*shape, 3), dtype=torch.float64, device=shift.device)
-    scores = torch.zeros(shape, dtype=torch.float32, device=shift.device)
-    available = torch.zeros(shape, dtype=torch.bool, device=shift.device)
-    displacement[pairs.cluster, pairs.source, :2] = shift.flip(1).double() * pixel_size  # (dy, dx) -> (x, y)
-    scores[pairs.cluster, pairs.source] = score
-    available[pairs.cluster, pairs.source] = True
-    return Estimates(displacement, scores, available, batch.elapsed[clusters.window, 1:])
+    displacement = F.pad(shift.flip(1).double() * pixel_size, (0, 1))  # (dy, dx) -> (x, y, 0)
+    return Estimates.of(pairs, displacement, score, batch.elapsed[clusters.window, 1:])
 
 
 def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | None = None) -> tuple[Tensor, Tensor]:

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Iterator
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.ops.indices import concat_ranges, flat_nonzero, gather, index_in_group, split_index
 from cflow_torch.ops.morphology import erode_cross
-from cflow_torch.ops.patches import gather_patches
 from cflow_torch.windows.collation import Batch
 
 # Rows and columns of a tile, rows of a band, key points in a group. Of the settings that we counted for groups of 16,
@@ -55,12 +55,22 @@ def detect(occupancy: Tensor) -> Tensor:
 def describe(images: Tensor, patch_size: int) -> KeyPoints:
     """Find the key points of one sweep and describe each by the L x L pixels around it (Sec. Descriptor).
 
-    The images are (B, H, W) bool; patches are zero outside. Cost: memory K L^2 bytes; the images are not unfolded.
+    The images are (B, H, W) bool; patches are zero outside. Cost: K L^2 bytes, written one row of a patch at a time.
     """
     pixel = flat_nonzero(detect(images))
     line, col = split_index(pixel, images.shape[2])
     window, row = split_index(line, images.shape[1])
-    return KeyPoints(pixel, window, row, col, *gather_patches(images, window, row, col, patch_size))
+    half = patch_size // 2
+    padded = F.pad(images.byte(), (half, half, half, half))
+    _, height, width = padded.shape
+    runs = padded.flatten().unfold(0, patch_size, 1)  # a view: the `patch_size` pixels from each one on
+    first = (window * height + row) * width + col
+    rows = (first[:, None] + torch.arange(patch_size, device=images.device) * width).flatten()
+    patches = runs.index_select(0, rows).view(-1, patch_size * patch_size)
+    # A sum over the patches would write them again as integers, so we take differences of running sums of the images.
+    sums = F.pad(padded.flatten().cumsum(0, dtype=torch.int32), (1, 0))
+    energy = (sums[patch_size:] - sums[:-patch_size]).index_select(0, rows).view(-1, patch_size).sum(1)
+    return KeyPoints(pixel, window, row, col, patches, energy)
 
 
 def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Tensor:

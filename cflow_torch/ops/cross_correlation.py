@@ -67,16 +67,3 @@ def _by_conv(images: Tensor, num_templates: int, target: Tensor) -> Tensor:
     # One group per template. Sums of products of zeros and ones are exact in float32 up to 2^24, also with TF32.
     counts = F.conv2d(padded[None], templates[:, None], groups=num_templates)[0]
     return F.pad(counts, (0, images.shape[2] - width, 0, images.shape[1] - height))
-
-
-def parabola_vertex(low: Tensor, middle: Tensor, high: Tensor) -> Tensor:
-    """Position of the maximum of the parabola through three samples, in steps from the middle one.
-
-    Args:
-        low, middle, high: (...) of any type.
-
-    Returns:
-        (...) float64 within half a step; 0 where the parabola is not concave.
-    """
-    curve = (2 * middle - low - high).double()
-    return ((high - low) / (2 * curve)).masked_fill_(curve <= 0, 0.0).clamp_(-0.5, 0.5)

@@ -15,9 +15,8 @@ from torch import Tensor
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.clustering import Pixels as ClusterPixels
-from cflow_torch.dense.correlation import best_shifts
+from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
-from cflow_torch.ops.cross_correlation import parabola_vertex
 from cflow_torch.ops.indices import (
     constant,
     flat_nonzero,
@@ -46,57 +45,11 @@ class Candidates(NamedTuple):
 def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig) -> Candidates:
     """Return the candidates of all nodes, each correlated at its own pixel size.
 
-    Args:
-        nodes: N of them.
-        components: gives the number of scales and their pixel sizes.
-        sweeps: finest images.
-        config: `max_speed`, `correlation`, `max_memory`.
-    """
-    estimates, scores, available = _find_peaks(nodes, components, sweeps, config)
-    intervals = sweeps.elapsed.index_select(0, nodes.window)[:, 1:]
-    own = list_motions(estimates, available, intervals)
-    parent = F.pad(nodes.parent, (0, 1), value=nodes.count)
-    around = [nodes.parent]
-    for _ in range(components.num_levels - 2):
-        around.append(parent.index_select(0, around[-1]))
-    others = lookup(own[:, 0], torch.cat(around)).view(len(around), nodes.count, 2).transpose(0, 1)
-    newest = available.int().argmax(1, keepdim=True)
-    return Candidates(torch.cat((own, others), 1), scores.gather(1, newest)[:, 0])
-
-
-def list_motions(estimates: Tensor, available: Tensor, intervals: Tensor) -> Tensor:
-    """Return (M, C, 2) float64, pixels per sweep interval: the median of the estimates in y and in x (if K > 1), then
-    each estimate divided by its interval.
-
-    Args:
-        estimates: (M, K, 2) float64, (y, x) finest pixels m -> t+1, nearest sweep first.
-        available: (M, K) bool, False = the estimate is unknown and its entry ignored.
-        intervals: (M, K) float64, sweep intervals from m to t+1; not 0 where an estimate is available.
-
-    Convention:
-        The median of one estimate is that estimate, so sweeps that a window lacks do not affect the choice. The result
-        has no -0.0.
+    Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
+        The median is that of y and that of x. With one other sweep there is none. A median of one estimate is that
+        estimate, so sweeps that a window lacks do not affect the choice.
 
     Source: adapted from Sec. leverage_past_pcs, which takes the median of magnitudes and that of orientations.
-    """
-    unknown = ~available
-    per_interval = (estimates / intervals.masked_fill(unknown, 1.0)[:, :, None]).masked_fill_(unknown[:, :, None], 0.0)
-    if estimates.shape[1] == 1:
-        return per_interval + 0.0  # turns -0.0 into 0.0
-    return torch.cat((masked_median(per_interval, available)[:, None], per_interval), 1) + 0.0
-
-
-def _find_peaks(
-    nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the sub-pixel displacement m -> t+1 of each node for every other sweep m. Arguments are as for `propose`.
-
-    Returns:
-        estimates: (N, S - 1, 2) float64, (y, x), finest pixels m -> t+1, nearest sweep first.
-        scores: (N, S - 1) float32, NCC at the peak.
-        available: (N, S - 1) bool, False = the node has no pixel in that sweep; both above are 0 then.
-
-    Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
     """
     images = _NodeImages.of(nodes, components.blocks, sweeps)
     clusters = Clusters(nodes.window, images.first, images.size, images.pixels)
@@ -104,12 +57,18 @@ def _find_peaks(
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
     peak = shift + _parabola(images, pairs, shift)
     peak *= images.block.index_select(0, pairs.cluster)[:, None]
-    shape, slot = (nodes.count, sweeps.num_steps - 1), pairs.cluster * (sweeps.num_steps - 1) + pairs.source
-    estimates = peak.new_zeros((shape[0] * shape[1], 2)).index_copy_(0, slot, peak).view(*shape, 2)
-    scores = score.new_zeros(shape[0] * shape[1]).index_copy_(0, slot, score).view(shape)
-    available = torch.zeros_like(scores, dtype=torch.bool)
-    available.view(-1).index_fill_(0, slot, True)
-    return estimates, scores, available
+    estimates = Estimates.of(pairs, peak, score, sweeps.elapsed.index_select(0, nodes.window)[:, 1:])
+
+    own = estimates.per_interval().masked_fill_(~estimates.available[:, :, None], 0.0)
+    if sweeps.num_steps > 2:
+        own = torch.cat((masked_median(own, estimates.available)[:, None], own), 1)
+    own = own + 0.0  # turns -0.0 into 0.0
+    parent = F.pad(nodes.parent, (0, 1), value=nodes.count)
+    around = [nodes.parent]
+    for _ in range(components.num_levels - 2):
+        around.append(parent.index_select(0, around[-1]))
+    others = lookup(own[:, 0], torch.cat(around)).view(len(around), nodes.count, 2).transpose(0, 1)
+    return Candidates(torch.cat((own, others), 1), estimates.newest_score())
 
 
 class _NodeImages(NamedTuple):
@@ -166,7 +125,8 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     """Return the sub-pixel offset of each peak, (J, 2) float64, (y, x), pixels of its scale.
 
     `shift` is the shift of each peak, (J, 2). The offset is the vertex of the parabolas through the counts of common
-    slices at the peak and at its four neighbours. It is 0 for pairs whose peak is at shift 0.
+    slices at the peak and at its four neighbours, at most half a pixel. It is 0 for pairs whose peak is at shift 0, and
+    where a parabola is not concave.
     """
     is_moved = shift.any(1)
     template = pairs.template
@@ -184,5 +144,8 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     own = images.image.index_select(0, images.occupied.index_select(0, pixel))
     target = images.image.index_select(0, index.view(-1)).view_as(index)
     sums = scatter_count(pair, len(shift), count_slices(own & target) * inside)
-    # Counts before and after the peak: above and below it, then left and right of it.
-    return (parabola_vertex(sums[1::2], sums[:1], sums[2::2]) * is_moved).t()
+    # Counts at the peak and before and after it: above and below it, then left and right of it.
+    middle, low, high = sums[:1], sums[1::2], sums[2::2]
+    curve = (2 * middle - low - high).double()
+    vertex = ((high - low) / (2 * curve)).masked_fill_(curve <= 0, 0.0).clamp_(-0.5, 0.5)
+    return (vertex * is_moved).t()
