@@ -18,13 +18,7 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
 
 
 def flat_nonzero(mask: Tensor) -> Tensor:
-    """Flat indices of the True elements, ascending: `mask.flatten().nonzero()[:, 0]`.
-
-    Args:
-        mask: (...) bool.
-
-    Returns:
-        (K,) int64.
+    """Flat indices of the True elements of (...) bools, (K,) int64, ascending: `mask.flatten().nonzero()[:, 0]`.
 
     Cost: one pass and, on a GPU, one synchronisation. On the CPU we call NumPy, which is about five times
     faster than torch for a sparse mask of half a million pixels.
@@ -35,29 +29,12 @@ def flat_nonzero(mask: Tensor) -> Tensor:
 
 
 def gather(index: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
-    """Select the same elements of several tensors.
-
-    Args:
-        index: (K,) int64.
-        tensors: (N, ...) each.
-
-    Returns:
-        (K, ...) each.
-    """
+    """Select the same elements of several tensors: (K, ...) of (N, ...) each, by (K,) int64 indices."""
     return tuple(values.index_select(0, index) for values in tensors)
 
 
 def lookup(table: Tensor, index: Tensor, missing: float = 0) -> Tensor:
-    """Select entries of a table, with a default for index N.
-
-    Args:
-        table: (N, ...).
-        index: (K,) int64, 0 ... N; N stands for "none".
-        missing: the entry of index N.
-
-    Returns:
-        (K, ...), dtype of the table.
-    """
+    """Select entries of an (N, ...) table: (K, ...) in its dtype. Index N, "none", has the entry `missing`."""
     padding = (0, 0) * (table.dim() - 1) + (0, 1)
     return F.pad(table, padding, value=missing).index_select(0, index)
 
@@ -81,11 +58,7 @@ def scatter_count(index: Tensor, size: int, weights: Tensor | None = None) -> Te
 
 
 def renumber(index: Tensor, size: int) -> Tensor:
-    """Invert a list of indices.
-
-    Args:
-        index: (K,) int64, distinct, below S.
-        size: S.
+    """Invert a list of K distinct indices, (K,) int64, below the size S.
 
     Returns:
         (S + 1,) int64, position of each number in the list; K for numbers that are not in it, and for S ("none").
@@ -116,15 +89,7 @@ def index_in_group(group: Tensor) -> Tensor:
 
 
 def concat_ranges(start: Tensor, count: Tensor) -> Tensor:
-    """Concatenate ranges: start[0], start[0] + 1, ... (count[0] of them), start[1], start[1] + 1, ...
-
-    Args:
-        start: (R,) int64.
-        count: (R,) int64, not negative.
-
-    Returns:
-        (sum of `count`,) int64.
-    """
+    """Concatenate R ranges: start[0], start[0] + 1, ... (count[0] of them), start[1], start[1] + 1, ...; all int64."""
     offset = torch.repeat_interleave(start + count - count.cumsum(0), count)
     return offset.add_(torch.arange(offset.numel(), device=offset.device))
 
@@ -160,13 +125,7 @@ def largest_of_rows(values: Tensor) -> Tensor:
 
 
 def occupied(image: Tensor) -> Tensor:
-    """Indices of the elements that are not 0, ascending.
-
-    Args:
-        image: (N,) uint8, mostly 0.
-
-    Returns:
-        (K,) int64.
+    """Indices, (K,) int64, ascending, of the elements of an (N,) uint8 image that are not 0; most are 0.
 
     Cost: one pass over the image, on the CPU eight elements at a time; on a GPU, one synchronisation.
     """

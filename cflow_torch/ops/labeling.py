@@ -37,21 +37,13 @@ _ROUNDS, _JUMPS = 3, 3
 
 @dataclass(frozen=True)
 class Blocks:
-    """Component of every block of padded images.
+    """Component of every block of padded images."""
 
-    Args:
-        side: pixels per side of a block.
-        cols: blocks per row.
-        first: smallest possible component of these images.
-        num_components: V, larger than every component.
-        component: (all blocks,) int64, 0 ... V - 1; undefined for blocks without set pixels.
-    """
-
-    side: int
-    cols: int
-    first: int
-    num_components: int
-    component: Tensor
+    side: int  # pixels per side of a block
+    cols: int  # blocks per row
+    first: int  # smallest possible component of these images
+    num_components: int  # V, larger than every component
+    component: Tensor  # (all blocks,) int64, 0 ... V - 1; undefined for blocks without set pixels
 
     def of_pixel(self, row: Tensor, col: Tensor) -> Tensor:
         """Component of the pixels at (row, col), (P,) int64. Rows continue from one padded image to the next."""
@@ -63,14 +55,8 @@ class Blocks:
 
 
 def pad(images: Sequence[Tensor]) -> Tensor:
-    """Combine sets of images with OR, and add the margin to the right and below that `label_together` needs.
-
-    Args:
-        images: (B, H, W) bool each, or uint8, 0 = not set.
-
-    Returns:
-        (B, H', W') bool.
-    """
+    """Combine sets of (B, H, W) bool images with OR, and add the margin to the right and below that `label_together`
+    needs: (B, H', W') bool."""
     first = images[0]
     num_images, height, width = first.shape
     padded = first.new_empty((num_images, padded_size(height), padded_size(width)))
@@ -178,14 +164,10 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
 
 
 def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
-    """Find the connected components of a graph by hooking and pointer jumping.
+    """Find the connected components of a graph of V nodes by hooking and pointer jumping.
 
-    Args:
-        num_nodes: V.
-        sources, targets: (E,) int64, the two ends of each edge.
-
-    Returns:
-        (V,) int64: the smallest node of the same component.
+    `sources` and `targets`, (E,) int64, are the two ends of each edge. The result, (V,) int64, is the smallest node of
+    the component of each node.
 
     Cost: a few rounds (about log V), each linear in V + E, with one host synchronisation after three rounds and after
     each further one. The parent of a node only changes to a smaller node of its component. Once both ends of every

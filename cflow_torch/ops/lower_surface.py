@@ -52,11 +52,7 @@ def _is_supported(low: Tensor) -> Tensor:
 def _gentlest(heights: Tensor, slope: int) -> Tensor:
     """The surface of limited slope through all heights that are not too high above the others, defined everywhere.
 
-    Args:
-        heights: (B, H, W) int32, mm; `UNKNOWN` = unknown.
-        slope: mm per cell, along rows and along columns.
-
-    Convention: between known cells, the mean of the highest and the lowest possible surface.
+    Between known cells, it is the mean of the highest and the lowest possible surface. The slope is in mm per cell.
     """
     is_ground = (heights - _cone(heights, slope) <= _ROUGH).logical_and_(heights < UNKNOWN)
     both = torch.cat([heights, -heights]).masked_fill_(~is_ground.repeat(2, 1, 1), UNKNOWN)

@@ -45,18 +45,10 @@ def _with_both_neighbours(combine: Callable[..., Tensor], values: Tensor, distan
 
 
 def erode_cross(image: Tensor) -> Tensor:
-    """Erosion with a plus of five pixels: a pixel stays if it and its four neighbours are set.
+    """Erosion of (..., H, W) bools with a plus: a pixel stays if its distance to the background is more than 1.
 
-    Args:
-        image: (..., H, W) bool.
-
-    Returns:
-        (..., H, W) bool: the pixels whose Euclidean distance to the background is more than 1.
-
-    Convention:
-        Pixels outside the image are background, unlike in `close_3x3`, so pixels on the border never stay.
-
-    Cost: four passes over the image.
+    Pixels outside the image are background, unlike in `close_3x3`, so pixels on the border never stay. Cost: four
+    passes over the image.
     """
     inner = torch.zeros_like(image)
     middle = image[..., 1:-1, 1:-1] & image[..., :-2, 1:-1]

@@ -26,14 +26,9 @@ def segment_amin(values: Tensor, index: Tensor, num_segments: int, empty: float)
 
 
 def segment_minmax(values: Tensor, index: Tensor, num_segments: int) -> tuple[Tensor, Tensor]:
-    """Smallest and largest value of each segment.
+    """Smallest and largest value of each segment, (..., S) int64 each; 2^61 and -2^61 for a segment without values.
 
-    Args:
-        values: (..., N) int64, from -2^61 to 2^61.
-        index, num_segments: as for `segment_amin`.
-
-    Returns:
-        smallest, largest: (..., S) int64; 2^61 and -2^61 for a segment without values.
+    Args are as for `segment_amin`, and the values are int64 from -2^61 to 2^61.
     """
     last = values.new_full((*values.shape[:-1], num_segments), -_FAR)
     last.scatter_reduce_(-1, index.expand_as(values), values, "amax")
@@ -41,30 +36,17 @@ def segment_minmax(values: Tensor, index: Tensor, num_segments: int) -> tuple[Te
 
 
 def first_of_segment(index: Tensor, num_segments: int) -> Tensor:
-    """Position of the first element of the segment of each element.
-
-    Args:
-        index: (N,) int64, segment of each element, 0 ... num_segments - 1.
-        num_segments: S.
-
-    Returns:
-        (N,) int64.
-    """
+    """Position of the first element of the segment of each element, (N,) int64. Args as for `segment_amin`."""
     position = torch.arange(index.numel(), device=index.device)
     return segment_amin(position, index, num_segments, index.numel()).index_select(0, index)
 
 
 def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int) -> tuple[Tensor, Tensor]:
-    """Bounding box of the pixels of each segment.
-
-    Args:
-        rows, cols: (N,) int64 pixel coordinates.
-        index: (N,) int64 segment of each pixel.
-        num_segments: S.
+    """Bounding box of the pixels of each segment. All arguments and results are int64.
 
     Returns:
-        first: (S, 2) int64, smallest (row, col).
-        size: (S, 2) int64, height and width; negative for a segment without pixels.
+        first: (S, 2), smallest (row, col).
+        size: (S, 2), height and width; negative for a segment without pixels.
     """
     # Reductions of one column each are faster than one of several columns.
     top, bottom = segment_minmax(rows, index, num_segments)
@@ -75,15 +57,8 @@ def bounding_boxes(rows: Tensor, cols: Tensor, index: Tensor, num_segments: int)
 def masked_median(values: Tensor, mask: Tensor) -> Tensor:
     """Median of the selected rows of each matrix, column by column.
 
-    Args:
-        values: (M, K, C) float.
-        mask: (M, K) bool, True = selected.
-
-    Returns:
-        (M, C) float; 0 for a matrix without selected rows.
-
-    Convention:
-        Even count: mean of the middle two, (a + b) / 2.
+    `values` are (M, K, C) floats, and `mask` is (M, K) bool, True = selected. The result is (M, C), and 0 for a matrix
+    without selected rows. Even count: mean of the middle two, (a + b) / 2.
     """
     ordered = values.masked_fill(~mask[:, :, None], float("inf")).sort(dim=1).values
     count = mask.sum(dim=1)[:, None, None]
@@ -93,20 +68,9 @@ def masked_median(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def segment_median(values: Tensor, index: Tensor, num_segments: int) -> Tensor:
-    """Median of each segment.
+    """Median of each segment, (S,) float64; 0 for a segment without values. Args as for `segment_amin`.
 
-    Args:
-        values: (N,) float64.
-        index: (N,) int64, segment of each value, 0 ... num_segments - 1.
-        num_segments: S.
-
-    Returns:
-        (S,) float64; 0 for a segment without values.
-
-    Convention:
-        Even count: mean of the middle two, (a + b) / 2.
-
-    Cost: two sorts.
+    Even count: mean of the middle two, (a + b) / 2. Cost: two sorts.
     """
     if values.numel() == 0:
         return values.new_zeros(num_segments)

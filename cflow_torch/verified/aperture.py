@@ -41,7 +41,6 @@ def slides_along_itself(
     """Find the motions that a static line would seem to have.
 
     Args:
-        sweeps: images of all windows.
         members: K pixels of components.
         component: (K,) int64, component of each pixel.
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
@@ -82,16 +81,10 @@ def slides_along_itself(
 def principal_axes(
     component: Tensor, row_col: Tensor, num_components: int, pixel_size: float
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """Return which components are lines, and the variances of their pixels.
+    """Return which of A components are lines, (A,) bool, and the variances of their pixels at t+1.
 
-    The first result is (A,) bool. The second is the largest variance in any direction, and the third has the variance
-    in y, the covariance and the variance in x. Each of these is (A,) float64, square pixels.
-
-    Args:
-        component: (Q,) int64, component of each pixel at t+1.
-        row_col: (2, Q) int64, row and column of each pixel at t+1.
-        num_components: A.
-        pixel_size: s, metres.
+    These are the largest variance in any direction; then the variance in y, the covariance and the variance in x. Each
+    is (A,) float64, square pixels. The component of each pixel is (Q,) int64; its row and column are (2, Q) int64.
     """
     one_y_x = torch.cat((torch.ones_like(row_col[:1]), row_col))  # `F.pad` of torch 2.0 fails without pixels
     moments = scatter_count(component, num_components, (one_y_x[:, None] * one_y_x).view(9, -1)).view(3, 3, -1)
@@ -110,7 +103,6 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     """Find the long components whose two ends both move.
 
     Args:
-        sweeps: P occupied pixels.
         roots: (L, P) int64, component of each pixel at each level.
         is_long: (V,) bool, the components to test; each has pixels at t+1.
 

@@ -101,8 +101,6 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
     """Label the components of all scales by one union-find, and apply the static test.
 
     Args:
-        sweeps: P occupied pixels.
-        change: change of the pixels.
         blocks: side of a pixel at each scale in finest pixels, coarse to fine, the last one 1. Each scale is dilated as
             in Alg. clustering, but not eroded, so the scales are nested. The last level is the plain components of the
             finest pixels, without dilation.
@@ -163,10 +161,7 @@ def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -
 def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: float | None) -> Nodes:
     """List the components that may move.
 
-    Args:
-        sweeps: P occupied pixels.
-        components: V names.
-        longest: metres; components longer than this at t+1 may move only if both of their ends do. None = no such test.
+    Components longer than `longest` metres at t+1 may move only if both of their ends do. None = no such test.
 
     Convention: a plain component that equals its dilated parent is not listed twice.
 
@@ -206,8 +201,7 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
     """Select objects from the leaves up: a component wins if its motion has more evidence than its children together.
 
     Args:
-        nodes: N of them.
-        components: those of the tree, with names below V. Components under overhangs have names from V on.
+        nodes, components: components under overhangs are nodes, but are not among the components of the tree.
         evidence: (N,) int64, of the best motion of each node; 0 = none is significant. Sums must stay below 2^63.
         num_pixels: P, including the pixels of copies (`HeightSlicedSweeps.with_copies`).
 

@@ -94,11 +94,7 @@ def _groups_of_one_motion(
 def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, margin: Tensor) -> Tensor:
     """Return the probability that the motion of a pixel of t is right to 0.1 m per sweep interval.
 
-    Args:
-        sweeps: finest images, P occupied pixels.
-        objects: G of them.
-        rigid: their motion. Rotations are ignored: all pixels of an object move as its centre does.
-        margin: (G,) float64, of each motion, `MotionMargin.z`.
+    `margin`, (G,) float64, is `MotionMargin.z`. Rotations are ignored: all pixels of an object move as its centre does.
 
     Returns:
         (P + 1,) float32; entry P is for points whose pixel was left out. Undefined for pixels of sweeps other than t.

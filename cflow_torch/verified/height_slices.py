@@ -107,7 +107,6 @@ class HeightSlicedSweeps:
 
         Args:
             batch: positions with three axes.
-            grid: the finest BEV.
             min_height: metres; pixels lower than this above the ground of the batch are left out, unless they are next
                 to a higher one. None = all are drawn.
 
@@ -152,14 +151,11 @@ class HeightSlicedSweeps:
     def with_copies(self, rows: Tensor) -> HeightSlicedSweeps:
         """Return the sweeps with copies of some points, drawn by themselves in further windows B ... 2 B - 1.
 
+        The copies follow the points, and their pixels follow the others. Both sweeps share the images, which hold one
+        set of copies, so call this method only once.
+
         Args:
             rows: (K,) int64, points of the batch.
-
-        Returns:
-            Sweeps with the copies after their points, and the pixels of the copies after the others. They share the
-            images, which hold one set of copies, so call this method only once.
-
-        Cost: that of the copies.
         """
         count = self.num_pixels
         height_slice = slice_of(self.batch.positions[2].index_select(0, rows), SLICE_HEIGHT)
@@ -256,12 +252,8 @@ def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Te
 
 
 def count_slices(slices: Tensor) -> Tensor:
-    """Count the set bits in both halves of uint8 values.
-
-    Returns:
-        int64 of the same shape: the count of the lower four bits, plus 2^32 times that of the upper four. The two
-        share a number because sums cost more than lookups.
-    """
+    """Count the set bits in both halves of uint8 values: int64, the count of the lower four bits, plus 2^32 times that
+    of the upper four. The two share a number because sums cost more than lookups."""
     return constant(_COUNTS, torch.int64, slices.device).index_select(0, slices.reshape(-1).int()).view(slices.shape)
 
 

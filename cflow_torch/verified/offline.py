@@ -39,14 +39,8 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
     The side of an object that is visible at t may match any side that later sweeps show, so correlation peaks are off
     by a pixel or two. The paired test over all sweeps chooses among the neighbours of the peak.
 
-    Args:
-        sweeps: finest images; objects of windows without sweeps after t+1 keep their motion.
-        objects: G of them.
-        motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
-        significance: z of the paired test.
-
-    Returns:
-        (G, 2) float64.
+    The motion is (G, 2) float64, (y, x), finest pixels per sweep interval. Objects of windows without sweeps after t+1
+    keep theirs. `significance` is the z of the paired test.
 
     Convention: whole pixels in y and in x. Ties: the nearest motion, then the first in raster order.
 

@@ -41,20 +41,16 @@ _HALF_OF_NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if st
 def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> tuple[HeightSlicedSweeps, Nodes]:
     """Add nodes for components under other components.
 
-    Args:
-        sweeps: images, and the points.
-        components: we search those of the finest dilated level that may move.
-        nodes: nodes of all levels.
-
     Returns:
         The sweeps with copies of the points of objects under other components, and the nodes followed by the added
         ones.
 
     Convention:
-        Cells of 0.4 m x 0.4 m x 0.5 m are connected to their 26 neighbours. A component is under another one if, in any
-        column, the next occupied cell above one of its cells belongs to the other one, with at least two empty cells
-        between. It is an object if it is at most eleven cells high. If two components share a pixel of a sweep, the
-        pixel belongs to the one whose first cell has the lower index.
+        We search the components of the finest dilated level that may move. Cells of 0.4 m x 0.4 m x 0.5 m are connected
+        to their 26 neighbours. A component is under another one if, in any column, the next occupied cell above one of
+        its cells belongs to the other one, with at least two empty cells between. It is an object if it is at most
+        eleven cells high. If two components share a pixel of a sweep, the pixel belongs to the one whose first cell has
+        the lower index.
 
     Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
     """

@@ -38,8 +38,6 @@ def verify(
     """Return the candidate of each node that explains the sweeps best, if it is significant.
 
     Args:
-        sweeps: images.
-        nodes: N of them.
         candidates: (N, C, 2) float64, (y, x), finest pixels per sweep interval.
         num_levels: L. Nodes of changed pixels have level L, and their z is `_CHANGED_Z`.
         significance: z of the paired test for all other nodes.
@@ -75,13 +73,8 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
     pedestrian touches a wall, the middle belongs to the component of the wall.
 
     Args:
-        sweeps: images, P pixels.
-        nodes: N of them.
         motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = static.
         num_levels: L, the level of nodes of changed pixels.
-
-    Returns:
-        The nodes with more pixels.
 
     Convention: a pixel at most two rows and columns away from a moving node of changed pixels joins it if the motion
         wins more slices than it loses in the 3 x 3 pixels around, without the pixels of such nodes. Ties: the first of
@@ -142,7 +135,6 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     of far objects are sparse and rarely fall into the same pixels again.
 
     Args:
-        sweeps: images.
         members: K pixels of components.
         component: (K,) int64, component of each pixel.
         candidates: (M, C, 2) float64, (y, x) finest pixels per sweep interval, axes of ego1; C at least 1.
@@ -239,17 +231,10 @@ def evidence_of(won: Tensor, lost: Tensor, z: float | Tensor) -> Tensor:
 
 
 def best_candidate(evidence: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the motion with the most evidence for each component.
+    """Return the motion with the most evidence for each component, and its evidence, (M,) int64.
 
-    Args:
-        evidence: (M, C) int64, below 2^36 (C below 2^20), as `evidence_of` gives it.
-        candidates: (M, C, 2) float64.
-
-    Returns:
-        motion: (M, 2) float64; 0 where no candidate has evidence.
-        evidence: (M,) int64, of that motion.
-
-    Convention: ties go to the first candidate.
+    The evidence is (M, C) int64, below 2^36 (C below 2^20). The candidates are (M, C, 2) float64, and the motion is
+    (M, 2), 0 where no candidate has evidence. Ties: the first candidate.
     """
     num_candidates = evidence.shape[1]
     reverse = torch.arange(num_candidates - 1, -1, -1, device=evidence.device)

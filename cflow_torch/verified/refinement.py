@@ -42,17 +42,10 @@ _LEAST_STRETCH = 0.75
 def refine(
     sweeps: HeightSlicedSweeps, components: Components, objects: Objects, motion: Tensor, longest: float | None
 ) -> tuple[RigidMotion, RigidMotion]:
-    """Return the final motion of objects.
+    """Return the final motion of objects, and their apparent motion, which differs if points have times.
 
-    Args:
-        sweeps: finest images.
-        components: among them those of the objects.
-        objects: G of them.
-        motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
-        longest: metres; static objects longer than this at t+1 stay static. None = no bound.
-
-    Returns:
-        The motion in metres, and the apparent motion between the images, which differs if points have times.
+    `motion` is (G, 2) float64, (y, x), finest pixels per sweep interval. Static objects longer than `longest` metres at
+    t+1 stay static. None = no bound.
     """
     # A static object of a pair is a whole component; copies of points are objects only if they move.
     length = lookup(components.length, objects.component.clamp(max=components.count))
@@ -68,7 +61,6 @@ def register_deskewed(
 
     Args:
         points: points of the objects that move, as `VoxelPairs` takes them.
-        sweeps: finest images.
         start: (G, 2) float64, x and y, metres per sweep interval, from which registration starts.
 
     Returns:
@@ -106,8 +98,6 @@ class VoxelPairs:
 
     Args:
         points: those of the moving objects, in sweeps at most `MOST_TIME` sweep intervals from t+1.
-        sweeps: finest images.
-        num_objects: G.
 
     Cost: that of `spread_of`.
     """
@@ -180,7 +170,7 @@ class VoxelPairs:
         """Return the ratio of the time between two measurements of an object to the time between their sweeps.
 
         Args:
-            rigid: apparent motion of the objects, the result of `register`. Their points must have times.
+            rigid: apparent motion of the objects, the result of `register`. The points have times.
 
         Returns:
             (G,) float64: the sum of w k (k + b - a) divided by the sum of w k^2, over all pairs of voxels. Here w is
@@ -247,18 +237,13 @@ class VoxelPairs:
 def deskew(
     points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion
 ) -> tuple[ObjectPoints, HeightSlicedSweeps]:
-    """Move the points of objects to their positions at the instant of their sweep.
-
-    Args:
-        points: of G objects, with times.
-        sweeps: finest images.
-        rigid: motion of the objects, whose translation and rotation are proportional to time.
+    """Move the points of objects, which have times, to their positions at the instant of their sweep.
 
     Returns:
         The points, and sweeps whose occupied pixels are those of the moved points; the images are unchanged.
 
-    Convention: points that leave the region are dropped. If several objects share a pixel, only the points of the first
-    one are kept. Points whose time is 0 do not move.
+    Convention: translation and rotation are proportional to time. Points that leave the region are dropped. If several
+    objects share a pixel, only the points of the first one are kept. Points whose time is 0 do not move.
 
     Cost: a sort of the points.
     """

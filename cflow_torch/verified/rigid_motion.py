@@ -79,7 +79,6 @@ def motion_by_pixel(
     """Return the motion of G objects by pixel; the clusters of the result are the P pixels.
 
     Args:
-        sweeps, objects: finest images, and the objects.
         rigid: their motion in the plane. The slope of the ground around their centre gives the z of the flow.
         score: (G,) float32.
         confidence: (P + 1,) float32.

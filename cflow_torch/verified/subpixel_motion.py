@@ -32,9 +32,7 @@ def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor
     """Return the motion of all objects, including slow objects of pairs.
 
     Args:
-        sweeps: finest images; windows with history keep their motion.
-        objects: G of them.
-        motion: (G, 2) float64, (y, x), finest pixels per sweep interval; 0 = static.
+        motion: (G, 2) float64, (y, x), finest pixels per sweep interval; 0 = static. Windows with history keep theirs.
         may_be_slow: (G,) bool, static objects to test; the other static ones stay static.
 
     Returns:

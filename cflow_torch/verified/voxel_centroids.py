@@ -58,8 +58,6 @@ def points_of_objects(
     """Return the points of some objects, in the order of the batch.
 
     Args:
-        sweeps: finest images.
-        objects: G of them.
         wanted: (G,) bool.
         slice_height: of the `layer` of each point, metres.
         num_slices: number of layers before they repeat, a power of 2.
@@ -79,11 +77,6 @@ def points_of_objects(
 
 class Voxels:
     """V voxels that contain points of objects, sorted by pixel, then by slice.
-
-    Args:
-        points: points of all sweeps.
-        sweeps: finest images.
-        num_slices: number of slices of the points.
 
     Convention: coordinates are rounded to the nearest unit, and their mean is rounded down.
 
@@ -166,14 +159,8 @@ class Voxels:
 def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
     """Return for each voxel the covariance of the centroids around it that belong to its object and sweep.
 
-    A block has 2 x 2 x 2 voxels. The centroids around a voxel are those in its block and in the 26 adjacent blocks.
-
-    Args:
-        voxels: V of them.
-        pixel_size, layer_height: metres, sides of a voxel.
-
-    Returns:
-        (3, 3, V) float64, squares of units of 1 / `UNITS` m.
+    A block has 2 x 2 x 2 voxels. The centroids around a voxel are those in its block and in the 26 adjacent blocks. The
+    result is (3, 3, V) float64, squares of units of 1 / `UNITS` m. The sides of a voxel are in metres.
 
     Cost: 18 searches for each block.
     """
@@ -190,12 +177,9 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
 
 
 def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
-    """Return the sums of values, (R, V) int64, over the 27 blocks around the block of each voxel.
+    """Return the sums of values, (R, V) int64, over the 27 blocks around the block of each voxel, in the same image.
 
-    Args:
-        block: (3, V) int64, column, row and layer; layers beyond +-2046 are merged.
-        image: (V,) int64; only voxels of the same image are added.
-        values: (R, V) int64.
+    `block`, (3, V) int64, has columns, rows and layers; layers beyond +-2046 are merged.
     """
     column = torch.add(block[0], torch.add(block[1], image, alpha=_ROW), alpha=_ROW)
     layer = block[2].clamp(2 - _LAYER // 2, _LAYER // 2 - 2)
