@@ -96,12 +96,29 @@ class Pairing:
 
 def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
     """Find the candidates among `target` of groups of `source`, all within `reach` pixels and a few more."""
-    member = _group(source)
-    candidate, count, limit = _candidates(source, member, target, reach)
+    key, order = _band_key(target.window, target.row // _BAND, target.col).sort()
+    groups = _group(source)
+    window = source.window.take(groups[:, :1])
+    member = torch.where(groups == source.row.numel(), groups[:, :1], groups)
+    (top, bottom), (left, right) = (
+        values.take(member).aminmax(dim=1, keepdim=True) for values in (source.row, source.col)
+    )
+    reach = reach.take(window)
+    num_bands = min((2 * int(reach.max()) + _TILE_ROWS) // _BAND + 2, 1 << 13)
+    band = (top - reach.long()).clamp_(min=0) // _BAND + torch.arange(num_bands, device=key.device)
+    gap = torch.maximum(top - (band * _BAND + _BAND - 1), band * _BAND - bottom).clamp_(min=0)
+    square = reach * reach - gap * gap
+    half_width = square.clamp(min=0).sqrt().ceil().clamp(max=1 << 15).long()
+    start = torch.searchsorted(key, _band_key(window, band, (left - half_width).clamp(min=0)))
+    end = torch.searchsorted(key, _band_key(window, band, right + half_width + 1))
+    length = (end - start).mul_(square >= 0)
+    candidate = order.index_select(0, concat_ranges(start.flatten(), length.flatten()))
+    limit = (reach * reach).floor().clamp(max=torch.iinfo(torch.int32).max - 1).int()[:, 0]
+    count = length.sum(1)
     first = count.cumsum(0) - count
     count, order = count.sort(descending=True)
-    member, first, limit = gather(order, member, first, limit)
-    return Pairing(member, candidate, first, count, limit)
+    groups, first, limit = gather(order, groups, first, limit)
+    return Pairing(groups, candidate, first, count, limit)
 
 
 def pairs_at_once(device: torch.device, max_memory: float | None) -> int:
@@ -131,29 +148,6 @@ def _group(points: KeyPoints) -> Tensor:
     member = torch.full((int(group[-1]) + 1, _GROUP), tile.numel(), dtype=torch.int64, device=tile.device)
     member.view(-1).scatter_(0, group * _GROUP + slot, order)
     return member
-
-
-def _candidates(source: KeyPoints, member: Tensor, target: KeyPoints, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates of all groups, one group after the other, their number, and `Pairing.limit` of each group."""
-    key, order = _band_key(target.window, target.row // _BAND, target.col).sort()
-    first = member[:, :1]
-    window = source.window.take(first)
-    member = torch.where(member == source.row.numel(), first, member)
-    (top, bottom), (left, right) = (
-        values.take(member).aminmax(dim=1, keepdim=True) for values in (source.row, source.col)
-    )
-    reach = reach.take(window)
-    num_bands = min((2 * int(reach.max()) + _TILE_ROWS) // _BAND + 2, 1 << 13)
-    band = (top - reach.long()).clamp_(min=0) // _BAND + torch.arange(num_bands, device=key.device)
-    gap = torch.maximum(top - (band * _BAND + _BAND - 1), band * _BAND - bottom).clamp_(min=0)
-    square = reach * reach - gap * gap
-    half_width = square.clamp(min=0).sqrt().ceil().clamp(max=1 << 15).long()
-    start = torch.searchsorted(key, _band_key(window, band, (left - half_width).clamp(min=0)))
-    end = torch.searchsorted(key, _band_key(window, band, right + half_width + 1))
-    length = (end - start).mul_(square >= 0)
-    candidate = order.index_select(0, concat_ranges(start.flatten(), length.flatten()))
-    limit = (reach * reach).floor().clamp(max=torch.iinfo(torch.int32).max - 1).int()
-    return candidate, length.sum(1), limit[:, 0]
 
 
 def _band_key(window: Tensor, band: Tensor, col: Tensor) -> Tensor:

@@ -10,30 +10,14 @@ from cflow_torch.types import CFlowError
 
 
 def close_3x3_kornia(image: Tensor) -> Tensor:
-    """Dilate, then erode, with a 3 x 3 square of ones.
-
-    Args:
-        image: (B, H, W) bool.
-
-    Returns:
-        (B, H, W) bool. Pixels outside the image are ignored, so no pixel is lost at the border.
-    """
+    """Dilate, then erode (B, H, W) bool images with a 3 x 3 square of ones. No pixel is lost at the border."""
     from kornia.morphology import closing
 
     return closing(image[:, None].float(), torch.ones(3, 3, device=image.device))[:, 0] > 0.5
 
 
 def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity: int = 8, reach: int = 1) -> Tensor:
-    """Label the set pixels by kornia's union-find.
-
-    Args:
-        occupancy: (B, H, W) bool images.
-        pixels: (P,) int64, flat indices into `occupancy` of the set pixels, ascending.
-        connectivity: 4 or 8.
-        reach: 1 (plain) or 3 (after a 3 x 3 dilation).
-
-    Returns:
-        (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
+    """Label the set pixels by kornia's union-find. Arguments and result are those of `connected_components`.
 
     Raises:
         CFlowError: kornia is older than 0.9 and has no exact labelling (its iterative one splits long components).

@@ -32,7 +32,6 @@ _LONGEST = 60.0  # metres; no road vehicle is longer. The ends of longer noise b
 # A guard rail has fewer height slices per pixel at t+1, on average, and a larger standard deviation along the line, in
 # metres. No vehicle is as low and as long. Where a rail crosses the border of a slice, its pixels have two slices.
 _TALL, _RAIL = 2, 2.0
-_DIRECTIONS = ((1, 0), (0, 1), (1, 1), (1, -1))  # rows and columns: y, x and the diagonals
 
 
 def slides_along_itself(
@@ -130,8 +129,8 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     group = torch.add(component, pixels.step != 0, alpha=count)
     is_tall = scatter_count(group, 2 * count, count_slices(pixels.slices) - _TALL)[:count] >= 0
 
-    # The first pixel in each direction and in each opposite direction.
-    directions = (*_DIRECTIONS, *((-y, -x) for y, x in _DIRECTIONS))
+    # The first pixel in each direction, y, x and the diagonals, and in each opposite direction.
+    directions = ((1, 0), (0, 1), (1, 1), (1, -1), (-1, 0), (0, -1), (-1, -1), (-1, 1))
     along = constant(directions, torch.float64, name.device) @ pixels.row_col.double()
     ends = segment_amin(along, group, 2 * count, math.inf).view(2, 4, 2, count)
     metres = tuple(scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))

@@ -29,8 +29,6 @@ NUM_SLICES = 4
 SLICE_HEIGHT = 0.5  # metres
 OWN = (1 << NUM_SLICES) - 1  # bits of the slices of the pixel itself
 _COUNTS = tuple(bin(byte & OWN).count("1") + (bin(byte >> NUM_SLICES).count("1") << 32) for byte in range(256))
-# Beyond this, float64 has only multiples of 16, so clamping heights here changes no slice.
-_HIGHEST_SLICE = 2.0**56
 # Rows and columns each way. Several steps search so far around a pixel.
 REACH = 2
 
@@ -247,7 +245,7 @@ def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Te
     """Return the slices of heights, (N,) float64, metres: floor(z / slice_height) mod n, (N,) uint8; 0 for NaN. n is a
     power of 2, at most 16."""
     layer = (z / constant((slice_height,), z.dtype, z.device)).floor_()  # see `Grid.pixel`
-    layer.clamp_(-_HIGHEST_SLICE, _HIGHEST_SLICE).nan_to_num_(0.0)
+    layer.clamp_(-(2.0**56), 2.0**56).nan_to_num_(0.0)  # beyond, all are multiples of 16, so no slice changes
     return (layer.long() & (num_slices - 1)).to(torch.uint8)
 
 

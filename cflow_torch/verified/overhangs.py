@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import (
     constant,
     flat_nonzero,
@@ -34,8 +33,6 @@ _CELL = 0.4  # metres, side of a cell; it is as high as a slice
 _NUM_SLICES = 32  # from the lowest cell of a window on; higher points are in the highest slice
 _GAP = 3  # slices from a cell to the next one above it, at least; the body and the roof of a car are closer
 _LARGEST = 10  # slices from the lowest cell of an object to its highest one, at most: a bus
-# Rows, columns and slices to 13 of the 26 neighbours of a cell. The others are the same links, seen from the other end.
-_HALF_OF_NEIGHBOURS = tuple(step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0))
 
 
 def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> tuple[HeightSlicedSweeps, Nodes]:
@@ -93,21 +90,16 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     batch, grid = sweeps.batch, sweeps.grid
     # With an empty margin all around, neighbours need no bounds check.
     num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 3 for axis in (1, 0))
-    index = torch.empty_like(rows)
-    lowest = torch.full((batch.num_windows,), 1 << 41, device=rows.device)
-    height = torch.empty_like(rows)
     side = constant((_CELL,), torch.float64, rows.device)  # see `Grid.pixel`
     corner = constant(grid.lower[:2], torch.float64, rows.device)
-    for some in chunks(0, len(rows), rows.device):
-        position = take_columns(batch.positions, rows[some])
-        window = floor_divide(batch.image.index_select(0, rows[some]).long(), batch.num_steps)
-        col, row = (position[:2] - corner[:, None]).div_(side).long().add_(1)
-        index[some] = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)
-        height[some] = (position[2] / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
-        lowest.scatter_reduce_(0, window, height[some], "amin")
-    window = floor_divide(index, num_rows * num_cols)
+    position = take_columns(batch.positions, rows)
+    window = floor_divide(batch.image.index_select(0, rows).long(), batch.num_steps)
+    col, row = (position[:2] - corner[:, None]).div_(side).long().add_(1)
+    height = (position[2] / SLICE_HEIGHT).floor_().clamp_(-(2.0**40), 2.0**40).long()
+    lowest = segment_amin(height, window, batch.num_windows, 1 << 41)
     height = height.sub_(lowest.index_select(0, window)).clamp_(max=_NUM_SLICES - 3).add_(1)
-    index = index.mul_(_NUM_SLICES).add_(height)
+    column = torch.add(row, window, alpha=num_rows).mul_(num_cols).add_(col)
+    index = torch.add(height, column, alpha=_NUM_SLICES)
 
     shape = batch.num_windows * num_rows * num_cols * _NUM_SLICES
     is_occupied = lazy_zeros(shape, torch.bool, rows.device).index_fill_(0, index, True)
@@ -115,7 +107,9 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     count = cells.numel()
     number = lazy_empty(shape, torch.int32, rows.device)
     number.scatter_(0, cells, torch.arange(count, dtype=torch.int32, device=rows.device))
-    offsets = tuple((down * num_cols + right) * _NUM_SLICES + up for down, right, up in _HALF_OF_NEIGHBOURS)
+    # 13 of the 26 neighbours of a cell. The others are the same links, seen from the other end.
+    half = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)]
+    offsets = tuple((down * num_cols + right) * _NUM_SLICES + up for down, right, up in half)
     near = cells[:, None] + constant(offsets, torch.int64, rows.device)
     links = flat_nonzero(is_occupied.index_select(0, near.view(-1)))
     targets = number.index_select(0, near.view(-1).index_select(0, links)).long()

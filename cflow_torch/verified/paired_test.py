@@ -23,7 +23,6 @@ from cflow_torch.verified.height_slices import NUM_SLICES, REACH, HeightSlicedSw
 
 # Comparisons (pixel x sweep x candidate) at once; each needs about 64 bytes of temporaries.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
-_TWICE = 1 + (1 << NUM_SLICES)  # a factor that copies the slices of a pixel to the upper bits
 _FAR = 2  # pixels, in y or in x
 _NEAR_Z = 2.0  # for near counts, z is so many times larger: one slice matches several neighbours, so counts correlate
 _COVERED = 65  # per cent
@@ -153,7 +152,15 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     count, num_candidates, num_steps = len(candidates), candidates.shape[1], sweeps.num_steps
     area, device = sweeps.grid.height * sweeps.grid.width, component.device
     window = torch.zeros(count, dtype=torch.int64, device=device).scatter_(0, component, members.window)
-    moves = _Moves.of(sweeps, window, candidates)
+    # The displacements have a row for every difference of steps from 1 - S to S - 1, R = (2 S - 1) M rows in all.
+    k = sweeps.intervals.index_select(0, window)
+    shift = (candidates.permute(2, 1, 0)[..., None] * k + 0.5).floor_().flatten(2)  # (2, C, R), down and to the right
+    side, shift = torch.maximum(*shift.abs()), shift.long()
+    longest, is_given = side.amax(0), (k != 0).flatten()  # (R,), the last one: the window has both sweeps
+    offset = torch.add(shift[1], shift[0], alpha=sweeps.grid.width)  # of flat indices
+    # (C, R), first of the bits of an image that tell whether a slice is absent. If the shift in y or in x is at least
+    # two pixels, they are those of the 3 x 3 pixels around, otherwise those of the pixel itself.
+    absent_bit = (side >= _FAR).view(torch.uint8) * NUM_SLICES
     first = torch.sub(members.index, members.step, alpha=area)
     move = torch.add(members.step + (num_steps - 1), component, alpha=2 * num_steps - 1)
     at = members.table[3:]
@@ -170,50 +177,27 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         of, start, which, near_border = take_columns(table, pixel)
         start.add_(to, alpha=area)
         which -= to
-        index = take_columns(moves.offset, which).add_(start)
-        leaves = flat_nonzero(near_border < moves.longest.index_select(0, which))
-        shift = moves.shift.index_select(2, which.index_select(0, leaves))
-        shift += take_columns(at, pixel.index_select(0, leaves))[:, None]
-        index.index_copy_(1, leaves, sweeps.or_outside(take_columns(index, leaves), shift))
+        index = take_columns(offset, which).add_(start)
+        leaves = flat_nonzero(near_border < longest.index_select(0, which))
+        target = shift.index_select(2, which.index_select(0, leaves))
+        target += take_columns(at, pixel.index_select(0, leaves))[:, None]
+        index.index_copy_(1, leaves, sweeps.or_outside(take_columns(index, leaves), target))
 
         # Which slices of the pixel are in place, then which are at the target, (2, C, comparisons): in the pixel
         # itself, and where they must be absent, which is the pixel or, for far motions, the 3 x 3 pixels around.
         own = members.slices.index_select(0, pixel)
-        in_place = sweeps.image.index_select(0, start).bitwise_and_(own * _TWICE)
+        in_place = sweeps.image.index_select(0, start).bitwise_and_(own * (1 + (1 << NUM_SLICES)))  # in both halves
         at_target = sweeps.image.index_select(0, index.view(-1)).view_as(index)
         exact = torch.stack((in_place.expand_as(at_target), at_target))
-        near = (exact >> take_columns(moves.bits, which)).bitwise_and_(own)
+        near = (exact >> take_columns(absent_bit, which)).bitwise_and_(own)
         found, absent = torch.stack((exact, near)), own ^ near
         lost, won = found[:, 0] & absent[1], found[:, 1] & absent[0]
-        given = own * moves.is_given.index_select(0, which)
+        given = own * is_given.index_select(0, which)
         counted = torch.cat(((won << NUM_SLICES | lost).flatten(0, 1), given[None], in_place[None]))
         sums.scatter_add_(1, torch.add(to > 0, of, alpha=2).expand(len(sums), -1), count_slices(counted))
     sums = sums.view(len(sums), count, 2)
     of_motion = sums[:-2].sum(2).view(2, num_candidates, count).transpose(1, 2)
     return Wins(of_motion >> 32, of_motion & 0xFFFFFFFF, sums[-2:])
-
-
-class _Moves(NamedTuple):
-    """Displacements by C motions of T components between t+1 and each of S sweeps, in both directions. Each has a row
-    for every difference of steps from 1 - S to S - 1, so there are R = (2 S - 1) T rows."""
-
-    shift: Tensor  # (2, C, R) int64, whole pixels down and to the right
-    offset: Tensor  # (C, R) int64, the shift as an offset of flat indices
-    longest: Tensor  # (R,) float64, largest shift in y or x by any of the C motions, pixels
-    # (C, R) uint8, first of the bits of an image that tell whether a slice is absent. If the shift in y or in x is at
-    # least two pixels, they are those of the 3 x 3 pixels around, otherwise those of the pixel itself.
-    bits: Tensor
-    is_given: Tensor  # (R,) bool, the window has both sweeps
-
-    @classmethod
-    def of(cls, sweeps: HeightSlicedSweeps, window: Tensor, motion: Tensor) -> _Moves:
-        """Compute them from the window, (T,) int64, and the motions, (T, C, 2) float64 per sweep interval."""
-        k = sweeps.intervals.index_select(0, window)
-        shift = (motion.permute(2, 1, 0)[..., None] * k + 0.5).floor_().flatten(2)
-        side, shift = torch.maximum(*shift.abs()), shift.long()
-        offset = torch.add(shift[1], shift[0], alpha=sweeps.grid.width)
-        bits = (side >= _FAR).view(torch.uint8) * NUM_SLICES
-        return cls(shift, offset, side.amax(0), bits, (k != 0).flatten())
 
 
 def evidence_of(won: Tensor, lost: Tensor, z: float | Tensor) -> Tensor:

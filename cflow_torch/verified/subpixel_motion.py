@@ -16,15 +16,12 @@ from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import REACH, HeightSlicedSweeps, count_slices
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_objects
 
-# Rows and columns of a pixel ahead in four directions, then of a pixel behind.
-_SIDES = ((0, 1, 1, 1, 0, -1, -1, -1), (1, -1, 0, 1, -1, 1, 0, -1))
 _BIAS_Z, _LEAST_BIAS = 3, 0.1  # least difference, in standard deviations of noise and as a share of the slices
 _NUM_LAYERS = 16  # numbers of the layers of cubes repeat after so many
 # Steps to the best motion, and their length; above 1, because the nearest partners change with each step.
 NUM_STEPS, STEP_LENGTH = 4, 1.4
 _Z, _LEAST_GAIN = 4.0, 0.05  # standard deviations of noise; gain per cube, as a share of a perfect match
 _SIGMA = 0.07  # metres, of the weight of two centroids by their distance
-_BEYOND = 2.0**12  # units; cubes so far apart never match
 BYTES_PER_POINT = 560  # cubes and the 25 around each
 
 
@@ -63,8 +60,10 @@ def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> 
     some = flat_nonzero(lookup(wanted, objects.of_pixel) & (pixels.step < 2))
     of, asked = objects.of_pixel.index_select(0, some), pixels.take(some)
     grid, from_t = sweeps.grid, 2 * asked.step - 1  # opposite for t+1
-    offsets = tuple(dy * grid.width + dx - grid.height * grid.width for dy, dx in zip(*_SIDES))
-    offset, at = (constant(values, torch.int64, of.device)[..., None] * from_t for values in (offsets, _SIDES))
+    # Rows and columns of a pixel ahead in four directions, then of a pixel behind.
+    sides = ((0, 1, 1, 1, 0, -1, -1, -1), (1, -1, 0, 1, -1, 1, 0, -1))
+    offsets = tuple(dy * grid.width + dx - grid.height * grid.width for dy, dx in zip(*sides))
+    offset, at = (constant(values, torch.int64, of.device)[..., None] * from_t for values in (offsets, sides))
     index = sweeps.or_outside(asked.index + offset, asked.table[3:, None] + at)
     own = asked.slices
     ahead, behind = (own & sweeps.image.index_select(0, index.view(-1)).view_as(index)).view(2, 4, -1)
@@ -81,16 +80,17 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     units; 0 = it is not significant.
 
     Convention: a cube of t, moved by the shift, matches the nearest cube of t+1 among those in the 5 x 5 pixels around
-        it. A cube of t+1, moved back, likewise matches one of t. Ties: the first in raster order. Each step changes the
-        shift by `STEP_LENGTH` times the weighted mean of the errors. The gain is the weight of all matches minus their
-        weight without a shift. It must exceed `_Z` standard deviations of noise, and reach `_LEAST_GAIN` per cube.
+        it. A cube of t+1, moved back, likewise matches one of t. Cubes 4 m apart never match. Ties: the first in raster
+        order. Each step changes the shift by `STEP_LENGTH` times the weighted mean of the errors. The gain is the
+        weight of all matches minus their weight without a shift. It must exceed `_Z` standard deviations of noise, and
+        reach `_LEAST_GAIN` per cube.
     """
     some = flat_nonzero(voxels.step < 2)
     window, step, layer, of = gather(some, voxels.window, voxels.step, voxels.layer, voxels.object_id)
     position = take_columns(voxels.position[:2], some)
     near = voxels.around(window * voxels.num_steps + 1 - step, layer[None], position, REACH)
     ahead = take_columns(voxels.position[:2], near.view(-1)).view(2, *near.shape) - position[:, None]
-    ahead = ahead.clamp_(-_BEYOND, _BEYOND).mul_((2 * step - 1).double())  # for t+1, all signs change
+    ahead = ahead.clamp_(-4096, 4096).mul_((2 * step - 1).double())  # for t+1, all signs change
 
     weights, shift = _meeting_weights(step.device), position.new_zeros((2, num_objects))
     weight, error = _meet(ahead, weights)

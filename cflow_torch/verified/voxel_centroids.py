@@ -19,8 +19,6 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 
 # Centroids are multiples of 1 / UNITS metre, so their sums are exact, in any order of the points and on any device.
 UNITS = 1024
-_HIGHEST = 2.0**24  # units; coordinates are clamped to this, far beyond a region, so that no square overflows
-_BEYOND = 2.0**27  # units; a position far beyond all others
 NOISE = 0.05  # metres, standard deviation of a centroid, besides the spread of its surface
 _SIDE = 2  # voxels, of a block. With the blocks around, it covers 0.6 m
 _STEP = 4  # units; coordinates are multiples of 1/256 m, so that sums are exact
@@ -94,11 +92,12 @@ class Voxels:
         # All points of a voxel belong to one object, so it does not matter which of them is written last.
         self.object_id = torch.empty_like(key).scatter_(0, voxel, points.object_id)
         corner = constant((*sweeps.grid.lower[:2], 0.0), torch.float64, key.device)[:, None]
-        position = ((points.position - corner) * UNITS).round_().clamp_(-_HIGHEST, _HIGHEST)
+        # Coordinates are clamped far beyond a region, so that no square overflows.
+        position = ((points.position - corner) * UNITS).round_().clamp_(-(2.0**24), 2.0**24)
         centroid = torch.floor(scatter_count(voxel, len(key), position) / count)
         # (3, V + 1) float64, x and y from the lower corner of the region and z from 0, units; the last entry, for "no
         # voxel", is far away.
-        self.position = F.pad(centroid, (0, 1), value=_BEYOND)
+        self.position = F.pad(centroid, (0, 1), value=2.0**27)
         # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), len(key), device=key.device)
         self._of_key.scatter_(0, key + num_slices, torch.arange(len(key), device=key.device))

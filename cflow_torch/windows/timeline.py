@@ -103,8 +103,6 @@ def _is_same(a: Sweep, b: Sweep) -> bool:
     """Compare points and poses. Harnesses repeat the first sweep of a scene where the history is missing."""
     if a is b:
         return True
-    if (a.pose is None) != (b.pose is None):
-        return False
     if a.pose is not None and b.pose is not None and not np.array_equal(as_numpy(a.pose), as_numpy(b.pose)):
         return False
     return have_same_points(a, b)
