@@ -12,7 +12,7 @@ from torch import Tensor
 from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
-from cflow_torch.dense.packing import Packing, Search, pack
+from cflow_torch.dense.packing import Packing, Search, pack, shift_at
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.cross_correlation import cross_correlate
@@ -166,7 +166,7 @@ def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor
     end = searched.cumsum(0)
     # Two samples give a lower bound: no shift, and the largest count, moved into the search range if it lies outside.
     middle, largest = low[0] * stride + low[1], torch.cat([largest_of_rows(piece) for piece in run.pieces])
-    dy, dx = torch.minimum(Search(low, high, stride, searched).shift(largest), high)
+    dy, dx = torch.minimum(shift_at(largest, stride, low), high)
     probe = middle + dy * stride + dx
     if radius is not None:
         square = (radius[run.pairs] * radius[run.pairs]).floor()
@@ -179,7 +179,7 @@ def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor
     sample = flat_nonzero(torch.cat([(piece > least).view(-1) for piece, least in zip(run.pieces, needed_of_piece)]))
     pair = torch.searchsorted(end, sample, right=True)
     table = take_columns(torch.cat((low, high, stride[None], start[None])), pair)
-    shift = Search(table[:2], table[2:4], table[4], table[5]).shift(sample - table[5])
+    shift = shift_at(sample - table[5], table[4], table[:2])
     is_searched = (shift <= table[2:4]).all(0)
     if radius is not None:
         is_searched &= (shift * shift).sum(0) <= square.index_select(0, pair)

@@ -38,10 +38,11 @@ class Search:
     # (K,) int64, number of leading samples that hold the search range; equal for all images of a class.
     searched: Tensor
 
-    def shift(self, sample: Tensor) -> Tensor:
-        """(2, K) int64, dy and dx at one sample (K,) int64 of each image; undefined beyond `high`."""
-        row = sample // self.stride
-        return torch.stack((row, sample - row * self.stride)) - self.low
+
+def shift_at(sample: Tensor, stride: Tensor, low: Tensor) -> Tensor:
+    """(2, K) int64, dy and dx at one sample (K,) int64 of each image; undefined beyond `high`."""
+    row = sample // stride
+    return torch.stack((row, sample - row * stride)) - low
 
 
 class SizeClass(NamedTuple):

@@ -47,10 +47,7 @@ class Blocks:
 
     def of_pixel(self, row: Tensor, col: Tensor) -> Tensor:
         """Component of the pixels at (row, col), (P,) int64. Rows continue from one padded image to the next."""
-        if self.side == 3:
-            row, col = floor_divide(row, 3), floor_divide(col, 3)
-        else:
-            row, col = row >> self.side // 2, col >> self.side // 2  # 1, 2, 4 -> 0, 1, 2
+        row, col = floor_divide(row, self.side), floor_divide(col, self.side)
         return self.component.index_select(0, torch.add(col, row, alpha=self.cols))
 
 

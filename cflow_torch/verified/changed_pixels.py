@@ -52,8 +52,11 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     around = sweeps.image.index_select(0, index.view(-1)).view_as(index) >> NUM_SLICES
     is_given = ((sweeps.elapsed != 0) | (every == 0)) & sweeps.has_history[:, None]
     missing = (pixels.slices[:, None] & ~around).mul_(is_given.index_select(0, pixels.window))
-    comparison, bit = _bits(missing)
-    pixel, step = split_index(comparison, num_steps)
+    # The set bits of these masks.
+    some = flat_nonzero(missing.bool())
+    bits = missing.view(-1).index_select(0, some)[:, None] & constant((1, 2, 4, 8), torch.uint8, missing.device)
+    entry, bit = split_index(flat_nonzero(bits.bool()), NUM_SLICES)
+    pixel, step = split_index(some.index_select(0, entry), num_steps)
     sweep = pixels.window.index_select(0, pixel) * num_steps + step
     farther = RangeImages(sweeps).farther(sweep, _centre(sweeps, pixel, bit))
     is_seen = farther >= 0
@@ -61,14 +64,6 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     change = of_missing.new_zeros((2, len(nothing)))
     change.scatter_reduce_(1, pixel.expand(2, -1), of_missing, "amax")
     return ChangedPixels(*change.view(torch.bool))
-
-
-def _bits(missing: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the set bits of (P, S) uint8 masks: flat index of the mask and number of the bit, (K,) int64 each."""
-    some = flat_nonzero(missing.bool())
-    bits = missing.view(-1).index_select(0, some)[:, None] & constant((1, 2, 4, 8), torch.uint8, missing.device)
-    entry, bit = split_index(flat_nonzero(bits.bool()), NUM_SLICES)
-    return some.index_select(0, entry), bit
 
 
 def _centre(sweeps: HeightSlicedSweeps, pixel: Tensor, bit: Tensor) -> Tensor:

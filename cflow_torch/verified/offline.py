@@ -26,8 +26,15 @@ _TIMES = 2
 
 def choose_side(batch: Batch, motion: RotatingMotion) -> RotatingMotion:
     """Return the motion in which each point of t has the pixel of the chosen side, of the past or of the future."""
-    shown, pixel = _num_shown(batch, motion), motion.cell_of_point
-    begin, end = batch.rows[0].start, batch.rows[-1].stop
+    window, step = split_index(batch.image.long(), batch.num_steps)
+    number = 1 + motion.cluster_id.index_select(0, motion.cluster(slice(None)))  # 0 = no object
+    most = int(number.amax()) + 1 if number.numel() else 1
+    row = window * most + number
+    shows = torch.zeros((batch.num_windows * most, batch.num_steps), dtype=torch.bool, device=row.device)
+    shows.view(-1).index_fill_(0, row * batch.num_steps + step, True)
+    # Number of sweeps besides t and t+1 that show the object of each point.
+    shown = shows[:, 2:].sum(1).index_select(0, row).masked_fill_(number == 0, 0)
+    pixel, begin, end = motion.cell_of_point, batch.rows[0].start, batch.rows[-1].stop
     past, future = slice(begin, end), slice(end, 2 * end - begin)  # the same points of t
     chosen = torch.where(shown[future] > _TIMES * shown[past], pixel[future], pixel[past])
     return replace(motion, cell_of_point=pixel.slice_scatter(chosen, 0, begin, end))
@@ -55,14 +62,3 @@ def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, si
     wins = count_wins(sweeps, sweeps.pixels.take(pixel), objects.of_pixel.index_select(0, pixel), candidates)
     best, evidence = best_candidate(evidence_of(wins.won[0], wins.lost[0], significance), candidates)
     return torch.where((evidence > 0)[:, None], best, motion)
-
-
-def _num_shown(batch: Batch, motion: RotatingMotion) -> Tensor:
-    """Count the sweeps besides t and t+1 that show the object of each of the N points, (N,) int64; 0 = no object."""
-    window, step = split_index(batch.image.long(), batch.num_steps)
-    number = 1 + motion.cluster_id.index_select(0, motion.cluster(slice(None)))
-    most = int(number.amax()) + 1 if number.numel() else 1
-    row = window * most + number
-    shows = torch.zeros((batch.num_windows * most, batch.num_steps), dtype=torch.bool, device=row.device)
-    shows.view(-1).index_fill_(0, row * batch.num_steps + step, True)
-    return shows[:, 2:].sum(1).index_select(0, row).masked_fill_(number == 0, 0)

@@ -66,21 +66,16 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     kept, node = members_of(name, component, num_names)
     pixel = kept + num_own
     window = torch.zeros_like(name).scatter_(0, node, sweeps.pixels.window.index_select(0, pixel))
-    count = nodes.count + len(name)
-    none = torch.full_like(name, count)
-    return (
-        sweeps,
-        Nodes(
-            component=torch.cat(
-                (nodes.component, components.count + torch.arange(nodes.count, count, device=name.device))
-            ),
-            level=torch.cat((nodes.level, torch.full_like(name, components.num_levels + 1))),
-            parent=torch.cat((nodes.parent.masked_fill(nodes.parent == nodes.count, count), none)),
-            window=torch.cat((nodes.window, window)),
-            travels=F.pad(nodes.travels, (0, len(name))),
-            pixel=torch.cat((nodes.pixel, pixel)),
-            node=torch.cat((nodes.node, node + nodes.count)),
-        ),
+    count, added = nodes.count + len(name), (0, len(name))
+    number = torch.arange(nodes.count, count, device=name.device)
+    return sweeps, Nodes(
+        component=torch.cat((nodes.component, components.count + number)),
+        level=F.pad(nodes.level, added, value=components.num_levels + 1),
+        parent=F.pad(nodes.parent.masked_fill(nodes.parent == nodes.count, count), added, value=count),
+        window=torch.cat((nodes.window, window)),
+        travels=F.pad(nodes.travels, added),
+        pixel=torch.cat((nodes.pixel, pixel)),
+        node=torch.cat((nodes.node, node + nodes.count)),
     )
 
 
