@@ -67,16 +67,6 @@ class Pixels:
         """(2, K) int64."""
         return self.table[3:]
 
-    @property
-    def row(self) -> Tensor:
-        """(K,) int64."""
-        return self.table[3]
-
-    @property
-    def col(self) -> Tensor:
-        """(K,) int64."""
-        return self.table[4]
-
     def take(self, index: Tensor) -> Pixels:
         """Select pixels by (L,) int64 positions in the list."""
         return Pixels(take_columns(self.table, index), self.slices.index_select(0, index))

@@ -163,7 +163,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     absent_bit = (side >= _FAR).view(torch.uint8) * NUM_SLICES
     first = torch.sub(members.index, members.step, alpha=area)
     move = torch.add(members.step + (num_steps - 1), component, alpha=2 * num_steps - 1)
-    at = members.table[3:]
+    at = members.row_col
     ends = constant((sweeps.grid.height - 1, sweeps.grid.width - 1), torch.int64, device)[:, None]
     border = torch.minimum(*torch.minimum(at, ends - at))
     table = torch.stack((component, first, move, border))

@@ -64,7 +64,7 @@ def _is_biased(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> 
     sides = ((0, 1, 1, 1, 0, -1, -1, -1), (1, -1, 0, 1, -1, 1, 0, -1))
     offsets = tuple(dy * grid.width + dx - grid.height * grid.width for dy, dx in zip(*sides))
     offset, at = (constant(values, torch.int64, of.device)[..., None] * from_t for values in (offsets, sides))
-    index = sweeps.or_outside(asked.index + offset, asked.table[3:, None] + at)
+    index = sweeps.or_outside(asked.index + offset, asked.row_col[:, None] + at)
     own = asked.slices
     ahead, behind = (own & sweeps.image.index_select(0, index.view(-1)).view_as(index)).view(2, 4, -1)
     counts = count_slices(torch.cat((ahead & ~behind, behind & ~ahead, own[None])))

@@ -70,12 +70,12 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
     sweeps, change, components, nodes, objects, moves, result = take_steps(drive)
     pixels, size, own, levels = sweeps.pixels, sweeps.grid.pixel_size, components.roots.shape[1], components.num_levels
     high = np.array(low) + (width, width * HIGH / WIDE)
-    corners = np.stack((pixels.col, pixels.row), 1) * size + sweeps.grid.lower[:2]  # lower left ones
+    corners = pixels.row_col.flip(0).T.numpy() * size + sweeps.grid.lower[:2]  # lower left ones
 
     def paint(axes: Any, *layers: tuple[torch.Tensor, Any]) -> None:
         image = np.full((sweeps.grid.height, sweeps.grid.width, 3), 255, np.uint8)
         for pixel, rgb in layers:
-            image[pixels.row[pixel], pixels.col[pixel]] = rgb
+            image[tuple(pixels.row_col[:, pixel])] = rgb
         left, bottom = sweeps.grid.lower[:2]
         extent = (left, left + image.shape[1] * size, bottom, bottom + image.shape[0] * size)
         axes.imshow(image, extent=extent, origin="lower", interpolation="nearest")
@@ -98,7 +98,7 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
             panels[2].add_patch(Rectangle(corner, *(far - corner), fill=False, linestyle=line[0], linewidth=line[1]))
     chosen = torch.where(lookup(moves, objects.of_pixel))[0]
     chosen, rgb = colours(chosen, objects.of_pixel[chosen])
-    rgb[(chosen >= own) & ((pixels.row[chosen] + pixels.col[chosen]) % 6 < 2)] = 255
+    rgb[(chosen >= own) & (pixels.row_col[:, chosen].sum(0) % 6 < 2)] = 255
     paint(panels[3], (every, PALE), (chosen, rgb))
 
     flow, rows = result.residual_flow.numpy(), sweeps.batch.rows[0]

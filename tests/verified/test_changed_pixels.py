@@ -64,7 +64,7 @@ def shares(sweeps: Sequence[np.ndarray], rows: tuple[float, float]) -> tuple[flo
     """Share of the pixels at t with x in a range that are missing, and that have changed, in t+1, t, t-1."""
     pc1, pc0, older = (Sweep(np.concatenate((cloud, floor()))) for cloud in sweeps)
     images = sweeps_of([Window(pc0, pc1, (older,))], SETTINGS)
-    found, x = find_changed(images), (images.pixels.col.double() + 0.5) * 0.25 - 20
+    found, x = find_changed(images), (images.pixels.row_col[1].double() + 0.5) * 0.25 - 20
     mine = (images.pixels.step == 1) & (x > rows[0]) & (x < rows[1])
     assert mine.sum() > 3
     return tuple(float(values[mine].double().mean()) for values in found)  # type: ignore[return-value]

@@ -54,7 +54,7 @@ def grown(seed: int, longest: float | None = 3.0, blocks=(4, 2, 1), shape=(3, 3,
     images[-1, 2:], elapsed[-1, 2:] = 0, 0  # a pair among others
     sweeps = from_images(images, SIZE, elapsed)
     # Few pixels are missing in some stripes, so that the static test decides, and most of them in others.
-    odds = np.choose(sweeps.pixels.col.numpy() // 6 % 4, (0.0, 0.15, 0.1, 0.95))
+    odds = np.choose(sweeps.pixels.row_col[1].numpy() // 6 % 4, (0.0, 0.15, 0.1, 0.95))
     is_missing = torch.from_numpy(rng.random(sweeps.num_pixels) < odds) & sweeps.has_history[sweeps.pixels.window]
     change = ChangedPixels(is_missing, is_missing & torch.from_numpy(rng.random(sweeps.num_pixels) < 0.8))
     config = VerifiedConfig(pixel_sizes=tuple(SIZE * block for block in blocks), max_object_length=longest)

@@ -48,7 +48,7 @@ def test_copies_are_images_of_their_own():
     of_copy = copies.pixels.take(copies.pixel_of_point[len(sweeps.pixel_of_point) :])
     own = copies.pixels.take(sweeps.pixel_of_point[rows])
     assert torch.equal(of_copy.window, own.window + 2)
-    assert all(torch.equal(getattr(of_copy, name), getattr(own, name)) for name in ("step", "row", "col"))
+    assert all(torch.equal(getattr(of_copy, name), getattr(own, name)) for name in ("step", "row_col"))
     slices = copies.image[of_copy.index] & fast.OWN
     assert torch.equal(slices, of_copy.slices) and bool((slices & ~own.slices == 0).all())
     points = fast.slice_of(sweeps.batch.positions[2, rows], fast.SLICE_HEIGHT).long()

@@ -114,7 +114,7 @@ def slides(component: dict[int, Pixels], motion, others=None, slices: int = 1) -
     sweeps = from_images(np.minimum(image, 1) * slices, 0.1)
     own = torch.from_numpy(image.ravel())[sweeps.pixels.index] == 2
     members = sweeps.pixels.take(own.nonzero()[:, 0])
-    given = sweeps, members, torch.zeros_like(members.row), torch.tensor([[motion]], dtype=torch.float64)
+    given = sweeps, members, torch.zeros_like(members.index), torch.tensor([[motion]], dtype=torch.float64)
     return bool(slides_along_itself(*given, count_wins(*given).is_covered))
 
 
