@@ -10,7 +10,6 @@ from __future__ import annotations
 from itertools import product
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import (
@@ -66,14 +65,15 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
     kept, node = members_of(name, component, num_names)
     pixel = kept + num_own
     window = torch.zeros_like(name).scatter_(0, node, sweeps.pixels.window.index_select(0, pixel))
-    count, added = nodes.count + len(name), (0, len(name))
+    count = nodes.count + len(name)
     number = torch.arange(nodes.count, count, device=name.device)
+    parent = nodes.parent.masked_fill(nodes.parent == nodes.count, count)
     return sweeps, Nodes(
         component=torch.cat((nodes.component, components.count + number)),
-        level=F.pad(nodes.level, added, value=components.num_levels + 1),
-        parent=F.pad(nodes.parent.masked_fill(nodes.parent == nodes.count, count), added, value=count),
+        level=torch.cat((nodes.level, torch.full_like(name, components.num_levels + 1))),
+        parent=torch.cat((parent, torch.full_like(name, count))),
         window=torch.cat((nodes.window, window)),
-        travels=F.pad(nodes.travels, added),
+        travels=torch.cat((nodes.travels, torch.zeros_like(name, dtype=torch.bool))),
         pixel=torch.cat((nodes.pixel, pixel)),
         node=torch.cat((nodes.node, node + nodes.count)),
     )
