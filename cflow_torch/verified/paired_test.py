@@ -154,7 +154,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     window = torch.zeros(count, dtype=torch.int64, device=device).scatter_(0, component, members.window)
     # The displacements have a row for every difference of steps from 1 - S to S - 1, R = (2 S - 1) M rows in all.
     k = sweeps.intervals.index_select(0, window)
-    shift = (candidates.permute(2, 1, 0)[..., None] * k + 0.5).floor_().flatten(2)  # (2, C, R), down and to the right
+    shift = (candidates.permute(2, 1, 0)[..., None] * k + 0.5).floor_().flatten(2)  # (2, C, R), pixels down and right
     side, shift = torch.maximum(*shift.abs()), shift.long()
     longest, is_given = side.amax(0), (k != 0).flatten()  # (R,), the last one: the window has both sweeps
     offset = torch.add(shift[1], shift[0], alpha=sweeps.grid.width)  # of flat indices

@@ -58,11 +58,12 @@ class Timeline:
         farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
         entries: list[Entry] = []
         for index, sources in enumerate(sides):
-            window = windows[index % len(windows)]
+            number = index % len(windows)
+            window, of_window = windows[number], [source.sweep for source in given[number]]
             times = elapsed_times(window, sources, config)
             table[:2, index, 1 : 1 + len(sources)] = np.transpose(times)
             # A sweep without point times would seem to be measured at other times than the rest.
-            has_times = all(sweep.point_times is not None for _, sweep in named_sweeps(window))
+            has_times = all(sweep.point_times is not None for sweep in (window.pc1, *of_window))
             interval = times[0][1] / times[0][0] if needs_times and has_times else None
             pose1, transform = window.pc1.pose, None
             T_ego1_world = None if pose1 is None else np.linalg.inv(rigid_transform(pose1, "pose1", farthest))
