@@ -97,10 +97,12 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_s
     Cost: for each size of voxel, three sorts of the points.
     """
     matches: dict[int, int] = {}
+    taken: set[int] = set()
     for side in VOXELS:
         for earlier, current in _by_overlap(points0, group0, points1, group1, min_share, side):
-            if earlier not in matches and current not in matches.values():
+            if earlier not in matches and current not in taken:
                 matches[earlier] = current
+                taken.add(current)
     matched = torch.tensor([*matches.items()], dtype=torch.int64, device=points0.device).view(-1, 2)
     return matched[:, 0], matched[:, 1]
 

@@ -54,7 +54,10 @@ class CleanLog(Log):
         model: SceneFlowModel | None = None,
         flow: Callable[[int], FlowResult] | None = None,
         remove_stopped: bool = False,
+        standing: None = None,
     ) -> None:
+        if standing is not None:
+            raise CFlowError("standing= is now remove_stopped=")
         self.log_id, self.timestamps = log.log_id, log.timestamps
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
