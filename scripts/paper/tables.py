@@ -10,8 +10,7 @@ Arguments with "=" are Hydra overrides and go to every `cflow eval -m experiment
 call the script again after an interruption. Results are written to output=FOLDER (default outputs/paper), the page to
 FOLDER/paper.md, and its files to FOLDER/paper: NAME.csv for each table or figure, and NAME.png for each figure (needs
 matplotlib). They have the paper's numbers next to ours; "-" = unknown. For figures, the page has the means over the
-classes, and NAME.csv has the classes. Across data sets, the page has our methods, and NAME.csv has all methods. Missing
-runs are listed on the screen.
+classes, and NAME.csv has the classes. Across data sets, the page has our methods, and NAME.csv has all methods.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any, Iterable, List, Sequence
+from typing import Any, List, Sequence
 
 from plots import draw
 from results import CLASS_COLUMNS, METHODS, Line, Numbers, Records, load_paper, load_runs, make_lines, protocol
@@ -65,8 +64,8 @@ def main() -> None:
 
 def write_pages(output: Path) -> None:
     """Write the page, its tables and figures into a folder, from the results.json files below it."""
-    runs, missing = load_runs(output), []
-    page, last_described = [INTRODUCTION], []
+    runs, page = load_runs(output), [INTRODUCTION]
+    last_described: list[str] = []
     for name, about in load_paper().items():
         ours = runs.get(name, {})
         lines = make_lines(name, about, ours)
@@ -86,7 +85,6 @@ def write_pages(output: Path) -> None:
             notes += [f"{method}: {reason}" for method, score in protocol(ours).items() for reason in score.missing]
         else:
             shown = mean_cells(lines) if is_figure else [[*row[:2], *row[-2:]] for row in cells]
-        missing += missing_runs(name, METHODS.values() if "columns" in about else about["rows"], ours)
         page += [f"## {about['title']} ({about['label']})", "", markdown(shown)]
         page += [*(f"- {line}" for line in notes), ""] if notes else []
         if is_figure:
@@ -94,7 +92,7 @@ def write_pages(output: Path) -> None:
                 draw(name, about, lines).savefig(temporary, format="png", dpi=130)
             page += [f"![{about['title']}](paper/{name}.png)", ""]
     write_text(output / "paper.md", "\n".join(page))
-    print(*missing, f"tables and figures: {output / 'paper.md'}", sep="\n")
+    print(f"tables and figures: {output / 'paper.md'}")
 
 
 def table_cells(about: dict[str, Any], lines: Sequence[Line]) -> Cells:
@@ -126,16 +124,6 @@ def number(numbers: Numbers, column: str, is_difference: bool = False) -> str:
     """Four decimals, "-" for NaN."""
     value = numbers.get(column, math.nan)
     return "-" if math.isnan(value) else f"{value:+.4f}" if is_difference else f"{value:.4f}"
-
-
-def missing_runs(name: str, wanted: Iterable[str], ours: Records) -> list[str]:
-    """A line for each data set whose runs are not complete."""
-    lines = []
-    for data_set, rows in ours.items():
-        absent = [row for row in wanted if row not in rows]
-        if absent:
-            lines.append(f"{name}, {data_set}: {'; '.join(absent)} (cflow eval -m experiment={name} data=...)")
-    return lines
 
 
 def about_runs(ours: Records) -> list[str]:
