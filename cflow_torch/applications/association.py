@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups
 from cflow_torch.applications.track_state import Tracks
-from cflow_torch.ops.indices import concat_ranges, lookup
+from cflow_torch.ops.indices import concat_ranges, lookup, unique_pairs
 
 _MIN_SHARE = 0.1  # of common voxels, for a match of two groups
 _MIN_CLAIM = 0.5  # share of a track's points that a group has in its box, from which the track claims the group
@@ -45,8 +45,7 @@ def _settle(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:
     """
     moves, is_inside = groups.group >= 0, box >= 0
     num_static = torch.bincount(box[is_inside & ~moves], minlength=num_boxes)
-    pairs = torch.stack([groups.group, box])[:, is_inside & moves]
-    (group, box), count = torch.unique(pairs, dim=1, return_counts=True)
+    group, box, _, count = unique_pairs(groups.group[is_inside & moves], box[is_inside & moves])
     is_piece = (count > groups.count[group] / 2) & (groups.count[group] < num_static[box])
     return groups.divide(torch.where(torch.isin(groups.group, group[is_piece]), -1, 0))
 
@@ -58,8 +57,7 @@ def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGrou
     with several claims is divided: points go to the box that holds them, all others to one of the claims.
     """
     moves = groups.group >= 0
-    pairs = torch.stack([groups.group, box])[:, moves]
-    (group, box), pair_of_point, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)
+    group, box, pair_of_point, count = unique_pairs(groups.group[moves], box[moves])
     least = lookup(_MIN_CLAIM * num_points, torch.where(box < 0, len(num_points), box), torch.inf)
     claims = count >= least
     piece = torch.where(claims, box + 1, 0)
@@ -94,7 +92,7 @@ def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_s
     earlier sweep, (K,) int64, and those of the current sweep, (K,) int64.
 
     Convention: greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
-    Cost: for each size of voxel, three sorts of the points.
+    Cost: for each size of voxel, four sorts of the points.
     """
     matches: dict[int, int] = {}
     taken: set[int] = set()
@@ -111,19 +109,17 @@ def _by_overlap(
     points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float, side: float
 ) -> list[list[int]]:
     """Pairs of groups (earlier, current) that share voxels of `side` metres, the largest overlap first."""
+    if not (len(points0) and len(points1)):
+        return []
     both = torch.cat([points0, points1])
     voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
-    voxel = torch.unique(voxel, dim=0, return_inverse=True)[1]
-    # A number, voxel * num_groups + group or earlier * num_groups + current, sorts faster than a pair.
-    num_groups = 1 + int(torch.cat([group0, group1]).amax()) if len(both) else 1
-    own0 = torch.unique(voxel[: len(group0)] * num_groups + group0)
-    own1 = torch.unique(voxel[len(group0) :] * num_groups + group1)
-    voxel1, voxel0 = own1 // num_groups, own0 // num_groups
+    x, y, z = (voxel - voxel.amin(0)).T
+    voxel = unique_pairs(unique_pairs(x, y)[2], z)[2]
+    voxel0, own0, _, _ = unique_pairs(voxel[: len(points0)], group0)
+    voxel1, own1, _, _ = unique_pairs(voxel[len(points0) :], group1)
     begin, end = (torch.searchsorted(voxel1, voxel0, right=right) for right in (False, True))
-    own0, own1 = own0 % num_groups, own1 % num_groups
-    pairs = own0.repeat_interleave(end - begin) * num_groups + own1[concat_ranges(begin, end - begin)]
-    pairs, shared = torch.unique(pairs, return_counts=True)
-    earlier, current = pairs // num_groups, pairs % num_groups
+    own, other = own0.repeat_interleave(end - begin), own1[concat_ranges(begin, end - begin)]
+    earlier, current, _, shared = unique_pairs(own, other)
     share = shared / (torch.bincount(own0)[earlier] + torch.bincount(own1)[current] - shared)
     order = share.argsort(descending=True, stable=True)
     return torch.stack([earlier, current], 1)[order[share[order] >= min_share]].tolist()  # type: ignore[no-any-return]

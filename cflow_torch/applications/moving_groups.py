@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.ops.indices import unique_pairs
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
 MOVING = 0.05  # metres per sweep: least residual flow of a moving point, as in evaluation
@@ -53,8 +54,7 @@ class MovingGroups:
     def divide(self, piece: Tensor) -> MovingGroups:
         """Divide the groups by the piece of each point, (M,) int64; pieces keep cluster and confidence, -1 = static."""
         moves = (self.group >= 0) & (piece >= 0)
-        pairs = torch.stack([self.group, piece])[:, moves]
-        (origin, _), index, count = torch.unique(pairs, dim=1, return_inverse=True, return_counts=True)
+        origin, _, index, count = unique_pairs(self.group[moves], piece[moves])
         group = torch.full_like(self.group, -1).masked_scatter(moves, index)
         confidence = self.confidence[origin]
         return replace(self, group=group, cluster=self.cluster[origin], count=count, confidence=confidence)

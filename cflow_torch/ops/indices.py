@@ -83,6 +83,18 @@ def members_of(groups: Tensor, group: Tensor, num_groups: int) -> tuple[Tensor, 
     return kept, number.index_select(0, kept)
 
 
+def unique_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the U distinct pairs of two (N,) int64 in lexicographic order; the numbers must be at least -1.
+
+    Returns:
+        The first and the second number of each pair, (U,) each; the pair of each input, (N,); the count of each pair.
+    """
+    width = 2 + int(second.amax()) if len(second) else 1
+    key, index, count = torch.unique(first * width + second + 1, return_inverse=True, return_counts=True)
+    own = floor_divide(key, width)
+    return own, key - own * width - 1, index, count
+
+
 def index_in_group(group: Tensor) -> Tensor:
     """(N,) int64, index of each element among the elements of its group, from groups (N,) in ascending order."""
     return torch.arange(group.numel(), device=group.device) - torch.searchsorted(group, group)

@@ -10,13 +10,21 @@ from scipy import ndimage
 
 from cflow_torch.ops import morphology
 from cflow_torch.ops.cross_correlation import cross_correlate
-from cflow_torch.ops.indices import floor_divide, scatter_count, split_index
+from cflow_torch.ops.indices import floor_divide, scatter_count, split_index, unique_pairs
 from cflow_torch.ops.kornia_engine import close_3x3_kornia
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.linear import adjugate
 from cflow_torch.ops.lower_surface import _cone
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.ops.segments import masked_median, segment_median
+
+
+@pytest.mark.parametrize("length", [0, 1, 50])
+def test_unique_pairs_are_numpys(length):
+    pairs = np.random.default_rng(length).integers([0, -1], [4, 3], (length, 2))
+    expected, index, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+    first, second, *rest = (values.tolist() for values in unique_pairs(*torch.from_numpy(pairs).T))
+    assert [first, second] == expected.T.tolist() and rest == [index.ravel().tolist(), count.tolist()]
 
 
 def test_medians_are_numpys():
