@@ -11,37 +11,37 @@ from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.ops.indices import concat_ranges, lookup, unique_pairs
 
-_MIN_SHARE = 0.1  # of common voxels, for a match of two groups
-_MIN_CLAIM = 0.5  # share of a track's points that a group has in its box, from which the track claims the group
-_MIN_STOPPED_SHARE = 0.3  # share of a track's points that lie in its box, from which its object has stopped there
-_MARGIN = 0.2  # metres by which that box is larger
-VOXELS = (0.3, 0.6, 1.2)  # metres; a group of few points shares no small voxel with itself in the next sweep
-_HEIGHT = 3.0  # of a voxel, in sides: the beams meet an object at other heights in each sweep
+_MIN_OVERLAP = 0.1  # intersection over union of the voxels of two groups that match
+_MIN_CLAIM = 0.5  # share of a track's points; with so many points of a group in its box, the track claims the group
+_MIN_STOPPED_SHARE = 0.3  # share of a track's points; with so many static points in its box, the object has stopped
+_MARGIN = 0.2  # metres, added to the sides of these boxes
+VOXELS = (0.3, 0.6, 1.2)  # metres, sides; sparse groups share only large voxels with the next sweep
+_HEIGHT = 3.0  # height of a voxel over its side: the beams hit an object at different heights in each sweep
 
 
 class Matches(NamedTuple):
-    """Tracks that explain a sweep: track i continues in moving group i, or has stopped."""
+    """Tracks that are seen in a sweep: `track[i]` continues as moving group `group[i]`; `stopped` tracks are static."""
 
     track: Tensor  # (M,) int64
     group: Tensor  # (M,) int64
     stopped: Tensor  # (S,) int64 tracks
     num_points: Tensor  # (S,) int64 points in the boxes of the stopped tracks
-    track_of_static: Tensor  # (P,) int64 for each static point the stopped track whose box holds it, -1 = none
+    track_of_static: Tensor  # (P,) int64, the stopped track whose box holds each static point, -1 = none
 
 
 def regroup(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
-    """Correct the moving groups of a sweep by the boxes in which we expect the confirmed objects."""
+    """Correct the moving groups of a sweep with the predicted boxes of confirmed tracks."""
     known = tracks.take(tracks.is_confirmed)
     box = box_of_point(groups.point, known.box, known.size + _MARGIN, known.heading)
-    return _divide(_settle(groups, box, len(known.id)), box, known.num_points)
+    return _divide(_make_pieces_static(groups, box, len(known.id)), box, known.num_points)
 
 
-def _settle(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:
-    """Take a moving group as static if it is a small piece of a confirmed object that has stopped.
+def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:
+    """Make a moving group static if it is a small piece of a confirmed object that has stopped.
 
-    While the vehicle passes a stopped object, the visible outline of the object changes. A piece of it then seems to
-    move, and the track would follow the piece. A group is such a piece if the box of the object holds most of its
-    points, and more static points than the group has points.
+    While the vehicle passes a stopped object, the visible outline of the object changes. A piece of the object then
+    seems to move, and the track would follow this piece. We recognise a piece by the box of the object: it holds more
+    than half of the points of the group, and more static points than the group has points.
     """
     moves, is_inside = groups.group >= 0, box >= 0
     num_static = torch.bincount(box[is_inside & ~moves], minlength=num_boxes)
@@ -53,8 +53,8 @@ def _settle(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:
 def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGroups:
     """Divide moving groups that hold several confirmed objects, such as two cars side by side.
 
-    An object claims a group if its box holds half as many points of the group as the object had, `num_points`. A group
-    with several claims is divided: points go to the box that holds them, all others to one of the claims.
+    An object claims a group if its box holds `num_points` / 2 points of it, half of those that the object had. The
+    points of a group with several claims go to the box that holds them, all others to one of the claiming objects.
     """
     moves = groups.group >= 0
     group, box, pair_of_point, count = unique_pairs(groups.group[moves], box[moves])
@@ -68,9 +68,9 @@ def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGrou
 
 
 def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> Matches:
-    """Match tracks to the groups and static points of a sweep, by the (P, 3) points of tracks and the track of each."""
+    """Match tracks with moving groups and static points, given (P, 3) points of the tracks and the track of each."""
     moves = groups.group >= 0
-    track, group = link(points, track_of_point, groups.point[moves], groups.group[moves], _MIN_SHARE)
+    track, group = link(points, track_of_point, groups.point[moves], groups.group[moves], _MIN_OVERLAP)
     may_have_stopped = tracks.is_confirmed.clone()
     may_have_stopped[track] = False
     candidate = may_have_stopped.nonzero()[:, 0]
@@ -86,10 +86,10 @@ def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: Moving
 def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
     """Match groups of two sweeps that share small voxels, one to one, then the remaining groups in larger voxels.
 
-    Points are (N, 3) float64 in metres; those of the earlier sweep are already moved to where they should be now. The
-    group of each point is (N,) int64, counted from 0. `min_share` is the smallest overlap of a match: the number of
-    common voxels over the number of voxels of either group (intersection over union). Returns the matched groups of the
-    earlier sweep, (K,) int64, and those of the current sweep, (K,) int64.
+    Points are (N, 3) float64, metres. The points of the earlier sweep are already at their predicted positions in the
+    current one. The group of each point is (N,) int64, counted from 0. `min_share` is the smallest overlap of a match:
+    the intersection over union of the voxels of both groups. Returns the matched groups of the earlier and of the
+    current sweep, (K,) int64 each.
 
     Convention: greedy, the largest overlap first. Ties: the smaller earlier group, then the smaller current one.
     Cost: for each size of voxel, four sorts of the points.
@@ -113,14 +113,18 @@ def _by_overlap(
         return []
     both = torch.cat([points0, points1])
     voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
-    x, y, z = (voxel - voxel.amin(0)).T
-    voxel = unique_pairs(unique_pairs(x, y)[2], z)[2]
-    voxel0, own0, _, _ = unique_pairs(voxel[: len(points0)], group0)
-    voxel1, own1, _, _ = unique_pairs(voxel[len(points0) :], group1)
+    voxel = torch.unique(voxel, dim=0, return_inverse=True)[1]
+    # One number, voxel * num_groups + group or earlier * num_groups + current, sorts faster than two.
+    num_groups = 1 + int(torch.cat([group0, group1]).amax()) if len(both) else 1
+    key0 = torch.unique(voxel[: len(group0)] * num_groups + group0)
+    key1 = torch.unique(voxel[len(group0) :] * num_groups + group1)
+    voxel1, voxel0 = key1 // num_groups, key0 // num_groups
     begin, end = (torch.searchsorted(voxel1, voxel0, right=right) for right in (False, True))
-    own, other = own0.repeat_interleave(end - begin), own1[concat_ranges(begin, end - begin)]
-    earlier, current, _, shared = unique_pairs(own, other)
-    share = shared / (torch.bincount(own0)[earlier] + torch.bincount(own1)[current] - shared)
+    key0, key1 = key0 % num_groups, key1 % num_groups
+    pairs = key0.repeat_interleave(end - begin) * num_groups + key1[concat_ranges(begin, end - begin)]
+    pairs, shared = torch.unique(pairs, return_counts=True)
+    earlier, current = pairs // num_groups, pairs % num_groups
+    share = shared / (torch.bincount(key0)[earlier] + torch.bincount(key1)[current] - shared)
     order = share.argsort(descending=True, stable=True)
     return torch.stack([earlier, current], 1)[order[share[order] >= min_share]].tolist()  # type: ignore[no-any-return]
 
@@ -128,7 +132,7 @@ def _by_overlap(
 def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Tensor:
     """(N,) int64 index of the first of K upright boxes that holds each of (N, 3) float64 points, -1 = none.
 
-    The (K, 3) sizes are length along the heading (K,), width and height. Cost: K * N comparisons.
+    The (K, 3) sizes are length, width, height; the length is along `heading`, (K,) radians. Cost: K * N comparisons.
     """
     offset = points[None] - centre[:, None]
     along, across = rotate(offset[..., 0], offset[..., 1], -heading[:, None])
@@ -141,7 +145,7 @@ def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) 
 def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
     """Return the centres and the sizes, (K, 3) float64 each, of upright boxes around K groups.
 
-    `group` is the group of each point, (N,), and `heading` the direction of each box, (K,). No group may be empty.
+    `group` is the group of each point, (N,), and `heading` the direction of each box, (K,) radians. No group is empty.
     """
     along, across = rotate(points[:, 0], points[:, 1], -heading[group])
     local = torch.stack([along, across, points[:, 2]], 1)
@@ -153,6 +157,6 @@ def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tenso
 
 
 def rotate(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotate x, y by `angle` radians to the left."""
+    """Rotate x, y by `angle` radians, counter-clockwise."""
     cos, sin = angle.cos(), angle.sin()
     return cos * x - sin * y, sin * x + cos * y

@@ -21,28 +21,28 @@ from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_array
 
 _MARGIN = 0.2  # metres by which a box is larger than the visible part of its object
-_SLOW = 3.0  # m/s; an object that is faster when it is first seen has not waited there
-_MAX_DISTANCE = 100.0  # metres of a box from the vehicle
-_MAX_VOXELS = 1 << 20  # of a map in each direction from its first sweep
+_SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
+_MAX_DISTANCE = 100.0  # metres from the vehicle to a box, at most
+_MAX_VOXELS = 1 << 20  # in a map, at most so many from its first sweep in each direction
 
 
 class CleanLog(Log):
     """A log without its moving points. Every command, writer and loader accepts it like any other log.
 
-    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep has no flow. There, the moving
-    objects of the sweep before are moved by their flow, and the points inside their boxes are removed.
+    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep has no flow. There, we take the
+    boxes of the objects that move in the sweep before, shift them by the flow, and remove the points inside.
 
     Args:
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
         model: the method; None = preset `offline`.
-        flow: index -> flow of that pair, in place of a model; with residual_flow, and cluster_id and is_valid for
-            `remove_stopped`.
-        remove_stopped: also remove objects that have stopped or not yet started, such as cars at a light, by their
-            tracks. This takes a pass over the log before the first sweep is returned, and 1 bit of memory per point.
+        flow: index -> flow of that pair, in place of a model. We use residual_flow and cluster_id, and with
+            `remove_stopped` also is_valid.
+        remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
+            finds them. It takes a pass over the log before the first sweep is returned, and 1 bit per point.
 
     Attributes:
         log_id, timestamps: those of the log.
-        num_stopped: points that only `remove_stopped` removes; None without it, or before the first sweep is returned.
+        num_stopped: number of points that only `remove_stopped` removes; None without it, or before the first sweep.
 
     Examples:
         >>> write_array_log(CleanLog(log), "outputs/clean")
@@ -85,7 +85,7 @@ class CleanLog(Log):
         return {name: values[is_kept] for name, values in columns.items()}
 
     def moving(self, index: int) -> np.ndarray:
-        """(N,) bool, True for the points of the log's sweep `index` that are removed.
+        """(N,) bool, True for the points of sweep `index` of the log that are removed.
 
         Raises:
             CFlowError: a sweep cannot be read, or its flow has another number of rows.
@@ -101,7 +101,7 @@ class CleanLog(Log):
         return model([sweeps])[0]  # type: ignore[no-any-return]
 
     def _moves(self, index: int) -> np.ndarray:
-        """(N,) bool, True for the points that move by their flow."""
+        """(N,) bool, True for the points that move according to their flow."""
         sweep = self._log.sweep(index)
         if index == len(self.timestamps) - 1:
             return self._reached(sweep, index)
@@ -113,7 +113,7 @@ class CleanLog(Log):
         return moves
 
     def _reached(self, sweep: Sweep, index: int) -> np.ndarray:
-        """(N,) bool, points of the last sweep in a box that a moving cluster of the sweep before has reached."""
+        """(N,) bool, points of the last sweep in the boxes to which the clusters of the sweep before have moved."""
         result, moves = self._flow(index - 1), self._moves(index - 1)
         before = _world(self._log.sweep(index - 1))[moves]
         step = as_numpy(result.residual_flow, np.float64)[moves] @ pose_of(sweep)[:3, :3].T
@@ -194,11 +194,11 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
 
 
 def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: torch.Tensor) -> np.ndarray:
-    """(N,) bool, points of a sweep that are not ground and lie in one of the boxes, which are in the world."""
+    """(N,) bool, points of a sweep that are not ground and lie in one of the boxes (world frame)."""
     is_inside = box_of_point(torch.from_numpy(_world(sweep)), centre, size + _MARGIN, heading).numpy() >= 0
     return is_inside if sweep.is_ground is None else is_inside & ~as_numpy(sweep.is_ground).astype(bool)
 
 
 def _world(sweep: Sweep) -> np.ndarray:
-    """(N, 3) float64, points in the world."""
+    """(N, 3) float64 points of a sweep, metres, in the world."""
     return transform_points(as_numpy(sweep.points)[:, :3], pose_of(sweep))

@@ -13,14 +13,14 @@ from cflow_torch.windows.validation import read_positions
 def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> Tensor:
     """Move the points of sweep t to where they were at the time stamp of that sweep.
 
-    A spinning LiDAR may meet a car twice, or its front later than its rear; the car is then torn or stretched. We move
-    each point back by the part of its flow between the time stamp and its own measurement, as if objects moved at
-    constant velocity within the sweep. The motion of the recording vehicle must have been compensated already, as our
-    readers do.
+    A spinning LiDAR may scan a car twice, or the front of a car later than its rear. The car then looks torn or
+    stretched. We assume that objects move at constant velocity within the sweep, and undo the motion of each point
+    since the time stamp. The points must already be compensated for the motion of the recording vehicle. Our readers do
+    this.
 
     Args:
         window: the sweeps of the flow; `pc0.point_times` and the poses and time stamps of pc0 and pc1 are used.
-        result: flow of its points, from a preset that uses point times (`default`, `offline`).
+        result: flow of its points, by a preset that uses point times (`default`, `offline`).
         sweep_interval: seconds from t to t+1 where the two have no time stamps.
 
     Returns:
@@ -28,8 +28,8 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
         flow keep their positions.
 
     Raises:
-        CFlowError: the sweep has no point times, the times are not in order, or the result has another number of points
-            or lacks the residual flow.
+        CFlowError: the sweep has no point times, t+1 is not after t, or the result has another number of points or
+            lacks the residual flow.
 
     Examples:
         >>> result = VerifiedFlow.from_preset("default")([window])[0]
@@ -46,7 +46,7 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
     if not interval > 0:
         raise CFlowError(f"t+1 is {interval} s after t: give time stamps in order, or a positive sweep_interval")
     flow = result.residual_flow.double().t()
-    if before.pose is not None:  # from the axes of t+1 into those of t
+    if before.pose is not None:  # from the axes of t+1 to the axes of t
         rotation = relative_transform(before.pose, after.pose)
         rotation[:3, 3] = 0
         flow = compensate(flow, rotation)

@@ -1,9 +1,9 @@
 """Write labels for self-supervised training into OpenSceneFlow's scenes: moving points, and groups of points.
 
-A group of points counts as moving if its flow is at least `MOVING` long and plausible: the sum of its confidence
-(0 ... 1) and its agreement (0 ... 1) is at least `AGREEMENT`. The agreement is the share of its points that the flow
-carries to points with a similar motion in the sweeps before and after. Motion that a single window reports by mistake
-(leaves, edges that come into view) rarely passes.
+A group moves if it has points with a flow of at least `MOVING`, and if the flow of these points is plausible: the sum
+of their confidence (0 ... 1) and their agreement (0 ... 1) is at least `AGREEMENT`. The agreement is the share of them
+for which we find a similar motion at the predicted positions in the sweeps before and after. False motion of a single
+window (leaves, edges that come into view) rarely passes.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from cflow_torch.errors import import_optional
 from cflow_torch.stages import FlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
-AGREEMENT = 1.3  # chosen on simulated drives of five sensors, seeds 100 to 103, and on KITTI 0000
-_MAX_DISTANCE = 0.5  # metres from where the flow leads to the nearest moving point
+AGREEMENT = 1.3  # we chose it on simulated drives of five sensors, seeds 100 to 103, and on KITTI 0000
+_MAX_DISTANCE = 0.5  # metres from the predicted position of a point to the nearest moving point, at most
 _SIMILAR = (0.1, 0.5)  # two motions agree if they differ by at most so many metres, or by this share of their length
 _MIN_POINTS = 20  # of a static group, as in OpenSceneFlow's own recipe
-_MAX_GROUPS = 32_767  # that an int16 can number
-_NND = (0.14, 4.4)  # metres from a point to the nearest of the next sweep: faster than 5 km/h, slower than 160
+_MAX_GROUPS = 32_767  # the largest int16
+_NND = (0.14, 4.4)  # metres from a point to the nearest one of the next sweep: 5 to 160 km/h at 10 Hz
 
 
 class DynamicPoints(NamedTuple):
-    """The M points of a sweep that move by its own flow."""
+    """The M points of a sweep that move according to its flow."""
 
     rows: np.ndarray  # (M,) int64
     positions: np.ndarray  # (M, 3) float64, metres, world
@@ -48,7 +48,7 @@ def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", o
     Args:
         file: `<scene>.h5` in OpenSceneFlow's layout.
         model: a `VerifiedFlow`; the preset `offline` is the most accurate.
-        find_ground: "grid" or "patchwork", how to find the ground of sweeps without a mask.
+        find_ground: method for the ground of sweeps without a mask, "grid" or "patchwork".
         overwrite: replace labels that the scene already has.
 
     Raises:
@@ -68,21 +68,21 @@ def find_labels(
     Args:
         log: its sweeps have ground masks and poses.
         flows: results of all pairs, in order, by the verified method.
-        model: the method that made them; it also estimates the flow of the last sweep, back to the one before.
+        model: the method that computed `flows`. It also estimates the flow from the last sweep to the one before.
         workers: threads of the nearest-neighbour searches.
 
     Yields:
         (time stamp, labels), in order. The labels of N points are:
         `ground_mask` (N,) bool.
-        `dufo` (N,) uint8, 1 = moves at least `MOVING` per sweep and is not ground.
+        `dufo` (N,) uint8, 1 = moves at least `MOVING` per sweep, in a moving group; 0 for ground.
         `cluster` (N,) int16, moving groups and groups of at least 20 points; 0 = ground or no group. Moving groups have
         the first numbers, from 1, because `seflowpp_auto` keeps numbers in 8 bits.
         `dufocluster` (N,) int16, `cluster` where `dufo` is 1, else 0.
-        `nnd` (N,) uint8, 1 = the nearest point of the next sweep is 0.14 m to 4.4 m away after ego motion, ground
-        included.
+        `nnd` (N,) uint8, 1 = the nearest point of the next sweep is 0.14 m to 4.4 m away after compensation of ego
+        motion. Ground points have it, too.
 
     Convention: the last sweep has no successor. Its flow and its `nnd` are those to the sweep before, with time
-        reversed. Groups of a sweep after the 32,767th are not numbered.
+        reversed. Groups of a sweep after the 32,767th have the number 0.
 
     Raises:
         CFlowError: results without confidence, another number of results or of points, or SciPy is not installed.
@@ -93,7 +93,7 @@ def find_labels(
     log = CachedLog(log, 3)
     dynamic: list[DynamicPoints] = []
     groups: list[np.ndarray] = []
-    neighbours = [*range(1, len(log)), len(log) - 2]  # the sweep that the flow of each sweep leads to
+    neighbours = [*range(1, len(log)), len(log) - 2]  # index of the sweep to which the flow of each sweep leads
     for index, result in enumerate(_with_last(log, flows, model)):
         sweep, other = log.sweep(index), log.sweep(neighbours[index])
         if result.confidence is None or len(result.cluster_id) != len(sweep.points):
@@ -106,7 +106,7 @@ def find_labels(
     trees = [tree(each.positions) for each in dynamic]
     for index, stamp in enumerate(log.timestamps):
         sweep = log.sweep(index)
-        is_ground = as_numpy(sweep.is_ground, bool)  # type: ignore[arg-type]  # they have masks
+        is_ground = as_numpy(sweep.is_ground, bool)  # type: ignore[arg-type]  # `find_labels` requires masks
         moves = np.zeros(len(is_ground), bool)
         moves[dynamic[index].rows[_is_confirmed(dynamic, trees, index)]] = True
         moves &= ~is_ground
@@ -126,7 +126,7 @@ def find_labels(
 def flow_back(log: Log, model: FlowModel) -> FlowResult:
     """Estimate the flow of the last sweep to the one before it, by playing the log backwards.
 
-    The sweeps further back take the place of `num_future`. The result has the axes of the sweep before the last.
+    Earlier sweeps serve as the `num_future` later ones. The flow has the axes of the sweep before the last.
     """
     last = len(log.timestamps) - 1
     first = max(last - 1 - model.config.num_future, 0)

@@ -1,4 +1,4 @@
-"""The active points of a sweep and its moving groups, in the world frame."""
+"""The valid points of a sweep and its moving groups, in the world frame."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from cflow_torch.ops.indices import unique_pairs
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
 MOVING = 0.05  # metres per sweep: least residual flow of a moving point, as in evaluation
-MIN_POINTS = 5  # of a group
+MIN_POINTS = 5  # of a group, at least
 
 
 @dataclass(frozen=True)
 class MovingGroups:
-    """The M active points of a sweep, in the world, and its G moving groups."""
+    """The M valid points of a sweep (`is_valid`), in the world, and its G moving groups."""
 
     row: Tensor  # (M,) int64 rows of the sweep
     point: Tensor  # (M, 3) float64 position, metres
@@ -29,7 +29,7 @@ class MovingGroups:
 
     @classmethod
     def of(cls, sweeps: Window, result: FlowResult) -> MovingGroups:
-        """Find the moving groups of sweep t of a window; a flow of another window is a `CFlowError`."""
+        """Find the moving groups of sweep t of a window; a flow with another number of rows is a `CFlowError`."""
         flow = result.residual_flow.double()
         points = torch.as_tensor(as_numpy(sweeps.pc0.points, np.float64)[:, :3].copy(), device=flow.device)
         if len(points) != len(flow):
@@ -52,7 +52,7 @@ class MovingGroups:
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
     def divide(self, piece: Tensor) -> MovingGroups:
-        """Divide the groups by the piece of each point, (M,) int64; pieces keep cluster and confidence, -1 = static."""
+        """Divide each group by the (M,) int64 piece of its points, -1 = static. Pieces keep cluster and confidence."""
         moves = (self.group >= 0) & (piece >= 0)
         origin, _, index, count = unique_pairs(self.group[moves], piece[moves])
         group = torch.full_like(self.group, -1).masked_scatter(moves, index)
@@ -60,7 +60,7 @@ class MovingGroups:
         return replace(self, group=group, cluster=self.cluster[origin], count=count, confidence=confidence)
 
     def mean(self, values: Tensor) -> Tensor:
-        """(G, C) means over the groups, of values (M, C) per point."""
+        """Return the (G, C) means of the (M, C) values of points over each group."""
         moves = self.group >= 0
         total = values.new_zeros(len(self.count), values.shape[1]).index_add_(0, self.group[moves], values[moves])
         return total / self.count[:, None]

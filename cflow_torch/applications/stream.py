@@ -23,8 +23,8 @@ _log = logging.getLogger(__name__)
 class FlowStream:
     """Push sweeps one after the other; get the flow of a sweep as soon as the next one arrives.
 
-    A stream keeps the last `num_history` + 2 sweeps on the device of the method, and nothing else. A result is equal,
-    bit for bit, to that of `make_model(config)([window])` with these sweeps.
+    A stream keeps the last `num_history` + 2 sweeps on the device of the method, and the map of KISS-ICP if it
+    estimates poses. A result is equal, bit for bit, to that of `make_model(config)([window])` with these sweeps.
 
     Args:
         preset: "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
@@ -146,7 +146,7 @@ class FlowStream:
         return True
 
     def _prepare(self, sweep: Sweep) -> Sweep:
-        """Copy a sweep to the device, with ground and pose."""
+        """Check a sweep, copy it to the device, and add the ground and the pose that are missing."""
         check_windows([Window(sweep, sweep)], self.config)
         for newest in list(self._sweeps)[:1]:
             poses = (None if self._odometry else newest.pose, sweep.pose)

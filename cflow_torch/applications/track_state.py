@@ -10,13 +10,13 @@ from torch import Tensor
 
 # A track is confirmed by the motion that it has shown, because most short-lived groups are noise of the static world.
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
-_NO_CONFIDENCE = 0.7  # log-odds of a method without confidence
-_THIN = 0.12  # metres; we do not trust narrower boxes: posts, and slices of fronts along which a shadow moves
-_MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # metres, and share of the length of its box: least net displacement
+_NO_CONFIDENCE = 0.7  # log-odds per sweep if the method has no confidence
+_THIN = 0.12  # metres; narrower boxes add no evidence: posts, and strips of a façade that an occlusion uncovers
+_MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # least net displacement: metres, plus a share of its length
 _TRAVEL_FACTOR = 2.0  # largest factor between the net displacement of its box and that of its flow
 # Without that evidence, its box has to move farther, and more exactly as its flow predicts.
-_LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres, and at least its length; share of it; sweeps
-_JUMP, _SMALL = 1.5, 1.5  # factor of its length, plus metres, from which a box shows another part of its object
+_LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres (or its length, if that is longer); relative; sweeps
+_JUMP, _SMALL = 1.5, 1.5  # if length + _SMALL (metres) changes by the factor _JUMP, the box shows another part
 
 
 _NUMBER, _FLAG = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
@@ -39,11 +39,11 @@ class Tracks(NamedTuple):
     size: Tensor = _VECTOR  # (K, 3) length, width, height of the box
     heading: Tensor = _SCALAR  # (K,) radians, of the box
     begin: Tensor = _SCALAR  # (K,) seconds, time of the first sweep
-    start: Tensor = _VECTOR  # (K, 3) centre of the box in the first sweep
-    start_length: Tensor = _SCALAR  # (K,) length of the box in the first sweep
-    travel: Tensor = _VECTOR  # (K, 3) metres, sum of the flow since then
+    start: Tensor = _VECTOR  # (K, 3) centre of the box where we began to measure `travel`
+    start_length: Tensor = _SCALAR  # (K,) length of that box
+    travel: Tensor = _VECTOR  # (K, 3) metres, sum of the flow since `start`
     confidence: Tensor = _SCALAR  # (K,) of the flow when it last moved
-    evidence: Tensor = _SCALAR  # (K,) sum of the log-odds of the confidence
+    evidence: Tensor = _SCALAR  # (K,) sum of the log-odds of the confidence since `start`
     num_points: Tensor = _NUMBER  # (K,) int64
     num_moving: Tensor = _NUMBER  # (K,) int64 sweeps in which it moved
     missed: Tensor = _NUMBER  # (K,) int64 sweeps since it was last seen
@@ -52,7 +52,7 @@ class Tracks(NamedTuple):
     is_confirmed: Tensor = _FLAG  # (K,) bool
 
     def map(self, function: Callable[[Tensor], Any]) -> Tracks:
-        """The tracks with a function applied to each tensor."""
+        """Apply a function to each tensor."""
         return Tracks(*map(function, self))
 
     def take(self, index: Tensor) -> Tracks:
@@ -74,7 +74,7 @@ class Tracks(NamedTuple):
             getattr(self, name)[index] = values
 
     def predict(self, seconds: float, acceleration: float) -> Tracks:
-        """The tracks after `seconds`, if each has a constant random acceleration of this standard deviation, m/s²."""
+        """Predict position and covariance after `seconds`; `acceleration` is the standard deviation of noise, m/s²."""
         transition = self.covariance.new_tensor([[1.0, seconds], [0.0, 1.0]])
         push = self.covariance.new_tensor([seconds**2 / 2, seconds]) * acceleration
         covariance = transition @ self.covariance @ transition.T + torch.outer(push, push)
@@ -94,8 +94,8 @@ class Tracks(NamedTuple):
     def start_again(self, index: Tensor, length: Tensor) -> None:
         """Restart the evidence of motion of the indexed tracks whose box is now much longer or shorter.
 
-        `length` (K,) is that of the sweep before. The centre of the box has jumped, because another part of the object
-        has become visible, or the object was merged with another one.
+        `length` (K,) is that of their boxes in the sweep before. The centre of such a box has jumped, because another
+        part of the object has become visible, or the object was merged with another one.
         """
         ratio = (self.size[index, 0] + _SMALL) / (length + _SMALL)
         index = index[(ratio > _JUMP) | (ratio < 1 / _JUMP)]
@@ -104,8 +104,8 @@ class Tracks(NamedTuple):
     def have_shown_motion(self) -> Tensor:
         """(K,) bool: the track moves, and its box has moved about as its flow predicts.
 
-        If `evidence` is high, both ends of the box must have moved at least a little: a piece of a wall has flow, too,
-        but its box grows, shrinks or jumps. Otherwise, the box must have moved far, and very nearly as predicted.
+        If `evidence` is high, both ends of the box must have moved at least a little: a piece of a wall may have flow,
+        but its box then grows, shrinks or jumps. Otherwise, the box must have moved far, and very nearly as predicted.
         """
         predicted, length = self.travel.norm(dim=1), self.size[:, 0]
         moved = self.box - self.start

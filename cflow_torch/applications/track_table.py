@@ -36,7 +36,7 @@ def join_tables(tables: Sequence[Table]) -> Table:
 
 
 def confirmed(table: Table) -> Table:
-    """Keep all rows of tracks that are confirmed at some time, including the rows before."""
+    """Keep all rows of tracks that are confirmed at any time, including the rows before that."""
     is_kept = np.isin(table["id"], table["id"][table["is_confirmed"]])
     return {name: values[is_kept] for name, values in table.items()}
 
@@ -48,7 +48,7 @@ def write_tracks(path: PathLike, table: Table) -> None:
 
 
 def read_tracks(path: PathLike) -> Table:
-    """Read a table that `write_tracks` wrote; a missing or another file is a `CFlowError`."""
+    """Read a table that `write_tracks` wrote; a missing file, or one without its columns, is a `CFlowError`."""
     path = as_path(path)
     hint = "give a table that `cflow flow tracks=true` wrote"
     with file_errors(path, hint):

@@ -27,7 +27,7 @@ class Tracked(NamedTuple):
 
     Args:
         table: a row for each track that is seen in the sweep; `track` describes the columns.
-        track_id: (N,) int64 for every point of the sweep, -1 = of no track.
+        track_id: (N,) int64 for every point of the sweep, -1 = no track.
     """
 
     table: dict[str, np.ndarray]
@@ -37,9 +37,9 @@ class Tracked(NamedTuple):
 class Tracker:
     """Track moving objects sweep by sweep.
 
-    The flow moves the points of a group to the next sweep. The group there that shares most voxels with them is the
-    same object. An object that stops is tracked as long as there are points in its box. An object that is not seen for
-    up to three sweeps is expected where its velocity takes it. Memory: the points of the current tracks.
+    The flow moves the points of a group to the next sweep. The group of that sweep that shares most voxels with them is
+    the same object. We track a stopped object as long as there are points in its box. If an object is not seen for up
+    to three sweeps, we predict its position from its velocity. Memory: the points of the current tracks.
 
     Args:
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
@@ -57,7 +57,7 @@ class Tracker:
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
         self._num_sweeps, self._num_tracks = 0, 0
         self._tracks = Tracks()
-        # Points of the tracks, where the next sweep should have them, and the track of each.
+        # Points of the tracks at their predicted positions in the next sweep, and the track of each point.
         self._points, self._track_index = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
 
     def push(self, sweeps: Window | tuple[Sweep, Sweep], result: FlowResult) -> Tracked:
@@ -71,8 +71,8 @@ class Tracker:
             The tracks at t. Tracks that are not (yet) `is_confirmed` are mostly noise of the static world.
 
         Raises:
-            CFlowError: the sweep is not later than the one before, or the result belongs to another sweep or lacks a
-                field.
+            CFlowError: the sweep is not later than the one before, or the result has another number of rows or lacks
+                a field.
         """
         sweeps = sweeps if isinstance(sweeps, Window) else Window(*sweeps)
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
@@ -82,7 +82,7 @@ class Tracker:
         device = groups.point.device
         tracks = self._tracks.map(lambda values: values.to(device))
         points, track_index = self._points.to(device), self._track_index.to(device)
-        # Boxes and points are already where the last flow brings them. If the sweep is late, they move on by velocity.
+        # The last flow has already moved boxes and points. If the sweep is late, their velocity moves them further.
         points = points + late * tracks.velocity[track_index]
         tracks = tracks._replace(box=tracks.box + late * tracks.velocity).predict(elapsed, _ACCELERATION)
         groups = regroup(groups, tracks)
@@ -117,9 +117,9 @@ class Tracker:
         return Tracked(table, track_id.cpu().numpy())
 
     def _times(self, sweeps: Window) -> tuple[float, float, float, float]:
-        """Time of sweep t, and seconds from t to t+1, from the sweep before to t, and from the end of its flow to t.
+        """Return the time of t, and three durations: t to t+1, last sweep to t, and end of the last flow to t; seconds.
 
-        The last is more than 0 if a sweep is missing.
+        The last duration is more than 0 if a sweep is missing.
         """
         begin, end = sweeps.pc0.timestamp_ns, sweeps.pc1.timestamp_ns
         last, due = self._clock or (None, 0.0)
@@ -143,15 +143,15 @@ class Tracker:
         velocity = tracks.velocity[matches.track]
         is_fast = velocity[:, :2].norm(dim=1) >= MOVING / interval
         heading = torch.atan2(flow[:, 1], flow[:, 0])
-        of_track = torch.atan2(velocity[:, 1], velocity[:, 0])
-        heading[matches.group] = torch.where(is_fast, of_track, heading[matches.group])
+        track_heading = torch.atan2(velocity[:, 1], velocity[:, 0])
+        heading[matches.group] = torch.where(is_fast, track_heading, heading[matches.group])
         moves = groups.group >= 0
         box, size = boxes(groups.point[moves], groups.group[moves], heading)
         noise = box.new_tensor([_BOX_NOISE, _FLOW_NOISE / interval])
 
         is_new = torch.ones_like(groups.count, dtype=torch.bool)
         is_new[matches.group] = False
-        number = is_new.cumsum(0) - 1  # of each new track
+        number = is_new.cumsum(0) - 1  # of a new track among the new ones
         track_of_group = len(tracks.id) + number
         track_of_group[matches.group] = matches.track
         new = track_of_group[is_new]
@@ -207,7 +207,7 @@ def track(
     """Track the moving objects of a drive, each with one id.
 
     Args:
-        log: the drive. Without poses, all sweeps are taken to lie in one frame, which is then the world.
+        log: the drive. Without poses, we assume that all sweeps are in one frame, the world.
         results: (index, flow of sweep `index` to `index + 1`), ascending; sweeps without a result are bridged. None =
             estimate the flow with the preset `default`.
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
@@ -217,17 +217,17 @@ def track(
         is seen, sorted by sweep, then id. The columns are:
         `sweep`, `timestamp_ns`, `id`;
         x, y, z: filtered centre of the box, metres in the world; vx, vy, vz: filtered velocity over ground, m/s;
-        `velocity_std`: m/s, standard deviation of each of the three, if errors are independent;
+        `velocity_std`: m/s, standard deviation of each of vx, vy and vz, if errors are independent;
         length (along the heading), width, height: metres, of the visible part of the object;
         `heading`: radians in the world from +x to the left;
         `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved;
-        `is_moving`: False = it has moved, and is static now;
+        `is_moving`: False = the track moved before, and is static now;
         `cluster_id`: of this sweep's flow, -1 while it is static; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;
         `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must
-        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. Otherwise the box
-        must have moved by the larger of 1.5 m and its length, and by its summed flow ± 25 %. Tracks that are never
-        confirmed are left out.
+        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. Otherwise, its
+        flow in at least three sweeps must add up to 1.5 m and to its length, and the box must have moved by this sum
+        ± 25 %. Tracks that are never confirmed are left out.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
