@@ -74,7 +74,7 @@ class Tracks(NamedTuple):
             getattr(self, name)[index] = values
 
     def predict(self, seconds: float, acceleration: float) -> Tracks:
-        """Predict position and covariance after `seconds`; `acceleration` is the standard deviation of noise, m/s²."""
+        """Predict position and covariance after `seconds`; `acceleration`, m/s², is the process noise."""
         transition = self.covariance.new_tensor([[1.0, seconds], [0.0, 1.0]])
         push = self.covariance.new_tensor([seconds**2 / 2, seconds]) * acceleration
         covariance = transition @ self.covariance @ transition.T + torch.outer(push, push)

@@ -17,7 +17,7 @@ from cflow_torch.evaluation.scored_points import Accumulator, ScoredPoints
 
 _MEANS = ("static_epe", "dynamic_error")
 _RANGE_EDGES = (0.0, 35.0, 50.0, 75.0, 100.0, np.inf)  # metres, of the range-wise error
-_RANGE_DYNAMIC_SPEED = 1.4  # m/s, from which a point is dynamic in the range-wise error
+_RANGE_DYNAMIC_SPEED = 1.4  # m/s, least speed of a dynamic point in the range-wise error
 
 
 def mean_of_present(values: np.ndarray) -> float:
@@ -77,7 +77,7 @@ class BucketedByRange(Accumulator):
         """Return "ranges", "mean" and "speed_edges".
 
         "ranges" has a dictionary for each range ("0-35", ...), with "classes" and "mean" as in `BucketedEPE`. "mean"
-        is the mean of `static_epe` and `dynamic_error` over the ranges. It is NaN if a range has no points to score.
+        has the means of `static_epe` and of `dynamic_error` over the ranges, NaN if a range has no points to score.
         """
         names = range_names(self.definition.region_edges)
         ranges = {name: bucket_scores(*sums) for name, *sums in zip(names, self.count, *self.sums)}
@@ -101,7 +101,7 @@ class BucketedEPE(BucketedByRange):
         """Return "classes", "mean" and "speed_edges" (metres per frame).
 
         Each class has `static_epe` (metres), `dynamic_error` (ratio), `num_static` and `num_dynamic` (points), and
-        "buckets", each with `count`, `epe`, `speed` and `normalized`. "mean" averages the first two over classes.
+        "buckets", each with `count`, `epe`, `speed` and `normalized`. "mean" has the first two, averaged over classes.
         """
         return {**bucket_scores(self.count[0], *self.sums[:, 0]), "speed_edges": list(self.definition.speed_edges)}
 
@@ -117,7 +117,7 @@ class RangeWiseEPE(Accumulator):
         super().__init__(definition, (len(_RANGE_EDGES) - 1, 2), num_quantities=1)
 
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
-        """Cells are range and motion; the quantity is the error."""
+        """Return the cell (range, motion) of each scored point, and one quantity: the error."""
         ring = interval_of(scored.distance, _RANGE_EDGES)
         # We multiply by the rate, as OpenSceneFlow does: a division rounds differently at the threshold.
         dynamic = scored.speed * (1.0 / self.definition.sweep_interval) >= _RANGE_DYNAMIC_SPEED

@@ -20,8 +20,8 @@ class Definition:
     Args:
         name: label of the results.
         metrics: which of `METRICS` are computed.
-        ego_motion: ego motion that is removed from the flow. "points": that of the frame of the points. "stored": that
-            of the stored poses, even where they belong to another frame (OpenSceneFlow's Argoverse 2 scenes).
+        ego_motion: ego motion that is removed from the flow. "points": motion of the frame of the points. "stored":
+            motion of the stored poses, even where they belong to another frame (OpenSceneFlow's Argoverse 2 scenes).
         region: how ranges are measured, "box" by max(|x|, |y|), "disc" by sqrt(x^2 + y^2).
         max_range: metres, outer bound of the region whose points "bucketed" and "three_way" score; inf = all points.
         closed: whether a point at exactly `max_range` is scored (<= or <). The same holds for the upper edge of each
@@ -35,14 +35,14 @@ class Definition:
         three_way_flow: flow that the three-way scores compare. It affects accuracy and angle, not the end-point error.
         half_precision: round truth and prediction of the three-way scores to float16 (the files of the 2023 challenge).
         foreground: "all": every category but background; "meta": only the four meta classes, others are ignored.
-        background: "static": background points of any true speed are in bucket 0; "bucketed": in that of their speed.
+        background: "static": all background points are in bucket 0; "bucketed": each is in the bucket of its speed.
         average: average of the three-way end-point errors and IoU. "points": over all points of all frames, NaN where
             there are none. "frames": over frames, where a frame without points of a set counts as 0.
         nan_rows: "drop": a point with NaN in position, truth or prediction is not scored, which flatters a method that
             returns NaN (`num_nan` counts them). "error": such a point is an error.
         norm_dtype: precision in which lengths of residuals are computed.
         dynamic_threshold: metres per frame; true or predicted residual from which a point is dynamic (three-way).
-        speed_edges: metres per frame, ascending edges of the speed buckets, lower one included; the first is "static".
+        speed_edges: metres per frame, ascending edges of the buckets; the first is "static". Lower edges are included.
         sweep_interval: seconds between the sweeps of a pair (angle error, range-wise speed).
 
     Raises:
@@ -124,7 +124,7 @@ DEFINITIONS: Dict[str, Definition] = {
 def interval_of(values: np.ndarray, edges: Sequence[float], closed: bool = False) -> np.ndarray:
     """Return (M,) int64, the interval between ascending edges that each of (M,) values lies in; -1 = outside all.
 
-    An interval contains its lower edge; if `closed`, its upper edge, and the first interval also 0.
+    An interval contains its lower edge. If `closed`, it contains its upper edge instead; the first one also contains 0.
     """
     index = np.searchsorted(np.asarray(edges), values, side="left" if closed else "right") - 1
     if closed and edges[0] == 0:

@@ -15,7 +15,7 @@ from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy, p
 
 
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
-    """Compute the flow of a static world, T p - p, (N, 3) float32 metres in the axes of ego1, of (N, 3) points of t.
+    """Compute the flow of static (N, 3) points of t, T p - p: (N, 3) float32, metres, axes of ego1.
 
     It is computed in float64 and rounded once, because the difference of two float32 positions at 100 m has 1e-5 m of
     noise.

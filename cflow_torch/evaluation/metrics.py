@@ -42,7 +42,7 @@ class SceneFlowMetrics:
         self.counts = Counter(num_frames=0, num_points=0, num_nan=0)
 
     def update(self, frame: EvalFrame) -> None:
-        """Add one frame; a `CFlowError` as in `score_points`."""
+        """Add one frame; NaN that the definition forbids, or a missing T_ego1_ego0, is a `CFlowError`."""
         scored = score_points(frame, self.definition)
         for metric in self.parts.values():
             metric.update_points(scored)
@@ -85,7 +85,7 @@ def errors_by_range(results: Mapping[str, Any]) -> dict[str, float]:
     """Return the dynamic bucket-normalised error of each range ("0-35", ...), a mean over classes.
 
     It is NaN if the range has no dynamic points. `results` are those of `SceneFlowMetrics.compute` or of results.json.
-    If they lack the metric "bucketed_by_range", that is a `CFlowError`.
+    Results without the metric "bucketed_by_range" are a `CFlowError`.
     """
     if "bucketed_by_range" not in results:
         raise CFlowError("the results have no 'bucketed_by_range': use definition='challenge_2026'")

@@ -28,14 +28,14 @@ class ScoredPoints(NamedTuple):
     true_flow: np.ndarray  # (M, 3) float64, metres, true flow that the three-way scores compare
     predicted_flow: np.ndarray  # (M, 3) float64, metres, predicted flow that the three-way scores compare
     is_dynamic: np.ndarray  # (M,) bool, whether the true residual reaches the dynamic threshold
-    predicted_dynamic: np.ndarray  # (M,) bool, whether the predicted residual does
+    predicted_dynamic: np.ndarray  # (M,) bool, whether the predicted residual reaches it
     num_nan: int  # number of points that are ignored because of NaN
 
 
 class Accumulator:
     """Counts points and sums their quantities per cell; frames come in any order.
 
-    `count` is the int64 number of points of each cell, and `sums` has a float64 array of its shape per quantity.
+    `count` is the int64 number of points of each cell. `sums` has a float64 array of the same shape per quantity.
     """
 
     def __init__(self, definition: Definition, shape: Sequence[int], num_quantities: int = 2) -> None:
@@ -74,7 +74,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
 
     Rounding follows the evaluator that the definition is named after. Totals and residuals are float32. Like the
     harnesses, we add the pose flow to a predicted residual and subtract it again. Lengths are computed in `norm_dtype`.
-    Rows without a valid label are never read.
+    Rows without a valid label have no effect.
     """
     points, true_total = as_numpy(frame.points), frame.labels.flow
     pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]
@@ -97,7 +97,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     if definition.residual_axes == "t":
         T = frame.transform()
         residual, true_residual = _residual_at_t(points, total, T), _residual_at_t(points, true_total, T)
-        if frame.residual_flow is not None:  # a residual that was given needs a rotation only
+        if frame.residual_flow is not None:  # a residual that the frame already has needs only a rotation
             given = as_numpy(frame.residual_flow)[keep]
             residual = given if frame.residual_axes == "t" else (given @ T[:3, :3]).astype(np.float32)
     is_total = definition.three_way_flow == "total"

@@ -15,7 +15,7 @@ DISTANCES = ("close", "far")
 QUANTITIES = ("epe", "accuracy_strict", "accuracy_relax", "angle_error")
 ACCURACY_STRICT, ACCURACY_RELAX = 0.05, 0.1  # metres, and fraction of the true flow
 ACCURACY_EPS = 1e-10  # metres, keeps the fraction finite
-FRAME_COUNT_EPS, FRAME_IOU_EPS = 1e-8, 1e-6  # of OpenSceneFlow's per-frame values
+FRAME_COUNT_EPS, FRAME_IOU_EPS = 1e-8, 1e-6  # OpenSceneFlow adds them to the denominators of per-frame values
 
 # The three sets of the score as (categories, motion).
 _FOREGROUND = slice(1, None)
@@ -24,10 +24,10 @@ _GROUPS: dict[str, Any] = {"background": slice(0, 1), "foreground": _FOREGROUND}
 
 
 def point_quantities(predicted: np.ndarray, true: np.ndarray, sweep_interval: float) -> np.ndarray:
-    """Compute the error measures of each point, (4, M) float64, of (M, 3) float64 metres per frame.
+    """Compute the (4, M) float64 error measures of points from (M, 3) float64 flows, metres per frame.
 
-    The rows are `QUANTITIES`: end-point error in metres; 1 where the error or error / true length is below 0.05; the
-    same below 0.1; angle in radians between space-time vectors whose fourth component is `sweep_interval`, seconds.
+    The rows are `QUANTITIES`: end-point error in metres; 1 where the error in metres or error / true length is below
+    0.05, else 0; the same for 0.1; angle in radians between (x, y, z, `sweep_interval`) of both flows.
     """
     error = np.linalg.norm(predicted - true, axis=1)
     share = error / (np.linalg.norm(true, axis=1) + ACCURACY_EPS)

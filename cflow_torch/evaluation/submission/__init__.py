@@ -1,1 +1,1 @@
-"""Archives for the public leaderboards, versions 1 and 3: written, packed and checked."""
+"""Write, pack and check archives for the public leaderboards, versions 1 and 3."""

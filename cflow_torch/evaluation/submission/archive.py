@@ -1,6 +1,6 @@
-"""Submission formats, versions 1 and 3: how a flow becomes a file, and how files are written, packed and checked.
+"""Submission formats, versions 1 and 3: encode a flow as a file, and write, pack and check files.
 
-Files are written whole or not at all, and packed into the same bytes every time.
+Files are written whole or not at all. The same files give the same archive, byte by byte.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ def get_version(number: Any) -> SubmissionVersion:
 def encode(
     version: SubmissionVersion, result: FlowResult, is_ground: Array | None = None, mask: np.ndarray | None = None
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Convert the flow of one frame to the columns of its file; also return (M,) float64, metres, the rounding errors.
+    """Convert the flow of one frame to the columns of its file, and return them and the rounding errors, (M,) metres.
 
     Args:
         version: the format.
         result: flow of the N points of sweep t; values that are NaN, infinite or beyond float16 are a `CFlowError`.
         is_ground: (N,) bool, True = ground; None = no point is ground.
-        mask: (N,) bool, the points to write of a version with a mask; None for the others.
+        mask: (N,) bool, the points to write if the version has a mask; None for other versions.
 
     Convention:
         The flow is float16 metres until the next sweep. A residual flow is in the axes of t+1, as OpenSceneFlow writes
@@ -91,7 +91,7 @@ def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]
 
 
 def is_complete(folder: str | Path, name: str, rows: int, version: SubmissionVersion) -> bool:
-    """Check that the file of a frame exists already, has this number of rows, and passes every other check."""
+    """Check that the file of a frame exists, has this number of rows, and passes all other checks."""
     return not _check_file(name, partial(read_bytes, Path(folder) / name), rows, version)
 
 
@@ -110,7 +110,7 @@ def pack(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
 
 
 def check_submission(path: str | Path, version: SubmissionVersion, expected: Mapping[str, int]) -> list[str]:
-    """Compare an archive with what it must contain: all problems, one line each. Nothing is extracted.
+    """Check an archive and return all problems, one line each. Nothing is extracted.
 
     Args:
         path: a zip, or the folder that it is made from. Hidden files of a folder are skipped, because an interrupted

@@ -48,7 +48,7 @@ class MaskArchive:
 
 
 def log_mask(log: Log, index: int) -> np.ndarray | None:
-    """Read the (N,) bool evaluation mask that a log stores (method `eval_mask`); None where it has none."""
+    """Read the (N,) bool evaluation mask that a log stores (method `eval_mask`); None if it has none."""
     read = getattr(log, "eval_mask", None)
     return None if read is None else read(index)
 
@@ -79,7 +79,7 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """Return the path of the file of the frame inside the archive."""
+        """Return the path of the frame's file inside the archive."""
         return f"{self.log.log_id}/{self.log.timestamps[self.index]}.feather"
 
     def count_rows(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> int:
