@@ -100,7 +100,7 @@ def save_animation(figures: Iterable[Figure], path: str | Path, *, frames_per_se
 
 
 def _of_one_size(figures: Iterable[Figure]) -> Iterator[Figure]:
-    """Yield the figures, each with a canvas, after their sizes are checked."""
+    """Give each figure a canvas, check that all have one size in pixels, and yield them."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     first = None
@@ -142,7 +142,7 @@ def _write_mp4(path: Path, figures: Iterator[Figure], frames_per_second: float) 
     imageio_ffmpeg = import_optional("imageio_ffmpeg", need)
     first = next(figures)
     options = "-pix_fmt yuv420p -crf 18 -movflags +faststart -f mp4"
-    rate: Any = frames_per_second  # not only int
+    rate: Any = frames_per_second  # matplotlib declares it as an int
     writer = FFMpegWriter(rate, "h264", extra_args=options.split())
     program = rc_context({"animation.ffmpeg_path": imageio_ffmpeg.get_ffmpeg_exe()})
     try:

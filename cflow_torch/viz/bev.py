@@ -15,7 +15,7 @@ from cflow_torch.viz.panel import MOVING, dot_area, draw_error, draw_flow, draw_
 from cflow_torch.viz.style import Figure
 
 _OUTLIERS = 0.2  # per cent of the points on each side that the view may leave out
-_HEIGHTS = (2, 98)  # per cent of the points, ends of the colours
+_HEIGHTS = (2, 98)  # percentiles of height, ends of the colour map
 
 
 def plot_flow(
@@ -124,7 +124,7 @@ def save_picture(figure: Figure, path: str | Path) -> Path:
 def split_sweep(
     points: Array, is_ground: Array | None, point_cloud_range: Sequence[float] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The view as in `view_of`, positions (N, 3) float64, and (N,) bool each: ground in view, other points in view."""
+    """Return the view as in `view_of`, (N, 3) float64 positions, and (N,) masks of ground and other points in view."""
     position = point_rows("points", points)
     ground = np.zeros(len(position), bool) if is_ground is None else as_numpy(is_ground).astype(bool)
     if ground.shape != (len(position),):
@@ -134,7 +134,7 @@ def split_sweep(
 
 
 def view_of(position: np.ndarray, point_cloud_range: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """The view, (2, 3) low and high corner, and (N,) bool, the points inside the range."""
+    """Return the view, (2, 3) low and high corner in metres, and the (N,) bool mask of points inside the range."""
     default = DenseConfig().point_cloud_range
     bounds = np.asarray(default if point_cloud_range is None else point_cloud_range, np.float64)
     if bounds.shape != (6,) or not (bounds[:3] < bounds[3:]).all():

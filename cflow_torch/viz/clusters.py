@@ -48,19 +48,19 @@ def plot_clusters(
         raise CFlowError(f"cluster_id has shape {cluster.shape}, {cluster.dtype}: give ({len(position)},) integers")
 
     floor, position, cluster = position[is_floor], position[rest], cluster[rest]
-    has_one = cluster >= 0
-    _, number, size = np.unique(cluster[has_one], return_inverse=True, return_counts=True)
+    has_cluster = cluster >= 0
+    _, number, size = np.unique(cluster[has_cluster], return_inverse=True, return_counts=True)
 
     figure, (axes,) = new_figure(("",), view, title, _CAPTION)
     draw_ground(axes, floor)
-    alone, members = position[~has_one], position[has_one]
+    alone, members = position[~has_cluster], position[has_cluster]
     axes.scatter(alone[:, 0], alone[:, 1], s=dot_area(axes), color=style.STATIC, linewidths=0, zorder=2)
     order = np.argsort(-size[number], kind="stable")  # small ones on top
     color = cluster_colors(members, number, (0, 0, 0))[order] / 255
     axes.scatter(members[order, 0], members[order, 1], s=3 * dot_area(axes), c=color, linewidths=0, zorder=3)
     style.draw_scale(axes)
     draw_ego(axes)
-    _draw_sizes(axes, position, has_one, size)
+    _draw_sizes(axes, position, has_cluster, size)
     return figure
 
 
@@ -74,12 +74,12 @@ def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Seq
     Cost: quadratic in the number of clusters, about 0.1 s for a thousand.
     """
     colors = np.tile(np.array(no_cluster, np.uint8), (len(cluster_id), 1))
-    has_one = cluster_id >= 0
-    _, group, size = np.unique(cluster_id[has_one], return_inverse=True, return_counts=True)
+    has_cluster = cluster_id >= 0
+    _, group, size = np.unique(cluster_id[has_cluster], return_inverse=True, return_counts=True)
     low, high = np.full((len(size), 2), np.inf), np.full((len(size), 2), -np.inf)
-    np.minimum.at(low, group, position[has_one, :2])
-    np.maximum.at(high, group, position[has_one, :2])
-    distance = np.full((len(size), len(PALETTE)), np.inf)  # from each cluster to the nearest one of each colour
+    np.minimum.at(low, group, position[has_cluster, :2])
+    np.maximum.at(high, group, position[has_cluster, :2])
+    distance = np.full((len(size), len(PALETTE)), np.inf)  # from each cluster to the nearest cluster of each colour
     color_of, uses = np.zeros(len(size), np.int64), np.zeros(len(PALETTE), np.int64)
     for cluster in np.argsort(-size, kind="stable"):
         color = np.lexsort((uses, -distance[cluster]))[0]
@@ -87,13 +87,13 @@ def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Seq
         uses[color] += 1
         gap = np.maximum(low - high[cluster], low[cluster] - high).max(axis=1).clip(min=0)
         distance[:, color] = np.minimum(distance[:, color], gap)
-    colors[has_one] = PALETTE[color_of[group]]
+    colors[has_cluster] = PALETTE[color_of[group]]
     return colors
 
 
-def _draw_sizes(axes: Axes, position: np.ndarray, has_one: np.ndarray, size: np.ndarray) -> None:
+def _draw_sizes(axes: Axes, position: np.ndarray, has_cluster: np.ndarray, size: np.ndarray) -> None:
     """Draw a small table in a corner: the number of clusters by size."""
-    box = style.legend_box(axes, position, has_one, (2.3, 1.5))
+    box = style.legend_box(axes, position, has_cluster, (2.3, 1.5))
     bounds = (1, 10, 100, 1000, np.inf)
     words = ("under 10", "10 to 99", "100 to 999", "1000 or more")
     counts, _ = np.histogram(size, bounds)

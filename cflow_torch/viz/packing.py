@@ -1,6 +1,6 @@
 """Points, colours, arrows and boxes of a drive, thinned and packed for a page.
 
-Each colouring of a page has a palette, and a point has one byte, the entry of its colour.
+Each colouring of a page has a palette. A point has one byte per colouring: the index of its colour in the palette.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from cflow_torch.viz.wheel import flow_to_rgb
 
 _UNIT = 0.01  # metres; 16 bits reach to 327 m
 _REACH = 32000 * _UNIT
-_SORT = 2.0  # metres; points of a cell are stored together, which compresses better
-_FLOOR_RADIUS = 15.0  # metres; the ground near the vehicle has the height of the rings
-STATIC, GROUND, UNKNOWN, FIRST = 0, 1, 2, 3  # greys, which the page chooses; the colours of a palette begin at FIRST
-_HUES, _LEVELS = 36, 6  # the wheel in the page; one more level is for flow longer than max_flow
-_PALEST = 0.35  # saturation of slow motion, which would be white on a light page
-_FADED, _GREY = 0.15, 140  # static objects: share of their colour, the rest is this grey, which both themes show
+_SORT = 2.0  # metres, side of a cell; we store the points of a cell together, which compresses better
+_FLOOR_RADIUS = 15.0  # metres; the range rings lie at the height of the ground this near the vehicle
+STATIC, GROUND, UNKNOWN, FIRST = 0, 1, 2, 3  # indices of greys that the page chooses; a palette begins at FIRST
+_HUES, _LEVELS = 36, 6  # of the colour wheel; one more level is for flow longer than max_flow
+_PALEST = 0.35  # least saturation, so that slow motion is visible on a light page
+_FADED, _GREY = 0.15, 140  # static objects: share of their colour; the rest is this grey, visible in both themes
 _STEPS = 64  # colours of a ramp
 _RAMP = np.array([(66, 125, 245), (38, 190, 205), (112, 205, 80), (250, 200, 40), (235, 60, 45)], float)
 
@@ -32,8 +32,8 @@ _RAMP = np.array([(66, 125, 245), (38, 190, 205), (112, 205, 80), (250, 200, 40)
 class PackedDrive:
     """Thinned scenes of one drive, with the colours of points as indices into palettes.
 
-    A flow of `max_flow`, metres per sweep, has full colour. We keep one static point in each cube of `voxel` metres, on
-    the ground of twice that side.
+    A flow of `max_flow`, metres per sweep, has full colour. We keep one static point in each voxel of side `voxel`,
+    metres; voxels on the ground have twice that side.
     """
 
     def __init__(self, max_flow: float, voxel: float) -> None:
@@ -43,7 +43,7 @@ class PackedDrive:
         self.max_flow, self.voxel = max_flow, voxel
         self.frame = ViewerFrame()
         self.frames: list[dict[str, Any]] = []
-        self.points: list[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]] = []  # units, entries, cluster
+        self.points: list[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]] = []  # units, colours, cluster
         self.num_given = 0
         self.floor: list[float] = []
 
@@ -136,7 +136,7 @@ class PackedDrive:
         }
 
     def _thin(self, position: np.ndarray, important: np.ndarray, ground: np.ndarray) -> np.ndarray:
-        """Indices of the points to keep, neighbours together: all important ones, and the first other one per voxel."""
+        """Return the rows to keep, neighbours together: all important ones, and the first other one of each voxel."""
         in_reach = (np.abs(position) < _REACH).all(axis=1)
         other = np.flatnonzero(in_reach & ~important)
         side = np.where(ground[other], 2 * self.voxel, self.voxel)[:, None]
@@ -148,7 +148,7 @@ class PackedDrive:
 
 
 def _planes(units: np.ndarray, entries: Sequence[np.ndarray]) -> bytes:
-    """Bytes of a frame: per axis the low and the high bytes of differences between points, then the entries."""
+    """Return the bytes of a frame: per axis all low, then all high bytes of differences of points; then the entries."""
     steps = np.diff(units, axis=0, prepend=np.zeros((1, 3), np.int16)).astype("<i2")
     axes = [steps[:, axis].copy().view(np.uint8).reshape(-1, 2).T.tobytes() for axis in range(3)]
     return b"".join(axes + [entry.tobytes() for entry in entries])
@@ -183,7 +183,7 @@ def _colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
 
 
 def _wheel() -> np.ndarray:
-    """(_HUES * (_LEVELS + 1), 3) uint8 colours of the wheel: direction by direction, each from slow to too fast."""
+    """(_HUES * (_LEVELS + 1), 3) uint8 colours of the wheel: for each hue, from slow to longer than max_flow."""
     angle = (np.arange(_HUES) + 0.5) * (2 * np.pi / _HUES)
     length = np.append(np.maximum(np.arange(1, _LEVELS + 1) / _LEVELS, _PALEST), 1.3)
     flow = np.stack([np.cos(angle)[:, None] * length, np.sin(angle)[:, None] * length], axis=-1)
@@ -199,7 +199,7 @@ def _wheel_entry(flow: np.ndarray, max_flow: float) -> np.ndarray:
 
 
 def _ramp() -> np.ndarray:
-    """(_STEPS, 3) uint8, from low to high."""
+    """(_STEPS, 3) uint8 colours, from low to high values."""
     at = np.linspace(0, len(_RAMP) - 1, _STEPS)
     return np.stack([np.interp(at, np.arange(len(_RAMP)), c) for c in _RAMP.T], axis=1).astype(np.uint8)
 
@@ -210,7 +210,7 @@ def _ramp_entry(value: np.ndarray, most: float) -> np.ndarray:
 
 
 def _object_entry(position: np.ndarray, cluster: np.ndarray, moving: np.ndarray, static: np.ndarray) -> np.ndarray:
-    """(N,) int64 entries; `static` for points in no cluster. Clusters of which less than half moves are pale."""
+    """(N,) int64 entries; `static` for points in no cluster. A cluster is pale if less than half of it moves."""
     colors = cluster_colors(position, cluster, (0, 0, 0))
     _, number, size = np.unique(cluster, return_inverse=True, return_counts=True)
     is_pale = 2 * np.bincount(number, moving) < size

@@ -14,18 +14,18 @@ from cflow_torch.viz.style import Axes, Figure
 from cflow_torch.viz.wheel import flow_to_rgb
 
 MOVING = 0.08  # metres per sweep; the field's viewers draw slower points in white
-MIN_ERROR, MAX_ERROR = 0.05, 0.35  # metres, ends of the viewers' error colours; a smaller error is drawn as none
+MIN_ERROR, MAX_ERROR = 0.05, 0.35  # metres, ends of the viewers' error colours; a smaller error is drawn as 0
 ARROW_STEPS = 5  # length of an arrow, sweeps
 MIN_ARROW_POINTS = 8  # a cluster with fewer moving points gets no arrow
 OBJECT_PIXEL = 0.5  # metres; without clusters, moving points in touching pixels are one object
-_MAX_PIXELS = 2048  # a side; larger scenes get larger pixels
+_MAX_PIXELS = 2048  # pixels on a side, at most; larger scenes get larger pixels
 FLOW_CAPTION = (
     f"grey: static   colour: moves more than {MOVING:g} m per sweep   "
     f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / style.SWEEP_RATE:g} s at {style.SWEEP_RATE} Hz)"
 )
 EGO_OUTLINE = ((2.4, 0.0), (-1.9, 1.15), (-1.0, 0.0), (-1.9, -1.15))  # metres
 _RING, _MOST_RINGS = 10.0, 20  # metres between two rings; a view with more rings gets wider steps
-_HIGHEST = 2.0  # largest height of a panel, in widths; the smallest is the height of two wheels
+_HIGHEST = 2.0  # largest height of a panel over its width; the smallest height is that of two colour wheels
 
 _SLOW_RIM, _FAST_RIM = np.array((0.62, 0.66, 0.70)), np.array((0.10, 0.12, 0.15))
 _SLATE = (80 / 255, 90 / 255, 110 / 255)  # background of errors: black (none) and white (large) are visible on it
@@ -38,7 +38,7 @@ def new_figure(
 
     The name "" makes a panel without a heading. The view is (2, 2+) float64, metres: its low and its high corner. A
     view that is too long and thin for a panel gets empty space along its long sides. The caption is one line below the
-    panels. It explains the colours; the distance of the rings is added.
+    panels. It explains the colours; we append the distance of the rings.
     """
     gap, foot = 0.2, 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
@@ -52,7 +52,7 @@ def new_figure(
     from matplotlib.patches import Circle
 
     farthest = float(np.abs(view).max())
-    step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding removes up to three fifths
+    step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding takes off up to three fifths
     radii = np.arange(step, farthest + 1e-9, step).tolist() if has_rings else []
     panels = []
     for i, name in enumerate(names):
@@ -161,6 +161,6 @@ def draw_ego(axes: Axes, color: str = style.INK, halo: Any = "white") -> None:
 
 
 def dot_area(axes: Axes) -> float:
-    """Area of a static point in square points: that of a dot of about 0.2 m, but at least 0.5."""
+    """Return the area of the dot of a static point, about 0.2 m wide, in square typographic points, at least 0.5."""
     points_per_metre = 72 * style.inches_of(axes)[0] / float(np.diff(axes.get_xlim())[0])
     return max((0.2 * points_per_metre) ** 2, 0.5)

@@ -52,9 +52,9 @@ def record_log(
         Number of pairs in the recording.
 
     Convention:
-        The origin of the world is the ego vehicle at the end of the first pair. world/ego_vehicle moves through it,
-        world/trajectory is its path, and world/tracks has the boxes of `tracks`. The frame of world/ego_vehicle is that
-        of t+1. It holds arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long) and these points:
+        The origin of the world is the ego vehicle at the end of the first pair. world/trajectory is the path of the
+        vehicle, and world/tracks has the boxes of `tracks`. world/ego_vehicle moves through the world; its frame is the
+        ego frame at t+1. It holds arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long) and these points:
         - lidar/cflow: points of t, moved by the ego motion and coloured by residual flow, grey up to `panel.MOVING`
         - lidar/ground_truth: points of t with known truth, coloured by the true residual flow
         - lidar/clusters, lidar/ground: points of t; lidar/next_sweep: points of t+1
@@ -103,7 +103,7 @@ class _Drive:
         self.trajectory: list[np.ndarray] = []
 
     def add(self, scene: Scene, pc1: Sweep) -> None:
-        """Log one pair. Args: pc1: sweep t+1."""
+        """Log one pair; `pc1` is its sweep t+1."""
         rr, position, is_ground = self.rr, scene.position, scene.is_ground
         self.stream.set_time("sweep", sequence=scene.index)
         if scene.timestamp_ns is not None and scene.timestamp_ns >= _CALENDAR:
@@ -120,11 +120,11 @@ class _Drive:
         self._points(GROUND, position[is_ground], _GROUND_COLOR, _FINE_DOT)
         after = as_numpy(pc1.points)[:, :3]
         self._points(NEXT_SWEEP, after[np.isfinite(after).all(axis=1)], _NEXT_COLOR, _FINE_DOT)
-        if scene.truth is not None or self.has_truth:  # no points clear the truth of an earlier pair
+        if scene.truth is not None or self.has_truth:  # to log no points clears the truth of an earlier pair
             self.has_truth = True
             truth = np.full_like(position, np.nan) if scene.truth is None else scene.truth
-            has = ~is_ground & np.isfinite(truth).all(axis=1)
-            self._points(TRUTH, position[has], self._color(truth[has]))
+            is_known = ~is_ground & np.isfinite(truth).all(axis=1)
+            self._points(TRUTH, position[is_known], self._color(truth[is_known]))
 
         numbers, start, vector = scene.arrows()
         arrows = rr.Arrows3D(

@@ -17,7 +17,7 @@ MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
 
 @dataclass(frozen=True)
 class Scene:
-    """One pair, without points at infinity."""
+    """One pair, without NaN and infinite points."""
 
     index: int  # of sweep t
     timestamp_ns: int | None  # of sweep t, None = unknown
@@ -32,7 +32,7 @@ class Scene:
 
     @classmethod
     def of(cls, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> Scene:
-        """Gather the scene of sweeps t and t+1, a flow of as many rows as t and, if there are any, labels."""
+        """Make the scene of sweeps t and t+1, from the flow of all points of t and, if there are any, labels."""
         points, rows = as_numpy(pc0.points, np.float64)[:, :3], len(result.residual_flow)
         if rows != len(points):
             raise CFlowError(f"pair {index}: the flow has {rows} rows, its sweep {len(points)} points")
@@ -70,8 +70,7 @@ def _interval(begin: int | None, end: int | None) -> float:
 
 
 class ViewerFrame:
-    """The frame of a viewer: the ego frame at the end of the first pair that has a pose. Viewers use float32, so the
-    origin must be near."""
+    """The ego frame at the end of the first pair with a pose: viewers use float32, so their origin must be near."""
 
     def __init__(self) -> None:
         self.T_world_viewer: np.ndarray | None = None
@@ -83,7 +82,7 @@ class ViewerFrame:
         return np.linalg.solve(self.T_world_viewer, pose)
 
     def boxes(self, tracks: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Centres (K, 3), metres, and headings (K,), radians, of rows of a table of `cflow_torch.track`."""
+        """Return centres (K, 3), metres, and headings (K,), radians, of rows of a table of `cflow_torch.track`."""
         T_viewer_world = np.eye(4) if self.T_world_viewer is None else np.linalg.inv(self.T_world_viewer)
         centre = np.stack([tracks[axis] for axis in "xyz"], 1) @ T_viewer_world[:3, :3].T + T_viewer_world[:3, 3]
         return centre, tracks["heading"] + np.arctan2(T_viewer_world[1, 0], T_viewer_world[0, 0])

@@ -26,10 +26,10 @@ from cflow_torch.viz.style import Axes, Figure
 from cflow_torch.viz.wheel import flow_to_rgb
 
 _MARGIN = 2.0  # metres around the object in the close-up
-_SMALLEST = 4.0  # metres, half a side of the close-up
+_SMALLEST = 4.0  # metres, least half side of the close-up
 _COLORMAP = "viridis"
 _PEAK = "#e6194b"
-_MOST_LINES = 160  # of the surface, a side
+_MOST_LINES = 160  # of the surface along each axis
 _HALF_VIEW = np.array((5.0, 3.6))  # metres, half width and height of the view
 _CELL = 4.0  # metres, side of the cells in which matches are added up to choose the view
 _POINT_COLOR = "#ffb000"
@@ -42,7 +42,7 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
 
     Args:
         window: sweeps.
-        config: of one of the paper's methods; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, without
+        config: settings of a method of the paper; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, without
             older sweeps.
         cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
 
@@ -99,7 +99,7 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
 
 
 def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale], shown: np.ndarray) -> None:
-    """Draw one object in the input of each scale, and in the last panel in the result. Args: shown: (N,) bool."""
+    """Draw a close-up of the points `shown`, (N,) bool: the input of each scale and, in the last panel, the result."""
     ends = np.concatenate([position, position + found[-1].flow])[np.tile(shown, 2), :2]
     ends = ends if len(ends) else np.zeros((1, 2))
     middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
@@ -121,7 +121,7 @@ def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale],
 def _draw_flows(
     panels: list[Axes], config: Config, position: np.ndarray, flows: list[np.ndarray], is_valid: np.ndarray
 ) -> float:
-    """Draw the flow after each scale, and that of the finest alone; return the metres per sweep of full colour."""
+    """Draw the flow after each scale, and of the finest scale alone; return the metres per sweep of full colour."""
     view, is_inside = view_of(position, config.point_cloud_range)
     keep = is_inside & is_valid
     max_flow = longest_flow(np.concatenate([flow[keep] for flow in flows]))
@@ -225,9 +225,9 @@ def _draw_map(axes: Axes, colors: Axes, found: ClusterCorrelation) -> None:
 
 
 def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
-    """Draw the scores as a surface. Args: axes: three-dimensional."""
-    axes.patch.set_visible(False)  # it would cover the numbers next to it
-    # A margin of zeros makes a surface of a map that has a single row or column.
+    """Draw the scores as a surface into 3-D axes."""
+    axes.patch.set_visible(False)  # the patch would cover the numbers next to it
+    # With a margin of zeros, a map of a single row or column is a surface, too.
     scores = np.pad(np.nan_to_num(found.ncc), 1)
     y, x = (np.arange(n) - 1 - (n - 2) // 2 for n in scores.shape)
     axes.plot_surface(
@@ -263,7 +263,7 @@ def _pair(x: float, y: float) -> str:
 def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
     """Draw a close-up of the key points of a pair of sweeps and their matches, where the matches move most.
 
-    The config is of the key-point method; None = the preset "keypoints", without older sweeps.
+    `config` is for the key-point method; None = the preset "keypoints", without older sweeps.
 
     Returns:
         Figure, 1600 pixels wide. Left: the pixels of both sweeps, and the key points of t as dots. Right: moving

@@ -60,7 +60,7 @@ class Occupancy:
 class Scale:
     """One scale of a coarse-to-fine run."""
 
-    sweeps: ProjectedSweeps  # the input of this scale: the one window, warped by the flow of the coarser scales
+    sweeps: ProjectedSweeps  # the input of this scale: a batch of one window, warped by the flow of the coarser scales
     flow: np.ndarray  # (N, 3) float64, residual flow of the rows of pc0 after this scale, metres per sweep interval
 
     def seen(self) -> Occupancy:
@@ -81,7 +81,7 @@ class ClusterCorrelation:
 
     cluster_id: int  # as in `FlowResult`
     images: Occupancy  # template (t) and target (t+1): the pixels of the cluster in its box
-    ncc: np.ndarray  # (H, W) float64 of each shift (dy, dx) at [dy + H // 2, dx + W // 2], 0 ... 1; NaN = not searched
+    ncc: np.ndarray  # (H, W) float64, 0 ... 1, shift (dy, dx) at [dy + H // 2, dx + W // 2]; NaN = not searched
     shift: np.ndarray  # (2,) int64, (dy, dx) that the method chooses, pixels
     score: float  # NCC at that shift
     # (3,) float64, residual flow of the cluster, metres per sweep interval: the shift times the pixel size, combined
@@ -153,7 +153,7 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
 
 
 def choose_cluster(of_point: np.ndarray, flow: np.ndarray, cluster_id: int | None = None) -> int | None:
-    """The given cluster, or else that with the largest product of points and metres of flow; None = there is none.
+    """Return the given cluster, else the one with the largest product of points and metres of flow; None = no cluster.
 
     `of_point` is the (N,) cluster of each point, -1 = none, and `flow` its residual flow.
     """
@@ -193,7 +193,7 @@ def _pair(sweeps: ProjectedSweeps) -> Occupancy:
 
 
 def _image(images: Images, number: int, size: Tensor) -> Tensor:
-    """(H, W) float32, one of a set of images."""
+    """Return image `number`, (H, W) float32."""
     pixel = flat_nonzero(images.image == number)
     image = torch.zeros(size.tolist())
     image[images.row[pixel], images.col[pixel]] = 1
@@ -201,7 +201,7 @@ def _image(images: Images, number: int, size: Tensor) -> Tensor:
 
 
 def _ncc_map(template: Tensor, target: Tensor) -> Tensor:
-    """(H, W) float64, as `ClusterCorrelation.ncc`. The energies are the correlation of the target with ones."""
+    """(H, W) float64, as `ClusterCorrelation.ncc`. The energy of the target is its correlation with ones."""
     height, width = template.shape
     images = torch.zeros(3, 2 * height, 2 * width)
     images[:, :height, :width] = torch.stack((template, torch.ones_like(template), target))
@@ -214,7 +214,7 @@ def _ncc_map(template: Tensor, target: Tensor) -> Tensor:
 
 
 def sweep_marks() -> list[Any]:
-    """Legend entries of the colours of the pixels."""
+    """Return legend entries for the colours of the pixels."""
     from matplotlib.lines import Line2D
 
     colors = {name: "#{:02x}{:02x}{:02x}".format(*color) for name, color in COLORS.items()}

@@ -49,7 +49,7 @@ def add_panel(figure: Figure, left: float, bottom: float, width: float, height: 
 
 
 def add_heading(figure: Figure, inches: float, title: str) -> None:
-    """Write one line, its middle `inches` below the upper edge; a long line is smaller."""
+    """Write one line, its middle `inches` below the upper edge; a long line gets a smaller font."""
     size = 17 * min(1, _TITLE * figure.get_figwidth() / max(len(title), 1))
     height = 1 - inches / figure.get_figheight()
     # A log's name may contain "$", which is not a formula.
@@ -63,7 +63,7 @@ def add_caption(figure: Figure, caption: str) -> None:
 
 
 def set_view(axes: Axes, low: np.ndarray, high: np.ndarray, has_ticks: bool = False) -> None:
-    """Set limits, equal scales and a thin frame. Args: low, high: (2,) float64, metres, corners (x, y)."""
+    """Set limits, (2,) corners (x, y) in metres, with equal scales and a thin frame."""
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     if has_ticks:
         thin_ticks(axes)
@@ -103,12 +103,12 @@ def inches_of(axes: Axes) -> np.ndarray:
 
 
 def draw_wheel(axes: Axes, position: np.ndarray, moves: np.ndarray, max_flow: float, corner: str | None = None) -> None:
-    """Draw the colour wheel in a corner of the panel, see `legend_box`. It avoids moving points most."""
+    """Draw the colour wheel in a corner of the panel, see `legend_box`, where it covers few moving points."""
     fill_wheel(legend_box(axes, position, moves, WHEEL_INCHES, corner), max_flow)
 
 
 def fill_wheel(box: Axes, max_flow: float) -> None:
-    """Draw the colour wheel and its scale. Args: box: of `WHEEL_INCHES`; max_flow: metres per sweep at the rim."""
+    """Draw the colour wheel and its scale into a box of `WHEEL_INCHES`. `max_flow` is at the rim, metres per sweep."""
     box.imshow(wheel_image(256), extent=(-1, 1, -1, 1), interpolation="bilinear")
     box.set(xlim=(-1.3, 1.3), ylim=(-1.77, 1.194))
     rim = f"rim: {max_flow:.4g} m per sweep\n{max_flow * SWEEP_RATE:.4g} m/s at {SWEEP_RATE} Hz"
