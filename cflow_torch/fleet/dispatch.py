@@ -1,4 +1,4 @@
-"""Engine `local`: distribute units among worker processes and repeat what is lost when one of them dies."""
+"""Engine `local`: distribute units among worker processes, and repeat the lost work of a process that dies."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from cflow_torch.fleet.work import Worker, describe, make_worker, source_name
 from cflow_torch.types import CFlowError
 
 _POLL_S = 0.2  # how soon a signal is noticed
-_GRACE_S = 20.0  # time to finish the frames that have begun after a signal; schedulers kill after 30 s or more
-_MAX_FAILED_STARTS = 3  # in a row; then a worker is given up
-# Processes that may die on one unit; then the rest of it is left. Perhaps all its frames are too large for the memory,
-# and each new process takes seconds to start.
+_GRACE_S = 20.0  # after a signal, time to finish the frames that have begun; schedulers kill after 30 s or more
+_MAX_FAILED_STARTS = 3  # in a row; then we give up the worker
+# If so many processes die on one unit, we leave its rest. Perhaps all its frames are too large for the memory, and each
+# new process takes seconds to start.
 _MAX_DEATHS = 10
 
 
@@ -54,8 +54,8 @@ def dispatch(
 ) -> Iterator[Event]:
     """Do all units, and yield events as they happen. If no worker can start, that is a `CFlowError`.
 
-    When a process dies, its unit is repeated, then each of the unit's frames by itself, `retries` times each. This does
-    no harm: files are written as a whole or not at all, and complete ones are skipped.
+    When a process dies, its unit is repeated, then each of the unit's frames by itself, `retries` times each. To repeat
+    them does no harm: files are written as a whole or not at all, and complete ones are skipped.
 
     Args:
         processes: one per worker, not started yet, whose calls take a unit and yield its events. Each is used by a
@@ -95,7 +95,7 @@ def dispatch(
 def _work(
     process: ChildProcess, todo: Iterator[Unit], answers: Queue[Any], stop: Callable[[], bool], retries: int
 ) -> None:
-    """Do units until none is left. After a stop, units that have not begun are taken and left undone."""
+    """Do units until none is left. After a stop, skip the units that have not begun."""
     unit = None
     try:
         _start(process)

@@ -19,7 +19,7 @@ _UNITS_PER_WORKER = 2
 
 @dataclass(frozen=True)
 class Job:
-    """What every worker gets to know about a run. The units of work are sent separately."""
+    """The settings of a run, which every worker gets. The units of work are sent separately."""
 
     config: Config  # settings of the method
     identity: str  # hash of method, data settings and versions, see `cflow_torch.fleet.manifest`
@@ -28,7 +28,7 @@ class Job:
     output: str  # folder of the results; a path, or the address of an object store
     contents: tuple[str, ...] = CONTENTS  # of a flow file, names of `flow_file.CONTENTS` and `ON_REQUEST`
     batch: int = 1  # windows that are computed together
-    redo: bool = False  # compute frames that exist already
+    redo: bool = False  # compute frames again that exist already
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Unit:
     number: int  # index among the units of a run
     source: Any  # one of `catalog.find_sources`
     first: Fraction = Fraction(0)  # share of the log's pairs before the first frame, 0 ... 1
-    last: Fraction = Fraction(1)  # share before the end
+    last: Fraction = Fraction(1)  # share of the log's pairs before the end of the unit
     only: frozenset[int] | None = None  # time stamps of the frames to do; None = all of them
     deaths: int = 0  # number of workers that have died on it
 
@@ -57,7 +57,7 @@ class Opened(NamedTuple):
 
 
 class Done(NamedTuple):
-    """A frame is on disk. `seconds` by stage are those of its batch, divided by the number of frames."""
+    """A frame is on disk. `seconds` by stage: those of "compute" are of its batch, divided by the number of frames."""
 
     unit: int
     timestamp: int
@@ -65,7 +65,7 @@ class Done(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """A frame has no result; `timestamp` None: the whole unit has none."""
+    """A frame has no result; `timestamp` None: the unit, or the rest of it, has none."""
 
     unit: int
     name: str
@@ -86,7 +86,7 @@ Event = Union[Opened, Done, Failed, Noted]
 
 @dataclass(frozen=True)
 class Shard:
-    """Share number `index`, 0 ... `count` - 1, of `count`."""
+    """Share `index`, 0 ... `count` - 1, of a run that is divided into `count` shares."""
 
     index: int = 0
     count: int = 1
@@ -96,7 +96,7 @@ class Shard:
             raise CFlowError(f"shard.index={self.index} of shard.count={self.count}: give 0 ... count - 1")
 
     def units(self, sources: Sequence[Any], workers: int = 1) -> list[Unit]:
-        """Return this shard's share of the logs, in units that are enough for all workers, numbered from 0.
+        """Divide this shard's share of the logs into units, numbered from 0, enough of them for all workers.
 
         The sequence of all logs is divided into `count` parts of equal length. So a shard opens only its own logs, and
         shares at most the first and the last of them with a neighbour.
@@ -116,7 +116,7 @@ def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:
     """Return the shard of this process. `index` counts from 0; both arguments may be "auto".
 
     "auto" reads the environment variables: RANK and WORLD_SIZE of torchrun, or the task of an `srun` step. In a SLURM
-    array, we combine it with the task of the array. Without any of them this is the only shard.
+    array, we combine it with the task of the array. Without these variables, this is the only shard.
     """
     if index != AUTO and count == AUTO:
         raise CFlowError(f"shard.index={index} is given without shard.count: give both")

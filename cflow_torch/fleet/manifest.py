@@ -87,7 +87,7 @@ def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
 def claim_log(folder: Path, log: Log, run: str) -> None:
     """Make sure that the frames in a log's folder were computed from this log, and write its manifest.
 
-    A log that has changed since, and another one of its name, are a `CFlowError`. Cost: reads three sweeps.
+    A log that has changed since, or another log of its name, is a `CFlowError`. Cost: reads three sweeps.
     """
     now = _describe_log(log, run)
     if _read(folder / MANIFEST) is None:
@@ -115,7 +115,7 @@ def _describe_log(log: Log, run: str) -> dict[str, Any]:
 
 
 def complete_frames(folder: Path) -> set[int]:
-    """Return the time stamps whose flow is in a log's folder. Cost: reads the last bytes of every local file.
+    """Return the time stamps of the complete frames in a log's folder. Cost: reads the last bytes of every local file.
 
     Files without the log's manifest do not count, because their input is unknown. Incomplete files, such as those of an
     interrupted copy, do not count either.
@@ -151,8 +151,8 @@ def _digest(log: Log, index: int) -> str:
 def _clear(output: Path) -> None:
     """Remove the results of a run and no other files.
 
-    The run's manifest is removed first, so that a killed run leaves no claim, and that of a log last, because it marks
-    the folder as ours.
+    We remove the manifest of the run first, so that a killed process leaves an unclaimed folder. We remove the manifest
+    of a log last, because it marks the folder of the log as ours.
     """
     logs = [path for path in output.iterdir() if (path / MANIFEST).exists()]
     for name in (MANIFEST, "config.yaml"):

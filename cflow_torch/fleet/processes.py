@@ -22,9 +22,9 @@ class ChildProcess:
     """A child process that does one call at a time. It ignores `SIGNALS` and ends when its parent does.
 
     Args:
-        make: called in the child process; returns the generator function that does the calls. It gets the arguments of
-            a call, then a function that is True after `stop`.
-        arguments: of `make`. They are pickled, like all that a call takes and yields.
+        make: called in the child process; returns the generator function that does the calls. That function gets the
+            arguments of a call, then a function that returns True after `stop`.
+        arguments: of `make`. They are pickled, like the arguments and results of calls.
         timeout: seconds after which a process that has not answered is ended; None = no limit.
     """
 
@@ -34,7 +34,7 @@ class ChildProcess:
         self._pipe: Any = None
 
     def start(self) -> None:
-        """Start a new process and wait until `make` has returned; `WorkerDied` if it has ended or cannot be started.
+        """Start a new process and wait until `make` has returned; `WorkerDied` if the process ends or cannot start.
 
         `CFlowError` and OSError of `make` are raised here. Any other error is a RuntimeError with the child's
         traceback.
@@ -67,7 +67,7 @@ class ChildProcess:
                 self._pipe.send(None)
 
     def close(self) -> None:
-        """Kill the process, whatever it does."""
+        """Kill the process, even during a call."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()
@@ -127,7 +127,7 @@ def _serve(pipe: Any, make: Callable[..., Any], arguments: Any) -> None:
 
 def _how(status: int | None) -> str:
     """Describe in words how a process with this exit status has ended."""
-    if status is None or status >= 0:  # None: another thread has just received it
+    if status is None or status >= 0:  # None: another thread has just read the status
         return f"with status {status}"
     return f"by signal {-status}, {signal.strsignal(-status)}" + " (out of memory?)" * (-status == signal.SIGKILL)
 
@@ -162,5 +162,5 @@ class StopSignal:
             raise KeyboardInterrupt
         self.received = number
         name = signal.Signals(number).name
-        with suppress(OSError):  # `print` is not safe here: the signal may interrupt another one
+        with suppress(OSError):  # `print` is not safe here: the signal may interrupt another `print`
             os.write(2, f"\n{name}: finishing the frames that have begun; repeat the signal to end at once\n".encode())

@@ -15,9 +15,9 @@ _LINE = "{desc}{n_fmt} of {total_fmt} frames, {rate_noinv_fmt}, {remaining} left
 
 
 class _Stderr:
-    """Standard error that may be gone, such as a closed terminal: the run goes on, and the text is lost.
+    """Standard error; if it is gone (a closed terminal), the run goes on, and the text is lost.
 
-    If it is not a terminal, each text of a bar is a line of its own.
+    Unless it is a terminal, each text of a bar is a line of its own.
     """
 
     def write(self, text: str) -> None:
@@ -54,5 +54,5 @@ def log_line(text: str) -> None:
 
 
 def show_warnings_as_lines() -> None:
-    """Show warnings as lines for people, without the path of a source file, from now on."""
+    """From now on, show each warning as a line without the path of a source file."""
     warnings.showwarning = lambda message, *_, **__: log_line(f"warning: {message}")

@@ -66,13 +66,13 @@ def run_ray(
     _connect(ray, settings)
     try:
         _check_room(ray, needs)
-        needed = {"num_cpus": needs["CPU"], "num_gpus": needs["GPU"], "max_concurrency": 2}  # `run` and `stop`
-        actor = ray.remote(_Actor).options(**needed)
+        options = {"num_cpus": needs["CPU"], "num_gpus": needs["GPU"], "max_concurrency": 2}  # `run` and `stop`
+        actor = ray.remote(_Actor).options(**options)
         device = "cuda" if is_gpu else "cpu"  # a worker sees only the GPUs that Ray gives it
         processes = [_Process(ray, actor, os.getcwd(), job, device) for _ in layout.devices]
         yield from dispatch(processes, units, stop, retries)
     finally:
-        ray.shutdown()  # this also ends a cluster in this process
+        ray.shutdown()  # this also ends a cluster that `ray.init` has started
 
 
 class _Actor:
@@ -100,7 +100,7 @@ class _Actor:
 
 
 class _Process(ChildProcess):
-    """An actor in place of a child process."""
+    """A Ray actor with the interface of a child process."""
 
     def __init__(self, ray: ModuleType, actor: Any, *arguments: Any) -> None:
         super().__init__(actor.remote, *arguments)
@@ -122,7 +122,7 @@ class _Process(ChildProcess):
 
     def close(self) -> None:
         if self._actor is not None:
-            with suppress(Exception):  # without its cluster the actor has ended
+            with suppress(Exception):  # if its cluster has ended, the actor has, too
                 self._ray.kill(self._actor)
 
     def _get(self, answer: Any) -> Any:

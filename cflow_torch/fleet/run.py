@@ -39,7 +39,7 @@ def run_fleet(
 ) -> dict[str, Any]:
     """Compute the frames of a shard that are not complete, and write a report.
 
-    Claim the folder of the job first (`manifest.claim_folder`). `sources` are all logs, of all shards.
+    Call `manifest.claim_folder` first. `sources` are the logs of all shards.
 
     Returns:
         The report of `Counters.report` with the entries of `about`. It is also written to OUTPUT/reports/<shard>.json.
@@ -96,7 +96,7 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
 def count_frames(job: Job, units: Iterable[Unit]) -> Iterator[tuple[str, int, int]]:
     """Yield the name of each unit's log, the number of its frames, and how many of them are not complete.
 
-    A log that cannot be opened has none. Cost: opens the log and lists its files in the output. Nothing is written.
+    A log that cannot be opened counts as 0. Cost: opens the log and lists its files in the output. Nothing is written.
     """
     for unit in units:
         try:
@@ -123,7 +123,7 @@ class Counters:
     def __init__(self, units: Sequence[Unit]) -> None:
         self.failures: list[tuple[str, str]] = []  # (frame or log, message)
         self.notes: Counter[tuple[str, str]] = Counter()  # (log, message)
-        self.num_opened = self.total = self.num_before = self.num_failed = 0  # units; frames
+        self.num_opened = self.total = self.num_before = self.num_failed = 0  # num_opened: units; others: frames
         # (unit number, time stamp) -> name of a frame that is neither on disk nor failed, of opened units
         self.waiting: dict[tuple[int, int | None], str] = {}
         self._unopened = {unit.number for unit in units}
@@ -162,7 +162,7 @@ class Counters:
             "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": the counts
             "total", "complete_before", "computed", "failed" and "waiting" (of opened logs, not done), and the counts of
             logs or parts of logs "failed_logs" and "unopened_units"; "frames_per_s" of those computed; "stages":
-            seconds per computed frame, summed over the workers, although these work at the same time; lists of
+            seconds per computed frame, summed over the workers, which work at the same time; lists of
             "failures" and of "waiting" frames; "notes": log, message and how often.
         """
         computed = self.total - self.num_before - self.num_failed - len(self.waiting)

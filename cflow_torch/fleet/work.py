@@ -44,7 +44,7 @@ class _Frame:
 
 
 class Worker:
-    """Computes units and keeps the log of the last one open. A device that cannot be used is a `CFlowError`."""
+    """Computes units, and keeps the log of the last unit open. A device that cannot be used is a `CFlowError`."""
 
     def __init__(self, job: Job, device: str) -> None:
         try:
@@ -59,9 +59,9 @@ class Worker:
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
 
     def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
-        """Do those frames of a unit that are not complete. `WorkerDied` if the GPU can no longer be used.
+        """Do the frames of a unit that are not complete. `WorkerDied` if the GPU can no longer be used.
 
-        Once `stop`, which is called before each batch, returns True, computed frames are written and no others begin.
+        We call `stop` before each frame and batch. Once it returns True, we write computed frames and begin no others.
 
         Yields:
             `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something other than a
@@ -145,7 +145,7 @@ class Worker:
                 good[0].content = error.with_traceback(None)
                 self._check_device()
         if results is None:
-            # Only now, after the except block: until then the traceback keeps the memory of the batch on the GPU.
+            # We are after the except block, because the traceback there keeps the memory of the batch on the GPU.
             for frame in good if len(good) > 1 else []:
                 self._compute([frame])
             return frames
@@ -174,7 +174,7 @@ class Worker:
 def make_worker(
     job: Job, device: str, memory: float | None = None
 ) -> Callable[[Unit, Callable[[], bool]], Iterator[Event]]:
-    """Make a worker in its own process, and return its `run`.
+    """Make the worker of this process, and return its `run`.
 
     On a CPU it computes on one thread: other workers use the other cores. `memory` limits the bytes of address space.
     """
