@@ -45,7 +45,7 @@ def task(cfg: DictConfig) -> None:
 def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: Sequence[int] = ()) -> dict[str, Any]:
     """Measure the seconds and the memory of a method, `repeats` times for each window and batch size.
 
-    One run before them warms up. A batch that is larger than the number of windows repeats them.
+    A warm-up run comes first. A batch that is larger than the number of windows repeats windows.
 
     Returns:
         "points" (mean number per sweep), "windows", "repeats", "device"; "seconds": of one window, see
@@ -98,7 +98,7 @@ def format_report(report: dict[str, Any]) -> str:
 
 
 def _windows(log: Log, count: int, config: Config) -> list[Window]:
-    """`count` windows, spread evenly over those with all sweeps before and after; without such, the last ones."""
+    """Read `count` windows, spread evenly over those with whole history and future; if there are none, read one."""
     end = len(log.timestamps) - 2
     first = min(config.num_history, end)
     last = max(end - config.num_future, first)

@@ -20,7 +20,7 @@ from cflow_torch.setting import bounds, checked
 
 # Settings of the last version; those of the methods are in `config.REMOVED`.
 _REMOVED = {"standing": "use remove_stopped", "residual_axes": "leave it out"}
-# What is allowed besides the default. The other settings have the type of their default.
+# Values that are allowed besides the default. Settings that are not listed have the type of their default.
 _FROM_0, _FROM_1 = bounds(int, low=0), bounds(int, low=1)
 _ABOVE_0 = bounds(float, above=0, high=1e12)
 _ALLOWED = {
@@ -57,7 +57,7 @@ class UnfinishedJob(RuntimeError):
 
 
 def check_settings(cfg: Any, command: str, choices: Mapping[str, Any]) -> None:
-    """Check settings and the path of the data, before torch is imported. `choices` are those of the groups."""
+    """Check settings and the path of the data, before torch is imported. `choices` maps groups to options."""
     config_from(OmegaConf.to_container(cfg.model, resolve=True))  # type: ignore[arg-type]
     for name, file, default in defaults(command, choices):
         value = OmegaConf.select(cfg, name, default=default)
@@ -78,7 +78,7 @@ def check_settings(cfg: Any, command: str, choices: Mapping[str, Any]) -> None:
 
 
 def explain(error: Exception, command: str) -> str:
-    """The message for a call that Hydra or a command rejects."""
+    """Return the message for a call that Hydra or a command rejects."""
     if isinstance(error, CFlowError):
         return str(error)
     if isinstance(error, MissingConfigException) and error.options:
@@ -101,7 +101,7 @@ def explain(error: Exception, command: str) -> str:
 
 
 def _unknown_setting(key: str, method: str | None, command: str) -> str:
-    """The message for a setting (in dotted form) that is of another method or picture, was removed, or is mistyped."""
+    """Return the message for a setting (dotted) that is of another method or picture, was removed, or is mistyped."""
     group, _, name = key.rpartition(".")
     if group == "model" and method is not None and name != "pixel_size":
         try:

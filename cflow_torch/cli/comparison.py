@@ -14,7 +14,7 @@ from hydra.experimental.callback import Callback
 
 RESULTS = "results.json"
 TABLE = "comparison.csv"
-# A class with fewer dynamic points than about one pedestrian has in ten sweeps.
+# The scores of a class with fewer dynamic points are uncertain. One pedestrian has about so many in ten sweeps.
 _FEW = 1000
 # A setting and its value in the name of a job's folder.
 _SWEPT = re.compile(r"(?:^|,)([^=,]+)=(.*?)(?=,[^=,]+=|$)")
@@ -96,7 +96,7 @@ def headline(results: dict[str, Any], seconds: dict[str, Any]) -> dict[str, floa
 
 
 def summary(results: dict[str, Any], seconds: dict[str, Any]) -> str:
-    """One line with the most important scores, and one about classes with few dynamic points, if there are any."""
+    """Return a line with the most important scores and, if classes have few dynamic points, a line that lists these."""
     scores = headline(results, seconds)
     dynamic, static = "mean dynamic error {dynamic_error:.3f}", "static EPE {static_epe:.3f} m"
     if "bucketed" not in results:

@@ -1,7 +1,7 @@
 """Simulates a drive, estimates its flow, scores it and draws it. You need no data.
 
 The drive is written in Argoverse 2's format to outputs/cache and read from there like a real log. OUTPUT (outputs/demo)
-gets flow.html (a 3-D page for any browser), flow.png, <log id>/ with one flow file per pair, results.json with the
+contains flow.html (a 3-D page for any browser), flow.png, <log id>/ with one flow file per pair, results.json with the
 scores, and config.yaml with the settings.
 
 examples:
@@ -33,8 +33,8 @@ from cflow_torch.viz.style import blank_figure
 
 def task(cfg: DictConfig) -> None:
     output, picture = run.output_folder(cfg), "none"
-    draws = _can("picture", lambda: blank_figure((1, 1), 100))  # matplotlib and k3d are extras
-    shows = _can("page", load_k3d)
+    draws = _is_available("picture", lambda: blank_figure((1, 1), 100))  # matplotlib and k3d are extras
+    shows = _is_available("page", load_k3d)
     scores = Scores(cfg)
     model = TimedModel(run.make_model(cfg))
     logs, failures = run.open_logs(cfg)
@@ -67,8 +67,8 @@ def task(cfg: DictConfig) -> None:
     run.finish(failures)
 
 
-def _can(name: str, load: Callable[[], Any]) -> bool:
-    """True if the extra for an output is installed. Prints what is left out otherwise."""
+def _is_available(name: str, load: Callable[[], Any]) -> bool:
+    """Return True if the extra for an output is installed; if not, print which output is missing."""
     try:
         load()
     except CFlowError as error:

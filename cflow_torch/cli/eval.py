@@ -112,7 +112,7 @@ class Scores:
 
 
 def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
-    """The record of an earlier run with the same settings and versions; None if there is none or `overwrite` is set.
+    """Read the record of an earlier run with the same settings and versions; None if there is none or with `overwrite`.
 
     Results of other settings are a `CFlowError`.
     """
@@ -128,8 +128,7 @@ def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
 
 
 def objective(results: dict[str, Any]) -> float:
-    """The number that a sweeper minimises: the mean dynamic error, or if the definition has none, the three-way
-    end-point error in metres. NaN without scored points."""
+    """Return what a sweeper minimises: the mean dynamic error, else the three-way EPE in metres; NaN without points."""
     if results.keys() & {"bucketed", "bucketed_by_range"}:
         return headline(results, {})["dynamic_error"]
     value = results["three_way"]["epe_3way"]
@@ -137,7 +136,7 @@ def objective(results: dict[str, Any]) -> float:
 
 
 def _origin(cfg: DictConfig) -> dict[str, Any]:
-    """What determines the results, as JSON holds it."""
+    """Return what determines the results, in types that JSON has."""
     generator = generator_key() if cfg.data.get("name") == "benchmark" else None
     settings = json_ready(OmegaConf.to_container(cfg, resolve=True))
     return {"versions": run.versions(), "generator": generator, "config": settings}

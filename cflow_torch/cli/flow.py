@@ -3,9 +3,9 @@
 Each file has one row per point of sweep t. Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects,
 pose_t{x,y,z}_m ego motion (float32, metres until the next sweep, in the ego frame at t+1), cluster_id, score, is_valid.
 There is also a column confidence, unless model=paper or keypoints. contents=[residual,is_valid] writes only these
-columns: files are much smaller, and the flow and pose follow from the poses.
+columns. Files are then much smaller; ego motion and total flow follow from the poses.
 
-OUTPUT/config.yaml contains the settings and versions, OUTPUT/reports what was done. Run the command again to resume.
+OUTPUT/config.yaml contains the settings and versions, OUTPUT/reports what the run did. Run the command again to resume.
 After Ctrl-C, SIGTERM or SIGHUP the run finishes the frames that it has begun. The exit status is 0 if every frame is
 complete, 1 if one is missing, 2 if the call was wrong, and 128 + n after signal number n. The report has the time of
 each stage, and verbose=true prints it.
@@ -169,7 +169,7 @@ def _write_more(cfg: DictConfig, flow: FlowRun, report: dict[str, Any]) -> Failu
 
 
 def _write_tracks(kind: Any, flow: FlowRun, output: Path) -> Failures:
-    """Write the tracks of each log of this shard whose frames are all complete, also those of other shards."""
+    """Write the tracks of each log of this shard whose frames, also those of other shards, are all complete."""
     failures: Failures = []
     stored = run.stored_flow(output, ())
     for unit in tqdm(flow.shard.units(flow.sources.logs), desc="tracks", unit="log", disable=None):

@@ -4,7 +4,7 @@
 
 examples:
   cflow info            paste the output into a bug report
-  cflow info --full     if you report a bug of the installation or of a GPU
+  cflow info --full     for a bug of the installation or of a GPU
   cflow --version       prints the version only
 """
 

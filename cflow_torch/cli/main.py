@@ -119,7 +119,7 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     main_of = hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)
     try:
-        # The folder of a job is named after what is swept, and after what tells sweeps into the same output apart.
+        # The folder of a job is named after the swept settings and those that distinguish sweeps into the same output.
         parsed = OverridesParser.create().parse_overrides(overrides)
         fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
         unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}

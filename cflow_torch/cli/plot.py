@@ -70,7 +70,7 @@ def find_log(cfg: DictConfig) -> Log:
     named = {source_name(source): source for source in sources.logs}
     if cfg.log is None or cfg.log in named:
         return sources.open(named.get(cfg.log, sources.logs[0]))
-    for source in sources.logs:  # few logs are not named after their file or folder
+    for source in sources.logs:  # the id of some logs is not the name of their file or folder
         with suppress(CFlowError, OSError):
             log = sources.open(source)
             if log.log_id == cfg.log:

@@ -45,7 +45,7 @@ def versions() -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """The machine, on which times depend: "platform", "cpu", "cores", "threads" (of torch)."""
+    """Describe the machine, on which times depend: "platform", "cpu", "cores", "threads" (of torch)."""
     return {
         "platform": platform.platform(),
         "cpu": processor(),
@@ -90,7 +90,7 @@ def local_folder(cfg: DictConfig) -> Path:
 
 
 def complete_data(data: DictConfig) -> DictConfig:
-    """Replace data=auto by the settings of the recognised format, and print it; add defaults for own readers."""
+    """Replace data=auto by the settings of the recognised format, and print it; add defaults for your own reader."""
     if "_target_" in data:
         defaults = {"label": HydraConfig.get().runtime.choices["data"], "first": 0, "step": 1}
         return OmegaConf.merge(defaults, data)  # type: ignore[return-value]
@@ -165,7 +165,7 @@ def open_logs(cfg: DictConfig) -> tuple[list[Log], Failures]:
 
 
 def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], FlowResult]:
-    """Return a reader of the flow of pairs in the output of `cflow flow`. It rejects a file without a needed field."""
+    """Return a function that reads the flow of a pair from the output of `cflow flow` and rejects incomplete files."""
     output = as_path(folder)
     if not output.is_dir():
         raise CFlowError(f"flow={folder} is not a folder: give the output of `cflow flow`")
@@ -183,7 +183,7 @@ def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], Flow
 
 @contextmanager
 def collect_failures(failures: Failures, name: str) -> Iterator[None]:
-    """A step for one frame or log. If it fails, the error is printed and appended, and the program continues."""
+    """Run a step for one frame or log. If it fails, print the error, append it to `failures`, and continue."""
     try:
         yield
     except (CFlowError, OSError) as error:

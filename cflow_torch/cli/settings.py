@@ -89,7 +89,7 @@ def harness_models() -> dict[str, str]:
 
 
 def _sections() -> Iterator[tuple[list[str], str, list[str]]]:
-    """The sections of the page: their names, title and lines."""
+    """Yield the sections of the page: names, title and lines."""
     for method, kind in METHODS.items():
         presets = {preset: make_config(preset) for preset, (of, _) in PRESETS.items() if of == method}
         rows = ["| setting | default | presets | allowed | meaning |", "|---|---|---|---|---|"]
@@ -108,7 +108,7 @@ def _sections() -> Iterator[tuple[list[str], str, list[str]]]:
 
 
 def _about(name: str) -> list[str]:
-    """The sections of this name, the first lines of the choices of a group, and the lines of a setting."""
+    """Return the sections of this name, the first lines of the choices of a group, and the lines of a setting."""
     group, _, setting = name.rpartition(".")
     own_line = re.compile(rf"(\| `model\.| *){re.escape(setting)}(`|:)")
     found: list[str] = []

@@ -1,7 +1,7 @@
 """Replays the first log of the data in real time and measures the latency: a summary and OUTPUT/stream.json.
 
 Latency is the time from the arrival of sweep t+1 to the flow of sweep t. A late result delays the next one. If sweeps
-have no poses, KISS-ICP (extra odometry) estimates them. The latency includes this.
+have no poses, KISS-ICP (extra odometry) estimates them, and the latency includes this time.
 
 examples:
   cflow stream drive.bag                          at the speed of the recording

@@ -1,4 +1,4 @@
-"""Write the archive for a public leaderboard: OUTPUT/v<version>.zip, from the files in OUTPUT/v<version>/.
+"""Writes the archive for a public leaderboard: OUTPUT/v<version>.zip, from the files in OUTPUT/v<version>/.
 
 The archive is checked and stays only if it passes. Run the command again to resume. OUTPUT/config.yaml contains the
 settings and versions.
@@ -31,7 +31,7 @@ from cflow_torch.fleet.progress import Progress
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
-Plan = List[Tuple[Frame, int]]  # with the number of rows
+Plan = List[Tuple[Frame, int]]  # frames with their numbers of rows
 _Masks = Optional[MaskArchive]
 _Listed = Optional[Mapping[str, Sequence[int]]]
 

@@ -1,10 +1,10 @@
 """Writes a 3-D page per log, OUTPUT/<log id>.html, that any browser opens without a network. Needs the extra `html`.
 
-A page shows, along a timeline of sweeps, the points of sweep t coloured by residual flow, speed, object, confidence
-and, if the log has labels, truth and error; an arrow per moving cluster; boxes, trails, ids and speeds of tracks.
-flow=FOLDER shows the output of `cflow flow`, and its tracks, instead of new estimates. format=rerun writes a recording
-OUTPUT/<log id>.rrd for the viewer rerun instead, with all points and sweep t+1 (extra `rerun`). show=true opens the
-files at the end. OUTPUT/config.yaml contains the settings and versions.
+A page has a timeline of sweeps. It shows the points of sweep t, coloured by residual flow, speed, object, confidence
+and, if the log has labels, truth or error. It also shows an arrow per moving cluster, and the boxes, trails, ids and
+speeds of tracks. flow=FOLDER shows the output of `cflow flow`, and its tracks, instead of new estimates. format=rerun
+writes a recording OUTPUT/<log id>.rrd for the viewer rerun instead of a page, with all points and sweep t+1 (extra
+`rerun`). show=true opens the files at the end. OUTPUT/config.yaml contains the settings and versions.
 
 examples:
   cflow view                                                   a simulated street, no data needed
@@ -75,7 +75,7 @@ def task(cfg: DictConfig) -> None:
 def _save_page(
     cfg: DictConfig, log: Log, results: Iterator[tuple[int, FlowResult]], file: Path, table: Table | None
 ) -> int:
-    """Save a page. Without a table of tracks, the results are tracked as they arrive."""
+    """Save a page. Without a table of tracks, track the objects of the results as they arrive."""
     tracker, tables = Tracker(), []
 
     def tracked() -> Iterator[tuple[int, FlowResult]]:
