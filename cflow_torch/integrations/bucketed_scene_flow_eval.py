@@ -1,4 +1,4 @@
-"""An estimator for BucketedSceneFlowEval: its frames in, its `EgoLidarFlow` out."""
+"""An estimator for BucketedSceneFlowEval: it takes frames and returns `EgoLidarFlow`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class CorrelationFlowEstimator(SequenceFlow):
             K - 1 `EgoLidarFlow`. Flow i has a row for each point of `frames[i].pc.full_pc`, in their order. The frames
             before i, at most `num_history`, are its history.
             full_flow: (N, 3) float32, metres until frame i + 1, residual (ego motion removed), in the axes of the
-                points of frame i. 0 for inactive points and outside `point_cloud_range`.
+                points of frame i. It is 0 for inactive points and outside `point_cloud_range`.
             mask: the frame's own `pc.mask`. A flow of 0 outside the method's range is scored like any other.
 
         Convention:
@@ -107,7 +107,7 @@ def _read_frame(name: str, frame: Any, timestamp_ns: int | None) -> _LogFrame:
 def _earlier(known: Sequence[_LogFrame], first: _LogFrame, num_history: int) -> list[_LogFrame]:
     """Return the known frames before `first`, at most `num_history`, with poses in the global frame of `first`."""
     same = [frame for frame in known if (frame.log_id, frame.log_idx) == (first.log_id, first.log_idx)]
-    if not same:  # another log, or items that do not overlap, whose global frames are unrelated
+    if not same:  # another log, or an item without overlap, whose global frame is unrelated
         return []
     shift = first.ego_to_global @ np.linalg.inv(same[0].ego_to_global)
     older = [frame for frame in known if first.log_idx - num_history <= frame.log_idx < first.log_idx]

@@ -1,4 +1,4 @@
-"""A model of SceneFlowZoo: `TorchFullFrameInputSequence` in, `TorchFullFrameOutputSequence` out."""
+"""A model for SceneFlowZoo: it takes `TorchFullFrameInputSequence` and returns `TorchFullFrameOutputSequence`."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def register(name: str = "CorrelationFlow") -> None:
 
 
 def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
-    """Return sweeps without padding, the first one whose flow is needed, and the (K, PadN) mask (1, 0, NaN)."""
+    """Return sweeps without padding, the index of the first one to estimate, and the (K, PadN) mask (1, 0, NaN)."""
     points, mask = sequence.full_pc, sequence.full_pc_mask
     check_array(points, f"{name}.full_pc", (None, None, 3), "f", "(K, PadN, 3) floats, metres")
     if len(points) < 2:

@@ -1,6 +1,6 @@
 """Residual flow of sequences of sweeps, in the axes of the points.
 
-BucketedSceneFlowEval and SceneFlowZoo, which builds on it, both pass such sequences.
+BucketedSceneFlowEval passes such sequences, and so does SceneFlowZoo, which builds on it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Frame:
     timestamp_ns: int | None = None  # nanoseconds, None = unknown
 
     def ego_points(self) -> Array:
-        """Return (N, 3) points in the ego frame of this sweep, float64 if the sensor has a frame of its own."""
+        """Return (N, 3) points in the ego frame of this sweep; float64, unless they already were in that frame."""
         if np.array_equal(self.sensor_to_ego, np.eye(4)):
             return self.points
         device = self.points.device if isinstance(self.points, Tensor) else torch.device("cpu")
@@ -49,8 +49,8 @@ class SequenceFlow(nn.Module):
     Args:
         preset: "default", "offline", "keypoints" or "paper" (`make_config`).
         device: "auto" = that of the given tensors, else a GPU if there is one, else the CPU.
-        ground: None = the masks of the frames exclude the ground (`with_ground=False`). "auto" or "patchwork" = also
-            find it in every sweep.
+        ground: None = the masks of the frames exclude the ground (`with_ground=False`). "auto" or "patchwork" = find
+            ground in every sweep, and exclude it, too.
         **settings: `method`, or any setting of the method.
     """
 
@@ -114,16 +114,16 @@ class SequenceFlow(nn.Module):
 def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Tensor:
     """Rotate (N, 3) residual flow from the ego axes at t+1 (`following`) to the axes of the points at t (`now`).
 
-    The rotation is (R_global_ego0 R_ego_sensor)^T R_global_ego1, in float64; a difference of positions is not
-    translated.
+    The rotation is (R_global_ego0 R_ego_sensor)^T R_global_ego1, in float64; flow is a difference of positions,
+    so there is no translation.
     """
     rotation = np.eye(4)
-    global_R_sensor = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]
-    rotation[:3, :3] = global_R_sensor.T @ following.ego_to_global[:3, :3]
+    R_global_sensor = now.ego_to_global[:3, :3] @ now.sensor_to_ego[:3, :3]
+    rotation[:3, :3] = R_global_sensor.T @ following.ego_to_global[:3, :3]
     return compensate(residual_flow.double().t(), rotation).t().float().contiguous()
 
 
 def times_in_ns(stamps: Sequence[Any]) -> tuple[int | None, ...]:
-    """Return the time stamps of sweeps; None for each if they are not nanoseconds (some data sets number sweeps)."""
+    """Return time stamps in nanoseconds; None for all if they have another unit (some data sets number the sweeps)."""
     shortest = min((int(b) - int(a) for a, b in zip(stamps, stamps[1:])), default=0)
     return tuple(int(stamp) if shortest >= 1_000_000 else None for stamp in stamps)

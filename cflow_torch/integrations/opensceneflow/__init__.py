@@ -1,4 +1,4 @@
-"""A model of OpenSceneFlow (SeFlow, DeltaFlow and their forks) that needs no change in the checkout.
+"""A model for OpenSceneFlow (SeFlow, DeltaFlow and their forks) that needs no change in the checkout.
 
 `python -m cflow_torch.integrations.opensceneflow FILE` writes the checkpoint without weights that its scripts require.
 """

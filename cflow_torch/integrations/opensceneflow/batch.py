@@ -20,7 +20,7 @@ class Sample(NamedTuple):
     # t as "origin_pc0", its ground points follow those of pc0, with a mask.
     window: Window
     rows0: Tensor  # (K,) int64, rows of batch["pc0"] that are in `window.pc0`
-    T_ego1_ego0: np.ndarray  # (4, 4) float32, motion that the harness computes from the poses and adds itself
+    T_ego1_ego0: np.ndarray  # (4, 4) float32, motion that the harness computes from the poses and adds to the flow
     # (4, 4) float64, motion of the frame of the points; None = `T_ego1_ego0` is that motion.
     T_lidar1_lidar0: np.ndarray | None
 
@@ -37,9 +37,9 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
         ego_T_lidar: (4, 4); None = identity; "auto" = `recognized_extrinsics` of the sweep.
 
     Convention:
-        We apply a ground mask that has as many rows as its sweep has points. If instead it has as many rows that are
-        not ground, the harness has already applied it (to pc0, pc1 and some or all of the history).
-        Rows with NaN are ignored: they are padding, or beams without a return. "flow" and other truth is never read. A
+        We apply a ground mask that has as many rows as its sweep has points. If instead only its rows that are not
+        ground are as many, the harness has already applied it (to pc0, pc1 and some or all of the history).
+        Rows with NaN are ignored: they are padding, or beams without a return. We never read "flow" and other truth. A
         `CFlowError` names the key of a value that is missing, has a wrong shape, or is not a rigid motion.
     """
     history = [f"h{i}" for i in range(1, num_history + 1) if f"pch{i}" in batch]
@@ -86,7 +86,7 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor
 
 
 def _ground_of_t(batch: Mapping[str, Any], b: int) -> Tensor:
-    """Return the (K, 3) ground points of t, which the harness has taken out of pc0; none if the batch lacks them."""
+    """Return the (K, 3) ground points of t, which the harness has removed from pc0; none if the batch lacks them."""
     if "origin_pc0" in batch and "gm0" in batch:
         points, is_ground = _entry(batch, "origin_pc0", b), _mask(batch, "gm0", b)
         if len(points) == is_ground.numel():

@@ -35,8 +35,8 @@ class CFlow(nn.Module):
         device: "auto" = that of the batch.
         voxel_size, grid_feature_size: ignored. The harness passes them.
         preset, method: as for `make_config`; "default" if neither is given.
-        **settings: settings of the method, instead of the preset's. We ignore `num_history`, `num_future` and settings
-            that the method does not have, and name them in a warning.
+        **settings: settings of the method, which replace those of the preset. We ignore `num_history`, `num_future` and
+            settings that the method does not have, and name them in a warning.
 
     Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
@@ -69,7 +69,7 @@ class CFlow(nn.Module):
         has_matrix = ego_T_lidar is not None and not (isinstance(ego_T_lidar, str) and ego_T_lidar == "auto")
         self.ego_T_lidar = rigid_transform(ego_T_lidar, "ego_T_lidar") if has_matrix else ego_T_lidar
         self.timer: Any = None
-        with suppress(ImportError):  # the harness always has it, and requires the attribute
+        with suppress(ImportError):  # the harness always has dztimer, and requires the attribute
             self.timer = import_module("dztimer").Timing()
         self._has_warned = False
 
@@ -81,8 +81,8 @@ class CFlow(nn.Module):
 
         Returns:
             Lists of B tensors, on the device of the method:
-            flow: (M, 3) float32, metres from t to t+1, axes of the frame of t+1, which the harness adds to pose_flow.
-                With `ego_T_lidar`, it also contains the error of the harness's own pose_flow.
+            flow: (M, 3) float32, metres from t to t+1, axes of the frame of t+1. The harness adds it to pose_flow.
+                With `ego_T_lidar`, it also corrects the error of the harness's own pose_flow.
             pc0_valid_point_idxes: (M,) int64, the rows of batch["pc0"] that `flow` belongs to.
             pose_flow: (N, 3) float32, T p - p of all rows of pc0, as the harness computes it.
 
