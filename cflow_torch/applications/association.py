@@ -53,8 +53,8 @@ def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> Mo
 def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGroups:
     """Divide moving groups that hold several confirmed objects, such as two cars side by side.
 
-    An object claims a group if its box holds `num_points` / 2 points of it, half of those that the object had. The
-    points of a group with several claims go to the box that holds them, all others to one of the claiming objects.
+    An object claims a group if its box holds at least `num_points` / 2 points of the group; the object itself had
+    `num_points`. In a group with several claims, points in a claiming box go to its object, all others to one of these.
     """
     moves = groups.group >= 0
     group, box, pair_of_point, count = unique_pairs(groups.group[moves], box[moves])

@@ -20,10 +20,10 @@ from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_array
 
-_MARGIN = 0.2  # metres by which a box is larger than the visible part of its object
+_MARGIN = 0.2  # metres, added to the sides of the box around the visible part of an object
 _SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
 _MAX_DISTANCE = 100.0  # metres from the vehicle to a box, at most
-_MAX_VOXELS = 1 << 20  # in a map, at most so many from its first sweep in each direction
+_MAX_VOXELS = 1 << 20  # largest distance of a map from its first sweep in x, y and z, voxels
 
 
 class CleanLog(Log):
@@ -38,11 +38,11 @@ class CleanLog(Log):
         flow: index -> flow of that pair, in place of a model. We use residual_flow and cluster_id, and with
             `remove_stopped` also is_valid.
         remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
-            finds them. It takes a pass over the log before the first sweep is returned, and 1 bit per point.
+            finds them. It takes a pass over the log before the first sweep is returned, and 1 bit of memory per point.
 
     Attributes:
         log_id, timestamps: those of the log.
-        num_stopped: number of points that only `remove_stopped` removes; None without it, or before the first sweep.
+        num_stopped: number of points that only `remove_stopped` removes; None without it, or before a sweep is read.
 
     Examples:
         >>> write_array_log(CleanLog(log), "outputs/clean")
@@ -77,7 +77,7 @@ class CleanLog(Log):
         return replace(sweep, **kept)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
-        """The log's other columns of sweep `index`, such as intensity, without the rows of its moving points."""
+        """Other columns of sweep `index`, such as intensity, without the rows of moving points."""
         is_kept, columns = ~self.moving(index), self._log.columns(index)
         for name, values in columns.items():
             what = f"column {name} of sweep {index}"

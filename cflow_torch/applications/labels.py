@@ -165,7 +165,7 @@ def _seconds(sweep: Sweep) -> float:
 
 
 def _is_confirmed(dynamic: Sequence[DynamicPoints], trees: Sequence[Any], index: int) -> np.ndarray:
-    """(M,) bool: the dynamic points of one sweep whose group reaches `AGREEMENT`."""
+    """(M,) bool: dynamic points of sweep `index` whose group is plausible, by the threshold `AGREEMENT`."""
     own = dynamic[index]
     score = own.confidence.copy()
     neighbours = [other for other in (index - 1, index + 1) if 0 <= other < len(dynamic)]

@@ -52,7 +52,7 @@ class MovingGroups:
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
     def divide(self, piece: Tensor) -> MovingGroups:
-        """Divide each group by the (M,) int64 piece of its points, -1 = static. Pieces keep cluster and confidence."""
+        """Divide groups by the piece of each point, (M,) int64, -1 = now static. Pieces keep cluster and confidence."""
         moves = (self.group >= 0) & (piece >= 0)
         origin, _, index, count = unique_pairs(self.group[moves], piece[moves])
         group = torch.full_like(self.group, -1).masked_scatter(moves, index)

@@ -11,9 +11,9 @@ from torch import Tensor
 # A track is confirmed by the motion that it has shown, because most short-lived groups are noise of the static world.
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
 _NO_CONFIDENCE = 0.7  # log-odds per sweep if the method has no confidence
-_THIN = 0.12  # metres; narrower boxes add no evidence: posts, and strips of a façade that an occlusion uncovers
+_THIN = 0.12  # metres; narrower boxes add no evidence: posts, and strips of a façade at the edge of an occlusion
 _MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # least net displacement: metres, plus a share of its length
-_TRAVEL_FACTOR = 2.0  # largest factor between the net displacement of its box and that of its flow
+_TRAVEL_FACTOR = 2.0  # largest ratio of the net displacements of its box and of its flow, either way
 # Without that evidence, its box has to move farther, and more exactly as its flow predicts.
 _LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres (or its length, if that is longer); relative; sweeps
 _JUMP, _SMALL = 1.5, 1.5  # if length + _SMALL (metres) changes by the factor _JUMP, the box shows another part

@@ -18,7 +18,7 @@ PREFIXES = {"data": "data.", "engine": "engine.", "picture": ""}  # of the setti
 
 
 def groups(command: str) -> dict[str, list[str]]:
-    """Groups of a command and their choices: {"model": ["default", ...], ...}."""
+    """Return the groups of a command and their choices: {"model": ["default", ...], ...}."""
     entries = _load(CONFIGS / f"{command}.yaml")["defaults"]
     names = [name for entry in entries if isinstance(entry, dict) for name in entry]
     return {name: list(PRESETS) if name == "model" else [file.stem for file in files(name)] for name in names}
@@ -29,7 +29,7 @@ def files(group: str) -> list[Path]:
 
 
 def settings(command: str) -> list[str]:
-    """Return the names of all settings of a command in dotted form, those of every choice of its groups included."""
+    """Return the dotted names of all settings of a command and of all choices of its groups."""
     of_methods = [f"model.{name}" for preset in PRESETS for name in make_config(preset).as_dict()]
     return list(dict.fromkeys([*(name for name, _, _ in defaults(command)), *of_methods]))
 
@@ -45,7 +45,7 @@ def defaults(command: str, chosen: Mapping[str, Any] | None = None) -> Iterator[
 
 
 def own_settings(file: Path) -> dict[str, Any]:
-    """The settings in a YAML file and in those that it extends, in dotted form."""
+    """Return the dotted settings of a YAML file and of the files that it extends, with their defaults."""
     content, found = _load(file), {}
     for base in content.get("defaults", ()):
         if isinstance(base, str) and base not in ("_self_", "hydra"):
@@ -66,14 +66,14 @@ def _load(file: Path) -> dict[str, Any]:
 
 
 def near(word: str, known: Iterable[str]) -> str:
-    """The hint " (did you mean X?)" with the most similar name, with or without its group; "" if none is similar."""
+    """Return the hint " (did you mean X?)" with the most similar name, with or without group; "" if none is similar."""
     names = {form: name for name in known for form in (name.rpartition(".")[2], name)}
     found = get_close_matches(word, names, 1)
     return f" (did you mean {names[found[0]]}?)" if found else ""
 
 
 def settings_help(command: str) -> str:
-    """The settings of a command as in its YAML file, and the choices of its groups, for its help."""
+    """Return the settings for the help of a command: its YAML file, and the choices of its groups."""
     text = (CONFIGS / f"{command}.yaml").read_text(encoding="utf-8")
     own = re.sub(r"^((defaults|hydra):.*\n( .*\n)+|#.*\n)", "", text, flags=re.MULTILINE).strip()
     lines = [*own.splitlines(), *(f"{group}={'|'.join(names)}" for group, names in groups(command).items())]

@@ -51,7 +51,7 @@ target:
   voxel_size: [0.1, 0.1, 2000.0]  # the harness asks for it; without effect, pixel_sizes counts
 """
 _COMMANDS = sorted(file.stem for file in CONFIGS.glob("*.yaml") if file.stem != "hydra")
-_Z = 1000.0  # metres; the harness computes with the region, so infinite bounds of z are replaced by this one
+_Z = 1000.0  # metres, in place of infinite bounds of z, because the harness computes with the region
 
 
 def task(arguments: list[str]) -> None:

@@ -96,7 +96,7 @@ def _save_page(
 
 
 def _flow(cfg: DictConfig) -> tuple[Callable[[Log, int], FlowResult], int]:
-    """(Function that returns the flow of a pair, number of sweeps that it needs)."""
+    """Return a function that returns the flow of a pair, and the number of sweeps that this function needs."""
     if cfg.flow is not None:
         return run.stored_flow(cfg.flow, ("residual_flow", "pose_flow", "cluster_id", "is_valid")), 2
     model = run.make_model(cfg)

@@ -48,7 +48,7 @@ class Unit:
 
 
 class Opened(NamedTuple):
-    """A unit has begun: time stamps of its `frames`, and of those `todo` that are not complete yet."""
+    """A unit has begun. `frames` are the time stamps of its frames, `todo` the time stamps of incomplete frames."""
 
     unit: int
     log_id: str

@@ -21,7 +21,7 @@ CPU_BATCH, GPU_BATCH = 4, 32
 
 
 class Layout(NamedTuple):
-    """The use of a machine by a run."""
+    """How a run uses this machine."""
 
     devices: tuple[str, ...]  # one per worker
     batch: int  # windows that are computed together

@@ -1,4 +1,4 @@
-"""The progress of a run: a bar on a terminal; elsewhere, for example in a log file, a line now and then."""
+"""The progress of a run: a bar on a terminal; elsewhere, for example in a log file, a line every 30 seconds."""
 
 from __future__ import annotations
 

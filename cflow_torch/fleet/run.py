@@ -1,4 +1,4 @@
-"""A whole run: start the engine, count its events, write the report; or count what a run would do."""
+"""Run a fleet: start the engine, count its events and write the report; or count what a run would compute."""
 
 from __future__ import annotations
 

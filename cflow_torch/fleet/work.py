@@ -145,7 +145,7 @@ class Worker:
                 good[0].content = error.with_traceback(None)
                 self._check_device()
         if results is None:
-            # We are after the except block, because the traceback there keeps the memory of the batch on the GPU.
+            # This is after the except block: until its end, the traceback keeps the memory of the batch on the GPU.
             for frame in good if len(good) > 1 else []:
                 self._compute([frame])
             return frames

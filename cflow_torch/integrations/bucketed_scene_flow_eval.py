@@ -74,7 +74,7 @@ class CorrelationFlowEstimator(SequenceFlow):
 
 @dataclass(frozen=True)
 class _LogFrame(Frame):
-    """A frame with its log and its index there."""
+    """A frame with the id of its log and its index in this log."""
 
     log_id: str = ""
     log_idx: int = 0

@@ -124,7 +124,7 @@ def save_picture(figure: Figure, path: str | Path) -> Path:
 def split_sweep(
     points: Array, is_ground: Array | None, point_cloud_range: Sequence[float] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the view as in `view_of`, (N, 3) float64 positions, and (N,) masks of ground and other points in view."""
+    """Return the view as in `view_of`, (N, 3) float64 positions, and (N,) bool: ground and other points in view."""
     position = point_rows("points", points)
     ground = np.zeros(len(position), bool) if is_ground is None else as_numpy(is_ground).astype(bool)
     if ground.shape != (len(position),):

@@ -120,7 +120,7 @@ class _Drive:
         self._points(GROUND, position[is_ground], _GROUND_COLOR, _FINE_DOT)
         after = as_numpy(pc1.points)[:, :3]
         self._points(NEXT_SWEEP, after[np.isfinite(after).all(axis=1)], _NEXT_COLOR, _FINE_DOT)
-        if scene.truth is not None or self.has_truth:  # to log no points clears the truth of an earlier pair
+        if scene.truth is not None or self.has_truth:  # an empty cloud clears the truth of an earlier pair
             self.has_truth = True
             truth = np.full_like(position, np.nan) if scene.truth is None else scene.truth
             is_known = ~is_ground & np.isfinite(truth).all(axis=1)

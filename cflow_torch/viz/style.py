@@ -63,7 +63,7 @@ def add_caption(figure: Figure, caption: str) -> None:
 
 
 def set_view(axes: Axes, low: np.ndarray, high: np.ndarray, has_ticks: bool = False) -> None:
-    """Set limits, (2,) corners (x, y) in metres, with equal scales and a thin frame."""
+    """Set the limits `low` and `high`, (2,) metres each, with equal scales and a thin frame."""
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     if has_ticks:
         thin_ticks(axes)

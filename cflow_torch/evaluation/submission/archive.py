@@ -56,7 +56,7 @@ def get_version(number: Any) -> SubmissionVersion:
 def encode(
     version: SubmissionVersion, result: FlowResult, is_ground: Array | None = None, mask: np.ndarray | None = None
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Convert the flow of one frame to the columns of its file, and return them and the rounding errors, (M,) metres.
+    """Convert the flow of one frame to the columns of its file; also return the (M,) float64 rounding errors, metres.
 
     Args:
         version: the format.
