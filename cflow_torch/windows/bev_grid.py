@@ -26,7 +26,7 @@ class Grid:
     upper: tuple[float, ...]  # (x1, y1, z1), p^+, upper end; both ends belong to the region
 
     def __post_init__(self) -> None:
-        # `height` and `width` would raise here: a side may be infinite.
+        # Not `height` and `width`: their floor raises if a side is infinite.
         rows, cols = ((self.upper[axis] - self.lower[axis]) / self.pixel_size + 1 for axis in (1, 0))
         if not (max(rows, cols) < LONGEST_SIDE + 1 and self.height * self.width <= _MOST_PIXELS):
             raise CFlowError(
@@ -46,7 +46,7 @@ class Grid:
         return math.floor((self.upper[0] - self.lower[0]) / self.pixel_size) + 1
 
     def centre(self, pixel: Tensor) -> Tensor:
-        """Return y and x of the centres of pixels, (2, K) float64, metres. `pixel` has their row and column, (2, K)."""
+        """Return y and x of the centres of pixels, (2, K) float64, metres; `pixel` is (2, K), rows and columns."""
         lower = constant(self.lower[1::-1], torch.float64, pixel.device)
         return pixel.double().add_(0.5).mul_(self.pixel_size).add_(lower[:, None])
 
@@ -84,23 +84,23 @@ class Grid:
     def pixel_of_image(
         self, positions: Tensor, image: Tensor, num_images: int, is_active: Tensor | None = None
     ) -> Tensor:
-        """Return the flat index of the pixel of every point in a stack of B x H x W pixels, (N,) int32.
+        """Return the flat index of each point's pixel in a stack of B images, (N,) int32 (int64 if that is too small).
 
-        If int32 is too small, it is int64. Points with `is_active`, (N,) bool, False get the index B * H * W. It must
-        be False outside the region; None = all points are active and inside. Positions are (2, N) or (3, N) float64,
-        metres, frame of t+1. `image` is the image of each point, (N,) int32 or int64.
+        `positions` are (2, N) or (3, N) float64, metres, frame of t+1. `image` is the image of each point, (N,) int32
+        or int64. Points that are not active get the index B * H * W. `is_active`, (N,) bool, must be False outside the
+        region; None = all points are active and inside.
         """
         num_pixels = num_images * self.height * self.width
         pixel = self.pixel(positions)
         if num_pixels > torch.iinfo(torch.int32).max:
             pixel = pixel.long()
         pixel.add_(image, alpha=self.height * self.width)
-        if is_active is not None:  # a product: masked_fill_ would take four times as long
+        if is_active is not None:  # masked_fill_ would take four times as long as this product
             pixel.sub_(num_pixels).mul_(is_active.to(pixel.dtype)).add_(num_pixels)
         return pixel
 
     def draw(self, pixel: Tensor, num_images: int) -> Tensor:
-        """(B, H, W) bool images, set at (N,) int64 pixels from `pixel_of_image`."""
+        """Return (B, H, W) bool images that are True at the (N,) int64 pixels from `pixel_of_image`."""
         num_pixels = num_images * self.height * self.width
         occupancy = torch.zeros(num_pixels + 1, dtype=torch.bool, device=pixel.device).index_fill_(0, pixel, True)
         return occupancy[:-1].view(num_images, self.height, self.width)

@@ -18,10 +18,10 @@ _ORTHOGONALITY = 1e-3
 
 
 def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
-    """Check a rigid transform and convert it to (4, 4) float64. Another matrix is a `CFlowError` that names it.
+    """Check a rigid transform and convert it to (4, 4) float64. Any other matrix is a `CFlowError` with the `name`.
 
-    Its dtype must resolve a centimetre at its own translation, and at `reach`, the distance of the farthest point in
-    metres.
+    The dtype must resolve a centimetre at the translation of the transform, and at `reach`, the distance of the
+    farthest point in metres.
     """
     dtype = getattr(matrix, "dtype", None)
     try:
@@ -33,7 +33,7 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
     if not np.isfinite(result).all():
         raise CFlowError(f"{name} holds NaN or infinite values: give a finite rigid transform")
     rotation, last_row = result[:3, :3], result[3]
-    with np.errstate(over="ignore", invalid="ignore"):  # of values that are far from a rotation
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are far from a rotation may overflow
         error, determinant = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation)
     wrong_row = np.abs(last_row - (0, 0, 0, 1)).max()
     if not (error <= _ORTHOGONALITY and wrong_row <= _ORTHOGONALITY and determinant > 0):
@@ -52,7 +52,7 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
 
 
 def relative_transform(pose1: Any, pose: Any) -> np.ndarray:
-    """T_ego1_ego = inv(T_world_ego1) T_world_ego, (4, 4) float64, of two poses. Errors as in `rigid_transform`."""
+    """Return T_ego1_ego, (4, 4) float64, from two poses T_world_ego. Errors as in `rigid_transform`."""
     return np.linalg.inv(rigid_transform(pose1, "pose1")) @ rigid_transform(pose, "pose")
 
 
@@ -62,8 +62,8 @@ def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -
     Positions are (3, N) float64, metres. The transform is (4, 4) float64, or (3, 4, N), one per point; None = positions
     are in the frame of t+1 already. A point that is not finite has no finite coordinate after a transform.
 
-    Convention: ((R0 x + R1 y) + R2 z) + t with one rounding per operation instead of a matrix product: the same bits on
-    every device.
+    Convention: we compute ((R0 x + R1 y) + R2 z) + t with one rounding per operation, not as a matrix product. So every
+    device returns the same bits.
     """
     if T_ego1_ego is None:
         return positions[:num_axes]

@@ -1,9 +1,9 @@
 """Segment the ground without a map, for any mounting height, many sweeps at once.
 
 Idea: (1) Near the vehicle, most flat spots lie on one plane. (2) We grid the heights above that plane and keep the
-lowest of each cell. (3) The ground is the highest surface of limited slope below these heights, because objects on the
-ground are steeper. We fit it twice: first with slopes as steep as hills, then with gentle ones about the smoothed
-result. (4) A point is ground if it lies less than a threshold above the surface.
+tenth percentile of each cell. (3) The ground is the highest surface of limited slope below these heights, because
+objects on the ground are steeper. We fit the surface twice: first with slopes as steep as hills, then with gentle ones
+about the smoothed result. (4) A point is ground if it lies at most a threshold above the surface.
 
 All arithmetic is in whole millimetres, so the bits do not depend on the batch, the order of points or the device.
 """
@@ -23,7 +23,7 @@ from cflow_torch.types import Array, CFlowError, Sweep, Window, check_points
 from cflow_torch.windows.ground_plane import REACH, millimetres, near_plane, order_statistics
 from cflow_torch.windows.validation import choose_device, read_positions
 
-CHOICES = (None, "auto", "grid", "patchwork")  # None = there is no ground; "auto" = "grid" where there is no mask
+CHOICES = (None, "auto", "grid", "patchwork")  # None = do not look for ground; "auto" = "grid" where there is no mask
 THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster
 
 # Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
@@ -33,8 +33,8 @@ _HIGHEST = 1 << 28  # heights are clamped to this, mm
 # Of the points within 32 m and farther than half a metre from the ground, less than 1.5 % lie below it on four real
 # drives and 15 simulated ones, but more than 97 % if z points down.
 _NEAR, _FAR, _SHARE_BELOW, _FEWEST_BELOW = 32_000, 500, 0.8, 200
-_MOST_POINTS = 30_000  # of a sweep, for tests of the ground; of larger ones every second, third, ... point is taken
-_PATCHWORK_HEIGHT = 1.723  # metres, sensor height that Patchwork++'s default settings assume
+_MOST_POINTS = 30_000  # `has_ground` and `is_upside_down` take every second, third, ... point of larger sweeps
+_PATCHWORK_HEIGHT = 1.723  # metres, height of the sensor above ground in Patchwork++'s default settings
 
 
 def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOLD, device: Any = "auto") -> Array:
@@ -51,9 +51,9 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
         (N,) bool, True = ground. An array for an array, a tensor on the same device for a tensor.
 
     Convention:
-        All False if there are fewer than 20 pairs of flat spots (2 m x 2 m) 4 m apart within 32 m. NaN and infinite
-        points and points with |x| or |y| >= 131 m are not ground. The order of points, the other sweeps of the batch
-        and shifts by whole millimetres in z do not change the result.
+        All False if, within 32 m, fewer than 20 pairs of flat spots (2 m x 2 m) lie 4 m apart, or fewer than one pair
+        for every six spots with points. NaN, infinite points and those with |x| or |y| >= 131 m are not ground. The
+        order of points, the other sweeps and shifts by whole millimetres in z do not change the result.
 
     Raises:
         CFlowError: wrong shape, dtype, method or threshold; Patchwork++ is not installed.
@@ -67,10 +67,10 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
 def find_ground_batch(
     clouds: Sequence[Array], method: str = "grid", threshold: float = THRESHOLD, device: Any = "auto"
 ) -> list[Array]:
-    """Segment the ground points of several sweeps at once, as `find_ground` does each. Tensors must be on one device.
+    """Segment the ground of several sweeps at once, each as `find_ground` does. Tensors must be on one device.
 
-    Cost: two sorts of all points, some 60 passes over 256 x 256 cells per sweep; 100,000 points take 20 ms on one CPU
-    thread (docs/data.md).
+    Cost: two sorts of all points, and some 60 passes over 256 x 256 cells per sweep. 100,000 points take 20 ms on one
+    CPU thread (docs/data.md).
     """
     if method not in CHOICES[1:]:
         raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CHOICES[1:]))}")
@@ -107,7 +107,7 @@ def is_upside_down(cloud: Array) -> bool:
 
 
 def _thinned(cloud: Array) -> tuple[Tensor, Tensor, Tensor]:
-    """(3, N) mm, sweep and `inside` of every k-th point of a cloud."""
+    """Return every k-th point of a cloud: (3, N) int64 mm, the sweep (0), and `inside` as from `millimetres`."""
     check_points(cloud, "points")
     positions, sweep = _stack([cloud[:: max(1, -(-cloud.shape[0] // _MOST_POINTS))]], "auto")
     points, inside = millimetres(positions)
@@ -115,7 +115,7 @@ def _thinned(cloud: Array) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _grid(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: int) -> Tensor:
-    """(N,) bool ground by method "grid", of (3, N) float64 metres and the sweep of each point. Threshold in mm."""
+    """Segment the ground by the method "grid", (N,) bool, from (3, N) float64 metres. The threshold is in mm."""
     points, inside = millimetres(positions)
     plane = near_plane(points, sweep, inside, num_sweeps)
     above = (points[2] - plane.at(points[0], points[1], sweep)).clamp_(-_HIGHEST, _HIGHEST)
@@ -130,7 +130,7 @@ def _grid(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: int) -> 
 
 
 def _stack(clouds: Sequence[Array], device: Any) -> tuple[Tensor, Tensor]:
-    """(3, N) float64 positions of all clouds, and (N,) int64, the cloud of each point, on one device."""
+    """Return the positions of all clouds, (3, N) float64, and the cloud of each point, (N,) int64, on one device."""
     for number, cloud in enumerate(clouds):
         check_points(cloud, f"points of sweep {number}")
     sweeps = [Sweep(cloud) for cloud in clouds]
@@ -142,7 +142,7 @@ def _stack(clouds: Sequence[Array], device: Any) -> tuple[Tensor, Tensor]:
 
 
 def _patchwork(positions: Tensor, sweep: Tensor, num_sweeps: int) -> Tensor:
-    """(N,) bool by Patchwork++ with its default settings. We lift the cloud to the sensor height that they assume."""
+    """Segment by Patchwork++, (N,) bool. We shift each cloud in z to the sensor height of its default settings."""
     need = "method='patchwork' needs Patchwork++: pip install pypatchworkpp, or method='grid'"
     pypatchworkpp = import_optional("pypatchworkpp", need)
     points, inside = millimetres(positions)

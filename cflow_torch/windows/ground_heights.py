@@ -10,16 +10,16 @@ from cflow_torch.ops.indices import constant
 from cflow_torch.ops.linear import adjugate
 from cflow_torch.windows.bev_grid import Grid
 
-# Side of the blocks in which heights are averaged, metres; with the eight blocks around it, 6 m x 6 m.
+# Side of the blocks, metres. A block and the eight around it cover 6 m x 6 m.
 _BLOCK = 2.0
-# With fewer ground points than this in 6 m x 6 m the height is unknown.
+# With fewer ground points in 6 m x 6 m (`mean`) or in a block (`slopes`), the height is unknown.
 _FEWEST_POINTS = 5
 _FEWEST_BLOCKS = 5  # of a plane
-# Blocks each way that a plane is fitted to, 10 m x 10 m. We fit it three times, without the blocks that are farther
-# than this from it (millimetres; at a tie a block stays), such as a pavement. A steeper plane is not ground.
+# We fit a plane to the blocks at most two away each way (10 m x 10 m), three times. The second and third fit leave out
+# blocks more than 100 mm from the last plane, such as a pavement (ties stay). Planes steeper than 0.3 are not ground.
 _REACH, _NUM_FITS, _FARTHEST = 2, 3, 100 + 1e-6
 _STEEPEST = 0.3
-# Those blocks: 1, column and row, counted from the middle one.
+# Terms of the plane in each of these blocks: 1, and its column and row from the middle block.
 _AROUND = tuple((1, dx, dy) for dy in range(-_REACH, _REACH + 1) for dx in range(-_REACH, _REACH + 1))
 # Heights are whole centimetres, bounded so that no sum overflows; unknown ground lies below every point.
 _HIGHEST = 10**10
@@ -36,7 +36,7 @@ class GroundHeights:
         self._counts = torch.zeros_like(self._heights)
 
     def add(self, window: int | Tensor, positions: Tensor) -> None:
-        """Count ground points at (3, N) float64 metres in the region, frame of t+1, of one window or (N,) windows."""
+        """Add ground points in the region, (3, N) float64, metres, frame of t+1, of one window or (N,) windows."""
         block = self._block(positions).long() + window * self._heights[0].numel()
         height = torch.floor(positions[2] * 100).clamp_(-_HIGHEST, _HIGHEST).long()
         self._heights.view(-1).index_add_(0, block, height)
@@ -55,7 +55,7 @@ class GroundHeights:
     def at(self, positions: Tensor, window: Tensor, mean: Tensor) -> Tensor:
         """Return the height of the ground around each position, (N,) float64, centimetres.
 
-        Positions are (3, N), metres, in the region. `mean` is the result of the function `mean`.
+        Positions are (3, N), metres, in the region; `window` is (N,). `mean` is the result of the method `mean`.
         """
         block = torch.add(self._block(positions), window, alpha=mean.shape[1] * mean.shape[2])
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
@@ -63,11 +63,11 @@ class GroundHeights:
     def slopes(self, centre: Tensor, window: Tensor) -> Tensor:
         """Return the slopes of the ground around objects, (G, 2) float64, metres of height per metre in x and in y.
 
-        `centre` is that of each object, (G, 2) float64, x and y, metres, frame of t+1, anywhere. We fit a plane to the
-        mean heights of the blocks around it. The slope is 0 if the plane is steeper than 0.3, if fewer than five blocks
-        are known, or if they lie nearly on a line. Window B + w is window w once more, for copies of its points.
+        `centre` has x and y of each object, (G, 2) float64, metres, frame of t+1, in or outside the region. We fit a
+        plane to the mean heights of the blocks around it. The slope is 0 if the plane is steeper than 0.3, if fewer
+        than five blocks are known, or if they lie nearly on a line. `window` is (G,); B + w stands for window w.
 
-        Convention: block heights are whole millimetres, rounded down. So all sums are exact.
+        Convention: block heights are whole millimetres, rounded down, so all sums are exact.
         """
         num_windows, rows, cols = self._heights.shape
         blocks = F.pad(torch.stack((self._heights, self._counts)), (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
@@ -100,7 +100,7 @@ class GroundHeights:
         return torch.where(is_ground, slope, 0.0).t().contiguous()
 
     def _block(self, positions: Tensor) -> Tensor:
-        """(N,) int32 block of positions inside the region, where int() rounds down."""
+        """Return the block of positions in the region, (N,) int32. There int() rounds down."""
         lower = constant(self._lower[:2], positions.dtype, positions.device)
         col, row = (positions[:2] - lower[:, None]).div_(_BLOCK).int()
         return col.add_(row, alpha=self._heights.shape[2])

@@ -16,10 +16,10 @@ _STEP, _STEP_BITS = 2, 12  # the tilt is the median step between flat cells 4.09
 _MAX_STEP = 1024  # steeper steps than 25 % are ignored
 _FARTHEST_HEIGHT = 1e7  # metres; the largest that fits the sort key
 _TRIM = 10  # the lowest tenth of the points of a cell is ignored, because of multipath
-_FLAT, _FLAT_POINTS = 250, 4  # a cell of at least 4 points is flat if half of them lie in a layer of 250 mm
+_FLAT, _FLAT_POINTS = 250, 4  # a cell of 4 or more points is flat if median - tenth percentile is at most 250 mm
 _LAYER = 300  # flat cells of the ground differ by at most this (kerbs), mm
-# There is ground if at least 20 pairs of flat cells are level enough, and at least a sixth as many as occupied cells.
-# Simulated drives (seeds 400-409) have at least three times as many, and at most a tenth without their ground.
+# There is ground if at least 20 pairs of flat cells are level, and a sixth as many pairs as cells of 4 points or more.
+# Simulated drives (seeds 400-409) have at least three times as many pairs, and at most a tenth without their ground.
 _FEWEST_PAIRS, _SMALLEST_SHARE = 20, 6
 
 
@@ -33,13 +33,13 @@ class Plane:
     height: Tensor  # (B,) int64, mm, at the origin
 
     def at(self, x: Tensor, y: Tensor, sweep: Tensor) -> Tensor:
-        """(N,) int64 height in mm at x, y (N,) int64 mm."""
+        """Return the height of the plane of each point's sweep at x, y, all (N,) int64, mm."""
         rise = self.step_x.index_select(0, sweep).mul_(x).add_(self.step_y.index_select(0, sweep).mul_(y))
         return (rise >> _STEP_BITS).add_(self.height.index_select(0, sweep))
 
 
 def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int) -> Plane:
-    """Fit the plane of most flat spots of active points near the sensor; ties: the lowest. Points: (3, N) int64 mm."""
+    """Fit the plane of most flat cells near the origin to active points, (3, N) int64 mm. Ties: the lowest plane."""
     size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
     col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
     is_near = (((col | row) & -size) == 0).logical_and_(is_active)  # both in 0 ... size - 1
@@ -57,7 +57,7 @@ def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int
     unknown = torch.iinfo(torch.int64).max // 2
     heights = (low - rise).masked_fill_(~is_flat, unknown).flatten(1).sort(1).values
     rank = torch.arange(heights.shape[1], device=low.device)
-    in_layer = torch.searchsorted(heights, heights + _LAYER, right=True) - rank  # cells at most a layer above each
+    in_layer = torch.searchsorted(heights, heights + _LAYER, right=True) - rank  # cells from each to a layer above it
     in_layer.masked_fill_(heights == unknown, 0)
     most = in_layer.amax(1)
     first = torch.where(in_layer == most[:, None], rank, heights.shape[1]).amin(1)
@@ -66,10 +66,10 @@ def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int
 
 
 def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the tenth percentile, the median and the number of the heights of each cell, (num_cells,) int64 each.
+    """Return the tenth percentile, the median and the number of heights in each cell, (num_cells,) int64 each.
 
-    The first two are undefined where the number is 0. Heights are (N,) int64, mm, |height| < 2^36. Those in cell
-    `num_cells` are left out.
+    Where the number is 0, the others are undefined. Heights are (N,) int64, mm, |height| < 2^36. Heights in the cell
+    `num_cells` are ignored.
     """
     offset, bits = 1 << 36, 37
     key = (cell << bits).add_(height).add_(offset).sort().values  # by cell, then by height
@@ -87,7 +87,7 @@ def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tens
 
 
 def _median_step(first: Tensor, second: Tensor, is_pair: Tensor) -> tuple[Tensor, Tensor]:
-    """(B,) int64: median of second - first over the pairs that are not too steep, and the number of these pairs."""
+    """Return the median of second - first over pairs that are not too steep, and their number, (B,) int64 each."""
     step = second - first
     is_level = is_pair & (step.abs() <= _MAX_STEP)
     ordered = step.masked_fill(~is_level, UNKNOWN).flatten(1).sort(1).values
@@ -97,7 +97,7 @@ def _median_step(first: Tensor, second: Tensor, is_pair: Tensor) -> tuple[Tensor
 
 
 def millimetres(positions: Tensor) -> tuple[Tensor, Tensor]:
-    """(3, N) int64 mm, and (N,) bool: the point is finite and on the grid. The others are moved to the origin."""
+    """Return (3, N) int64 mm, and (N,) bool: the point is finite and on the grid. Other points move to the origin."""
     x, y, z = positions.abs()
     # A millimetre less than the reach, because rounding must not leave the grid.
     inside = (x < REACH - 0.001).logical_and_(y < REACH - 0.001).logical_and_(z < _FARTHEST_HEIGHT)

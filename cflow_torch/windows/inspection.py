@@ -28,17 +28,17 @@ BACKWARD = (
     "two sweeps in a row fit better if the motion between them is inverted: are poses inverted (they must be "
     "T_world_ego, and T_ego1_ego0 maps from t to t+1), or are sweeps interchanged?"
 )
-_FEWEST_REPEATED = 100  # so many equal points are not a coincidence
+_FEWEST_REPEATED = 100  # this many equal points are no coincidence
 _MOST_POINTS = 20_000  # of a sweep, for the comparison of two sweeps
-_LEAST_MOTION, _REACH = 0.3, 30.0  # metres at this distance, ego motion over one interval whose direction we judge
+_LEAST_MOTION, _REACH = 0.3, 30.0  # metres; we judge ego motions that move a point 30 m away by at least 0.3 m
 
 
 class Inspection:
     """Warns of likely mistakes in the windows of a model.
 
-    These are: z points down; ground without a mask; pc1 repeats pc0; inverted poses or interchanged sweeps. It checks
-    the points of the first window only, and the direction of the ego motion only in the first window in which the
-    sensor moves. Cost: about 20 ms, once; 5 us for each window.
+    In every window, it checks that pc1 does not repeat pc0. It makes the other checks once, in the first window of a
+    call. The first time that this window has points, it checks that z points up and ground is masked. The first time
+    that the sensor moves in it, it checks poses and order of sweeps. Cost: about 20 ms, once; 5 us for each window.
     """
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class Inspection:
 
 
 def repeats(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether two sweeps have the same points. Tensors on a GPU are not compared: that would wait for it."""
+    """Test whether two sweeps have the same 100 or more points. False for tensors on a GPU, to avoid waiting for it."""
     for points in (pc0.points, pc1.points):
         if len(points) < _FEWEST_REPEATED or (isinstance(points, torch.Tensor) and points.device.type != "cpu"):
             return False
@@ -72,7 +72,7 @@ def repeats(pc0: Sweep, pc1: Sweep) -> bool:
 
 
 def has_moved(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether the sensor moves enough, by the poses, to judge the direction of its motion."""
+    """Test whether the poses differ enough to judge the direction of the ego motion. False without poses."""
     if pc0.pose is None or pc1.pose is None:
         return False
     T = relative_transform(pc1.pose, pc0.pose)
@@ -80,7 +80,7 @@ def has_moved(pc0: Sweep, pc1: Sweep) -> bool:
 
 
 def is_backward(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether the structure of two sweeps coincides best if the ego motion by their poses is inverted."""
+    """Test whether the static structure of two sweeps fits better if the ego motion from their poses is inverted."""
     T_ego1_ego0 = relative_transform(pc1.pose, pc0.pose)
     older, newer = (structure(_thinned(sweep)) for sweep in (pc0, pc1))
     patches = Patches(newer[:, :2])
@@ -91,14 +91,14 @@ def is_backward(pc0: Sweep, pc1: Sweep) -> bool:
 
 
 def _thinned(sweep: Sweep) -> Sweep:
-    """Every k-th point of a sweep."""
+    """Return every k-th point of a sweep, with its ground mask."""
     step = max(1, -(-len(sweep.points) // _MOST_POINTS))
     is_ground = None if sweep.is_ground is None else as_numpy(sweep.is_ground[::step])
     return Sweep(as_numpy(sweep.points[::step]), is_ground)
 
 
 def warn_of_inactive(windows: Sequence[Window], results: Sequence[FlowResult], config: Config) -> None:
-    """Warn about points in millimetres, far away, or all on the ground. This waits for the device once."""
+    """Warn of each window whose pc0 has rows, but no active point. The host waits for the device once."""
     given = [(window, result) for window, result in zip(windows, results) if len(result.is_valid) > 0]
     has_active = torch.stack([result.is_valid.any() for _, result in given]).tolist() if given else []
     for (window, _), is_used in zip(given, has_active):
@@ -107,7 +107,7 @@ def warn_of_inactive(windows: Sequence[Window], results: Sequence[FlowResult], c
 
 
 def _describe_inactive(points: Array, config: Config) -> str:
-    """A text for a sweep without an active point, with its extent."""
+    """Return the warning for a pc0 without active points, with the extent of its points."""
     positions = as_numpy(points)[:, :3]
     finite = positions[np.isfinite(positions).all(axis=1)]
     seen = "all are NaN or infinite"

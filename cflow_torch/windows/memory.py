@@ -12,19 +12,19 @@ import torch
 from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.bev_grid import Grid
 
-_MUCH = 1 << 30  # bytes; smaller requests are not checked
+_MUCH = 1 << 30  # bytes; we check only larger requests
 _CGROUP = Path("/sys/fs/cgroup")
-# Working memory of a pixel of every sweep (occupancy and cluster) before the clusters are known.
+# Working memory of one pixel of one sweep (occupancy and cluster) before the clusters are known.
 _BYTES_PER_PIXEL = 10
-# Memory of a group on a CPU without `max_memory`: about 9 windows of a pair, or 4 of six sweeps. In larger groups the
-# fresh pages cost more than the operations that they save.
+# Memory of a group on a CPU if `max_memory` is None: about 9 pairs, or 4 windows of six sweeps. Larger groups save
+# operations, but fresh pages of memory cost more.
 _BYTES_ON_CPU = 1 << 29
 
 
 def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str) -> None:
-    """Raise before an allocation that does not fit, because a system that runs out of memory kills the process.
+    """Raise a `CFlowError` if so much memory is not free, because a system that runs out of memory kills the process.
 
-    `what` is the subject of the message, for example "a window of ...", and `remedy`, what to do, is its end.
+    The message begins with `what`, for example "a window of ...", and ends with `remedy`, which says what to do.
     """
     if num_bytes <= _MUCH:
         return
@@ -41,8 +41,8 @@ def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str)
 
 
 def available_memory(environ: Mapping[str, str]) -> int | None:
-    """Bytes that this process may still allocate: free memory, within its control groups and its share of a torchrun
-    job. None if the system does not report it."""
+    """Return the bytes that this process may still allocate: free memory within the limits of its control groups. The
+    processes of a torchrun job on this machine (`environ`) share them. None if the system does not report it."""
     free = []
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
@@ -55,7 +55,7 @@ def available_memory(environ: Mapping[str, str]) -> int | None:
 
 
 def peak_memory() -> int | None:
-    """Largest resident memory of this process, bytes; None if the system does not report it."""
+    """Return the largest resident memory of this process so far, bytes; None if the system does not report it."""
     try:
         import resource
     except ImportError:  # Windows
@@ -65,7 +65,7 @@ def peak_memory() -> int | None:
 
 
 def control_groups() -> list[Path]:
-    """Folders of the control groups (version 2) of this process, innermost first."""
+    """Return the folders of the control groups (version 2) of this process, innermost first."""
     with suppress(OSError, StopIteration):
         lines = Path("/proc/self/cgroup").read_text().splitlines()
         group = _CGROUP / next(line[3:] for line in lines if line.startswith("0::")).lstrip("/")
@@ -78,9 +78,9 @@ def split_windows(
 ) -> list[list[Window]]:
     """Split checked windows, in order, into groups that fit into memory. Results do not depend on the grouping.
 
-    The grid is that of the finest scale, whose images are the largest. `max_memory` is in bytes; None = no limit on a
-    GPU, 512 MiB per group on a CPU, where large groups are slower. A window that does not fit is a `CFlowError`.
-    """
+    The grid is that of the finest scale, whose images are the largest. `max_memory` is in bytes per group; None = no
+    limit on a GPU, 512 MiB on a CPU, where large groups are slower. A window that needs more is a group of its own. One
+    that does not fit into free memory is a `CFlowError`."""
     groups: list[list[Window]] = []
     if max_memory is None and device.type == "cpu":
         max_memory = _BYTES_ON_CPU

@@ -21,10 +21,10 @@ from cflow_torch.windows.validation import read_ground, read_point_times, read_p
 
 
 class Piece(NamedTuple):
-    """Points of one sweep, or of all sweeps of a kind: the K active points, or all K points of sweep t."""
+    """K points of one sweep, or of all sweeps of a kind: all points of sweeps t, the active points of other sweeps."""
 
     step: int  # smallest step of the sweeps
-    positions: Tensor  # this and the next four as in `Batch`
+    positions: Tensor  # this field and the next four are as in `Batch`
     is_active: Tensor
     has_result: Tensor
     image: Tensor
@@ -43,8 +43,8 @@ def read_pieces(
 ) -> Iterator[Piece]:
     """Yield the pieces in the order of the timeline, and add the ground points of t to `ground`, if it is not None.
 
-    The other arguments are as for `make_batch`. A CPU reads each sweep alone, in pieces that fit its cache. A GPU waits
-    for operations rather than for memory, so it reads all sweeps t+1 at once, then all sweeps t, then all others.
+    The other arguments are as for `make_batch`. For a CPU we read each sweep alone, in pieces that fit its cache. On a
+    GPU few launches matter more, so we read all sweeps t+1 at once, then all sweeps t, then all others.
     """
     on_cpu, num_steps = device.type == "cpu", timeline.table.shape[2]
     region = Grid(grid.pixel_size, config.point_cloud_range[:3], config.point_cloud_range[3:])
@@ -57,11 +57,11 @@ def read_pieces(
         times = None
         if has_times:
             times = torch.cat([read_point_times(entry.sweep, entry.name, entry.interval, device) for entry in group])
-        # z matters where the region bounds it. A transform spreads a z that is not finite to x and y.
-        is_flat = matrix is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
-        checked_axes = 2 if is_flat else 3
+        # We need not check an unbounded z after a transform, which spreads a z that is not finite to x and y.
+        skips_z = matrix is not None and math.isinf(grid.lower[2]) and math.isinf(grid.upper[2])
+        checked_axes = 2 if skips_z else 3
         moved_axes = 3 if step == 1 else max(num_axes, checked_axes)
-        # An empty sweep is a piece.
+        # An empty sweep gives an empty piece.
         for rows in chunks(0, max(sweeps[0].points.shape[0], 1), device) if on_cpu else [slice(None)]:
             raw = read_positions(sweeps, device, rows)
             moved = raw if matrix is None else compensate(raw, matrix, moved_axes)
@@ -93,7 +93,7 @@ def read_pieces(
 def _of_points(
     group: Sequence[Entry], num_steps: int, device: torch.device
 ) -> tuple[int | Tensor, int | Tensor, Tensor | None]:
-    """Window and image of each point, (N,) or one number for all, and its transform, (3, 4, N) or (3, 4, 1)."""
+    """Return window and image of each point, (N,) or one number, and transforms, (3, 4, N), (3, 4, 1) or None."""
     matrix = None
     if any(entry.T_ego1_ego is not None for entry in group):
         given = [np.eye(4) if entry.T_ego1_ego is None else entry.T_ego1_ego for entry in group]
@@ -108,12 +108,12 @@ def _of_points(
 
 
 def _select(values: Any, row: Tensor | None) -> Any:
-    """The values of some points, None = of all. A number is the value of every point."""
+    """Select the values of some points; None = of all. A number, which is the value of every point, stays."""
     return values if row is None or not isinstance(values, Tensor) else values.index_select(0, row)
 
 
 def _pose_flow(raw: Tensor, moved: Tensor) -> Tensor:
-    """(N, 3) float32 T p - p; 0 for points that are not finite. Overwrites `raw`."""
+    """Return T p - p, (N, 3) float32; 0 for points that are not finite. Overwrite `raw`."""
     flow = torch.zeros((raw.shape[1], 3), dtype=torch.float32, device=raw.device)
     if moved is raw:
         return flow

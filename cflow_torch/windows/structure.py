@@ -11,16 +11,16 @@ _CELL = 1.0  # metres, side of the cells whose points form one patch of a wall
 _FEWEST = 6  # points in a cell
 _BLUR = 0.03  # metres, smallest thickness of a patch: range noise and calibration
 _CLEARANCE = 0.4  # metres above the lowest point of a cell, below which a point may be ground
-_STEPS = 10
+_STEPS = 10  # of the Gauss-Newton fit
 _PRIOR = np.diag([1.0, 1.0, 100.0])  # 1 / (m^2, m^2, rad^2), for directions that the scene leaves open (a long wall)
-FEWEST_IN_PLACE = 150  # smallest agreement times points that we judge
+FEWEST_IN_PLACE = 150  # with a smaller product of the agreement and the number of points, we do not judge
 # Inverted motion must fit better by this factor. Correct poses of real and simulated drives gave less; inverted ones
 # gave 1.3 to 3.
 _BETTER = 1.25
 
 
 def structure(sweep: Sweep) -> np.ndarray:
-    """Return (N, 3) float64 points above ground, neither too near nor too far."""
+    """Return the points above ground that are 2.5 to 50 m from the origin, (N, 3) float64, metres."""
     points = as_numpy(sweep.points)[:, :3].astype(np.float64)
     reach = np.hypot(points[:, 0], points[:, 1])
     keep = np.isfinite(points).all(1) & (reach > _NEAREST) & (reach < _FARTHEST)
@@ -34,13 +34,13 @@ def structure(sweep: Sweep) -> np.ndarray:
 
 
 def _cells(xy: np.ndarray, size: float) -> np.ndarray:
-    """Return (N,) int64 cell indices; coordinates are within 10 km under all but hopeless poses."""
+    """Return (N,) int64 cell indices. We clamp coordinates to 10 km; only absurd poses exceed that."""
     column, row = np.floor(np.clip(xy, -1e4, 1e4) / size).astype(np.int64).T
     return row * 100_003 + column
 
 
 def move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
-    """Return (N, 2) float64, x and y after a transform."""
+    """Return x and y of (N, 3) points after a (4, 4) transform, (N, 2) float64."""
     return points @ transform[:2, :3].T + transform[:2, 3]
 
 
@@ -48,14 +48,14 @@ def is_better_inverted(given: float, none: float, inverted: float) -> bool:
     """Test whether the given motion between two sweeps is inverted.
 
     The arguments are the agreements of the sweeps under the given motion, no motion and the inverse motion. The motion
-    is inverted only if they increase in this order. On a highway, where most structure belongs to vehicles of the same
-    speed, no motion has the largest agreement.
+    is inverted only if they increase in this order, and the last is more than 1.25 times the first. On a highway, where
+    most structure belongs to vehicles of the same speed, no motion has the largest agreement.
     """
     return given < none < inverted and inverted > _BETTER * given
 
 
 class Patches:
-    """Gaussian patches of structure in the bird's-eye view."""
+    """Gaussian patches of structure in the bird's-eye view, one per cell: the mean and precision of its points."""
 
     def __init__(self, xy: np.ndarray) -> None:
         self.cell, member, count = np.unique(_cells(xy, _CELL), return_inverse=True, return_counts=True)
@@ -68,13 +68,13 @@ class Patches:
         self.usable = count >= _FEWEST
 
     def agreement(self, xy: np.ndarray) -> float:
-        """Mean over points of exp(-d^2 / 2), d = Mahalanobis distance to the patch of the cell; 0 without a patch."""
+        """Return the mean of exp(-d^2 / 2), d = Mahalanobis distance to the patch of the cell; 0 without a patch."""
         _, offset, precision = self._pairs(xy)
         distance = np.einsum("ni,nij,nj->n", offset, precision, offset)
         return float(np.exp(-distance / 2).sum() / max(len(xy), 1))
 
     def fit(self, xy: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """Return the shift and rotation that move points onto the patches, and the agreement of the moved points."""
+        """Return the shift (metres) and rotation (radians) that move points onto the patches, and their agreement."""
         x, y, rotation = 0.0, 0.0, 0.0
         for _ in range(_STEPS):
             moved = _rotated(xy, rotation) + (x, y)
@@ -91,7 +91,7 @@ class Patches:
         return np.array([x, y]), float(rotation), self.agreement(_rotated(xy, rotation) + (x, y))
 
     def _pairs(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which points fall on a patch, their offsets from its mean (M, 2), and its precision (M, 2, 2)."""
+        """Return which points fall on a patch, (N,) bool, their offsets from its mean, (M, 2), and its precision."""
         if not len(self.cell):
             return np.zeros(len(xy), bool), np.zeros((0, 2)), np.zeros((0, 2, 2))
         key = _cells(xy, _CELL)

@@ -1,4 +1,4 @@
-"""List the sweeps of a batch in order, with their steps, times and transforms. Points are not touched here."""
+"""List the sweeps of a batch in order, with their steps, times and transforms."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _FARTHEST_POSE = 100.0
 
 
 class Source(NamedTuple):
-    """A sweep other than t+1 that the flow is estimated from."""
+    """A sweep other than t+1 from which we estimate the flow."""
 
-    name: str  # as users know it, for errors
-    sweep: Sweep  # the sweep
-    # Sweep intervals from it to t+1, counted by its position in the window: 1 for t, 2 for t-1, ..., and -1 for t+2, -2
-    # for t+3, ...
+    name: str  # for errors: "pc0", "pch1", ...
+    sweep: Sweep
+    # Sweep intervals from the sweep to t+1, by its place in the window: 1 for t, 2 for t-1, ..., -1 for t+2, -2 for
+    # t+3, ...
     intervals: int
 
 
@@ -33,17 +33,17 @@ class Entry(NamedTuple):
 
     step: int  # 0 = t+1, 1 = t, 2 = t-1 or t+2, ...
     window: int  # index of the window in the batch
-    name: str  # as users know it, for errors
-    sweep: Sweep  # the sweep
-    T_ego1_ego: np.ndarray | None  # (4, 4) float64; None = its points lie in the frame of t+1
-    interval: float | None  # seconds from t to t+1; None = the times of its points are not used
+    name: str  # for errors: "pc1", "pc0", "pch1", ...
+    sweep: Sweep
+    T_ego1_ego: np.ndarray | None  # (4, 4) float64; None = the points are in the frame of t+1
+    interval: float | None  # seconds from t to t+1; None = times of points are not used
 
 
 @dataclass(frozen=True)
 class Timeline:
     """All sweeps of a batch: t+1 of every window, then t of every window, then t-1, ..."""
 
-    entries: list[Entry]  # the sweeps
+    entries: list[Entry]
     table: np.ndarray  # (5, B, S) float64: `elapsed`, `seconds` and x, y, z of `origin`, as in `Batch`
 
     @staticmethod
@@ -62,7 +62,7 @@ class Timeline:
             window, of_window = windows[number], [source.sweep for source in given[number]]
             times = elapsed_times(window, sources, config)
             table[:2, index, 1 : 1 + len(sources)] = np.transpose(times)
-            # A sweep without point times would seem to be measured at other times than the rest.
+            # If a sweep lacks times of points, times of the others would shift them against it.
             has_times = all(sweep.point_times is not None for sweep in (window.pc1, *of_window))
             interval = times[0][1] / times[0][0] if needs_times and has_times else None
             pose1, transform = window.pc1.pose, None
@@ -78,7 +78,7 @@ class Timeline:
 
 
 def source_sweeps(window: Window, config: Config) -> list[Source]:
-    """pc0, the history and then the sweeps after t+1, without repeated sweeps."""
+    """List pc0, the history and then the sweeps after t+1. We skip a sweep that repeats an earlier one of the list."""
     if len(window.pcf) > config.num_future:
         raise CFlowError(
             f"the window has {len(window.pcf)} future sweeps but num_future={config.num_future}: raise num_future, or "
@@ -101,7 +101,7 @@ def source_sweeps(window: Window, config: Config) -> list[Source]:
 
 
 def _is_same(a: Sweep, b: Sweep) -> bool:
-    """Compare points and poses. Harnesses repeat the first sweep of a scene where the history is missing."""
+    """Test whether points and poses are equal. Harnesses fill a missing history with the first sweep of the scene."""
     if a is b:
         return True
     if a.pose is not None and b.pose is not None and not np.array_equal(as_numpy(a.pose), as_numpy(b.pose)):
@@ -112,7 +112,7 @@ def _is_same(a: Sweep, b: Sweep) -> bool:
 def elapsed_times(window: Window, sources: Sequence[Source], config: Config) -> list[tuple[float, float]]:
     """Return the time from each source to t+1 in sweep intervals and in seconds, negative for sources after t+1.
 
-    It is that of the time stamps if all sweeps have one.
+    We take the time from the time stamps if all sweeps have one, otherwise from `sweep_interval`.
     """
     if any(sweep.timestamp_ns is None for _, sweep in named_sweeps(window)):
         return [(float(source.intervals), source.intervals * config.sweep_interval) for source in sources]

@@ -17,13 +17,13 @@ from cflow_torch.types import Array, CFlowError, Sweep, Window, as_numpy, named_
 _ALL_ROWS, _FIRST_POINTS = slice(None), 64
 # Largest time of a point, seconds from the instant of its sweep. Larger numbers have another unit.
 _LONGEST_TIME = 10.0
-# Times of points are multiples of this part of a sweep interval, so that their sums are exact in any order.
+# We round times of points to this fraction of a sweep interval, so that their sums are exact in any order.
 _TICKS = 1 << 20
 _log = logging.getLogger(__name__)
 
 
 def check_windows(windows: Any, config: Config) -> None:
-    """Check that this is a list of windows whose points are fine enough for the region and the finest pixels."""
+    """Check that this is a list of windows, and that the dtypes of points resolve the finest pixels in the region."""
     if isinstance(windows, (Window, Sweep)) or not isinstance(windows, (list, tuple)):
         raise CFlowError(f"got {type(windows).__name__}: give a list of cflow_torch.Window, also for one window")
     for window in windows:
@@ -34,7 +34,7 @@ def check_windows(windows: Any, config: Config) -> None:
 
 
 def keep_nearest(window: Window, num_history: int) -> Window:
-    """Drop the oldest sweeps beyond `num_history`, and log that."""
+    """Keep the newest `num_history` older sweeps of a window, and log if there are more."""
     if len(window.pch) <= num_history:
         return window
     _log.info("of %d history sweeps the nearest %d are used (num_history)", len(window.pch), num_history)
@@ -42,7 +42,7 @@ def keep_nearest(window: Window, num_history: int) -> Window:
 
 
 def have_same_points(a: Sweep, b: Sweep) -> bool:
-    """Test whether sweeps have the same points. We compare the first points first; most sweeps differ there."""
+    """Test whether sweeps have the same points. We first compare 64 points, because most sweeps differ there."""
     if a.points.shape != b.points.shape:
         return False
     parts = (slice(_FIRST_POINTS), slice(None))
@@ -72,7 +72,7 @@ def _check_resolution(dtype: Any, name: str, config: Config) -> None:
 
 
 def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
-    """The given device. For "auto": the device of the tensors, else a GPU if there is one, else the CPU."""
+    """Return the given device. For "auto": the device of the tensors, else a GPU if there is one, else the CPU."""
     if not (isinstance(device, str) and device == "auto"):
         try:
             torch.empty(0, device=device)
@@ -94,25 +94,25 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
 
 
 def read_positions(sweeps: Sequence[Sweep], device: torch.device, rows: slice = _ALL_ROWS) -> Tensor:
-    """(3, N) float64 copy of x, y and z of some rows of each sweep, one sweep after the other."""
+    """Return a copy of x, y and z of some rows of each sweep, one sweep after the other, (3, N) float64."""
     columns = [sweep.points[rows, :3].T for sweep in sweeps]
     if len(columns) == 1 and isinstance(columns[0], Tensor):
         # copy_ transposes and widens in one pass, about six times faster on the CPU than contiguous().
         return torch.empty(columns[0].shape, dtype=torch.float64, device=device).copy_(columns[0].detach())
-    # A GPU receives float32 where the input is no wider. Both types are in native byte order.
+    # A GPU receives float32 if no array is wider. NumPy converts to native byte order, too.
     widths = [values.dtype.itemsize for values in columns if not isinstance(values, Tensor)]
     narrow = device.type != "cpu" and max(widths, default=0) <= 4
     return _together(columns, np.float32 if narrow else np.float64, device).double()
 
 
 def read_ground(sweeps: Sequence[Sweep], device: torch.device) -> Tensor:
-    """(N,) bool copy of the ground masks, one sweep after the other, True = ground; False in sweeps without a mask."""
+    """Return a copy of the ground masks, one sweep after the other, (N,) bool; False in sweeps without a mask."""
     masks = [np.zeros(len(sweep.points), bool) if sweep.is_ground is None else sweep.is_ground for sweep in sweeps]
     return _together(masks, np.bool_, device)
 
 
 def _together(columns: Sequence[Array], dtype: Any, device: torch.device) -> Tensor:
-    """Concatenate (..., N) arrays or tensors on the device. Arrays have one upload, because the host waits for each."""
+    """Concatenate (..., N) arrays or tensors on the device. Arrays share an upload, because the host waits for each."""
     if not any(isinstance(values, Tensor) for values in columns):
         shape = (*columns[0].shape[:-1], sum(values.shape[-1] for values in columns))
         return torch.from_numpy(np.concatenate(columns, -1, out=np.empty(shape, dtype))).to(device)
@@ -123,8 +123,8 @@ def _together(columns: Sequence[Array], dtype: Any, device: torch.device) -> Ten
 def read_point_times(sweep: Sweep, name: str, interval: float | None, device: torch.device) -> Tensor:
     """Return the times of the points, (N,) float64, in sweep intervals, rounded to multiples of 2^-20.
 
-    The interval is the seconds from t to t+1; None = the times are not used, and the result is 0. Times that are not
-    finite or too far from the time stamp are a `CFlowError` with the name of the sweep.
+    `interval` is the time from t to t+1 in seconds; None = times are not used, and the result is 0. Times that are not
+    finite, or more than 10 s from the time stamp, are a `CFlowError` with the `name` of the sweep.
     """
     if interval is None:
         return torch.zeros(sweep.points.shape[0], dtype=torch.float64, device=device)
