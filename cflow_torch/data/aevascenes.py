@@ -40,7 +40,7 @@ CATEGORY_NAME: dict[str, str] = {
     "traffic_sign": "SIGN",
     **dict.fromkeys(GROUND, "NONE"),
 }
-"""Class of AevaScenes -> Argoverse 2 name. The data set publishes no such map; this one is ours."""
+"""Class of AevaScenes -> Argoverse 2 name. This map is ours, because the data set publishes none."""
 
 _PATHS = {"compensated": ("point_cloud_compensated_path", "point_cloud_path"), "raw": ("point_cloud_raw_path",)}
 
@@ -50,20 +50,20 @@ class AevaScenesLog(BoxLog):
 
     Args:
         folder: sequence folder with `sequence.json`.
-        clouds: "compensated", or "raw" (version 2 only, where the data set does not document what raw means).
+        clouds: "compensated" or "raw". Only version 2 has raw clouds; the data set does not document what raw means.
         lidars: names of the LiDARs to merge; None = all of the sequence, in its order.
-        ground: make ground masks from the stored class names, where every cloud of a sweep has them.
+        ground: make a ground mask from the stored class names, if all clouds of the sweep have them.
 
     Attributes:
         lidars: names of the LiDARs that are merged.
 
     Convention:
-        - Points are in the vehicle frame (x forward, y left, z up, origin at the rear axle), one LiDAR after the other,
-          transformed in float64 by `vehicle_to_lidar_extrinsics`, which despite its name is `T_vehicle_lidar`.
-        - `T_world_ego` is `ego_pose`; the world is the vehicle at the first frame.
-        - Truth comes from box tracks. Boxes of background classes (mostly poles) are not used.
-        - Class names are stored as pickled strings, which are decoded without executing anything.
-          `semantic_labels_idx` is not used, because its table is not published.
+        - Points are in the vehicle frame (x forward, y left, z up, origin at the rear axle), one LiDAR after the other.
+          We transform them in float64 by `vehicle_to_lidar_extrinsics`, which is `T_vehicle_lidar` despite its name.
+        - `T_world_ego` is `ego_pose`; the world is the vehicle frame of the first sweep.
+        - Truth comes from box tracks. Boxes of background classes (mostly poles) are ignored.
+        - Class names are stored as pickled strings, which we decode without executing anything.
+          `semantic_labels_idx` is ignored, because its table is not published.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class AevaScenesLog(BoxLog):
         if clouds not in _PATHS:
             raise CFlowError(f"clouds={clouds!r}: choose one of {', '.join(_PATHS)}")
         self._clouds, self._ground = clouds, ground
-        self._clouds_of = lru_cache(1)(self._open_clouds)  # several arrays of a sweep's clouds are read
+        self._clouds_of = lru_cache(1)(self._open_clouds)  # we read several arrays of the same clouds
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _HINT):
             content = read_json(self._file)
@@ -96,7 +96,7 @@ class AevaScenesLog(BoxLog):
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`; a ground mask or times that one of its clouds lacks are None."""
+        """Read sweep `index`. Its mask or times are None if one of its clouds lacks class names or times."""
         names = self._column(index, "semantic_labels", np.str_) if self._ground else None
         times = self._column(index, "time_offset_ns", np.int64)
         is_ground = None if names is None else np.isin(names, GROUND)
@@ -106,8 +106,8 @@ class AevaScenesLog(BoxLog):
     def radial_velocity(self, index: int) -> np.ndarray:
         """Read the (N,) float32 radial velocities of sweep `index`, m/s, positive = moving away from the LiDAR.
 
-        In compensated clouds the motion of the vehicle is removed, so static points have about 0. Third parties
-        measured the sign, which contradicts a comment in the SDK.
+        In compensated clouds the motion of the vehicle is removed, so static points have about 0. The sign is that
+        which third parties measured. A comment in the SDK states the opposite.
         """
         return np.concatenate([cloud.column("velocity", np.float32) for cloud in self._clouds_of(index)])
 
@@ -177,7 +177,7 @@ class Cloud:
             return values.reshape(len(self.points))
 
     def _texts(self, key: str) -> np.ndarray:
-        """Return an array of strings, also of pickled ones, which are decoded without executing anything."""
+        """Return an array of strings. Pickled strings are decoded without executing anything."""
         with self._arrays.zip.open(f"{key}.npy") as member:
             npy.read_magic(member)
             _, _, dtype = npy.read_array_header_1_0(member)

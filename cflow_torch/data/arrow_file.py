@@ -11,15 +11,15 @@ from cflow_torch.data.files import check_columns, file_errors
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError, check_array
 
-# Kind of a NumPy type -> kinds of columns that become it, and their name.
+# Kind of the wanted dtype -> kinds of columns that we convert to it, and their name in messages.
 _KINDS = {"f": ("f", "floats"), "i": ("iu", "integers"), "b": ("b", "bool")}
 
 
 class FeatherFile:
     """A feather file in memory: `table`, `names` of its columns, and `num_rows`. A damaged file is a `CFlowError`.
 
-    If you pass the contents as `data`, `file` is only the name in messages. Otherwise the whole file is read at once,
-    so it does no harm if the file shrinks later.
+    If you pass the contents as `data`, `file` is only the name in messages. Otherwise we read the whole file at once,
+    so a file that shrinks later does no harm.
     """
 
     def __init__(self, file: Any, data: bytes | None = None) -> None:
@@ -37,7 +37,7 @@ class FeatherFile:
         return self.table.select(list(columns))
 
     def matrix(self, columns: Sequence[str], dtype: Any = np.float64) -> np.ndarray:
-        """Return K columns as (rows, K) of `dtype`, which is a float, np.int64 or bool.
+        """Return K columns as (rows, K) of `dtype`, a floating-point type, np.int64 or bool.
 
         A column of another kind, or with an empty entry, is a `CFlowError`.
         """
@@ -51,5 +51,5 @@ class FeatherFile:
         return np.stack(arrays, axis=1).astype(dtype, copy=False)
 
     def vector(self, column: str, dtype: Any = np.float64) -> np.ndarray:
-        """Return one column as (rows,). The rest is as in `matrix`."""
+        """Return one column as (rows,). Dtypes and errors are those of `matrix`."""
         return self.matrix([column], dtype)[:, 0]

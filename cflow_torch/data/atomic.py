@@ -1,4 +1,4 @@
-"""Write files and folders that take their name only when they are complete, locally and wherever fsspec writes."""
+"""Write files, local or remote (fsspec), and local folders that take their name only when they are complete."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cflow_torch.errors import CFlowError
 # Object stores, in which a put replaces the older file at once and nobody sees an incomplete one.
 _ATOMIC_PUTS = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss", "memory"}
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
-_ABANDONED = 3600.0  # seconds without a change after which a temporary file belongs to no running process
+_ABANDONED = 3600.0  # seconds without a change after which we assume that no process writes a temporary file
 
 
 @contextmanager
@@ -27,8 +27,8 @@ def atomic_file(path: PathLike) -> Iterator[Any]:
 
     If the block raises, the new file is removed and an older one stays. Missing folders are created. Local files get a
     temporary name in the same folder, `.NAME.<random>.tmp`, and are renamed at the end. Only a killed process leaves
-    the temporary file behind, see `remove_stale`. Remote files are in memory until the end. An object store receives
-    them under their name; on other file systems they are put under a temporary name and then moved.
+    the temporary file behind (`remove_stale` removes it). Remote files are in memory until the end. An object store
+    receives them under their final name. On other file systems we write them under a temporary name and move them.
     """
     path = as_path(path)
     if is_remote(path):
@@ -80,9 +80,9 @@ def _put(path: Any, content: bytes) -> None:
 
 @contextmanager
 def new_folder(root: PathLike, name: str) -> Iterator[Path]:
-    """Create the folder `root/name`, which takes its name only when the block ends; if that raises, it is removed.
+    """Create the folder `root/name`, which takes its name when the block ends. If that raises, we remove the folder.
 
-    A folder that exists, a remote one and a name that is not safe are a `CFlowError`.
+    A folder that exists, a remote folder and a name that is not safe are a `CFlowError`.
     """
     folder = as_path(root) / safe_name(name, "log_id")
     if is_remote(folder):
@@ -102,10 +102,10 @@ def new_folder(root: PathLike, name: str) -> Iterator[Path]:
 
 
 def remove_stale(folder: PathLike) -> None:
-    """Remove the temporary files and folders that killed processes have left in a folder.
+    """Remove the temporary files and folders that killed processes have left in a folder, which may be remote.
 
-    They count as left if they have not changed for an hour. Newer ones may belong to a process that is still writing.
-    The folder may be remote. Its subfolders are not searched.
+    We remove those that have not changed for an hour. A process may still be writing to newer ones. Subfolders are not
+    searched.
     """
     folder = as_path(folder)
     forget_listings(folder)
@@ -120,15 +120,15 @@ def remove_stale(folder: PathLike) -> None:
 
 
 def _is_abandoned(path: Path) -> bool:
-    with suppress(Exception):  # some remote file systems know no times
+    with suppress(Exception):  # some remote file systems have no times of change
         return time.time() - path.stat().st_mtime > _ABANDONED
     return False
 
 
 def ensure_writable(folder: PathLike) -> Path:
-    """Create a folder and write a trial file, so that long work does not fail at its end; return its path.
+    """Create a folder and write a trial file, so that long work does not fail at its end. Return the folder.
 
-    What killed processes left in it is removed, see `remove_stale`. If it cannot be written to, raise a `CFlowError`.
+    We also remove the temporary files of killed processes. A folder that cannot be written to is a `CFlowError`.
     """
     folder = as_path(folder)
     try:
@@ -136,7 +136,7 @@ def ensure_writable(folder: PathLike) -> Path:
         trial = folder / _temporary_name("trial")
         with atomic_file(trial) as file:
             file.write(b"\0")
-        with suppress(OSError), remote_errors(folder):  # some stores let nobody delete
+        with suppress(OSError), remote_errors(folder):  # some stores do not allow deletion
             trial.unlink()
     except OSError as error:
         raise CFlowError(f"cannot write into {folder} ({error}): free some space, or pass output=FOLDER") from error
@@ -150,5 +150,5 @@ def _sync(path: Path) -> None:
 
 
 def _temporary_name(name: str) -> str:
-    """A hidden name for `name` while it is incomplete, which `remove_stale` recognises."""
+    """Return a hidden name for an incomplete file or folder, which `remove_stale` recognises."""
     return f".{name}.{secrets.token_hex(4)}.tmp"

@@ -18,8 +18,8 @@ from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_error
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array, vector_columns
 
-# Each rule has the largest distance of a ground point from the surface, metres, and the function that rounds grid
-# positions to cells (towards zero, or half to even).
+# Rule -> largest distance of a ground point from the surface, metres, and the function that rounds grid positions to
+# cells (towards zero, or half to even).
 GROUND_RULES: dict[str, tuple[float, Callable[[np.ndarray], Any]]] = {
     "av2-api": (0.3, np.trunc),
     "bsfe": (0.4, np.round),
@@ -85,7 +85,7 @@ class AV2Log(BoxLog):
             masks. A log whose map has no raster has no ground masks either.
 
     Convention:
-        - Points are in the ego frame of their sweep (stored as float16). The world frame is that of the city.
+        - Points are in the ego frame of their sweep (stored as float16). The world is the frame of the city.
         - Truth comes from the first of these sources that the log has: `flow_labels/<ns of sweep t>.feather` (if that
           folder exists, a pair without a file has no truth); `flow_labels.feather`, for the first pair;
           `annotations.feather`, for pairs inside the annotated time. Boxes without points are dropped, as in av2-api.
@@ -132,7 +132,7 @@ class AV2Log(BoxLog):
         return super()._labels(index)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
-        """Read intensity, laser_number, offset_ns and any other number of the points of sweep `index`."""
+        """Read intensity, laser_number, offset_ns and any other numeric column of sweep `index`."""
         return read_columns(self._files[self._timestamp(index)])
 
     def _points(self, index: int) -> np.ndarray:

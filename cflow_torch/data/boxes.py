@@ -71,9 +71,9 @@ def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.
 
 
 class BoxLog(Log):
-    """Base class of logs whose truth comes from tracked boxes. `_poses` is (K, 4, 4) float64 `T_world_ego`."""
+    """Base class of logs whose truth comes from tracked boxes."""
 
-    _poses: np.ndarray
+    _poses: np.ndarray  # (K, 4, 4) float64, `T_world_ego` of each sweep
 
     def _points(self, index: int) -> np.ndarray:
         """Read the (N, 3) float32 points of a sweep, in its ego frame."""
@@ -97,8 +97,8 @@ def flow_from_boxes(points: np.ndarray, boxes0: Boxes, boxes1: Boxes, T_ego1_ego
     `points` are (N, 3) float, metres, in the ego frame of t, and `T_ego1_ego0` is (4, 4) float64.
 
     Convention: TOTAL flow, computed in float64 and rounded to float32 at the end. Points in a box whose track ends
-        have the category of the box, the flow of ego motion and `is_valid` False. A point in several boxes takes the
-        flow and category of the last one, and is valid only if the tracks of all these boxes continue.
+        have the category of the box, the pose flow and `is_valid` False. A point in several boxes takes the flow and
+        category of the last one. It is valid only if the tracks of all these boxes continue.
 
     Source: the recipe of av2-api (torch/structures/flow.py), which rounds the ego motion to float32 first.
     """

@@ -1,4 +1,4 @@
-"""Every data set by name: how to recognise it, find its logs and open them; also logs of your own reader."""
+"""Recognise a data set, find its logs and open them, also with your own reader."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _log = logging.getLogger(__name__)
 class DataSet(NamedTuple):
     """One format."""
 
-    log: str  # class of its reader, source -> `Log`
-    what: str  # what one log is
-    marks: tuple[str, ...] = ()  # ends of paths by which we recognise the format
-    # Function of its module, root -> sources; "" = the folders that hold the first mark, at most `depth` levels below
-    # the root, or the root itself if there is no mark.
+    log: str  # name of the reader's class, which opens a source as a `Log`
+    what: str  # what one log is, for messages
+    marks: tuple[str, ...] = ()  # patterns of the ends of paths by which we recognise the format
+    # Name of the function of the reader's module that finds the sources below a root. "" = the sources are the folders
+    # that hold the first mark, at most `depth` levels below the root. Without marks, the root is the source.
     find: str = ""
     depth: int = 0
 
 
 _NUSCENES = ("v1.*/scene.json",)
-# The key is also the module of the reader, which is imported when it is needed.
+# The key is also the module of the reader, which we import when it is needed.
 DATA_SETS: dict[str, DataSet] = {
     # <root>/<data set>/sensor/<split>/<log> is the deepest layout in use.
     "av2": DataSet("AV2Log", "Argoverse 2 log", ("sensors/lidar",), depth=4),
@@ -46,7 +46,7 @@ DATA_SETS: dict[str, DataSet] = {
     "aevascenes": DataSet("AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
     "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
-    "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # all without a mark
+    "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
 }
 _DEEPEST = 6  # levels below the root that are searched for a mark
 
@@ -54,15 +54,15 @@ _DEEPEST = 6  # levels below the root that are searched for a mark
 class UserSource(NamedTuple):
     """One of the logs that your own reader returns."""
 
-    name: str
-    number: int
+    name: str  # "package.module.name[number]"
+    number: int  # index among these logs
 
 
 def recognise(root: Any) -> str:
-    """Return the name of the data set whose logs lie at a path, without opening a file.
+    """Return the name of the data set whose logs lie at a path. We open files only if their names do not decide.
 
     Args:
-        root: as for `find_sources`. The formats that fit closest to the root count.
+        root: file or folder. If formats fit at several levels of folders, the level closest to the root decides.
 
     Raises:
         CFlowError: the path does not exist, or no format fits, or several do.
@@ -94,10 +94,10 @@ def _has_logs(name: str, root: Any) -> bool:
 
 
 def find_user_sources(target: str, settings: Mapping[str, Any]) -> list[UserSource]:
-    """Return a source, for `open_log`, of each log that your own reader returns.
+    """Return one source for `open_log` per log that your own reader returns. No log is a `CFlowError`.
 
-    `target` names the reader, "package.module.name": a class or function that returns a log (`data.log.Log`), or a
-    sequence of logs, which may open them lazily. `settings` are its keyword arguments, and those of `open_log`.
+    `target` is the "package.module.name" of the reader, a class or function. It returns a log (`data.log.Log`) or a
+    sequence of logs, which may open them lazily. `settings` are its keyword arguments; those of `open_log` are ignored.
     """
     logs = _user_logs(target, {key: value for key, value in settings.items() if key not in _OF_ALL})
     if len(logs) == 0:
@@ -117,7 +117,7 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
             raise cause from None
         hint = "; put its module next to the configuration, or install it"
         if not isinstance(cause, ImportError):
-            _log.error("the reader %s fails", target, exc_info=cause)  # shows its author the line
+            _log.error("the reader %s fails", target, exc_info=cause)  # shows the line to the reader's author
             hint = ""
         raise CFlowError(f"the reader {target} fails: {type(cause).__name__}: {shortened(cause)}{hint}") from error
     if hasattr(made, "sweep"):
@@ -126,7 +126,7 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
 
 
 def find_sources(name: str, root: Any) -> Sequence[Any]:
-    """Return one source per log under a path, for `open_log`; none is a `CFlowError`."""
+    """Return one source for `open_log` per log under a path. If there is no log, that is a `CFlowError`."""
     top, (module, _), form = as_path(root), _reader(name), DATA_SETS[name]
     with remote_errors(top):
         if form.find:
@@ -151,7 +151,7 @@ def open_log(
         name: a key of `DATA_SETS`, or the `target` that you gave `find_user_sources`.
         source: from `find_sources` or `find_user_sources`.
         find_ground: method of `cflow_torch.windows.ground.find_ground` for sweeps without a ground mask, "grid" or
-            "patchwork"; "auto" = "grid", and `check` warns that it is used; None = all their points are kept.
+            "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
         **settings: keyword arguments of the reader.
@@ -179,7 +179,7 @@ def open_log(
 
 def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
     _, reader = _reader(name)
-    known = list(inspect.signature(reader.__init__).parameters)[2:]  # of the class, Python 3.8 returns Protocol's
+    known = list(inspect.signature(reader.__init__).parameters)[2:]  # the class has Protocol's signature in Python 3.8
     unknown = sorted(set(settings) - set(known))
     if unknown:
         raise CFlowError(f"data set {name} has no setting {', '.join(unknown)}; it has {', '.join(known) or 'none'}")
@@ -194,10 +194,10 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
 
 
 class GroundSegmentedLog(LogWrapper):
-    """A log with a ground mask for every sweep: its own where it has one, otherwise found from the points.
+    """A log with a ground mask for every sweep: the mask of the log if it has one, otherwise found from the points.
 
-    `method` is the `find_ground` of `open_log`. The attribute `has_found_ground` becomes True when the method is "auto"
-    and ground was found for a sweep.
+    `method` is the `find_ground` of `open_log`. The attribute `has_found_ground` becomes True when the method "auto"
+    finds ground in a sweep.
     """
 
     def __init__(self, log: Log, method: str = "grid") -> None:

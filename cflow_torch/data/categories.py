@@ -6,7 +6,7 @@ import numpy as np
 
 from cflow_torch.types import CFlowError
 
-# Category -> its meta class. Signs, cones, trailers of signs and animals have none and are not scored.
+# Category -> its meta class. Animals, signs, sign trailers, bollards, cones and barrels have none and are not scored.
 _META_CLASS = {
     "NONE": "BACKGROUND",
     "ANIMAL": "",
@@ -53,7 +53,7 @@ _META_OF_CATEGORY = np.array([META_NAMES.index(meta) if meta else -1 for meta in
 
 
 def meta_class(category: np.ndarray) -> np.ndarray:
-    """Return (N,) int64 indices into `META_NAMES` of (N,) categories 0 ... 30; -1 = it has no meta class."""
+    """Return the meta class of (N,) categories 0 ... 30 as (N,) int64 indices into `META_NAMES`; -1 = none."""
     if category.size and (category.min() < 0 or category.max() >= len(CATEGORIES)):
         raise CFlowError(
             f"category indices are 0 ... {len(CATEGORIES) - 1} (0 = background), got "

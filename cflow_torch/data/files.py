@@ -1,4 +1,4 @@
-"""What readers share: one error for all files that cannot be read, .npy and JSON files, and the search for logs."""
+"""What readers share: one error for all unreadable files, .npy and JSON files, settings, and the search for logs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def file_errors(file: Any, hint: str = "copy it again", doing: str = "read") -> 
     """Turn any exception of the block into one `CFlowError` that names the file.
 
     Libraries raise nearly anything for a damaged file (OSError, ValueError, KeyError, struct.error, MemoryError, ...).
-    `file` is a path, or a text that begins with one, and `hint` is what the user can do.
+    `file` is a path, or a text that begins with one. `hint` says what the user can do; `doing` is "read" or "write".
     """
     try:
         yield
@@ -69,8 +69,8 @@ def read_npy(path: Path, hint: str) -> np.ndarray:
 def read_json(file: Path, use: Callable[[dict[str, Any]], Any] | None = None) -> Any:
     """Read a JSON file in UTF-8, with or without a byte order mark.
 
-    Each object is replaced by what `use` returns for it, inner objects first. NaN and Infinity are accepted, as Python
-    writes them, and 1e999 is read as infinity. Check numbers that must be finite.
+    Each object is replaced by what `use` returns for it, inner objects first. Numbers may be NaN or infinite: we accept
+    NaN and Infinity, which Python writes, and read 1e999 as infinity.
     """
     content = read_bytes(file)
     with file_errors(f"{file} as JSON"):
@@ -83,7 +83,7 @@ def write_json(path: PathLike, value: Any) -> None:
 
 
 def json_ready(value: Any) -> Any:
-    """Replace values that JSON cannot hold: tuples by lists, NaN (no points) by null, infinity by text."""
+    """Replace values that JSON cannot hold: tuples by lists, NaN (a mean of no points) by null, infinity by text."""
     if isinstance(value, dict):
         return {str(key): json_ready(member) for key, member in value.items()}
     if isinstance(value, (list, tuple)):
@@ -106,7 +106,7 @@ def flatten(value: Any, name: str = "") -> dict[str, Any]:
 def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:
     """List the settings of two nested dictionaries that differ, as "key was A, is B; ..."; "" if none does.
 
-    The keys `ignored`, in the form of `flatten`, may differ.
+    The keys `ignored`, joined by dots as in `flatten`, may differ.
     """
     old, new = flatten(before), flatten(now)
     changed = sorted(key for key in {*old, *new} - set(ignored) if old.get(key) != new.get(key))
@@ -117,8 +117,8 @@ def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:
 def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Test = lambda folder: True) -> list[Path]:
     """Find the folders that are logs, sorted: `root` itself, or folders at most `depth` levels below it.
 
-    We do not search in logs, in hidden folders, or in folders for which `is_passed` is False. If the root is not a
-    folder, that is a `CFlowError` that says `what` to pass.
+    We do not search inside logs, hidden folders, or folders for which `is_passed` is False. A root that is not a folder
+    is a `CFlowError`, which says `what` to pass.
     """
     if not root.is_dir():
         raise CFlowError(f"{root} is not a folder; pass {what}")

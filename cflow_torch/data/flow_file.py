@@ -1,4 +1,4 @@
-"""One flow result per file, as feather columns with rows in the order of sweep t."""
+"""Flow files: the result of one window as a feather file, with rows in the order of sweep t."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
     Args:
         path: file name, by convention `<log id>/<time stamp of sweep t>.feather`.
         result: flow of one window.
-        contents: names of `CONTENTS` and `ON_REQUEST`. Pose flow and total flow follow from the poses; a file without
-            them has about a seventeenth of the size.
+        contents: names of `CONTENTS` and `ON_REQUEST`. You can compute pose flow and total flow from the poses; a file
+            without them is about 17 times smaller.
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
         ego1, cluster_id int64, score and confidence float32, is_valid bool.
-        Asking for a confidence that the result lacks is a `CFlowError`.
+        If you name a confidence that the result lacks, that is a `CFlowError`.
     """
     columns = result.columns()
     names = [column for name in contents for column in _COLUMNS.get(name, [name])]
@@ -43,9 +43,9 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
 
 
 def read_flow(path: PathLike) -> FlowResult:
-    """Read a result that `write_flow` wrote; fields that the file does not hold are None.
+    """Read a result that `write_flow` wrote. Fields that the file lacks are None.
 
-    A file that is not a flow file, or cannot be read, raises a `CFlowError`.
+    A file that cannot be read or is not a flow file is a `CFlowError`.
     """
     path = as_path(path)
     fields = {}

@@ -23,16 +23,16 @@ class KissICPLog(Log):
 
     Args:
         root: file or folder for the loader.
-        loader: its name: kitti, kitti_raw, helipr, mulran, ncd, nclt, boreas, apollo, ouster, generic, ...
+        loader: name of the loader: kitti, kitti_raw, helipr, mulran, ncd, nclt, boreas, apollo, ouster, generic, ...
         sequence: name of the sequence, such as "00", for loaders that need one.
 
     Attributes:
         log_id: name of the file or folder, and the sequence.
-        timestamps: 0, 1, 2, ..., not times, because the loaders have no common way to return them. We assume 0.1 s per
-            sweep.
+        timestamps: 0, 1, 2, ... Sweeps have no times, because the loaders have no common way to return them. We assume
+            0.1 s per sweep.
 
-    Convention: points and poses are those of the loader, in the frame of the LiDAR; poses are the data set's own
-        (`gt_poses`), None if it has none.
+    Convention: points and poses are those of the loader, in the frame of the LiDAR. The poses are the data set's own
+        (`gt_poses`); None if it has none.
     """
 
     def __init__(self, root: PathLike, loader: str, sequence: str | None = None) -> None:
@@ -63,7 +63,7 @@ class KissICPLog(Log):
 
 @contextmanager
 def _loader_errors(what: str) -> Iterator[None]:
-    """Turn what a loader prints before it ends the program into a `CFlowError`."""
+    """Turn a loader's exception or exit into a `CFlowError` with what it printed."""
     printed: Any = io.StringIO()
     try:
         with redirect_stdout(printed):

@@ -1,4 +1,4 @@
-"""A log is an ordered sequence of sweeps, read when you ask for them. Every reader is a log. Windows slide over it."""
+"""Logs and their windows. A log is an ordered sequence of sweeps, which are read when you ask for them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Log(Protocol):
     has truth, implement `labels`, too.
 
     Attributes:
-        log_id: name of the log, safe as a folder name; that of its file or folder, unless the reader says otherwise.
+        log_id: name of the log, safe as a folder name; the name of its file or folder unless the reader says otherwise.
         timestamps: sweep times, ascending; in nanoseconds, unless the reader says otherwise.
 
     Convention: our readers return float32 points and float64 poses `T_world_ego`. Opening a log reads its poses and
@@ -52,8 +52,8 @@ class Log(Protocol):
     Raises:
         CFlowError: the constructors of our readers raise it for a file that is missing, damaged or incomplete, a
             setting that is not allowed, and fewer than two sweeps. `sweep` and `labels` raise it if the index does
-            not exist, or if a file of the sweep is missing, damaged or of another size than the files that belong to
-            it. Other sweeps can still be read.
+            not exist, or if a file of the sweep is missing, damaged, or has another number of points than the others.
+            You can still read other sweeps.
     """
 
     log_id: str
@@ -127,10 +127,8 @@ class Log(Protocol):
 def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> Window:
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
-    The window is shorter near the start of the log, where fewer than `num_history` sweeps precede it, and near its
-    end, where fewer than `num_future` follow `index + 1`.
-
-    If `index` has no successor, or a sweep cannot be read, that is a `CFlowError`.
+    If fewer than `num_history` sweeps precede `index`, or fewer than `num_future` follow `index + 1`, the window has
+    only these. If `index + 1` does not exist, or a sweep cannot be read, that is a `CFlowError`.
     """
     count = len(log.timestamps)
     if not 0 <= index < count - 1:
@@ -148,7 +146,7 @@ def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Win
 
 
 class WindowDataset(Dataset):  # type: ignore[type-arg]
-    """The windows of one or more logs, for a `torch.utils.data.DataLoader`, whose workers then read the files.
+    """The windows of one or more logs, for a `torch.utils.data.DataLoader`. Its workers read the files.
 
     Args:
         logs: one log or a sequence of logs. They must be picklable if the workers are not forked.
@@ -178,12 +176,12 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
 
     @staticmethod
     def collate(windows: Sequence[Window]) -> list[Window]:
-        """Return the windows as a list; sweeps have different numbers of points and cannot be stacked."""
+        """Return the windows as a list. Sweeps of different numbers of points cannot be stacked."""
         return list(windows)
 
 
 class LogWrapper(Log):
-    """Base class of logs that change the sweeps of another log; every other attribute is that of the other log."""
+    """Base class of logs that change the sweeps of another log. Every other attribute comes from the other log."""
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
@@ -202,13 +200,13 @@ class LogWrapper(Log):
         return self.log.unwrapped
 
     def __getattr__(self, name: str) -> Any:
-        if name == "log" or name.startswith("__"):  # while unpickling `log` is not set, and Python asks for its hooks
+        if name == "log" or name.startswith("__"):  # Python asks for hooks while it unpickles, before `log` is set
             raise AttributeError(name)
         return getattr(self.log, name)
 
 
 class CachedLog(LogWrapper):
-    """A log that keeps its last `count` sweeps in memory, because neighbouring windows share all sweeps but one."""
+    """A log that keeps the last `count` sweeps in memory, because neighbouring windows share all sweeps but one."""
 
     def __init__(self, log: Log, count: int) -> None:
         super().__init__(log)

@@ -16,16 +16,17 @@ from cflow_torch.windows.ground_plane import REACH
 from cflow_torch.windows.inspection import BACKWARD, REPEATED, UPSIDE_DOWN, has_moved, is_backward, repeats
 from cflow_torch.windows.structure import FEWEST_IN_PLACE, Patches, is_better_inverted, move, structure
 
-BASELINE = 5  # sweeps between the two that are compared: the error of a wrong frame grows with the vehicle's rotation
+BASELINE = 5  # we compare sweeps this far apart, because the vehicle must turn to show the error of a wrong frame
 _PAIRS = 2  # compared per log
-_MOST_POINTS = 8000
+_MOST_POINTS = 8000  # of the older sweep
 # Tolerances. With correct poses, the shift was at most 13 mm on a real drive without de-skewing and 7 mm on simulated
-# drives. At the beginning of a turn, without de-skewing, it was 58 mm, together with 0.7 degrees.
+# drives. At the beginning of a turn without de-skewing, it was 58 mm, with a rotation of 0.7 degrees.
 _SHIFT, _SHIFT_PER_METRE, _SHIFT_PER_RADIAN = 0.03, 0.01, 10.0
 _ROTATION = np.radians(1.5)
-_BETTER, _GOOD = 2.0, 0.15  # factor by which no motion must fit better, and its least agreement, to be suggested
-_HOPELESS = 0.2  # share of `own`; correct poses gave 0.27 (the case above) or more than 0.5
-_ALIGNED = 0.5  # share of `own` from which a fit has converged; a LiDAR at a wrong position gave 0.7 and more
+_BETTER, _GOOD = 2.0, 0.15  # poses do not fit if no motion agrees by this factor better, and at least this well
+# Poses do not fit, either, if both agreements are lower than these shares of `own`: that under the poses (correct poses
+# gave 0.27 in that turn, else more than 0.5), and that after alignment (a LiDAR at a wrong position gave 0.7 or more).
+_HOPELESS, _ALIGNED = 0.2, 0.5
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,10 @@ class StaticResidual:
 
     index: int
     later: int
-    # (2,) float64, x and y, metres, frame of `later`: from the structure of `index` under the poses to that of `later`
+    # (2,) float64, x and y, metres, frame of `later`. It moves the structure of `index`, transformed by the poses, onto
+    # the structure of `later`, together with the `rotation`.
     shift: np.ndarray
-    rotation: float  # radians about z, likewise
+    rotation: float  # radians about z
     # 0 ... 1, how well the structures coincide under the poses: 0.3 to 0.5 on a street. NaN = too little to compare.
     agreement: float
     aligned: float  # agreement after `shift` and `rotation` are removed
@@ -97,9 +99,9 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
 def check_static_world(log: Log) -> list[StaticResidual]:
     """Measure whether the static world moves between two sweeps of a log, and warn if it does.
 
-    We compare two pairs and return their residuals. If the log has `poses`, they are the pairs over which the vehicle
-    turns most, otherwise the first and the last pair. A log of one sweep has none. One warning gives the verdict on the
-    worst pair.
+    We compare two pairs of sweeps and return their residuals. If the log has `poses`, these are the pairs over which
+    the vehicle turns most, otherwise the first and the last pair. A log of one sweep has no pair. One warning gives the
+    verdict on the worst pair.
 
     Cost: reads two sweeps per pair; 0.15 s each.
     """
@@ -123,7 +125,7 @@ def _residuals(log: Log) -> list[StaticResidual]:
 
 
 def _choose(log: Any, baseline: int) -> list[int]:
-    """Return the first sweeps of pairs that do not overlap, largest rotation first."""
+    """Return the index of the first sweep of each pair. Pairs do not overlap; the largest rotation comes first."""
     last = len(log.timestamps) - 1 - baseline
     poses: np.ndarray | None = getattr(log, "poses", None)
     if poses is None:
@@ -137,19 +139,19 @@ def _choose(log: Any, baseline: int) -> list[int]:
     return chosen
 
 
-_SMALLEST = 2.0  # metres, extent of a sweep
+_SMALLEST = 2.0  # metres; if all points are closer to the origin, they are not in metres
 
 
 def check_log(log: Log) -> None:
-    """Warn of what `find_problems` finds, a `CFlowWarning` each."""
+    """Give a `CFlowWarning` for each problem that `find_problems` lists."""
     for text in find_problems(log):
         warn(f"log {log.log_id}: {text}")
 
 
 def find_problems(log: Log) -> list[str]:
-    """List mistakes that do not show as an error in any single sweep, and what was done about missing ground masks.
+    """List likely mistakes that raise no error, and say if we find the ground because masks are missing.
 
-    A sweep that cannot be read is skipped here; reading it later raises the error.
+    We skip a check if a sweep that it needs cannot be read. Reading this sweep later raises the error.
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """

@@ -13,7 +13,7 @@ from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.types import Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
-# KISS-ICP starts with a static vehicle: its first steps are off by up to 14 cm at 6 m/s, later ones by 1 to 3 cm.
+# KISS-ICP first assumes a static vehicle: its first steps are off by up to 14 cm at 6 m/s, later ones by 1 to 3 cm.
 _RUN_IN = 5  # sweeps
 _FEWEST_POINTS = 100
 _NEED = (
@@ -28,9 +28,9 @@ def poses_from_odometry(log: Log) -> np.ndarray:
 
     Poses of the sweeps are ignored. Ground points are used, because they constrain height and tilt.
 
-    Convention: KISS-ICP runs with its own settings, without de-skewing, on one thread, so that the poses do not depend
-        on the number of threads. It needs a few sweeps to adapt to the speed, so we take the first five steps from a
-        second run, backwards from the eleventh sweep.
+    Convention: KISS-ICP runs with its default settings, but without de-skewing, and on one thread, so that the poses do
+        not depend on the number of threads. It needs a few sweeps to adapt to the speed. So we take the first five
+        steps from a second run, backwards from the eleventh sweep.
 
     Cost: one registration per sweep and eleven more, 0.13 s each for 120,000 points; reads as many sweeps.
 
@@ -46,7 +46,7 @@ def poses_from_odometry(log: Log) -> np.ndarray:
 
 
 def _register(log: Log, order: Sequence[int]) -> list[np.ndarray]:
-    """Return the poses of sweeps in the given order; the world is the frame of the first of them."""
+    """Return the poses of sweeps in the given order. The world is the ego frame of the first one in this order."""
     odometry = Odometry()
     return [
         odometry.next_pose(np.asarray(log.sweep(index).points), f"sweep {index} of log {log.log_id}")

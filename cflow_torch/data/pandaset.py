@@ -19,7 +19,7 @@ from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 _LIDARS = (0, 1)  # Pandar64, which rotates, and PandarGT, which looks forward
-_EVERY_LIDAR = -1  # of a cuboid; an object at different positions for both LiDARs has a cuboid for each
+_EVERY_LIDAR = -1  # sensor_id of a cuboid for both LiDARs; an object that they see at different positions has two
 _POSITION, _SIZE = ("position.x", "position.y", "position.z"), ("dimensions.y", "dimensions.x", "dimensions.z")
 
 _LABELS = {
@@ -39,7 +39,7 @@ _LABELS = {
     "WHEELED_DEVICE": ("Motorized Scooter", "Other Vehicle - Pedicab", "Personal Mobility Device"),
 }
 CATEGORY_NAME: dict[str, str] = {label: name for name, labels in _LABELS.items() for label in labels}
-"""Label of a cuboid, class of a point -> Argoverse 2 name. The data set publishes no such map; this one is ours."""
+"""Label of a cuboid or class of a point -> Argoverse 2 name. This map is ours, because the data set publishes none."""
 
 _GROUND = ("Driveway", "Ground", "Lane Line Marking", "Other Road Marking", "Road", "Sidewalk", "Stop Line Marking")
 _WITHOUT_FLOW = ("Exhaust", "Reflection", "Smoke", "Spray or rain")
@@ -52,12 +52,12 @@ class PandaSetLog(Log):
         folder: sequence folder with `lidar/00.pkl.gz` ..., `lidar/poses.json` and `lidar/timestamps.json`.
 
     Convention:
-        - Points are stored in the world, compensated for ego motion. We return them in the frame of the LiDAR's pose at
-          the sweep's time (x right, y forward, z up), those of both LiDARs in the order of the file.
+        - Points are stored in the world frame, compensated for ego motion. We return them in the frame of the stored
+          LiDAR pose (x right, y forward, z up), points of both LiDARs in the order of the file.
         - Ground masks come from the classes of points in `annotations/semseg`; None for a sequence without them.
-        - Truth comes from the tracked cuboids of `annotations/cuboids`; each LiDAR's points from its own cuboids. If
-          points have classes, these are the categories. A point is then valid only if it is in a cuboid and has the
-          class of an object, or neither; smoke, spray and reflections are not valid.
+        - Truth of a point comes from the tracked cuboids in `annotations/cuboids` for its LiDAR or for both. If points
+          have classes, these are the categories. A point is then valid only if it is in a cuboid and has the class of
+          an object, or neither. Smoke, exhaust, spray and reflections are not valid.
     """
 
     def __init__(self, folder: PathLike) -> None:
@@ -122,7 +122,7 @@ class PandaSetLog(Log):
         return points.astype(np.float32), table[3], table[4]
 
     def _classes(self, index: int, num_points: int) -> tuple[list[str], np.ndarray] | None:
-        """Read the names of C classes, and the (N,) index of the class of each point; None if the sequence has none."""
+        """Read the names of classes, and the index of each point's class, (N,); None if the sequence has no classes."""
         folder = self.folder / "annotations" / "semseg"
         file, table = folder / self._files[index].name, folder / "classes.json"
         with remote_errors(folder):

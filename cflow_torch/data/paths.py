@@ -1,7 +1,7 @@
-"""Local and remote paths (by fsspec): open files for the readers, and check the names in data that we use as paths.
+"""Local and remote paths (by fsspec): open files for the readers, and check the names from data that become paths.
 
-A path is a text ("/data/av2", "s3://bucket/av2"), a `pathlib.Path` or a `upath.UPath`. The readers use only pathlib's
-interface and the functions below.
+A path is a text ("/data/av2", "s3://bucket/av2"), a `pathlib.Path` or a `upath.UPath`. Readers use only the interface
+of pathlib and the functions below.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from cflow_torch.errors import CFlowError
 
 PathLike = Union[str, Path]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
-_BLOCK = 1 << 20  # bytes; smaller blocks need more requests, as HDF5's metadata is scattered and its data are long
+_BLOCK = 1 << 20  # bytes; smaller blocks need more requests, because metadata of HDF5 is scattered and arrays are long
 _KEPT_BLOCKS = 32  # of each open file: 32 MiB
 _COPIED = 8 << 20  # bytes per request while a file is copied
-_POINTER = b"version https://git-lfs.github.com/spec/"  # begins the file that git-lfs stores before data are fetched
+_POINTER = b"version https://git-lfs.github.com/spec/"  # first bytes of a file whose data git-lfs has not fetched
 _NAME = re.compile(r"(?!\.|[A-Za-z]:)[^/\\]+")  # not hidden, no `..`, no drive, no separator of any system
 _RULE = "a name has no / or \\, no control characters, no dot in front and no drive (C:)"
 _SHOWN = 80  # characters of a name in a message
@@ -36,8 +36,8 @@ def as_path(path: PathLike) -> Path:
     """Convert a text to a `pathlib.Path`, or to a `upath.UPath`, which has the same interface.
 
     "scheme://..." is a file system of fsspec; "file://..." and everything else is a path on this machine. Paths of
-    pathlib and of universal_pathlib (for example with storage options of their own) stay unchanged. A missing package
-    or a scheme that fsspec does not know is a `CFlowError`.
+    pathlib and universal_pathlib (which may have storage options) stay unchanged. A missing package or a scheme that
+    fsspec does not know is a `CFlowError`.
     """
     if not is_path_like(path) or path == "" or "\0" in str(path):
         raise CFlowError(f"{str(path)[:80]!r} is not a valid path: pass a string, a Path or 'scheme://...'")
@@ -54,7 +54,7 @@ def as_path(path: PathLike) -> Path:
         from upath import UPath
 
         fsspec.get_filesystem_class(scheme)
-    except (ImportError, ValueError) as error:  # it names a missing package
+    except (ImportError, ValueError) as error:  # the error names a missing package
         raise CFlowError(
             f"{path} cannot be opened: fsspec has no file system {scheme}:// ({error}). Is it spelled correctly? "
             "Remote paths need pip install universal_pathlib fsspec, and the package of their file system"
@@ -64,7 +64,7 @@ def as_path(path: PathLike) -> Path:
 
 
 def is_remote(path: Any) -> bool:
-    """Test whether a path is one of fsspec's, which `open` and memory mapping do not support."""
+    """Test whether a path is on a file system of fsspec, which `open` and memory mapping do not support."""
     return hasattr(path, "storage_options") and not isinstance(path, (PosixPath, WindowsPath))
 
 
@@ -87,7 +87,7 @@ def remote_errors(path: Path) -> Iterator[None]:
 
 
 def forget_listings(path: Any) -> None:
-    """Drop fsspec's cached folder listings, which also answer `is_file`, because others may have written since."""
+    """Drop the folder listings that fsspec caches, also for `is_file`, because others may have written since."""
     if is_remote(path):
         path.fs.invalidate_cache()
 
@@ -95,7 +95,7 @@ def forget_listings(path: Any) -> None:
 def read_bytes(path: Path) -> bytes:
     """Read a file, in one request if it is remote.
 
-    Devices and pipes, which an unpacked archive can contain, and an unreachable file system are an OSError, too.
+    A device or pipe, which an unpacked archive can contain, and an unreachable file system raise an OSError, too.
     """
     if not is_remote(path):
         check_file(path)
@@ -118,8 +118,8 @@ def source_for_random_access(path: Path) -> Any:
 def source_for_mmap(path: Path) -> Any:
     """Return a large file for pyarrow to read repeatedly: its name, or a local copy if it is remote.
 
-    The last four copies stay in unnamed files of the folder for temporary files (TMPDIR), which vanish with the
-    process however it ends.
+    We keep the last four copies as unnamed files in the folder for temporary files (TMPDIR). They vanish with the
+    process, even if it is killed.
     """
     return pa.BufferReader(_copy(path)) if is_remote(path) else check_file(path)
 

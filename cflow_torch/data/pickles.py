@@ -47,7 +47,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def load_array(stream: IO[bytes]) -> np.ndarray:
-    """Load a pickled array of numbers, texts or truth values. Another pickle raises nearly any exception."""
+    """Load a pickled array of numbers, texts or truth values. Any other pickle may raise any exception."""
     return _array(_Unpickler(stream).load())
 
 
@@ -70,7 +70,7 @@ def load_columns(stream: IO[bytes]) -> dict[str, np.ndarray]:
 
 
 def _array(stored: Placeholder) -> np.ndarray:
-    if stored.state is None:  # `_frombuffer`, of pickles of protocol 5
+    if stored.state is None:  # made by `_frombuffer`, in pickles of protocol 5
         data, dtype, shape, order = stored.arguments
     else:
         _, shape, dtype, is_fortran, data = stored.state

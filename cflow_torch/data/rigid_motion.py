@@ -9,14 +9,14 @@ import torch
 
 from cflow_torch.types import CFlowError
 
-QUATERNION_TOLERANCE = 1e-3  # only quaternions of length 1 are rotations; those of data sets are within 1e-6
+QUATERNION_TOLERANCE = 1e-3  # only quaternions of length 1 are rotations; lengths in data sets are within 1e-6 of 1
 
 
 def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[int], str]) -> np.ndarray:
     """Build poses, (K, 4, 4) float64, from translations, (K, 3), and quaternions, (K, 4). K may be 0.
 
     Quaternions are scalar first (w, x, y, z), and of length 1 within `QUATERNION_TOLERANCE`. A row that is not a pose
-    is a `CFlowError`, which begins with what `what` returns for the row.
+    is a `CFlowError`, which begins with `what(row)`.
     """
     shift = np.asarray(translation, dtype=np.float64).reshape(-1, 3)
     rotation = np.asarray(quaternion, dtype=np.float64).reshape(-1, 4)
@@ -32,7 +32,7 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
 def poses_from_json(nodes: Sequence[Any], translation: str, rotation: str, what: str) -> np.ndarray:
     """Return the poses of K JSON objects, (K, 4, 4) float64.
 
-    `translation` is the key of {x, y, z}, metres, and `rotation` that of the unit quaternion {w, x, y, z}. A pose that
+    `translation` and `rotation` are the keys of {x, y, z}, metres, and of the unit quaternion {w, x, y, z}. A pose that
     is not rigid is a `CFlowError`, in which `what` names the objects.
     """
     shifts = [[node[translation][axis] for axis in "xyz"] for node in nodes]

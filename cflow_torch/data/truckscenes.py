@@ -20,7 +20,7 @@ TRUCKSCENES_CATEGORIES: dict[str, str] = {
     "vehicle.train": "NONE",
     OWN_TRAILER: "NONE",
 }
-"""Category of a box -> name in Argoverse 2, as for nuScenes."""
+"""Category of a box -> name in Argoverse 2; NONE = background, although its points move with the box."""
 
 
 def find_truckscenes_scenes(root: PathLike) -> list[SceneSource]:
@@ -35,9 +35,9 @@ class TruckScenesLog(NuScenesLog):
         timestamps: times of the reference LiDAR's sweeps (LIDAR_LEFT, else the first), in microseconds, at 10 Hz.
 
     Convention: points are in the ego frame at the reference's time stamp. From every other LiDAR we take the sweep
-        closest in time; none if it is more than 60 ms off. The world is UTM, with coordinates of some 1e6 m. Between
-        the reference's sweeps, poses are interpolated. With `own_vehicle`, points in boxes of `vehicle.ego_trailer` are
-        removed, too. All else is as in `NuScenesLog`.
+        closest in time, unless it is more than 60 ms off. The world is UTM, with coordinates of some 1e6 m. We
+        interpolate poses between the reference's sweeps. Unless `own_vehicle` is None, we also remove points in boxes
+        of `vehicle.ego_trailer`. All else is as in `NuScenesLog`.
     """
 
     _categories = TRUCKSCENES_CATEGORIES

@@ -1,4 +1,4 @@
-"""Point clouds in one file each, in the format of the suffix: x, y, z in metres, and other columns on request."""
+"""Read and write files of one point cloud in the format of the suffix: x, y, z in metres, and other columns."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     """Read the positions of a point cloud.
 
     Args:
-        path: the file; its suffix tells the format (see Convention).
+        path: file; its suffix tells the format (see Convention).
         bin_columns: float32 numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes.
 
     Returns:
@@ -56,8 +56,8 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
 def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, np.ndarray]:
     """Read the other columns of a cloud, name -> (N,) bool, integers or floats as stored; errors as `read_cloud`.
 
-    Columns without a name, those of `.bin` files and of plain arrays, are called column_3, column_4, ... Texts, objects
-    and columns of several numbers per point are left out.
+    Columns without a name (`.bin` files, plain arrays) are called column_3, column_4, ... We leave out texts, objects
+    and columns of several numbers per point.
     """
     path, kept = as_path(path), {}
     with file_errors(path, _hint(path)):
@@ -176,7 +176,7 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
-    """Read an .npz file, which may also hold pickled objects: these stay unread."""
+    """Read the arrays of an .npz file. Pickled objects in it stay unread."""
     arrays = {}
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         for name in archive.files:
@@ -218,7 +218,7 @@ def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
     header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
     if len(table) != header.width * header.height:
         raise ValueError(f"it has {len(table)} points, but its header states {header.width} x {header.height}")
-    # pypcd4 names padding "#...", splits fields of several values, and mixes up those of compressed files.
+    # pypcd4 names padding "#...", splits fields of several values, and mixes these fields up in compressed files.
     names = [name for name, count in zip(header.fields, header.count) if count == 1 and name[0] != "#"]
     # pypcd4 1.4 makes a two-dimensional table of a cloud without points.
     return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}

@@ -1,7 +1,7 @@
 """Point clouds in the PLY format: the properties of the element `vertex`, as text or binary.
 
 No library reads all that we need. meshio 5.3.5 does not know `float64`, `short` and `ushort` in binary files (PDAL
-writes them), takes `uchar` for signed, and does not notice missing points. The licence of plyfile is the GPL.
+writes them), reads `uchar` as signed, and does not notice missing points. The licence of plyfile is the GPL.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Poses in text files as odometry tools write them: KITTI (12 numbers), TUM (time and quaternion), 4 x 4, or `.npy`."""
+"""Poses in text files of odometry tools: KITTI (12 numbers), TUM (time and quaternion), 4 x 4; or in `.npy` files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform
 
 CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets
-_LONGEST_GAP_NS = 500_000_000  # longest gap between two poses that we interpolate
+_LONGEST_GAP_NS = 500_000_000  # longest time between two poses over which we interpolate
 
 
 class Trajectory(NamedTuple):
@@ -29,7 +29,7 @@ class Trajectory(NamedTuple):
 
 
 def read_poses(path: PathLike) -> Trajectory:
-    """Read poses, with rotations orthogonal up to rounding. The number of columns tells the format.
+    """Read poses, whose rotations must be orthogonal up to rounding. The number of columns tells the format.
 
     Args:
         path: text with 12 numbers per line (KITTI: upper three rows of the matrix), 8 (TUM: time in seconds, tx ty tz,
@@ -54,7 +54,7 @@ def read_poses(path: PathLike) -> Trajectory:
 
 
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
-    """Return (K, 4, 4) or (K, 3, 4) rigid motions as (K, 4, 4) float64; an error names the `source`."""
+    """Check (K, 4, 4) or (K, 3, 4) rigid motions and return them as (K, 4, 4) float64. Errors name the `source`."""
     if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or matrices.dtype.kind not in "fiu":
         raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; pass (K, 4, 4) numbers")
     poses = np.tile(np.eye(4), (len(matrices), 1, 1))
@@ -101,7 +101,7 @@ def covered_poses(trajectory: Trajectory, times_ns: Sequence[int]) -> np.ndarray
     exactly the time of a pose, the result is this pose, unchanged.
     """
     known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
-    after = np.searchsorted(known, wanted).clip(0, len(known) - 1)  # the first pose that is not before
+    after = np.searchsorted(known, wanted).clip(0, len(known) - 1)  # the first pose at the time or after it
     before = np.where(known[after] == wanted, after, after - 1).clip(0)
     gap = known[after] - known[before]
     bad = (wanted < known[0]) | (wanted > known[-1]) | (gap > _LONGEST_GAP_NS)
@@ -116,7 +116,7 @@ def covered_poses(trajectory: Trajectory, times_ns: Sequence[int]) -> np.ndarray
 
 
 def _read_table(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """Read a text file as (K, C) words and the finite numbers that they are, K and C at least 1."""
+    """Read a table in a text file: (K, C) words and their values, finite float64. K and C are at least 1."""
     with file_errors(path, "every line must have the same number of numbers"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy warns about a file without lines
         text = read_bytes(as_path(path)).decode("utf-8").replace(",", " ")
@@ -128,7 +128,7 @@ def _read_table(path: PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nanoseconds(path: PathLike, seconds: np.ndarray) -> np.ndarray:
-    """Convert (K,) words to (K,) int64 exactly: unix times need 19 digits, and a float has 16."""
+    """Convert (K,) texts of ascending seconds to int64 exactly: unix times need 19 digits, and a float has 16."""
     times = [(Decimal(word) * 10**9).to_integral_value() for word in seconds.tolist()]
     if max(map(abs, times)) >= 2**62:
         raise CFlowError(f"{path} has {max(times)} ns: times in seconds go up to 4.6e9; are they nanoseconds?")

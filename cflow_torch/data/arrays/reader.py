@@ -1,4 +1,4 @@
-"""Reader for any sensor: a folder with one point cloud per file, and text files with poses and times next to it."""
+"""Reader for any sensor: a folder with one point cloud per file, and text files of poses and times."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ POSE_FILES = ("poses.txt", "poses.npy", "trajectory.txt")
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # file names that are times: 16 digits = microseconds, more = ns
+_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # file names that are times: 16, 17 digits = us, 18, 19 = ns
 _FIRST_NANOSECOND = 10**17
 
 
 def find_array_logs(root: PathLike) -> list[Path]:
     """Find the folders of all logs, at most four levels below a folder, sorted.
 
-    A log has two or more clouds, in the folder itself or in its subfolder points, lidar, velodyne or clouds.
+    A log has two or more clouds of one suffix, in its folder or in the subfolder points, lidar, velodyne or clouds.
     """
     what = "a folder with one point cloud per file, or a folder of such"
     is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
@@ -45,26 +45,26 @@ class ArraysLog(Log):
             velodyne or clouds that does. Clouds are sorted naturally: 2 before 10.
         poses: "auto" = poses.txt, poses.npy or trajectory.txt in the folder, or KITTI's ../../poses/<name>.txt, if
             there is one; None = no poses; or a file (see `read_poses`), or a (K, 4, 4) array.
-        poses_of: "ego" or "lidar", the frame whose poses they are.
+        poses_of: "ego" or "lidar", the frame that has these poses.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
-            converts poses of KITTI's camera to poses of the LiDAR, so `poses_of` is "lidar" then.
+            converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
         times: "auto" = times.txt in the folder; None = none; or a file with one time in seconds per sweep.
         ground: "auto" = the subfolder `ground`, if there is one; None = no masks; or a folder. It has one .npy file per
             cloud, of the same name, with (N,) bool or 0 and 1.
-        ego_T_lidar: (4, 4), coordinates of the stored points to the ego frame; None = they are the same.
-        suffix: the clouds to read, if a folder has several kinds.
+        ego_T_lidar: (4, 4), maps the frame of the stored points to the ego frame; None = they are the same.
+        suffix: suffix of the clouds to read, if a folder has several kinds.
         bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes.
 
     Attributes:
         files: the clouds, in order.
-        timestamps: nanoseconds, from `times`, else from the poses (TUM), else from file names of 16 digits or more
-            (microseconds, nanoseconds), else 0, 1, 2, ...; in that last case sweeps have no `timestamp_ns`.
+        timestamps: nanoseconds from `times`, else from file names of 16 digits or more (microseconds, nanoseconds),
+            else from TUM poses, if there is one per cloud. Otherwise 0, 1, 2, ..., and sweeps have no `timestamp_ns`.
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
 
     Convention:
         Sweeps are in the ego frame: points are transformed by `ego_T_lidar` in float64, then rounded to float32. Poses
-        with times of their own (TUM) are interpolated at the times of the sweeps, if these are known. Otherwise there
-        must be one pose per sweep. The frame should have z up, because the method works in the bird's-eye view.
+        with times (TUM) are interpolated at the times of the sweeps, if these are known. Otherwise there must be one
+        pose per sweep. The ego frame should have z up, because the method works in the bird's-eye view.
     """
 
     def __init__(
@@ -156,12 +156,12 @@ class ArraysLog(Log):
 
 
 def natural_key(name: str) -> tuple[Any, ...]:
-    """Sort key that compares the digits of a name as numbers: 2 before 10."""
+    """Return a key for sorting that compares digits in names as numbers: 2 before 10."""
     return tuple((0, int(run), run) if run.isdecimal() else (1, 0, run) for run in re.findall(r"\d+|\D+", name))
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
-    """Return the folder of a log's clouds, and those of each suffix that has two or more."""
+    """Return the folder that holds a log's clouds, and the clouds of each suffix that has two or more."""
     for parent in (folder, *(folder / name for name in POINT_FOLDERS)):
         kinds: dict[str, list[Path]] = {}
         if parent.is_dir():
@@ -189,7 +189,7 @@ def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
 
 
 def _resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
-    """Return the file or folder that a setting names; None = none."""
+    """Return the file or folder that a setting names, or that "auto" finds; None = none."""
     if setting is None:
         return None
     if setting == "auto":

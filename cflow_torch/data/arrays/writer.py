@@ -21,15 +21,15 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy") -> Path:
     Args:
         log: any log.
         root: parent folder, created if it does not exist.
-        suffix: of the clouds, one of `cloud_file.SUFFIXES`.
+        suffix: suffix of the clouds, one of `cloud_file.SUFFIXES`.
 
     Returns:
         The folder.
 
     Convention:
         The folder appears complete or not at all. Points are in the log's ego frame, poses `T_world_ego` with 12
-        numbers per line (KITTI). Poses, times and masks are written if every sweep has them, and every cloud has the
-        columns that the log has for it.
+        numbers per line (KITTI). We write poses, times and masks if every sweep has them, and the other columns of each
+        cloud.
 
     Raises:
         CFlowError: an unknown suffix, poses of only some sweeps, or the folder exists.

@@ -1,4 +1,4 @@
-"""Messages as arrays: clouds (PointCloud2) of any layout of fields, and the frames of a robot over time, from /tf."""
+"""Convert messages to arrays: clouds (PointCloud2) with any fields, and the frames of a robot over time, from /tf."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 
 
 
 def cloud_columns(message: Any) -> dict[str, np.ndarray]:
-    """Return the fields of the points of a PointCloud2, x, y, z and others: name -> (N,) numbers as stored.
+    """Return the fields of a PointCloud2, x, y, z and others: name -> (N,) numbers as stored.
 
-    Points that are not finite or at the origin are left out: they mean "no return". A cloud without x, y or z, or with
-    less data than it states, is a ValueError.
+    We leave out points that are not finite or lie at the origin, because they mean "no return". A cloud without x, y or
+    z, or with less data than it states, is a ValueError.
     """
     fields = {field.name: field for field in message.fields if field.count <= 1 and field.datatype in _TYPES}
     names = [name for name in fields if name]
@@ -42,9 +42,9 @@ def cloud_columns(message: Any) -> dict[str, np.ndarray]:
 def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:
     """Convert (N,) times of any unit to (N,) float64 seconds after the stamp of their sweep; None if that fails.
 
-    The unit, from seconds to nanoseconds, is the one in which they span 5 ms to 5 s. Values of at most 5 s count from
-    the stamp, larger ones from 1970. If the latter are more than 5 s away from the stamp, they come from another clock,
-    and we assume that the first shot was at the stamp.
+    The unit is the one of s, ms, us and ns in which the times span 5 ms to 5 s. If the first time is at most 5 s, times
+    count from the stamp, otherwise from 1970. If the first time since 1970 is more than 5 s away from the stamp, the
+    times come from another clock, and we assume that the first shot was at the stamp.
     """
     if not len(values):
         return None
@@ -65,11 +65,11 @@ Sample = Tuple[float, ...]  # nanoseconds (int), x, y, z, and the quaternion w, 
 
 
 class Frames:
-    """A tree of coordinate frames: the parent of each, and samples of its `T_parent_frame` over time."""
+    """A tree of coordinate frames: the parent of each frame, and samples of its `T_parent_frame` over time."""
 
     def __init__(self, parents: dict[str, str], samples: dict[str, list[Sample]]) -> None:
         self._parents = parents
-        # A transform that is always the same is a fixed one.
+        # If all samples of a transform are equal, it is fixed, and we keep one of them.
         self._links = {
             child: sorted_poses(rows if len({row[1:] for row in rows}) > 1 else rows[:1], f"the transform to {child}")
             for child, rows in samples.items()
@@ -86,7 +86,7 @@ class Frames:
         return self.chain(frame)[-1] == self.chain(other)[-1]
 
     def change_times(self, frame: str) -> np.ndarray:
-        """Return the (K,) int64 nanoseconds, ascending, of all moving transforms between the root and a frame."""
+        """Return the sample times of all moving transforms between the root and a frame, (K,) int64 ns, ascending."""
         times = [self._links[child][0] for child in self.chain(frame)[:-1]]
         return np.unique(np.concatenate([np.zeros(0, np.int64), *(t for t in times if len(t) > 1)]))
 
@@ -103,7 +103,7 @@ class Frames:
         return result
 
     def between(self, target: str, source: str, times_ns: np.ndarray) -> np.ndarray:
-        """Return (K, 4, 4) float64 `T_target_source`. Frames that no transforms connect raise a `CFlowError`."""
+        """Return (K, 4, 4) float64 `T_target_source` at the times. Frames that are not connected are a `CFlowError`."""
         if not self.are_joined(target, source):
             known = shortened(", ".join(sorted({*self._parents, *self._parents.values()})))
             raise CFlowError(f"no transforms connect {source} to {target}; the frames are {known or 'none'}")
@@ -115,7 +115,7 @@ def sample(time_ns: int, position: Any, rotation: Any) -> Sample:
 
 
 def sorted_poses(samples: list[Sample], what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return (K,) int64 ascending times and (K, 4, 4) float64 poses. Ties: the first sample."""
+    """Return ascending times, (K,) int64 nanoseconds, and poses, (K, 4, 4) float64. Ties: the first sample."""
     times, rows = np.unique(np.array([row[0] for row in samples], np.int64), return_index=True)
     numbers = np.array([samples[row][1:] for row in rows], np.float64).reshape(-1, 7)
     return times, poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda row: f"{what} at {times[row]} ns")

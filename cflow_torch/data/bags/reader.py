@@ -45,24 +45,24 @@ class BagLog(Log):
 
     Args:
         path: a file, or the folder of a ROS 2 bag, on this machine.
-        topic: of the clouds (sensor_msgs/PointCloud2); None = the only such topic.
+        topic: topic of the clouds (sensor_msgs/PointCloud2); None = the only one of this type.
         poses: "tf" = from the transforms; a topic of nav_msgs/Odometry, geometry_msgs/PoseStamped or
             PoseWithCovarianceStamped; None = no poses; "auto" = the first available of: transforms in which the ego
-            frame moves, the only topic of such a type, none.
+            frame moves, the only topic of these types, none.
         frame: name of the ego frame; None = base_link if transforms connect it to the LiDAR, else the LiDAR's own.
-        ego_T_lidar: (4, 4), coordinates of the clouds to the ego frame; None = from the transforms.
-        deskew: move each point with the pose that the vehicle had when it was measured, if poses and times of points
-            are known; False: the clouds are already compensated.
+        ego_T_lidar: (4, 4), maps the frame of the clouds to the ego frame; None = from the transforms.
+        deskew: move each point with the pose of the vehicle at the time of the point, if poses and times of points are
+            known; False: the clouds are already compensated.
 
     Attributes:
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
-        timestamps: nanoseconds of the clouds' headers (where they are 0: of their arrival). Clouds before the first
+        timestamps: nanoseconds from the header of each cloud (if that is 0, from its arrival). Clouds before the first
             or after the last pose are left out.
         topic, frame, deskew: the settings in use.
 
-    Convention: points are in the ego frame. Poses are interpolated at the time of the cloud; the world is the root of
-        the transforms, or that of the topic. A topic's poses are those of its `child_frame_id`, if transforms connect
-        it to the ego frame, else of the ego frame itself. Times of points: see `messages.seconds_after`.
+    Convention: points are in the ego frame. Poses are interpolated at the time of the cloud. The world is the root of
+        the transforms, or the world of the topic. A topic has the poses of its `child_frame_id` if transforms connect
+        that to the ego frame, otherwise of the ego frame itself. Times of points: see `messages.seconds_after`.
 
     Cost: opening a bag reads all its clouds, poses and transforms once.
     """
@@ -125,7 +125,7 @@ class BagLog(Log):
         return {name: values for name, values in columns.items() if name not in ("x", "y", "z")}
 
     def _reader(self) -> Any:
-        """Return the bag, opened by this process: after a fork or unpickling it is opened again."""
+        """Return the open bag. Each process opens it itself, also after a fork or unpickling."""
         if self._opened[0] != os.getpid():
             rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
             for file in [self.path] if self.path.is_file() else self.path.iterdir():
@@ -141,7 +141,7 @@ class BagLog(Log):
         return {**self.__dict__, "_opened": (0, None)}
 
     def _chosen(self, topics: dict[str, str], types: tuple[str, ...], name: str | None, setting: str) -> str:
-        """Return the topic of one of these types that is named, or the only one."""
+        """Return the topic with this name and one of these types; without a name, the only topic of these types."""
         found = sorted(topic for topic, kind in topics.items() if kind in types and name in (None, topic))
         if len(found) != 1:
             available = shortened(", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())))
@@ -207,7 +207,7 @@ class BagLog(Log):
 
 
 def _stamp(message: Any, arrived: int) -> int:
-    """Return the nanoseconds of a header; where it is 0, the time of arrival."""
+    """Return the time of a header in nanoseconds; if it is 0, the time of arrival."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
 

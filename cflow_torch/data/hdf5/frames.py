@@ -10,11 +10,11 @@ from torch import Tensor
 
 from cflow_torch.windows.ego_motion import compensate
 
-# Argoverse 2 counts nanoseconds from its own epoch: all its sweeps lie in this range, and those of no other data set.
+# Argoverse 2 counts nanoseconds from its own epoch: all its sweeps lie in this range, and no sweep of another data set.
 _ARGOVERSE2_STAMPS = (315_900_000_000_000_000, 316_000_000_000_000_000)
-# Its up_lidar is 2 m above the road, its ego frame 0.35 m: if the ground is lower than this, points are the sensor's.
+# Its up_lidar is 2 m above the road, its ego frame 0.35 m: if the ground is lower, points are in the sensor frame.
 _ARGOVERSE2_SENSOR_GROUND = -1.2
-# Extrinsics of up_lidar in one log of the set (7fab2350), yaw -0.58 degrees. Every log has its own, scenes have none.
+# Extrinsics of up_lidar in one log of the set (7fab2350), yaw -0.58 degrees. They differ by log; scenes lack them.
 _ARGOVERSE2_EGO_T_UP_LIDAR = np.array(
     [[0.9999483, 0.0101698, 0, 1.35018], [-0.0101698, 0.9999483, 0, 0], [0, 0, 1, 1.64042], [0, 0, 0, 1]]
 )
@@ -24,7 +24,7 @@ class StoredMotion(NamedTuple):
     """The ego motion that the harness uses for a pair of sweeps."""
 
     T_ego1_ego0: np.ndarray  # (4, 4) float32, from `harness_motion`
-    of_points: bool  # whether the poses are those of the frame of the points; False = `ego_T_lidar` lies between
+    of_points: bool  # whether the poses are of the frame of the points; False = `ego_T_lidar` leads to their frame
 
 
 def is_argoverse2(timestamp: int) -> bool:
@@ -34,12 +34,12 @@ def is_argoverse2(timestamp: int) -> bool:
 
 
 def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndarray | None) -> np.ndarray:
-    """Recognise ego_T_lidar, (4, 4) float64, which maps the points of a scene to the frame whose poses it stores.
+    """Recognise ego_T_lidar, (4, 4) float64, which maps the points of a scene to the frame of its stored poses.
 
-    The arguments are those of one sweep: its time stamp, its points as stored, (N, 3+) float in metres, and its ground
+    The arguments describe one sweep: its time stamp, its points as stored, (N, 3+) float in metres, and its ground
     mask, (N,) bool, None = unknown. We recognise sweeps of Argoverse 2 by the time stamp. If their ground is more than
-    1.2 m below the origin, their points are in the frame of up_lidar, and their poses are of the ego frame. We return
-    the extrinsics of one log of that set, because those of the scene's own log are not in its file: take them from
+    1.2 m below the origin, their points are in the frame of up_lidar, and their poses are of the ego frame. We then
+    return the extrinsics of one log of Argoverse 2, because the scene lacks its own: you can take these from
     `calibration/egovehicle_SE3_sensor.feather`. For all other sweeps we return the identity (nuScenes and ZOD have
     poses of the sensor, Waymo and TruckScenes have points in the ego frame).
     """
@@ -55,8 +55,8 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndar
 def harness_motion(pose0: Any, pose1: Any) -> np.ndarray:
     """Compute T_ego1_ego0, (4, 4) float32, from two stored poses T_world_ego as the harness does.
 
-    The inverse of a rotation is its transpose, and the translation of the inverse is summed in the precision of the
-    poses. With float32 and coordinates of kilometres this is off by up to half a millimetre, and so are its scores.
+    The harness inverts a rotation by its transpose, and sums the translation of the inverse in the precision of the
+    poses. With float32 poses kilometres from the origin, its motion and its scores are off by up to half a millimetre.
     """
     start, end = (torch.as_tensor(pose).detach().cpu() for pose in (pose0, pose1))
     inverse = torch.eye(4, dtype=torch.float64)
@@ -74,7 +74,7 @@ def harness_pose_flow(points: Tensor, T_ego1_ego0: np.ndarray) -> Tensor:
 def residual_for_harness(
     residual: Tensor, points: Tensor, T_ego1_ego0: np.ndarray, T_lidar1_lidar0: np.ndarray
 ) -> Tensor:
-    """Return the residual flow with which the harness gets the right total, even if its poses are of another frame.
+    """Return the residual flow that gives the right total flow in the harness, even if its poses are of another frame.
 
     `residual` and `points` are (N, 3) float32, metres; the points are in the frame of the LiDAR at t. `T_ego1_ego0` is
     the result of `harness_motion`. `T_lidar1_lidar0`, (4, 4) float64, is the motion of the frame of the points.

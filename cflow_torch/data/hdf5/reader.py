@@ -38,17 +38,17 @@ class HDF5Log(Log):
 
     Args:
         file: `<scene>.h5`.
-        ego_T_lidar: (4, 4), coordinates of the stored points to the frame whose poses are stored; None = the same
-            frame; "auto" = recognise it (see Convention).
-        needs_poses: False = sweeps of a scene without poses have the pose None, for `with_poses`.
+        ego_T_lidar: (4, 4), maps the frame of the stored points to the frame of the stored poses; None = they are the
+            same; "auto" = recognise it (see Convention).
+        needs_poses: False = sweeps of a scene without poses have the pose None, for `with_poses`; True = an error.
 
     Attributes:
         timestamps: names of the groups as integers, ascending, in nanoseconds or microseconds as the data set has
             them; the `timestamp_ns` of sweeps are nanoseconds.
-        ego_T_lidar: (4, 4) float64, the one in use.
+        ego_T_lidar: (4, 4) float64, the transform in use.
 
     Convention:
-        - Points, labels and results stay in the frame of the file, that of the LiDAR. A sweep's `pose` is the LiDAR's:
+        - Points, labels and results stay in the frame of the stored points. A sweep's `pose` is the pose of this frame:
           the stored pose times `ego_T_lidar`. So the static world is static even if the file combines points in the
           sensor frame with poses of the ego vehicle.
         - A scene without `pose` gets poses from `ego_motion`; the world is then the frame of the first sweep.
@@ -62,7 +62,7 @@ class HDF5Log(Log):
         self._chain = [np.eye(4)]  # poses from `ego_motion`, as far as they are known
         self.log_id = self.file.stem
         self._scene = open_scene(self.file)
-        # HDF5 closes its files after the interpreter has ended, which crashes if Python reads the file.
+        # HDF5 would close the file after the interpreter has ended, which crashes if Python reads the file.
         weakref.finalize(self, self._scene.close)
         with scene_errors(self.file):
             self.timestamps = sorted(int(name) for name in self._scene if is_timestamp(name))
@@ -119,7 +119,7 @@ class HDF5Log(Log):
         return StoredMotion(harness_motion(*poses), np.array_equal(self.ego_T_lidar, np.eye(4)))
 
     def keys(self, index: int) -> tuple[str, ...]:
-        """Return the names of all that sweep `index` contains, results included."""
+        """Return the names of all arrays of sweep `index`, results included."""
         with scene_errors(self.file):
             return tuple(sorted(self._group(index)))
 
@@ -145,7 +145,7 @@ class HDF5Log(Log):
             return stored @ self.ego_T_lidar
 
     def _stored_pose(self, index: int, dtype: Any = np.float64) -> Any:
-        """Read a pose, or compute it from the ego motion of all sweeps before; None if poses are not needed."""
+        """Read a pose, or compute it from earlier ego motions. Without any, return None unless poses are needed."""
         pose = self._values(index, "pose", (4, 4), dtype)
         if pose is not None:
             return pose
@@ -187,7 +187,7 @@ class HDF5Log(Log):
         return (shape[0],)
 
     def _values(self, index: int, key: str, shape: tuple[int, ...] | None = None, dtype: Any = None) -> Any:
-        """Read the values of a key in a shape, to which an axis of length 1 may follow; None if there are none."""
+        """Read the array of a key, None if there is none. Its stored shape may have one more axis, of length 1."""
         group, what = self._group(index), f"{self.file}: {key} of sweep {self.timestamps[index]}"
         stored = member(group, key, what)
         if stored is None:
@@ -215,10 +215,10 @@ def open_scene(file: Path) -> Any:
 
 
 def member(group: Any, name: str, where: PathLike) -> Any | None:
-    """Return the group or the array of numbers of a name in a group of h5py; None if there is none.
+    """Return the group or the numeric array with a name in a group of h5py; None if there is none.
 
-    A link, data in another file (which is never opened), and an array of another type are a `CFlowError` that begins
-    with `where`.
+    A link, data in another file (which we never open), and an array of another type are a `CFlowError` that begins with
+    `where`.
     """
     h5py = import_h5py()
     with scene_errors(f"{where}: {name}"):

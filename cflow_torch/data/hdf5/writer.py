@@ -21,7 +21,7 @@ from cflow_torch.data.paths import is_timestamp
 from cflow_torch.types import Array, CFlowError, as_numpy, check_array
 
 LABELS = ("dufo", "cluster", "dufocluster", "nnd")  # keys of labels for self-supervised training
-LABELLED = "cflow_labels"  # attribute of a scene that has ours
+LABELLED = "cflow_labels"  # attribute of a scene: how its labels were made
 # Keys of the scenes themselves, and names that have a special meaning in the viewers.
 RESERVED_KEYS = {
     *("lidar", "lidar_id", "lidar_dt", "lidar_center", "ground_mask", "pose", "ego_motion", "eval_mask"),
@@ -39,7 +39,7 @@ def write_hdf5_scene(log: Log, file: str | Path, eval_step: int = 5) -> None:
     Args:
         log: any log with poses; a `Recording` also provides lidar_id, lidar_dt, lidar_center and flow_instance_id.
         file: `<scene>.h5`.
-        eval_step: every how many labelled sweeps get an `eval_mask` (valid and not ground); 0 = none.
+        eval_step: sweeps 0, `eval_step`, ... get an `eval_mask` (valid and not ground) if they have labels; 0 = none.
 
     Convention:
         lidar, flow, ego_motion, lidar_dt, lidar_center are float32, poses float64, masks bool, flow_category_indices
@@ -48,7 +48,7 @@ def write_hdf5_scene(log: Log, file: str | Path, eval_step: int = 5) -> None:
         the identity. The file appears complete or not at all.
 
     Raises:
-        CFlowError: h5py is missing, a sweep has no pose, or time stamps are not distinct numbers.
+        CFlowError: h5py is missing, a sweep has no pose, or time stamps are negative or not distinct.
     """
     h5py = import_h5py()
     if len(set(log.timestamps)) < len(log.timestamps) or min(log.timestamps, default=0) < 0:
@@ -102,7 +102,7 @@ def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int,
         file: `<scene>.h5`; every other key keeps its contents.
         name: name of the result; we replace a result of the same name.
         results: pairs of the time stamp of sweep t and the (N, 3) TOTAL flow, metres per sweep interval, axes of ego1,
-            one row per point of the sweep, ground included; consumed one by one.
+            one row per point of the sweep, ground included. We write each before we ask for the next.
 
     Returns:
         Number of sweeps written.
@@ -131,10 +131,10 @@ def write_hdf5_labels(
 
     Args:
         file: `<scene>.h5`; every other key keeps its contents.
-        labels: (time stamp, {key: (N,) values}) of sweeps, keys of `LABELS` and `ground_mask`, which is only written
-            if the sweep has none; consumed one by one.
+        labels: (time stamp, {key: (N,) values}) of sweeps. Keys are those of `LABELS`, and `ground_mask`, which we
+            write only if the sweep has none. We write each sweep before we ask for the next.
         made_by: description of the method, stored as the attribute `LABELLED` of the scene.
-        overwrite: replace existing labels; if it is False, a scene with labels is a `CFlowError`.
+        overwrite: replace existing labels; False = a scene with labels is a `CFlowError`.
     """
     if not overwrite and labelled_by(file) is not None:
         raise CFlowError(f"{file} already has labels: overwrite=true replaces them, or label a copy")

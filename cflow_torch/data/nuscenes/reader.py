@@ -71,10 +71,10 @@ class NuScenesLog(Log):
         sweep_step: 1 = all sweeps (20 Hz); 2 = every second one after each key frame, and every key frame (10 Hz, as
             OpenSceneFlow thins nuScenes).
         lidars: channels to merge; None = every LiDAR of the scene.
-        own_vehicle: points above it are removed; "auto" = `OWN_VEHICLE`, None = keep them. Points at the sensor itself
-            mean "no return" and are always removed.
-        deskew: move each point with the pose that the vehicle had when it was measured; False: with the pose of its
-            LiDAR's sweep. Ignored if the format has no times of points, as that of nuScenes.
+        own_vehicle: `Footprint` whose points are removed; "auto" = `OWN_VEHICLE`, None = keep them. Points at the
+            sensor itself mean "no return" and are always removed.
+        deskew: move each point with the pose of the vehicle at the time of the point; False: at the time of its LiDAR's
+            sweep. Ignored for nuScenes, whose files have no times of points.
 
     Attributes:
         log_id: name of the scene.
@@ -83,13 +83,13 @@ class NuScenesLog(Log):
     Convention:
         - Points are in the ego frame at the sweep's time stamp (x forward, y left, z up, origin on the ground below the
           rear axle); nuScenes itself has compensated ego motion. It has no ground masks.
-        - Truth comes from boxes, which are annotated at 2 Hz and interpolated by `tables.Tracks.at`. If an
-          object is annotated at only one of the two samples around either sweep, its points are not valid. There is no
-          truth outside the annotated time.
+        - Truth comes from boxes, which are annotated at 2 Hz. `tables.Tracks.at` interpolates them. If an object is
+          annotated at only one of the two samples around either sweep, its points are not valid. There is no truth
+          outside the annotated time.
     """
 
     _categories: ClassVar[Mapping[str, str]] = NUSCENES_CATEGORIES
-    _reference: ClassVar[str] = "LIDAR_TOP"  # the LiDAR whose times are those of the log
+    _reference: ClassVar[str] = "LIDAR_TOP"  # the log has the times of this LiDAR
     # 4.084 m x 1.730 m around the LiDAR at x = 0.944 m, as OpenSceneFlow has it.
     OWN_VEHICLE: ClassVar[Footprint] = Footprint(rear=-1.098, front=2.986, half_width=0.865)
 
@@ -138,7 +138,7 @@ class NuScenesLog(Log):
         T_ego1_ego0 = self._T_ego_world[index + 1] @ self._poses[index]
         flow = np.zeros((len(points), 3), dtype=np.float32)
         category, is_valid = np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=bool)
-        # A shot hits an object where its box is at that time, so the boxes of both ends are shifted by the same lag.
+        # A shot hits an object where its box is at the time of the shot, so we take both boxes later by its lag.
         slices, group = np.unique(lag // _TIME_SLICE, return_inverse=True)
         for position, middle in enumerate(slices * _TIME_SLICE + (_TIME_SLICE // 2 if lag.any() else 0)):
             rows = np.flatnonzero(group == position)
@@ -166,10 +166,10 @@ class NuScenesLog(Log):
         for chain in self._lidars.values():
             row = int(np.abs(chain.times - time).argmin())
             if abs(int(chain.times[row]) - time) <= MAX_UNIT_LAG:
-                clouds.append(self._unit_points(chain, row, index))
+                clouds.append(self._lidar_points(chain, row, index))
         return np.concatenate([points for points, _ in clouds]), np.concatenate([lag for _, lag in clouds])
 
-    def _unit_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
+    def _lidar_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
         file = path_inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
         local, times = self._points_of(file)
         points = transform_points(local, chain.mount[row])

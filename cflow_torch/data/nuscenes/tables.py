@@ -71,8 +71,8 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
     """Find the scenes of all versions under a folder, sorted by folder and name. Scenes of a version share its tables.
 
     The root is a data root (it holds `v1.0-mini` or the like), the folder of one version, or a folder up to two levels
-    above data roots. We skip versions with one of the `foreign` tables, which belong to the related
-    data set. If all versions have one, a `CFlowError` names the first.
+    above data roots. We skip versions with one of the `foreign` tables, which belong to the other data set. If we skip
+    all versions, that is a `CFlowError`.
     """
     what = "the data root, which holds v1.0-mini or the like"
     versions = find_folders(
@@ -90,7 +90,7 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
 
 
 def read_table(folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> list[Row]:
-    """Read the rows of a table with the fields of `FIELDS`; if `key` is given, those whose `key` is one of `values`.
+    """Read the rows of a table with the fields of `FIELDS`. With a `key`, only rows whose `key` is one of `values`.
 
     Cost: memory of twice the file, and of the rows that are kept.
     """
@@ -108,9 +108,9 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
 
 
 class Tables:
-    """The tables of one version, `<data root>/<version>`, each read once when it is needed, with rows of LiDARs only.
+    """The tables of one version, `<data root>/<version>`, read once when they are needed, without cameras and radars.
 
-    Cost: about 5 s per million rows (measured on one core); rows of cameras and radars are dropped while reading.
+    Cost: about 5 s per million rows (measured on one core). We drop rows of cameras and radars while we read.
     """
 
     def __init__(self, folder: PathLike) -> None:
@@ -127,8 +127,8 @@ class Tables:
     def scene(self, name: str) -> tuple[np.ndarray, dict[str, LidarChain], Annotations]:
         """Return the rows of a scene, linked and checked: sample times, LiDARs by channel as in sensor.json, and boxes.
 
-        The times are ascending int64 microseconds. Rows that refer to missing ones, and two sweeps of a LiDAR or two
-        samples at one time, are a `CFlowError`.
+        The times are ascending int64 microseconds. A row that refers to a missing one, and two sweeps of a LiDAR or two
+        samples at one time are a `CFlowError`.
         """
         with file_errors(f"{self.folder}, {name}", _COPY):
             if not self._rows:
@@ -161,7 +161,7 @@ class Tables:
             self._rows[table] = grouped
 
     def _ordered(self, table: str, rows: Sequence[Row], key: str = "scene_token") -> list[Row]:
-        """Sort rows by time; two rows of one time and one `key` are an error."""
+        """Sort rows by time. Two rows with the same time and `key` are an error."""
         if len({(row["timestamp"], row[key]) for row in rows}) < len(rows):
             raise CFlowError(f"{self.folder / table}.json has two rows of one {key} and one time; {_COPY}")
         return sorted(rows, key=lambda row: row["timestamp"])
@@ -215,12 +215,11 @@ class Tracks:
     def at(self, time: int) -> tuple[Annotations, np.ndarray]:
         """Return the K boxes at a time, and whether each is known, (K,) bool; K is 0 outside the annotated time.
 
-        A box is not known, but a guess, if only one of the two samples around the time has the object. Guesses come
-        first.
+        A box is a guess, not known, if only one of the two samples around the time has the object. Guesses come first.
 
         Convention: at a sample, we return its own boxes. Between two samples the centre and the size change linearly,
-            and the rotation at a constant rate. If only one of the two samples has an object, we continue its motion
-            between that sample and the next one beyond; if that one lacks it too, the object stays where it is.
+            and the rotation at a constant rate. If only one of the two samples has an object, we extrapolate the motion
+            between that sample and its other neighbour. If the neighbour lacks the object, too, the box does not move.
         """
         if not self.start <= time <= self.end:
             return self._boxes(time, [])
@@ -230,7 +229,7 @@ class Tracks:
         if times[left] == time:
             return self._boxes(time, [(row, row, 0.0, True) for row in rows[left].values()])
         ends: list[tuple[int, int, float, bool]] = []  # row at one end, row at the other, fraction, whether it is known
-        for track, row in {**rows[left], **rows[left + 1], **rows[left]}.items():  # those of `left` come first
+        for track, row in {**rows[left], **rows[left + 1], **rows[left]}.items():  # tracks of `left` come first
             both = [k for k in (left, left - 1, left + 1) if track in rows.get(k, ()) and track in rows.get(k + 1, ())]
             start = both[0] if both else None
             if start is None:

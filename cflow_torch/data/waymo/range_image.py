@@ -15,7 +15,7 @@ LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
 
 TOP = LASERS["TOP"]
 RANGE, INTENSITY, ELONGATION, NO_LABEL_ZONE = range(4)
-"""Channels of a range image. Range is in metres, > 0 where there is a return; the zone is 1 inside, else outside."""
+"""Channels of a range image. Range is in metres, > 0 where there is a return. Inside a no-label zone, the flag is 1."""
 
 
 class LaserCalibration(NamedTuple):
@@ -69,15 +69,15 @@ def range_image_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the points of all pixels with a return, (N, 3) float64, and the index of each pixel, (N,) int64.
 
-    Points are in metres, in the vehicle frame of the frame. Indices are row * W + column, ascending. We compute in
-    float64, because world coordinates are about 10 km, where float32 has steps of 1 mm.
+    Points are in metres, in the vehicle frame at the time of the image. Indices are row * W + column, ascending. We
+    compute in float64, because world coordinates are about 10 km, where float32 has steps of 1 mm.
 
     Args:
         image: (H, W, 4) float: range (metres), intensity, elongation, no-label-zone flag.
-        calibration: of the laser.
-        T_world_ego: (4, 4) float64 vehicle pose of the frame, used with `pixel_poses`.
+        calibration: calibration of the laser.
+        T_world_ego: (4, 4) float64 vehicle pose at the time of the image, ignored without `pixel_poses`.
         pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of `T_world_ego` at the time of each pixel. Only the TOP laser
-            has them; the images of the others are made for the vehicle pose of the frame.
+            has them. Images of the other lasers are already made for one vehicle pose.
     """
     num_rows, num_columns = image.shape[:2]
     pixels = np.flatnonzero(image[..., RANGE] > 0)

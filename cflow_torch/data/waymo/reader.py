@@ -61,7 +61,7 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
 
 
 class WaymoLog(BoxLog):
-    """One segment. Experimental: of the released files we could test only the poses, no range images.
+    """One segment. Experimental: we could test poses on released files, but no range images.
 
     Args:
         file: `<split>/lidar/<segment>.parquet`; the other components lie next to that folder, under the same name.
@@ -70,8 +70,8 @@ class WaymoLog(BoxLog):
 
     Convention:
         - `timestamps` are the starts of the TOP scans.
-        - Points are in the vehicle frame of their frame (x forward, y left, z up, origin at the rear axle), computed in
-          float64: laser by laser, and row by row of the range image.
+        - Points are in the vehicle frame of their sweep (x forward, y left, z up, origin at the rear axle), computed in
+          float64. They are ordered by laser, and by row of the range image.
         - `T_world_ego` is `world_from_vehicle`, about the middle of the TOP scan.
         - The data set has no ground masks: `is_ground` is None.
         - Truth comes from box tracks. Points in a no-label zone are invalid; boxes of unknown type are background.
@@ -116,7 +116,7 @@ class WaymoLog(BoxLog):
         return labels and replace(labels, is_valid=labels.is_valid & ~self._frame(index)[1])
 
     def _read_frame(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Read the (N, 3) float32 points in the vehicle frame, and (N,) bool whether each lies in a no-label zone."""
+        """Read (N, 3) float32 points in the vehicle frame, and whether each lies in a no-label zone, (N,) bool."""
         time = self.timestamps[index] // 1000
         keys = [(time, laser) for laser in self._lasers]
         images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
@@ -147,7 +147,7 @@ class WaymoLog(BoxLog):
 
     @cached_property
     def _box_rows(self) -> dict[int, list[list[Any]]]:
-        """Read frame time -> rows of its boxes; empty if the segment has no labels (the testing split)."""
+        """Read the rows of boxes by frame time; empty if the segment has no labels (the testing split)."""
         component, by_frame = Component(self.file, "lidar_box"), defaultdict(list)
         with remote_errors(component.file):
             if not component.file.exists():
@@ -182,7 +182,7 @@ class Component:
             return list(zip(*(table.column(name).to_pylist() for name in columns)))
 
     def rows_by(self, key: str, wanted: Sequence[int], columns: Sequence[str]) -> dict[int, list[Any]]:
-        """Read some columns of the rows with the wanted values of a key column, by that value."""
+        """Read columns of the rows in which the key column has one of the wanted values: value -> columns."""
         rows = {value: row for value, *row in self.rows((key, *columns))}
         missing = [value for value in wanted if value not in rows]
         if missing:
@@ -219,7 +219,7 @@ class Component:
 
 
 def matrix_of(values: Any, where: str) -> np.ndarray:
-    """Return a (4, 4) float64 rigid motion from 16 numbers, row by row."""
+    """Return the (4, 4) float64 rigid motion of 16 numbers, row by row. Errors begin with `where`."""
     if values is None or len(values) != 16:
         raise CFlowError(f"{where} must have 16 numbers, row by row, got {0 if values is None else len(values)}")
     return rigid_transform(np.reshape(values, (4, 4)), where)
