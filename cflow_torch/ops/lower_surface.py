@@ -17,7 +17,7 @@ def lower_surface(low: Tensor) -> Tensor:
     """Fit the highest surface of limited slope below the heights. Objects on the ground are steeper than the ground.
 
     Args:
-        low: (B, H, W) int32, mm, lowest height of each cell; `UNKNOWN` = empty.
+        low: (B, H, W) int32, mm, low height of each cell, above which the surface must not lie; `UNKNOWN` = empty.
 
     Returns:
         (B, H, W) int32, mm, defined everywhere.
