@@ -1,15 +1,15 @@
-"""The aperture problem: static lines that seem to slide along themselves, and long vehicles that do.
+"""The aperture problem: static lines seem to slide along themselves, and long vehicles really do.
 
 A moving sensor samples walls, hedges and guard rails at positions that move with it, so they seem to slide along
-themselves. We take such a line for static if t+1 has most of it at the old position, or if the older sweeps have most
-of it at the new one. One of the two suffices, because one end of the line may enter or leave the view. The side of a
-car is a line as well, but its rear leaves the old position and its front reaches a new one. A low line of 7 m or more
-is a guard rail and always static.
+themselves. Such a line is static if t+1 has most of it at the old position, or if the older sweeps have most of it at
+the new one. One of the two suffices, because one end of the line may enter or leave the view. The side of a car is a
+line as well, but its rear leaves the old position and its front reaches a new one. A low line of 7 m or more is a guard
+rail, which is always static.
 
-A component longer than `max_object_length` moves only if both of its ends move, as those of a tram do. One end of a
-wall stays, or each end follows the border of what is visible. The ends of a guard rail or a noise barrier may keep pace
-with the ego vehicle, because the beams hit it at positions that are fixed in the frame of the vehicle. However, no
-vehicle is as low as a guard rail, or as long as a noise barrier.
+A component longer than `max_object_length` moves only if both of its ends move, like the ends of a tram. If a wall
+seems to move, one of its ends stays, or its ends are only the limits of the view. The ends of a guard rail or a noise
+barrier may keep pace with the ego vehicle, because the beams hit it at positions that are fixed in the frame of the
+vehicle. However, no vehicle is as low as a guard rail, or as long as a noise barrier.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from cflow_torch.ops.indices import constant, flat_nonzero, members_of, scatter_
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
 
-# A line: largest standard deviation across and smallest along, metres.
+# A line: its largest standard deviation across and its smallest one along it, metres.
 _THIN, _LONG = 0.3, 1.0
 _ALONG = 0.04  # squared sine of the largest angle between a line and a motion along it
 _LEAST_TRAVEL = 1.2  # metres; shorter displacements over the window are ignored
 _ALIKE = 0.1  # the displacements of two ends that move together differ by at most this share of their sum
-_LONGEST = 60.0  # metres; no road vehicle is longer. The ends of longer noise barriers border what is visible
-# A guard rail has fewer height slices per pixel at t+1, on average, and a larger standard deviation along the line, in
-# metres. No vehicle is as low and as long. Where a rail crosses the border of a slice, its pixels have two slices.
+_LONGEST = 60.0  # metres; no road vehicle is longer. The ends of a longer noise barrier are only the limits of the view
+# A guard rail has fewer than 2 height slices per pixel at t+1 on average, and a standard deviation of at least 2 m
+# along it. No vehicle is as low and as long. Where a rail crosses the border of a slice, its pixels have two slices.
 _TALL, _RAIL = 2, 2.0
 
 
@@ -43,16 +43,16 @@ def slides_along_itself(
         members: K pixels of components.
         component: (K,) int64, component of each pixel.
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
-        is_covered: (A,) bool, other sweeps have most of the component in place, as defined in `Wins`.
+        is_covered: (A,) bool, most of the component is found in place in other sweeps, see `Wins.is_covered`.
 
     Returns:
-        (A, C) bool. True if the pixels of the component at t+1 form a line, this line is covered or a rail, and the
-        motion points along it and is at least 1.2 m long over the window.
+        (A, C) bool. True if the pixels of the component at t+1 form a line, this line is covered or a rail, the motion
+        points along it, and its displacement over the window is at least 1.2 m.
 
     Convention:
         Moments are sums of integers; all else is elementwise float64 in the written order. The positions of the pixels
-        of a line have a standard deviation of at most 0.3 m across and at least 1 m along the line. A rail is a line
-        with at least 2 m along it and fewer than two slices per pixel on average. Zero motion never slides.
+        of a line have a standard deviation of at most 0.3 m across and at least 1 m along it; those of a rail, at least
+        2 m along it, and fewer than two slices per pixel on average. Zero motion never slides.
 
     Cost: some passes over the pixels.
     """
@@ -82,8 +82,8 @@ def principal_axes(
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Return which of A components are lines, (A,) bool, and the variances of their pixels at t+1.
 
-    These are the largest variance in any direction; then the variance in y, the covariance and the variance in x. Each
-    is (A,) float64, square pixels. The component of each pixel is (Q,) int64; its row and column are (2, Q) int64.
+    The first one is the largest variance in any direction. Then come the variance in y, the covariance and the variance
+    in x. Each is (A,) float64, square pixels. `component` is (Q,) int64, of each pixel; `row_col` is (2, Q) int64.
     """
     one_y_x = torch.cat((torch.ones_like(row_col[:1]), row_col))  # `F.pad` of torch 2.0 fails without pixels
     moments = scatter_count(component, num_components, (one_y_x[:, None] * one_y_x).view(9, -1)).view(3, 3, -1)
@@ -106,9 +106,9 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
         is_long: (V,) bool, the components to test; each has pixels at t+1.
 
     Returns:
-        (V,) bool. True if, between t+1 and the sweep farthest in time, both ends moved at least 1.2 m in one direction
-        along the component, their displacements differ by at most a tenth of their sum, its pixels at t+1 have at least
-        two slices on average, and it is at most 60 m long. False for components that are not tested.
+        (V,) bool, False for components that are not tested. True if, between t+1 and the sweep farthest in time, the
+        ends moved at least 1.2 m on average in one direction along the component, and their displacements differ by at
+        most a tenth of their sum. At t+1, it must be at most 60 m long, with two slices per pixel or more on average.
 
     Convention:
         The direction of a component is y, x or one of the diagonals: the one in which its pixels at t+1 reach farthest.

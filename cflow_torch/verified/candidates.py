@@ -38,7 +38,7 @@ _LARGEST_BOX = 1 << 12
 class Candidates(NamedTuple):
     """Motion candidates of N nodes."""
 
-    motion: Tensor  # (N, C, 2) float64, (y, x), finest pixels per sweep interval; 0 = unknown. Ties: the first one
+    motion: Tensor  # (N, C, 2) float64, (y, x), finest pixels per sweep interval; 0 = unknown
     score: Tensor  # (N,) float32, NCC with the nearest sweep in which the node has pixels
 
 
@@ -46,10 +46,10 @@ def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, co
     """Return the candidates of all nodes, each correlated at its own pixel size.
 
     Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
-        The median is that of y and that of x. With one other sweep there is none. A median of one estimate is that
-        estimate, so sweeps that a window lacks do not affect the choice.
+        We take the median of y and the median of x, if the batch has at least two other sweeps. A median of one
+        estimate is that estimate, so sweeps that a window lacks do not affect the choice.
 
-    Source: adapted from Sec. leverage_past_pcs, which takes the median of magnitudes and that of orientations.
+    Source: adapted from Sec. leverage_past_pcs, which takes the medians of magnitude and of orientation.
     """
     images = _NodeImages.of(nodes, components.blocks, sweeps)
     clusters = Clusters(nodes.window, images.first, images.size, images.pixels)
@@ -76,11 +76,11 @@ class _NodeImages(NamedTuple):
 
     block: Tensor  # (N,) int64, side of a pixel in finest pixels
     first: Tensor  # (N, 2) int64, top-left (row, col) of the box over all sweeps, in pixels of the scale
-    size: Tensor  # (N, 2) int64, its height and width
+    size: Tensor  # (N, 2) int64, height and width of the box
     start: Tensor  # (N,) int64, where the images of each node begin in `image`
     image: Tensor  # (I,) uint8, slices of the pixels of all images, one image after the other
-    pixels: ClusterPixels  # the occupied pixels
-    occupied: Tensor  # (Q,) int64, index of each of them into `image`
+    pixels: ClusterPixels  # the Q occupied pixels of the images
+    occupied: Tensor  # (Q,) int64, index of each occupied pixel into `image`
 
     @classmethod
     def of(cls, nodes: Nodes, blocks: Sequence[int], sweeps: HeightSlicedSweeps) -> _NodeImages:
@@ -101,7 +101,7 @@ class _NodeImages(NamedTuple):
         area = size.prod(1) * sweeps.num_steps
         end = area.cumsum(0)
 
-        # We draw the pixels to find those that coincide at their scale. Any one of those is kept.
+        # Several finest pixels may coincide at the scale of their node. We draw all and keep any one of them.
         begin = end - area
         table = torch.stack((begin, block, *size.unbind(1), *first.unbind(1)))
         of_member = take_columns(table, node)
@@ -144,7 +144,7 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     own = images.image.index_select(0, images.occupied.index_select(0, pixel))
     target = images.image.index_select(0, index.view(-1)).view_as(index)
     sums = scatter_count(pair, len(shift), count_slices(own & target) * inside)
-    # Counts at the peak and before and after it: above and below it, then left and right of it.
+    # Counts at the peak, before it (above, left) and after it (below, right).
     middle, low, high = sums[:1], sums[1::2], sums[2::2]
     curve = (2 * middle - low - high).double()
     vertex = ((high - low) / (2 * curve)).masked_fill_(curve <= 0, 0.0).clamp_(-0.5, 0.5)

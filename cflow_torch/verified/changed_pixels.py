@@ -17,12 +17,12 @@ from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, scatte
 from cflow_torch.ops.segments import segment_amin
 from cflow_torch.verified.height_slices import NUM_SLICES, SLICE_HEIGHT, HeightSlicedSweeps
 
-# Range images: bins of about half a degree of azimuth and one degree of elevation; half of them are below level.
+# Range images: bins of about half a degree of azimuth and one degree of elevation, half of them below the horizontal.
 _AZIMUTHS, _ELEVATIONS, _RISE = 720, 120, 1 / 57.3
 # Sweeps do not contain the sensor position. We assume that it is above the origin of the ego frame, at this height over
-# the lowest points within 12 m; one near point in fifty may be lower than those.
+# the lowest points within 12 m. Of these points, we ignore the lowest fiftieth as outliers.
 _ABOVE_LOWEST, _NEAR, _OUTLIERS = 1.6, 12.0, 50
-_PER_METRE, _HIGHEST = 256, 8192  # steps of height per metre; their largest number, up and down
+_PER_METRE, _HIGHEST = 256, 8192  # bins of height: number per metre; number above the origin, and below it
 
 
 class ChangedPixels(NamedTuple):
@@ -36,10 +36,10 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     """Compare every pixel in place with every other sweep of its window.
 
     Convention:
-        A slice is missing if none of the 3 x 3 pixels around its position has it. Slices repeat, so we take the lowest
-        one that is not below the slice of the lowest point of its pixel, and the height of its middle. A sweep saw a
-        position if a return in its direction is at least as far away. The position is occluded if all returns in its
-        direction are nearer. Without a return, it is neither seen nor occluded.
+        A slice is missing if none of the 3 x 3 pixels around its position has it. Slices repeat every 2 m, so its
+        height is ambiguous: we start at the layer of the lowest point of its pixel, go up to the first layer with this
+        slice, and take the middle. A sweep saw a position if a return in its direction is at least as far away. The
+        position is occluded if all returns in its direction are nearer. Without a return, it is neither.
 
     Cost: a lookup for each pixel and sweep, and a range image of every sweep.
     """
@@ -52,7 +52,7 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     around = sweeps.image.index_select(0, index.view(-1)).view_as(index) >> NUM_SLICES
     is_given = ((sweeps.elapsed != 0) | (every == 0)) & sweeps.has_history[:, None]
     missing = (pixels.slices[:, None] & ~around).mul_(is_given.index_select(0, pixels.window))
-    # The set bits of these masks.
+    # One entry for each set bit of the masks.
     some = flat_nonzero(missing.bool())
     bits = missing.view(-1).index_select(0, some)[:, None] & constant((1, 2, 4, 8), torch.uint8, missing.device)
     entry, bit = split_index(flat_nonzero(bits.bool()), NUM_SLICES)
@@ -79,7 +79,7 @@ class RangeImages:
     """Range images of all sweeps: the distance of the farthest return in each direction.
 
     Args:
-        sweeps: points that are active, without ground.
+        sweeps: we draw their active points, which exclude the ground.
 
     Convention: bins are computed without trigonometry, so that they are the same on every device. The azimuth is
     measured by y / (|x| + |y|), in bins of 0.32 to 0.64 degrees, and the elevation by height over distance. Distances
@@ -100,15 +100,15 @@ class RangeImages:
         self._farthest = farthest
 
     def farther(self, sweep: Tensor, positions: Tensor) -> Tensor:
-        """Return how much farther than each position the farthest return in its direction is, (K,) float32, metres.
+        """Return the distance of the farthest return in the direction of each position, minus that of the position.
 
-        -infinity = no return. Sweeps are window * S + step, (K,) int64. Positions are (3, K).
+        (K,) float32, metres; -infinity = no return. Sweeps are window * S + step, (K,) int64. Positions are (3, K).
         """
         direction, distance = self._direction(sweep, positions)
         return self._farthest.index_select(0, direction).sub_(distance)
 
     def _direction(self, sweep: Tensor, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the bin of the range images, (K,) int64, and the horizontal distance, (K,) float32, metres."""
+        """Return the bin of each position, (K,) int64, and its horizontal distance, (K,) float32, metres."""
         offset = positions.sub(take_columns(self._origin, sweep)).float()
         x, y, z = offset
         distance, sum_of_sides = offset[:2].square().sum(0).sqrt_(), offset[:2].abs().sum(0).clamp_(min=1e-3)
@@ -129,5 +129,5 @@ class RangeImages:
         count = scatter_count(height, batch.num_windows * batch.num_steps * 2 * _HIGHEST, is_near.long())
         below = count.view(batch.num_windows, batch.num_steps, -1)[:, 0].cumsum(1)  # of t+1
         low = (below <= floor_divide(below[:, -1:], _OUTLIERS)).sum(1)
-        # Without near points it is 0.
+        # Without near points, the height is 0.
         return torch.where(below[:, -1] > 0, (low - _HIGHEST).double() / _PER_METRE + _ABOVE_LOWEST, 0.0)

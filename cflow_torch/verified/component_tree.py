@@ -1,4 +1,4 @@
-"""The component tree: components at several scales, the test whether they may move, and the selection of objects.
+"""The component tree: components at several scales, which of them may move, and the selection of objects.
 
 A component contains its children, the components at the next finer scale. It may be one object whose children are too
 small to be matched, or several objects with different motions. The components of all scales that may move are nodes of
@@ -31,10 +31,9 @@ from cflow_torch.verified.aperture import both_ends_move
 from cflow_torch.verified.changed_pixels import ChangedPixels
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
-# The static test: a component may move only if more than one in so many of its pixels is missing in another sweep.
+# The static test: a component may move only if more than one in 20 of its pixels has a missing slice (`ChangedPixels`).
 _MISSING = 20
-# Metres; longer components of changed pixels at t+1 are not persons or cyclists.
-_LOCAL = 3.0
+_LOCAL = 3.0  # metres; a component of changed pixels that is longer at t+1 is not a pedestrian or a cyclist
 # The price of an object, in sixteenths of a slice. Children move separately only if that gains more evidence.
 _PRICE = 16 * 4
 
@@ -44,8 +43,8 @@ class Components:
     """All components of all windows. The name of each is a number below V. Names ascend by level; some are unused."""
 
     roots: Tensor  # (L, P) int64, component of each pixel at each level, coarse to fine; the last is not dilated
-    changed: Tensor  # (Q,) int64, pixels that changed, positions in the list
-    changed_root: Tensor  # (Q,) int64, component of each of them, labelled among the changed pixels alone
+    changed: Tensor  # (Q,) int64, positions of the changed pixels in the list of pixels
+    changed_root: Tensor  # (Q,) int64, component of each changed pixel, labelled among the changed pixels alone
     firsts: tuple[int, ...]  # first name of each level, then of the components of changed pixels; V if there are none
     parent: Tensor  # (V + 1,) int64, component of the next coarser level; V = none
     size: Tensor  # (V,) int64, number of pixels; 0 = an unused name
@@ -69,13 +68,13 @@ class Components:
 class Nodes:
     """N components that may move: coarse to fine, then those of changed pixels, then those under overhangs."""
 
-    component: Tensor  # (N,) int64, its name; names of those under overhangs begin at V
+    component: Tensor  # (N,) int64, name of the component; those under overhangs have names of V or more
     level: Tensor  # (N,) int64, 0 ... L - 1; L = changed pixels, L + 1 = under an overhang
-    parent: Tensor  # (N,) int64, the next coarser node around it; N = none
+    parent: Tensor  # (N,) int64, the next coarser node around the node; N = none
     window: Tensor  # (N,) int64
-    travels: Tensor  # (N,) bool, it is longer than other objects, and both of its ends move
-    pixel: Tensor  # (A,) int64, pixels of all nodes, positions in the list; a pixel of several nodes is repeated
-    node: Tensor  # (A,) int64, node of each of them
+    travels: Tensor  # (N,) bool, the node is longer than `max_object_length`, and both of its ends move
+    pixel: Tensor  # (A,) int64, positions in the list of the pixels of all nodes; a pixel of several nodes is repeated
+    node: Tensor  # (A,) int64, node of each entry of `pixel`
 
     @property
     def count(self) -> int:
@@ -102,8 +101,8 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
 
     Args:
         blocks: side of a pixel at each scale in finest pixels, coarse to fine, the last one 1. Each scale is dilated as
-            in Alg. clustering, but not eroded, so the scales are nested. The last level is the plain components of the
-            finest pixels, without dilation.
+            in Alg. clustering, but not eroded, so the scales are nested. The last level has the plain components: those
+            of the finest pixels without dilation.
 
     Convention: the static test excludes motions only in windows with history.
 
@@ -131,11 +130,11 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
 
     firsts = (*(blocks_of.first for blocks_of in found), count)[: len(roots) + 1]
     root = torch.cat((roots[-1], changed_root))
-    # The first sum counts all pixels and, times 2^32, those at t+1; the second counts those that are missing or may be.
+    # The first sum counts pixels and, times 2^32, those at t+1; the second those with a missing slice or no history.
     is_missing = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
     codes = torch.stack((((pixels.step == 0) << 32) + 1, is_missing))
     sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
-    # The sums of a component are those of its children added up.
+    # Add the sums of the children to those of their parents.
     for level in range(len(roots) - 1, 0, -1):
         names = slice(*firsts[level : level + 2])
         sums += scatter_count(parent[names], count + 1, sums[:, names])
@@ -152,7 +151,7 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
 
 
 def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -> Tensor:
-    """Draw (B, H', W') bool padded images from columns and from rows of all images in a stack, (K,) int64 each."""
+    """Draw padded images, (B, H', W') bool, from rows, counted through all images, and columns, (K,) int64 each."""
     shape = num_windows, padded_size(height), padded_size(width)
     image = lazy_zeros(math.prod(shape), torch.bool, row.device)
     return image.index_fill_(0, torch.add(col, row, alpha=shape[2]), True).view(shape)
@@ -161,7 +160,7 @@ def _draw(row: Tensor, col: Tensor, num_windows: int, height: int, width: int) -
 def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: float | None) -> Nodes:
     """List the components that may move.
 
-    Components longer than `longest` metres at t+1 may move only if both of their ends do. None = no such test.
+    Components longer than `longest` metres at t+1 may move only if both of their ends move. None = no such test.
 
     Convention: a plain component that equals its dilated parent is not listed twice.
 
@@ -201,7 +200,7 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
     """Select objects from the leaves up: a component wins if its motion has more evidence than its children together.
 
     Args:
-        nodes, components: components under overhangs are nodes, but are not among the components of the tree.
+        nodes, components: `nodes` includes components under overhangs, `components` does not.
         evidence: (N,) int64, of the best motion of each node; 0 = none is significant. Sums must stay below 2^63.
         num_pixels: P, including the pixels of copies (`HeightSlicedSweeps.with_copies`).
 
@@ -228,7 +227,7 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
     for _ in range(num_levels - 1):  # winners spread to their descendants, a level at a time
         winner = torch.minimum(winner, winner.index_select(0, parent))  # nodes are numbered coarse to fine
 
-    # Of all nodes of a pixel, the largest number is that of one of changed pixels or under an overhang, or the finest.
+    # The last node of a pixel is its node of changed pixels or under an overhang; without one, it is its finest node.
     is_other = nodes.level >= num_levels
     both = torch.stack((nodes.node, nodes.node.masked_fill(is_other.index_select(0, nodes.node), -1)))
     largest = both.new_full((2, num_pixels), -1).scatter_reduce_(1, nodes.pixel.expand_as(both), both, "amax")
@@ -245,7 +244,7 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
 
 
 def number_objects(name: Tensor, num_names: int) -> Objects:
-    """Number the objects, by the name of the component that each pixel belongs to, (P,) int64; `num_names` = none."""
+    """Number the objects. `name` is the component that each pixel belongs to, (P,) int64; `num_names` = none."""
     is_used = torch.zeros(num_names + 1, dtype=torch.bool, device=name.device).index_fill_(0, name, True)
     component = flat_nonzero(is_used[:-1])
     position = torch.arange(len(name), device=name.device)

@@ -4,9 +4,9 @@ The margin of a motion measures how much worse a displaced copy of it explains t
 than a displaced copy, the object is static, such as a wall that seems to slide or a trunk of few points.
 
 A table gives each point a probability from counts that need no ground truth. For a moving object, the probability
-depends on its margin. For a static point, it depends on the share of its neighbourhood that is matched, and it is lower
-next to a moving object, which may be larger than it seems. For a point without correspondence at t+1, the probability
-falls with the number of occupied height slices around it.
+depends on its margin. For a static point, it depends on the share of its neighbourhood that t+1 matches. A static point
+next to a moving object has a lower probability, because the object may be larger than it seems. For a point in a
+component without pixels at t+1, the probability falls with the number of occupied height slices around it.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class MotionMargin(NamedTuple):
     # (G,) float64. The motion matches this many more slices than its best displaced copy, in standard deviations of
     # noise. 0 = the motion is not better, or the object is static.
     z: Tensor
-    # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line, the motion matches more of
-    # it than zero motion does, and it is better than its displaced copies or at least twice as long as the
-    # displacement. If it is so long, the displaced copies are motions as well. A line needs z, because beams hit a rail
+    # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line; its won slices outnumber
+    # those lost plus those found in place; and the motion is better than its displaced copies, or at least twice as
+    # long as the displacement. Copies of such a long motion are motions, too. A line needs z, because beams hit a rail
     # at positions that move with the vehicle.
     is_dynamic: Tensor
 
@@ -75,7 +75,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
 def _groups_of_one_motion(
     sweeps: HeightSlicedSweeps, pixels: Pixels, which: Tensor, rigid: RigidMotion
 ) -> tuple[Tensor, Tensor]:
-    """Group pixels that share a motion: return the group of each pixel, (K,) int64, and the motion of each group.
+    """Group pixels by motion. Return the group of each pixel, (K,) int64, and the motion of each group.
 
     The pixels of an object are a group, except those that its rotation displaces by a pixel or more. Each of these is a
     group of its own, after the G objects. `which` is the object of each pixel, (K,) int64. The motion is
@@ -97,7 +97,7 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     `margin`, (G,) float64, is `MotionMargin.z`. Rotations are ignored: all pixels of an object move as its centre does.
 
     Returns:
-        (P + 1,) float32; entry P is for points whose pixel was left out. Undefined for pixels of sweeps other than t.
+        (P + 1,) float32; entry P is for points whose pixel was not drawn. Undefined for pixels of sweeps other than t.
 
     Cost: one lookup for each pixel of t, and nine for those that move.
     """
@@ -133,9 +133,9 @@ def _bin(values: Tensor, bounds: list[float]) -> Tensor:
 
 
 def _neighbourhood(sweeps: HeightSlicedSweeps, pixels: Pixels, motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Count the slices of t in the block around each of K pixels, and those that t+1 has at their target, (K,) int64.
+    """Count the slices of t in the block of each of K pixels, and those that t+1 has at their target, (K,) int64 each.
 
-    The motion of each pixel is (K, 2) float64, (y, x), finest pixels per interval.
+    `motion` is that of each pixel, (K, 2) float64, (y, x), finest pixels per interval.
     """
     side = max(1, round(_BLOCK / sweeps.grid.pixel_size))
     height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)

@@ -1,4 +1,4 @@
-"""Height-sliced occupancy: images of all sweeps at the finest pixels, with four height slices a pixel.
+"""Height-sliced occupancy: images of all sweeps at the finest pixels, with four height slices per pixel.
 
 Slices keep a wheel from matching a roof. A slice is half a metre high, and the slices repeat every two metres. One
 byte of an image holds the slices of its pixel and those of the 3 x 3 pixels around it.
@@ -29,8 +29,7 @@ NUM_SLICES = 4
 SLICE_HEIGHT = 0.5  # metres
 OWN = (1 << NUM_SLICES) - 1  # bits of the slices of the pixel itself
 _COUNTS = tuple(bin(byte & OWN).count("1") + (bin(byte >> NUM_SLICES).count("1") << 32) for byte in range(256))
-# Rows and columns each way. Several steps search so far around a pixel.
-REACH = 2
+REACH = 2  # rows and columns; several steps search this far around a pixel
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Pixels:
 
     @classmethod
     def of(cls, index: Tensor, slices: Tensor, grid: Grid, num_steps: int) -> Pixels:
-        """Make pixels from their flat indices and their slices, (K,) each."""
+        """Make pixels from their flat indices, (K,) int64, and their slices, (K,) uint8."""
         of_image, within = split_index(index, grid.height * grid.width)
         columns = (index, *split_index(of_image, num_steps), *split_index(within, grid.width))
         return cls(torch.stack(columns), slices)
@@ -78,14 +77,14 @@ class HeightSlicedSweeps:
 
     batch: Batch  # the points
     grid: Grid  # the finest BEV
-    # (I,) uint8 with I - 1 = 2 B S H W. Bits 0 ... 3: a point of this height slice is in the pixel. Bits 4 ... 7: one
-    # is in the 3 x 3 pixels around. The second half is empty until `with_copies` draws there. The last entry, always 0,
-    # is for positions outside the images.
+    # (I,) uint8 with I - 1 = 2 B S H W. Bits 0 ... 3: the pixel has a point in this height slice. Bits 4 ... 7: one of
+    # the 3 x 3 pixels around has one. The second half is empty until `with_copies` draws there. The last entry, always
+    # 0, is for positions outside the images.
     image: Tensor
-    rank: Tensor  # (I,) int32, 1 + position of each occupied pixel in the list; 0 for empty pixels
-    pixels: Pixels  # the P occupied pixels, ascending
-    # (N + K,) int64, position in the list of the pixel of each point, then of each copy; P for points that are inactive
-    # or in a pixel that was left out.
+    rank: Tensor  # (I,) int32, 1 + position of each occupied pixel in the list `pixels`; 0 for empty pixels
+    pixels: Pixels  # the list of the P occupied pixels, in order of their index
+    # (N + K,) int64, for each point, then for each copy: position of its pixel in the list; P for points that are
+    # inactive or in a pixel that was left out.
     pixel_of_point: Tensor
     copied: Tensor  # (K,) int64, the points that have copies; empty before `with_copies`
 
@@ -94,13 +93,13 @@ class HeightSlicedSweeps:
         """Draw every sweep of a batch with its height slices.
 
         Args:
-            batch: positions with three axes.
-            min_height: metres; pixels lower than this above the ground of the batch are left out, unless they are next
-                to a higher one. None = all are drawn.
+            batch: its positions have three axes.
+            min_height: metres; we leave out pixels whose points are all lower than this above the ground, unless a
+                higher pixel is near. None = all are drawn.
 
         Convention:
             The slice of a height z is floor(z / 0.5 m) mod 4 in float64. A height is compared with the ground in
-            centimetres. "Next to": at most two rows and two columns away.
+            centimetres. "Near": at most two rows and two columns away.
 
         Cost: linear in points and pixels.
         """
@@ -122,7 +121,7 @@ class HeightSlicedSweeps:
                 is_low[points] = positions[2] * 100 < height + round(100 * min_height)
         if ground is not None:  # after all points are drawn, because one tall point makes its pixel tall
             image.index_fill_(0, index.masked_fill(is_low, num_indices), 2)
-        image[num_indices].zero_()  # that of points that are inactive
+        image[num_indices].zero_()  # inactive points were drawn here
         pixel = occupied(image[:num_indices])
         rank = lazy_zeros(len(image), torch.int32, device)
         if ground is not None:
@@ -139,8 +138,8 @@ class HeightSlicedSweeps:
     def with_copies(self, rows: Tensor) -> HeightSlicedSweeps:
         """Return the sweeps with copies of some points, drawn by themselves in further windows B ... 2 B - 1.
 
-        The copies follow the points, and their pixels follow the others. Both sweeps share the images, which hold one
-        set of copies, so call this method only once.
+        Copies follow the points, and their pixels follow the other pixels. The result shares its images with `self`,
+        and they hold one set of copies, so call this method only once.
 
         Args:
             rows: (K,) int64, points of the batch.
@@ -182,7 +181,7 @@ class HeightSlicedSweeps:
 
     @cached_property
     def intervals(self) -> Tensor:
-        """(B, 2 S - 1) float64, sweep intervals from t+1 back to the sweeps S - 1 ... 1, 0, then from 1 ... S - 1."""
+        """(B, 2 S - 1) float64, sweep intervals from t+1 to the steps S - 1 ... 1, 0, then from 1 ... S - 1 to t+1."""
         return torch.cat((-self.elapsed.flip(1), self.elapsed[:, 1:]), 1)
 
     @cached_property
@@ -193,16 +192,16 @@ class HeightSlicedSweeps:
 
     @cached_property
     def num_more(self) -> Tensor:
-        """(B,) int64, number of sweeps of a window besides t and t+1."""
+        """(B,) int64, number of sweeps of each window besides t and t+1."""
         return (self.batch.elapsed != 0).sum(1) - 1
 
     @cached_property
     def has_history(self) -> Tensor:
-        """(B,) bool, whether a window has more sweeps than t and t+1."""
+        """(B,) bool, True = the window has more sweeps than t and t+1."""
         return self.num_more > 0
 
     def or_outside(self, index: Tensor, at: Tensor) -> Tensor:
-        """Replace the indices of pixels outside the images by that of the last entry of `image`; return (...) int64.
+        """Set the index of each pixel outside the images to the last entry of `image`. Return (...) int64.
 
         Args:
             index: (...) int64, flat indices into `image`; those of pixels outside may be wrong.
@@ -246,7 +245,8 @@ def count_slices(slices: Tensor) -> Tensor:
 
 
 def _slices(of_point: Tensor, height_slice: Tensor, num_pixels: int) -> Tensor:
-    """Return masks, (P,) uint8, of the slices, (N,) uint8, of the points of each pixel. Pixel P is ignored."""
+    """Return the bit mask of the slices in each pixel, (P,) uint8, from the pixel of each point, (N,) int64, P = none,
+    and its slice, (N,) uint8."""
     lanes = torch.zeros((num_pixels + 1) * NUM_SLICES, dtype=torch.bool, device=height_slice.device)
     lanes.index_fill_(0, torch.add(height_slice, of_point, alpha=NUM_SLICES), True)
     # A pixel is four bytes that are 0 or 1. Read as one number, these are its bits 0, 8, 16 and 24.
@@ -281,8 +281,8 @@ def _is_outside(at: Tensor, grid: Grid) -> Tensor:
 
 
 def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
-    """Return whether a pixel of value 2 is at most `REACH` rows and columns away from each pixel, (P,) bool.
-    Ground residue, the ground points that a ground mask misses, seems to move, because it differs in every sweep."""
+    """Return whether a tall pixel, of value 2, is at most `REACH` rows and columns away from each pixel, (P,) bool.
+    Low pixels are often ground that a ground mask misses. It seems to move, because it differs in every sweep."""
     answer = image.index_select(0, pixel) == 2
     low = flat_nonzero(~answer)
     line, col = split_index(pixel.index_select(0, low), grid.width)

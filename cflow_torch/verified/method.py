@@ -1,10 +1,10 @@
 """VerifiedFlow: draw, find changed pixels, build a tree, propose, verify, select, refine (docs/verified.md).
 
-Connected components at several pixel sizes are hypotheses for rigid objects. Each receives motion candidates: the
-correlation peaks with every sweep, their median, and the medians of the coarser components that contain it. A paired
-test against "static" at the finest pixels, over all sweeps and in both time directions, selects the best candidate. In
-the tree of components, a component wins if it explains more than its children together. Winning motions are refined to
-centimetres.
+Connected components at several pixel sizes are hypotheses for rigid objects. Each one gets motion candidates: its
+correlation peak with every sweep, the median of these peaks, and the medians of the coarser components around it. The
+paired test compares the candidates with "static" at the finest pixels of all sweeps, and selects the best one. In the
+tree of components, a component wins if its motion has more evidence than those of its children together. Refinement
+corrects the winning motions to centimetres.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from cflow_torch.verified.rigid_motion import RotatingMotion, motion_by_pixel
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
-# We process so many metres around the region as well, so that objects that cross its border are complete. An object of
-# 40 m/s covers 4 m in a sweep.
-_AROUND = 4.0
+# Metres around the region that we also process, so that objects at its border are complete. An object at 40 m/s covers
+# 4 m in a sweep.
+_MARGIN = 4.0
 
 
 class VerifiedFlow(SceneFlowModel):
@@ -61,13 +61,13 @@ class VerifiedFlow(SceneFlowModel):
         return int(super().bytes_per_point) + 170 + subpixel_motion.BYTES_PER_POINT
 
     def grid(self, pixel_size: float) -> Grid:
-        """Return the BEV at a pixel size in metres: the region and a margin of whole pixels of the coarsest size."""
+        """Return the BEV grid of a pixel size in metres: the region and a margin of whole coarsest pixels around it."""
         x0, y0, z0, x1, y1, z1 = self.config.point_cloud_range
-        wide = math.ceil(_AROUND / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
-        return Grid(pixel_size, (x0 - wide, y0 - wide, z0), (x1 + wide, y1 + wide, z1))
+        margin = math.ceil(_MARGIN / self.config.pixel_sizes[0]) * self.config.pixel_sizes[0]
+        return Grid(pixel_size, (x0 - margin, y0 - margin, z0), (x1 + margin, y1 + margin, z1))
 
     def motion(self, batch: Batch) -> RotatingMotion:
-        """Return the motion of all points of a batch, one per occupied pixel. Ids number the objects."""
+        """Return the motion of all points of a batch. Each occupied pixel is a cluster with the id of its object."""
         config = self.config
         blocks = [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes]
         with stage("draw"):

@@ -1,8 +1,8 @@
 """Sweeps after t+1, for recordings: they show objects that have just appeared, and all objects at the start of a log.
 
 Past and future are two windows of one batch. A point of t takes its motion from the future only if the future shows its
-object in more than twice as many sweeps as the past. A past of one sweep hardly helps; with all past sweeps, the future
-was not better in our tests.
+object in more than twice as many sweeps as the past. In our tests, a motion from a single past sweep was hardly better
+than one from no past sweep, and where all past sweeps showed the object, the future gave no better motion.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from cflow_torch.verified.paired_test import best_candidate, count_wins, evidenc
 from cflow_torch.verified.rigid_motion import RotatingMotion
 from cflow_torch.windows.collation import Batch
 
-# The future must show an object in more than so many sweeps for each sweep of the past. At 1, façades that are
+# The future must show an object in more than this many times as many sweeps as the past. At 1, façades that are
 # uncovered as the ego vehicle moves get more false motion (simulated drives).
-_TIMES = 2
+_RATIO = 2
 
 
 def choose_side(batch: Batch, motion: RotatingMotion) -> RotatingMotion:
-    """Return the motion in which each point of t has the pixel of the chosen side, of the past or of the future."""
+    """Return the motion in which each point of t takes its pixel from the past or from the future (`_RATIO`)."""
     window, step = split_index(batch.image.long(), batch.num_steps)
     number = 1 + motion.cluster_id.index_select(0, motion.cluster(slice(None)))  # 0 = no object
     most = int(number.amax()) + 1 if number.numel() else 1
@@ -36,20 +36,20 @@ def choose_side(batch: Batch, motion: RotatingMotion) -> RotatingMotion:
     shown = shows[:, 2:].sum(1).index_select(0, row).masked_fill_(number == 0, 0)
     pixel, begin, end = motion.cell_of_point, batch.rows[0].start, batch.rows[-1].stop
     past, future = slice(begin, end), slice(end, 2 * end - begin)  # the same points of t
-    chosen = torch.where(shown[future] > _TIMES * shown[past], pixel[future], pixel[past])
+    chosen = torch.where(shown[future] > _RATIO * shown[past], pixel[future], pixel[past])
     return replace(motion, cell_of_point=pixel.slice_scatter(chosen, 0, begin, end))
 
 
 def best_nearby(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, significance: float) -> Tensor:
     """Return the motion with the most evidence among those within two pixels of the motion of each object.
 
-    The side of an object that is visible at t may match any side that later sweeps show, so correlation peaks are off
-    by a pixel or two. The paired test over all sweeps chooses among the neighbours of the peak.
+    Later sweeps may show another side of an object than t. The correlation aligns one side with the other, so its peak
+    is off by a pixel or two. The paired test over all sweeps chooses among the neighbours of the peak.
 
-    The motion is (G, 2) float64, (y, x), finest pixels per sweep interval. Objects of windows without sweeps after t+1
-    keep theirs. `significance` is the z of the paired test.
+    The motion is (G, 2) float64, (y, x), finest pixels per sweep interval. Objects in windows without sweeps after t+1
+    keep their motion. `significance` is the z of the paired test.
 
-    Convention: whole pixels in y and in x. Ties: the nearest motion, then the first in raster order.
+    Convention: we try offsets of whole pixels. Ties: the nearest motion, then the first in raster order.
 
     Cost: 25 lookups for each pixel and sweep of the moving objects.
     """

@@ -1,8 +1,8 @@
 """Objects under overhangs: a car under the crown of a tree shares its bird's-eye component with the crown.
 
-The two are separate in space. We divide the points of components that may move into connected 3-D components. One that
-is under another one and above none becomes a node: we draw it again, without the other one, in a further window of the
-same batch.
+The car and the crown are separate in space, so we divide the points of components that may move into connected 3-D
+components. A 3-D component that is under another one and above none becomes a node. We draw copies of its points alone,
+in a further window of the same batch.
 """
 
 from __future__ import annotations
@@ -29,24 +29,23 @@ from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps
 
 _CELL = 0.4  # metres, side of a cell; it is as high as a slice
-_NUM_SLICES = 32  # from the lowest cell of a window on; higher points are in the highest slice
-_GAP = 3  # slices from a cell to the next one above it, at least; the body and the roof of a car are closer
-_LARGEST = 10  # slices from the lowest cell of an object to its highest one, at most: a bus
+_NUM_SLICES = 32  # from the lowest cell of a window up, with an empty one at each end; higher points are in the highest
+_GAP = 3  # least distance, in slices, of a cell from the next one above it; the body and the roof of a car are closer
+_LARGEST = 10  # largest distance, in slices, of the lowest and the highest cell of an object; it suffices for a bus
 
 
 def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> tuple[HeightSlicedSweeps, Nodes]:
     """Add nodes for components under other components.
 
     Returns:
-        The sweeps with copies of the points of objects under other components, and the nodes followed by the added
-        ones.
+        The sweeps with copies of the points under other components, and the nodes, with the added ones at the end.
 
     Convention:
         We search the components of the finest dilated level that may move. Cells of 0.4 m x 0.4 m x 0.5 m are connected
         to their 26 neighbours. A component is under another one if, in any column, the next occupied cell above one of
-        its cells belongs to the other one, with at least two empty cells between. It is an object if it is at most
-        eleven cells high. If two components share a pixel of a sweep, the pixel belongs to the one whose first cell has
-        the lower index.
+        its cells belongs to the other one, with at least two empty cells between. We add it if it is above no other
+        component and at most eleven cells high. If two added components share a pixel of a sweep, the pixel belongs to
+        the one whose first cell has the lower index.
 
     Cost: linear in the points that may move; 13 lookups for each cell, a few rounds of union-find.
     """
@@ -80,10 +79,10 @@ def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Node
 
 
 def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Select the points, (K,) int64, that are in an object under another component. Return them, the 3-D component of
-    each, named by its first cell, and the number of names."""
+    """Select the points, `rows`, that are in a 3-D component to be added. Return them, (K,) int64, the component of
+    each, (K,) int64, named by its first cell, and the number of names."""
     batch, grid = sweeps.batch, sweeps.grid
-    # With an empty margin all around, neighbours need no bounds check.
+    # An empty cell all around saves bounds checks of neighbours.
     num_rows, num_cols = (int((grid.upper[axis] - grid.lower[axis]) / _CELL) + 3 for axis in (1, 0))
     side = constant((_CELL,), torch.float64, rows.device)  # see `Grid.pixel`
     corner = constant(grid.lower[:2], torch.float64, rows.device)
@@ -102,7 +101,7 @@ def _components_under(sweeps: HeightSlicedSweeps, rows: Tensor) -> tuple[Tensor,
     count = cells.numel()
     number = lazy_empty(shape, torch.int32, rows.device)
     number.scatter_(0, cells, torch.arange(count, dtype=torch.int32, device=rows.device))
-    # 13 of the 26 neighbours of a cell. The others are the same links, seen from the other end.
+    # 13 of the 26 neighbours of a cell. The links to the others are found from their other end.
     half = [step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)]
     offsets = tuple((down * num_cols + right) * _NUM_SLICES + up for down, right, up in half)
     near = cells[:, None] + constant(offsets, torch.int64, rows.device)

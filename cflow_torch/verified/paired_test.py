@@ -23,11 +23,11 @@ from cflow_torch.verified.height_slices import NUM_SLICES, REACH, HeightSlicedSw
 
 # Comparisons (pixel x sweep x candidate) at once; each needs about 64 bytes of temporaries.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
-_FAR = 2  # pixels, in y or in x
-_NEAR_Z = 2.0  # for near counts, z is so many times larger: one slice matches several neighbours, so counts correlate
+_FAR = 2  # pixels in y or in x; for motions from this length on, absence is tested in 3 x 3 pixels
+_NEAR_Z = 2.0  # factor of z for near counts, which are correlated, because one slice matches several neighbours
 _COVERED = 65  # per cent
-_CHANGED_Z = 4.0
-# A motion must gain so many slices per sweep besides t and t+1, or one for every so many pixels, whichever is less.
+_CHANGED_Z = 4.0  # z for nodes of changed pixels
+# The evidence must exceed 3 slices per sweep besides t and t+1, or a slice for every 8 pixels, whichever is less.
 _LEAST_GAIN, _LEAST_SHARE = 3, 8
 
 
@@ -42,7 +42,7 @@ def verify(
         significance: z of the paired test for all other nodes.
 
     Returns:
-        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = none is significant with enough gain.
+        motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = no candidate has enough evidence.
         evidence: (N,) int64, of that motion, sixteenths of a slice.
     """
     tested = flat_nonzero(candidates.flatten(1).any(1))  # other nodes are static and cost nothing
@@ -68,16 +68,16 @@ def verify(
 def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_levels: int) -> Nodes:
     """Complete moving nodes of changed pixels: add the pixels of the same object that did not change.
 
-    The middle of a pedestrian is occupied in the other sweeps as well, so only the outline has changed. If the
+    The middle of a pedestrian is often occupied in the other sweeps as well, so only the outline has changed. If the
     pedestrian touches a wall, the middle belongs to the component of the wall.
 
     Args:
         motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = static.
         num_levels: L, the level of nodes of changed pixels.
 
-    Convention: a pixel at most two rows and columns away from a moving node of changed pixels joins it if the motion
-        wins more slices than it loses in the 3 x 3 pixels around, without the pixels of such nodes. Ties: the first of
-        several nodes; with as many slices won as lost, the pixel does not join.
+    Convention: we test the pixels around moving nodes of changed pixels, at most two rows and columns away. A pixel
+        joins the node if the motion wins more slices than it loses in the tested pixels of the 3 x 3 around it. Ties:
+        the first of several nodes; with as many slices won as lost, the pixel does not join.
 
     Cost: 25 lookups for each pixel of these nodes, and the paired test of the pixels around them.
     """
@@ -102,12 +102,12 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
 class Wins(NamedTuple):
     """Paired counts of M components with C candidate motions each."""
 
-    # (2, M, C) int64, numbers of slices. The second ones are the near counts: if the motion is at least two pixels, a
-    # slice also counts as found if it is in the 3 x 3 pixels around a position.
+    # (2, M, C) int64, numbers of slices. Index 1 has the near counts: for motions of at least two pixels, a slice also
+    # counts as found if it is in the 3 x 3 pixels around a position.
     won: Tensor
     lost: Tensor
-    # (2, M, 2) int64, numbers of slices. Last axis: slices of other sweeps, those of t+1. First axis: all of them, then
-    # those in place in the compared sweep plus, times 2^32, those that it has in the 3 x 3 pixels around.
+    # (2, M, 2) int64, numbers of slices. Last axis: slices of the other sweeps, then slices of t+1. First axis: all of
+    # them, then those that the compared sweep has in place plus, times 2^32, those that it has in the 3 x 3 pixels.
     of_static: Tensor
 
     @property
@@ -117,21 +117,21 @@ class Wins(NamedTuple):
 
     @property
     def is_covered(self) -> Tensor:
-        """(M,) bool: the other sweeps have `_COVERED` per cent of the slices at t+1 in the 3 x 3 pixels around the same
-        position, or t+1 has as many of those in the other sweeps. The other sweeps are counted together."""
+        """(M,) bool: the other sweeps have `_COVERED` per cent of the slices of t+1 in the 3 x 3 pixels around the same
+        position, or t+1 has that share of the slices of the other sweeps. The other sweeps are counted together."""
         total, near = self.of_static[0], self.of_static[1] >> 32
         return ((total > 0) & (near * 100 >= total * _COVERED)).any(1)
 
 
 def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, candidates: Tensor) -> Wins:
-    """Paired counts of candidate motions against "static".
+    """Count the slices that each candidate motion wins and loses against "static".
 
     For each slice of a pixel, we check two positions in another sweep: the target of the motion, and the position of
     the pixel itself. The motion wins the slice if it is found only at the target, and loses it if it is found only in
     place; slices found at both or at neither are ignored. For motions of two pixels or more, "not found" means absent
-    from the 3 x 3 pixels around as well. Beams sample a surface differently in each sweep, so a static surface would
-    otherwise seem to leave its position. For the near counts, "found" means found in the 3 x 3 pixels as well. Points
-    of far objects are sparse and rarely fall into the same pixels again.
+    from all 3 x 3 pixels around the position. Otherwise a static surface would seem to leave its position, because
+    beams sample it differently in each sweep. For the near counts of such motions, "found" means found in any of the
+    3 x 3 pixels, because the sparse points of far objects rarely fall into the same pixels again.
 
     Args:
         members: K pixels of components.
@@ -139,7 +139,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         candidates: (M, C, 2) float64, (y, x) finest pixels per sweep interval, axes of ego1; C at least 1.
 
     Returns:
-        The counts, summed over all sweeps m other than t+1: of m compared with t+1, and of t+1 compared with m.
+        The counts, summed over all sweeps m other than t+1. We look up slices of m in t+1, and slices of t+1 in m.
 
     Convention:
         The target is floor(k f + 0.5) pixels away, elementwise float64; k = elapsed intervals, negative from t+1 into
@@ -156,10 +156,10 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     k = sweeps.intervals.index_select(0, window)
     shift = (candidates.permute(2, 1, 0)[..., None] * k + 0.5).floor_().flatten(2)  # (2, C, R), pixels down and right
     side, shift = torch.maximum(*shift.abs()), shift.long()
-    longest, is_given = side.amax(0), (k != 0).flatten()  # (R,), the last one: the window has both sweeps
+    longest, is_given = side.amax(0), (k != 0).flatten()  # (R,) each; given = the window has both sweeps
     offset = torch.add(shift[1], shift[0], alpha=sweeps.grid.width)  # of flat indices
-    # (C, R), first of the bits of an image that tell whether a slice is absent. If the shift in y or in x is at least
-    # two pixels, they are those of the 3 x 3 pixels around, otherwise those of the pixel itself.
+    # (C, R), first of the image bits that tell whether a slice is absent: the bits of the 3 x 3 pixels for shifts of at
+    # least two pixels in y or in x, otherwise the bits of the pixel itself.
     absent_bit = (side >= _FAR).view(torch.uint8) * NUM_SLICES
     first = torch.sub(members.index, members.step, alpha=area)
     move = torch.add(members.step + (num_steps - 1), component, alpha=2 * num_steps - 1)
@@ -183,8 +183,8 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
         target += take_columns(at, pixel.index_select(0, leaves))[:, None]
         index.index_copy_(1, leaves, sweeps.or_outside(take_columns(index, leaves), target))
 
-        # Which slices of the pixel are in place, then which are at the target, (2, C, comparisons): in the pixel
-        # itself, and where they must be absent, which is the pixel or, for far motions, the 3 x 3 pixels around.
+        # (2, C, comparisons), the slices found in place, then at the target. `exact` looks in the pixel itself. `near`
+        # looks where slices must be absent: in the pixel or, for far motions, in the 3 x 3 pixels around it.
         own = members.slices.index_select(0, pixel)
         in_place = sweeps.image.index_select(0, start).bitwise_and_(own * (1 + (1 << NUM_SLICES)))  # in both halves
         at_target = sweeps.image.index_select(0, index.view(-1)).view_as(index)

@@ -1,9 +1,9 @@
 """Refinement: turn pixel motions into rigid motions accurate to centimetres, with rotation and the times of points.
 
-Registration takes a few Gauss-Newton steps on the voxels of objects, surface to surface, all objects at once. Beams hit
-a surface at positions that are fixed in the frame of the vehicle. Pairs of nearest points would align these positions,
-and so give the surface a wrong motion along itself. Therefore a pair counts mainly across the surface: the farther the
-voxels around the pair extend in a direction, the lower is the weight of the pair in that direction (generalised ICP).
+Registration takes a few Gauss-Newton steps on the voxels of all objects at once. Beams hit a surface at positions that
+are fixed in the frame of the vehicle. Pairs of nearest points would align these positions, and so give the surface a
+wrong motion along itself. Therefore a pair counts mainly across the surface: the farther the voxels around the pair
+extend in a direction, the lower is the weight of the pair in that direction (generalised ICP).
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from cflow_torch.verified.subpixel_motion import NUM_STEPS, STEP_LENGTH, subpixe
 from cflow_torch.verified.voxel_centroids import NOISE, UNITS, ObjectPoints, Voxels, points_of_objects, spread_of
 
 # We chose these values on real pairs and windows with history (docs/benchmarks.md).
-LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels, metres
+LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels: height in metres, number of layers before they repeat
 _FARTHEST = 0.2  # metres, between the voxels of a pair
 _FAR = 3.0  # squared distance of a pair, in variances of both surfaces, at which its weight is a quarter
 MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _WEIGHT, _ARM = 256, 16  # weights are multiples of 1/256, arms of 16 units, so sums are exact in any order
-# Weights that keep the motion near the given translation, as two pairs of points without a surface would, and near zero
-# rotation, as five pairs at a distance of 1 m would. The angle is nearly twice the tangent of its half.
+# Weights of x, y and the tangent of half the angle. They keep the translation near the given one, as two pairs of
+# points without a surface would, and the rotation near zero, as five pairs 1 m from the centre would.
 _HELD = (2.0 * _WEIGHT, 2.0 * _WEIGHT, 5.0 * _WEIGHT * (2 * UNITS) ** 2)
-# An object that passes a quarter of the rotation of the sensor in an interval would be nearer than its own length. If
-# times differ by more, the direction was measured at the end of one sweep and at the start of the next.
+# A quarter less than 1 is a quarter turn of the sensor. An object that passes it in an interval would be nearer than
+# its own length. So a smaller ratio means that we saw it at the end of one sweep and at the start of the next.
 _LEAST_STRETCH = 0.75
 
 
 def refine(
     sweeps: HeightSlicedSweeps, components: Components, objects: Objects, motion: Tensor, longest: float | None
 ) -> tuple[RigidMotion, RigidMotion]:
-    """Return the final motion of objects, and their apparent motion, which differs if points have times.
+    """Return the final motion of objects, and their apparent motion, which differs from it if points have times.
 
     `motion` is (G, 2) float64, (y, x), finest pixels per sweep interval. Static objects longer than `longest` metres at
     t+1 stay static. None = no bound.
     """
-    # A static object of a pair is a whole component; copies of points are objects only if they move.
+    # A static object of a pair is a whole component. Objects of copies get length 0; they move, so it does not matter.
     length = lookup(components.length, objects.component.clamp(max=components.count))
     start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
     points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
@@ -57,7 +57,7 @@ def refine(
 def register_deskewed(
     points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor
 ) -> tuple[RigidMotion, RigidMotion]:
-    """Return the motion of objects per sweep interval, by registration and the times of points.
+    """Register objects, and correct their motion per sweep interval for the times of points.
 
     Args:
         points: points of the objects that move, as `VoxelPairs` takes them.
@@ -66,12 +66,12 @@ def register_deskewed(
     Returns:
         The motion, and the apparent motion, which registration finds. Without times, both are equal. With times, the
         motion is the apparent motion divided by `VoxelPairs.stretch`. In windows with history, we then de-skew the
-        points and register them again, from the start divided by the same factor. In pairs we do not, because de-skewed
-        smooth surfaces would slide along the pattern of the beams, and only a third sweep can prevent that.
+        points and register them again, from the start divided by the same factor. We do not de-skew pairs, because
+        their smooth surfaces would slide along the pattern of the beams, and only a third sweep can prevent that.
 
     Convention: times of 0 give the same bits as no times.
 
-    Cost: that of two registrations, and a sort of the points.
+    Cost: two registrations with times, else one; a sort of the points.
     """
     pairs = VoxelPairs(points, sweeps, len(start))
     apparent = pairs.register(start)
@@ -92,14 +92,14 @@ def register_deskewed(
 
 
 class VoxelPairs:
-    """The voxels of G objects, which are paired with those of the same object at t+1.
+    """The voxels of G objects, each paired with the nearest voxel of the same object at t+1.
 
     Inside, lengths are in units of 1 / `UNITS` m, and vectors in the x-y plane are complex numbers.
 
     Args:
-        points: those of the moving objects, in sweeps at most `MOST_TIME` sweep intervals from t+1.
+        points: the points of the moving objects, in sweeps at most `MOST_TIME` sweep intervals from t+1.
 
-    Cost: that of `spread_of`.
+    Cost: as `spread_of`.
     """
 
     def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> None:
@@ -133,17 +133,17 @@ class VoxelPairs:
         variance = (NOISE * UNITS) ** 2
         noise = constant(tuple(variance if i % 4 == 0 else 0.0 for i in range(9)), torch.float64, device)
         self._own_spread = take_columns(spread, self._voxel) + noise[:, None]
-        # Derivatives of x, y and z at t+1 by x and y per interval: k and 0. That by the tangent is twice the arm times
-        # k, rotated by a right angle.
+        # Derivatives of (x, y, z) at t+1: by x and by y of the motion per interval, k or 0; by the tangent of half the
+        # angle, 2 k times the arm, rotated by a right angle.
         axes = constant(((1.0, 0.0), (0.0, 1.0), (0.0, 0.0)), torch.float64, device)
         self._by_flow, self._by_tangent = axes[..., None] * self._k, self._k * (2 * _ARM)
 
     def register(self, flow: Tensor) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
 
-        We pair every voxel of the sweeps other than t+1 with the nearest voxel of its object at t+1. Each step
-        minimises the errors of the pairs over translation and angle. Two more terms keep the motion near the given
-        translation and near zero rotation.
+        We pair every voxel of the other sweeps with the nearest voxel of its object at t+1. Each step minimises the
+        errors of the pairs over translation and angle. Two more terms keep the translation near the given one, and the
+        rotation near zero.
 
         Args:
             flow: (G, 2) float64, x and y, metres per sweep interval, to start from.
@@ -174,9 +174,9 @@ class VoxelPairs:
 
         Returns:
             (G,) float64: the sum of w k (k + b - a) divided by the sum of w k^2, over all pairs of voxels. Here w is
-            the weight of a pair in x plus that in y, k is the time between its sweeps, and a and b are the mean times
-            of the points in its voxels, all in sweep intervals. The motion divided by this ratio explains the pairs
-            best. The ratio is 1 for objects without pairs, and if it would be below 0.75.
+            the weight of a pair in x plus that in y, k is the time from its sweep to t+1, and a and b are the mean
+            times of the points in its voxels of that sweep and of t+1, all in sweep intervals. The motion divided by
+            the ratio explains the pairs best. Objects without pairs, or with a ratio below 0.75, get 1.
 
         Convention: k is rounded to a 16th and b - a to a 1024th.
         """
@@ -212,7 +212,7 @@ class VoxelPairs:
 
         Returns:
             other: (K,) int64, the voxel of t+1.
-            weight: (2, 3, K) float64, of the errors in x and y, times 256, rounded; 0 = not paired.
+            weight: (2, 3, K) float64, rows x and y of the weight matrix, times 256, rounded; 0 = not paired.
             error: (3, K) float64, units, from the moved voxel to the other one.
             arm: (K,) complex128, from the centre at t+1 to the moved voxel.
         """
@@ -228,7 +228,7 @@ class VoxelPairs:
         error, spread = of_other[10:] - target, self._own_spread[:, some] + of_other[1:10]
         inverse, scale = adjugate(spread.view(3, 3, -1))
         square = ((inverse * error).sum(1) * error).sum(0)
-        # (f / (f + d^2))^2 / s^2 of the squared distance d^2 = square / scale in standard deviations.
+        # The weight matrix is (f / (f + d^2))^2 times the inverse of the spread, where d^2 = square / scale.
         weight = scale / torch.add(square, scale, alpha=_FAR).square_() * is_pair
         factor = _WEIGHT * (_FAR * NOISE * UNITS) ** 2
         return other, (inverse[:2] * (weight * factor)).round_(), error, arm
@@ -237,10 +237,10 @@ class VoxelPairs:
 def deskew(
     points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion
 ) -> tuple[ObjectPoints, HeightSlicedSweeps]:
-    """Move the points of objects, which have times, to their positions at the instant of their sweep.
+    """Move the points of objects to their positions at the instant of their sweep. The points have times.
 
     Returns:
-        The points, and sweeps whose occupied pixels are those of the moved points; the images are unchanged.
+        The moved points, and sweeps with the pixels of these points. The images of the sweeps are unchanged.
 
     Convention: translation and rotation are proportional to time. Points that leave the region are dropped. If several
     objects share a pixel, only the points of the first one are kept. Points whose time is 0 do not move.
@@ -251,7 +251,7 @@ def deskew(
     grid, num_steps, object_id = sweeps.grid, sweeps.num_steps, points.object_id
     time, (window, step) = points.time.double(), take_columns(sweeps.pixels.table[1:3], points.pixel)
     flow, centre = (torch.view_as_complex(values.index_select(0, object_id)) for values in (rigid.flow, rigid.centre))
-    # The centre is that at t; at the instant of another sweep, it has moved.
+    # `centre` is that at t, so we move it to the instant of the sweep.
     image = torch.add(step, window, alpha=num_steps)
     since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
     at_instant = torch.complex(*points.position[:2]) - flow * time

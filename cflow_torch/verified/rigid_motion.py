@@ -1,4 +1,4 @@
-"""Rigid motion in the plane, a translation and a rotation about a centre, and the flow of points by it."""
+"""Rigid motion in the plane: a translation, and a rotation about a centre. It gives the flow of points."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class RigidMotion:
 
     flow: Tensor  # (G, 2) float64, x and y at the centre, metres, axes of ego1
     rotation: Tensor  # (G,) float64, tangent of half the angle, counter-clockwise
-    centre: Tensor  # (G, 2) float64, x and y, metres, frame of t+1
+    centre: Tensor  # (G, 2) float64, x and y of the centre at t, metres, frame of t+1
 
     def pixels_per_interval(self, pixel_size: float) -> Tensor:
-        """Return the flow at the centre, (G, 2) float64, (y, x), in pixels of a size in metres."""
+        """Return the flow at the centre, (G, 2) float64, (y, x), in pixels; `pixel_size` is in metres."""
         return self.flow.flip(1) / constant((pixel_size,), self.flow.dtype, self.flow.device)  # see `Grid.pixel`
 
     def only(self, is_moving: Tensor) -> RigidMotion:
-        """Keep the motion of some objects, (G,) bool, and make the others static."""
+        """Keep the motion of the objects where `is_moving`, (G,) bool, and make the others static."""
         static = ~is_moving
         flow, rotation = self.flow.masked_fill(static[:, None], 0.0), self.rotation.masked_fill(static, 0.0)
         return RigidMotion(flow, rotation, self.centre)
@@ -111,8 +111,8 @@ def motion_by_pixel(
 
 
 def _pixel_of_result(sweeps: HeightSlicedSweeps, is_moving: Tensor, is_sure: Tensor) -> Tensor:
-    """Return the pixel whose motion each point takes, (N,) int64, P = none. It is the pixel of its copy if that moves
-    and the motion of its own pixel is not sure; (P + 1,) bool each."""
+    """Return the pixel whose motion each point takes, (N,) int64, P = none. A point takes the pixel of its copy if that
+    pixel moves and its own pixel is not sure. `is_moving` and `is_sure` are (P + 1,) bool."""
     num_points = sweeps.batch.image.numel()
     pixel, copy = sweeps.pixel_of_point[:num_points], sweeps.pixel_of_point[num_points:]
     own = pixel.index_select(0, sweeps.copied)

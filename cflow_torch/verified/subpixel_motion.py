@@ -1,8 +1,8 @@
 """Sub-pixel motion of pairs: find slow objects by matching the centroids of small cubes.
 
 Between two sweeps, the pixels of a slow object hardly change, but the points within them shift. We put the points into
-cubes as high as a pixel is wide, and a few steps find the shift under which their centroids match best. A static object
-becomes a moving one if its match improves significantly. Registration then refines its motion to centimetres.
+cubes as high as a pixel is wide, and find the shift under which their centroids match best by a few mean-shift steps. A
+static object becomes a moving one if its match improves significantly. Registration then refines its motion.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import REACH, HeightSlicedSweeps, count_slices
 from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_objects
 
-_BIAS_Z, _LEAST_BIAS = 3, 0.1  # least difference, in standard deviations of noise and as a share of the slices
-_NUM_LAYERS = 16  # numbers of the layers of cubes repeat after so many
-# Steps to the best motion, and their length; above 1, because the nearest partners change with each step.
+_BIAS_Z, _LEAST_BIAS = 3, 0.1  # least |a - b| of `_is_biased`: in standard deviations of noise, as a share of slices
+_NUM_LAYERS = 16  # layers of cubes, after which their numbers repeat
+# Number of steps, and their length. It is above 1, because the nearest partners change with each step.
 NUM_STEPS, STEP_LENGTH = 4, 1.4
 _Z, _LEAST_GAIN = 4.0, 0.05  # standard deviations of noise; gain per cube, as a share of a perfect match
-_SIGMA = 0.07  # metres, of the weight of two centroids by their distance
-BYTES_PER_POINT = 560  # cubes and the 25 around each
+_SIGMA = 0.07  # metres, of the Gaussian that weights two centroids by their distance
+BYTES_PER_POINT = 560  # a cube and the 25 cubes around it
 
 
 def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, may_be_slow: Tensor) -> Tensor:
@@ -30,13 +30,13 @@ def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor
 
     Args:
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval; 0 = static. Windows with history keep theirs.
-        may_be_slow: (G,) bool, static objects to test; the other static ones stay static.
+        may_be_slow: (G,) bool, the static objects to test. The others stay static.
 
     Returns:
         (G, 2) float64, x and y, metres per sweep interval.
 
-    Cost: eight lookups for each pixel of objects that may be slow; for each cube of those that are biased 25 lookups,
-        and 25 comparisons a step.
+    Cost: eight lookups for each pixel of objects that may be slow. Of these, biased objects (`_is_biased`) cost 25
+        lookups for each cube, and 25 comparisons for each cube and step.
     """
     flow = motion.flip(1) * sweeps.grid.pixel_size
     window = sweeps.pixels.window.index_select(0, objects.first)
@@ -82,8 +82,8 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     Convention: a cube of t, moved by the shift, matches the nearest cube of t+1 among those in the 5 x 5 pixels around
         it. A cube of t+1, moved back, likewise matches one of t. Cubes 4 m apart never match. Ties: the first in raster
         order. Each step changes the shift by `STEP_LENGTH` times the weighted mean of the errors. The gain is the
-        weight of all matches minus their weight without a shift. It must exceed `_Z` standard deviations of noise, and
-        reach `_LEAST_GAIN` per cube.
+        weight of all matches with the shift minus their weight without it. It must exceed `_Z` standard deviations of
+        noise, and reach `_LEAST_GAIN` per cube.
     """
     some = flat_nonzero(voxels.step < 2)
     window, step, layer, of = gather(some, voxels.window, voxels.step, voxels.layer, voxels.object_id)
@@ -97,7 +97,7 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     unshifted = weight
     for _ in range(NUM_STEPS):
         sums = scatter_count(of, num_objects, torch.cat((weight[None], weight * error)))
-        shift += (STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # no weight is smaller
+        shift += (STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # the least weight above 0
         weight, error = _meet(ahead - take_columns(shift, of)[:, None], weights)
     gain = weight - unshifted
     gain, square, count = scatter_count(of, num_objects, torch.stack((gain, gain * gain, torch.ones_like(gain))))
@@ -105,7 +105,7 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
 
 
 def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the weight of the nearest of 25 cubes, (K,) float64, and its position, (2, K); `ahead` is (2, 25, K)."""
+    """Return the weight of the nearest of 25 cubes, (K,) float64, and its offset, (2, K); `ahead` is (2, 25, K)."""
     slot = constant(tuple(range(ahead.shape[1])), torch.float64, ahead.device)[:, None]
     # Square and slot share one number, because taking the minimum is several times faster than argmin.
     key = torch.add(slot, ahead.square().sum(0), alpha=32).amin(0).long()
@@ -114,7 +114,7 @@ def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _meeting_weights(device: torch.device) -> Tensor:
-    """Return the weights exp(-d^2 / 2 sigma^2) of centroids at distance d, (2049,) float64, multiples of 1/256. Entry i
-    is for d^2 from 64 i to 64 (i + 1) square units; the last entry, 0, is for larger distances."""
+    """Return the weights exp(-d^2 / (2 sigma^2)) of centroids at distance d, (2049,) float64, multiples of 1/256. Entry
+    i is for d^2 from 64 i to 64 (i + 1) square units; the last entry, 0, is for larger distances."""
     square = 64 * torch.arange(2048, dtype=torch.float64) + 32
     return F.pad((256 * torch.exp(square / (-2 * (_SIGMA * UNITS) ** 2))).round_() / 256, (0, 1)).to(device)

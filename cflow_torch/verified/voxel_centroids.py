@@ -1,4 +1,4 @@
-"""Voxels of objects: the centroids of their points, the search for the nearest one, the spread of surfaces around them.
+"""Voxels of objects: their centroids, the search for the nearest voxel, and the spread of the surface around each.
 
 A voxel is a pixel and a height slice of a sweep.
 """
@@ -20,10 +20,10 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps, slice_of
 # Centroids are multiples of 1 / UNITS metre, so their sums are exact, in any order of the points and on any device.
 UNITS = 1024
 NOISE = 0.05  # metres, standard deviation of a centroid, besides the spread of its surface
-_SIDE = 2  # voxels, of a block. With the blocks around, it covers 0.6 m
-_STEP = 4  # units; coordinates are multiples of 1/256 m, so that sums are exact
+_SIDE = 2  # side of a block, voxels. A block and the blocks around it cover 0.6 m
+_STEP = 4  # units; spreads use coordinates in multiples of 1/256 m, so that sums are exact
 _ROW, _LAYER = 1 << 15, 1 << 12  # more than the blocks in a row or column; more than the blocks in a stack
-# The moments are products of two of 1, x, y and z. Then: which moments are the entries of the 3 x 3 matrix of squares.
+# The two factors of each moment, among 1, x, y and z. Then: the moments in the 3 x 3 matrix of squares, row by row.
 _FACTORS = ((0, 0, 0, 0, 1, 1, 1, 2, 2, 3), (0, 1, 2, 3, 1, 2, 3, 2, 3, 3))
 _SQUARES = (4, 5, 6, 5, 7, 8, 6, 8, 9)
 
@@ -33,8 +33,8 @@ class ObjectPoints:
     """N points of G objects, of all sweeps; all points of a pixel belong to one object."""
 
     object_id: Tensor  # (N,) int64, object of each point
-    pixel: Tensor  # (N,) int64, number of its occupied pixel, 0 ... P - 1
-    layer: Tensor  # (N,) int64, height slice, from 0 on
+    pixel: Tensor  # (N,) int64, position of the pixel of each point in the list of occupied pixels
+    layer: Tensor  # (N,) int64, height slice of each point, from 0 on
     position: Tensor  # (3, N) float64, metres, frame of t+1; inside the region
     time: Tensor | None = None  # (N,) float32, sweep intervals, `Batch.point_times`; None = no times are given
 
@@ -57,11 +57,11 @@ def points_of_objects(
 
     Args:
         wanted: (G,) bool.
-        slice_height: of the `layer` of each point, metres.
+        slice_height: metres, height of a layer.
         num_slices: number of layers before they repeat, a power of 2.
         most_time: sweep intervals; sweeps farther in time from t+1 are left out.
 
-    Cost: a lookup for each point, and more for each that is kept.
+    Cost: a lookup for each point, and a few more for each point that is kept.
     """
     is_kept = lookup(wanted, objects.of_pixel) & (sweeps.elapsed_of_pixel.abs() <= most_time)
     points = flat_nonzero(lookup(is_kept, sweeps.pixel_of_point))
@@ -98,7 +98,7 @@ class Voxels:
         # (3, V + 1) float64, x and y from the lower corner of the region and z from 0, units; the last entry, for "no
         # voxel", is far away.
         self.position = F.pad(centroid, (0, 1), value=2.0**27)
-        # The first pixel of the table is "none", as in `HeightSlicedSweeps.rank`.
+        # The first row of the table is for "no pixel", which has rank 0 in `HeightSlicedSweeps.rank`.
         self._of_key = torch.full((num_slices * (sweeps.num_pixels + 1),), len(key), device=key.device)
         self._of_key.scatter_(0, key + num_slices, torch.arange(len(key), device=key.device))
         self.time: Tensor | None = None  # (V,) float64, mean of the times of the points
@@ -116,7 +116,7 @@ class Voxels:
 
         Returns:
             voxel: (K,) int64, V = not found. Ties: the first slice of the first pixel in raster order.
-            is_near: (K,) bool, it is found and at most `farthest` away; the square of that is rounded to square units.
+            is_near: (K,) bool, it is found and at most `farthest` away, whose square is rounded to square units.
 
         Cost: 9 L lookups for each position.
         """
@@ -137,8 +137,8 @@ class Voxels:
             reach: r, pixels.
 
         Returns:
-            ((2 r + 1)^2 L, K) int64, pixel by pixel in raster order, V = no voxel. Near the border and beyond it, the
-            outermost pixels are taken.
+            ((2 r + 1)^2 L, K) int64, pixel by pixel in raster order, V = no voxel. Near the border and beyond it, we
+            take the outermost pixels.
         """
         grid, device, line = self._sweeps.grid, layers.device, range(-reach, reach + 1)
         ends = ((reach, reach), (grid.width - 1 - reach, grid.height - 1 - reach))
@@ -159,7 +159,7 @@ def spread_of(voxels: Voxels, pixel_size: float, layer_height: float) -> Tensor:
     """Return for each voxel the covariance of the centroids around it that belong to its object and sweep.
 
     A block has 2 x 2 x 2 voxels. The centroids around a voxel are those in its block and in the 26 adjacent blocks. The
-    result is (3, 3, V) float64, squares of units of 1 / `UNITS` m. The sides of a voxel are in metres.
+    result is (3, 3, V) float64, squares of units of 1 / `UNITS` m. `pixel_size` and `layer_height` are in metres.
 
     Cost: 18 searches for each block.
     """
@@ -183,8 +183,8 @@ def _sums_around(block: Tensor, image: Tensor, values: Tensor) -> Tensor:
     column = torch.add(block[0], torch.add(block[1], image, alpha=_ROW), alpha=_ROW)
     layer = block[2].clamp(2 - _LAYER // 2, _LAYER // 2 - 2)
     key, of_voxel = torch.unique(torch.add(layer, column, alpha=_LAYER), return_inverse=True)
-    # The layers of a column are adjacent, so we subtract the sum of all blocks below three layers from the sum of all
-    # blocks up to them. Running sums may overflow, but their differences are right.
+    # The layers of a column follow each other in the order of keys, so the sum over three layers is a difference of two
+    # running sums. Running sums may overflow, but their differences are right.
     below = scatter_count(of_voxel, len(key), values).cumsum(1)
     below = F.pad(below, (1, 0)).t().contiguous()
     columns = [(down * _ROW + right) * _LAYER for down in (-1, 0, 1) for right in (-1, 0, 1)]
