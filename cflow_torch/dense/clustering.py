@@ -32,7 +32,7 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Clusters:
-    """Clusters that have pixels at t+1 and before, in order of window, then of first pixel in raster order."""
+    """Clusters with pixels both at t+1 and before, in order of window, then of first pixel in raster order."""
 
     window: Tensor  # (M,) int64, window of each cluster, ascending
     first: Tensor  # (M, 2) int64, top-left (row, col) of the bounding box over all sweeps
@@ -41,14 +41,14 @@ class Clusters:
 
 
 def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Clusters, Tensor, Tensor]:
-    """Aggregate the sweeps of each window, dilate, label, split oversized components, drop those that cannot move.
+    """Aggregate the sweeps of each window, dilate, label, split oversized components, keep those at t+1 and before.
 
     All engines of `labeling` return identical clusters.
 
     Returns:
         clusters: M clusters, which never join across windows (Alg. clustering).
-        cluster_of_cell: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none. The last
-            entry, M, is for points outside the images. Undefined for empty pixels.
+        cluster_of_cell: (B * S * H * W + 1,) int32, cluster of each occupied pixel of each sweep, M = none; undefined
+            for empty pixels. The last entry is for points outside the images; it is M.
         cell_of_point: (P,) int64, index of each point into `cluster_of_cell`.
     """
     images, pixel_size = sweeps.occupancy, sweeps.grid.pixel_size
@@ -61,7 +61,7 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
     indices = PixelIndices(pixels, padded_row, row, col)
     component, num_components = components_by_size(aggregated, height, width, indices, pixel_size, config)
 
-    # A pixel of sweep m lies m images behind that of t+1.
+    # The image of step m lies m images behind the image of t+1.
     cell = torch.add(col, row, alpha=width).add_(window, alpha=num_steps * area)
     flat = images.flatten()
     occupied = torch.stack([flat[m * area :].index_select(0, cell) for m in range(num_steps)])
@@ -91,7 +91,7 @@ def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Cl
 
 
 def _can_move(component: Tensor, num_components: int, occupied: Tensor) -> Tensor:
-    """Return whether each component has `occupied` pixels, (S, P) bool, at t+1 (index 0) and before, (C,) bool."""
+    """Return which components have pixels both at t+1 and before, (C,) bool. `occupied` is (S, P) bool, t+1 first."""
     newest, *older = occupied.unbind(0)
     before = reduce(torch.bitwise_or, older, torch.zeros_like(newest))
     kind = newest.byte() + (newest & before).byte()  # 0: occupied before only, 1: at t+1 only, 2: both
@@ -112,10 +112,10 @@ class PixelIndices:
 
 
 def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: ClusteringConfig) -> Tensor:
-    """Label the components of dilated images; erode and label again those that are too long (Alg. clustering).
+    """Label the components of dilated images; erode those that are too long and label them again (Alg. clustering).
 
-    `image` is (B, H, W) bool. `pixels` are the flat indices of its set pixels, (P,) int64, ascending. Return, for each
-    pixel, the position in `pixels` of the first pixel of its component in raster order, (P,) int64.
+    `image` is (B, H, W) bool. `pixels` are the flat indices of its set pixels, (P,) int64, ascending. The result is the
+    position in `pixels` of the first pixel, in raster order, of the component of each pixel, (P,) int64.
     """
     _, height, width = image.shape
     padded = pad([image])
@@ -129,10 +129,10 @@ def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: C
 def components_by_size(
     padded: Tensor, height: int, width: int, indices: PixelIndices, pixel_size: float, config: ClusteringConfig
 ) -> tuple[Tensor, int]:
-    """Return the component of each set pixel, and a number above the largest component.
+    """Return the component of each set pixel, (P,) int64, and a number above the largest component.
 
     `height` and `width` are those of the images without padding. We erode all oversized components together. They do
-    not affect each other, because no 3 x 3 neighbourhood within their union has pixels of two components.
+    not affect each other, because no 3 x 3 square inside the dilated components has pixels of two of them.
     """
     component, count = _components(padded, indices, 3, config)
     top, bottom = segment_minmax(indices.row, component, count)
@@ -156,7 +156,7 @@ def components_by_size(
 
 
 def _components(padded: Tensor, indices: PixelIndices, reach: int, config: ClusteringConfig) -> tuple[Tensor, int]:
-    """Return the component of each pixel, and a number above the largest one. Dilate first if `reach` is 3."""
+    """Label once, after a 3 x 3 dilation if `reach` is 3. The result is that of `components_by_size`."""
     if config.labeling == "kornia":
         component = connected_components_kornia(padded, indices.pixel, config.connectivity, reach)
         return component, indices.pixel.numel()

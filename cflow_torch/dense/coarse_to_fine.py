@@ -1,4 +1,4 @@
-"""Coarse to fine (the paper's multi-scale strategy): warp the sweeps by the flow so far, project, estimate, repeat."""
+"""Coarse to fine (the paper's multi-scale strategy): warp the sweeps by the flow found so far, project, estimate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ProjectedSweeps:
 
     batch: Batch  # points of all windows
     grid: Grid  # pixels of the bird's-eye view
-    # (A, P) float64, metres per sweep interval, the flow of every point before t+1 so far. None = no flow yet.
+    # (A, P) float64, metres per sweep interval: flow found so far of each point; undefined at t+1. None = no flow yet.
     flow: Tensor | None
     occupancy: Tensor  # (B, S, H, W) bool; index 0 of S is sweep t+1
     pixel: Tensor  # (P,) int64, flat index into `occupancy`; its size for ignored points
@@ -34,9 +34,9 @@ class ProjectedSweeps:
 
 
 def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
-    """Warp every sweep m by (t+1-m) times its flow so far, and draw it (Eq. 3d_to_bev).
+    """Warp every sweep by its flow so far times its intervals to t+1, and draw it (Eq. 3d_to_bev).
 
-    `flow` is as in `ProjectedSweeps`. Points that are warped out of the region are ignored at this scale.
+    `flow` is as in `ProjectedSweeps`. We ignore points that are warped out of the images at this scale.
     """
     num_images, num_points = batch.num_windows * batch.num_steps, len(batch.image)
     pixel = torch.empty(num_points, dtype=torch.int64, device=batch.image.device)
@@ -53,7 +53,7 @@ def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
 
 
 def _warp(batch: Batch, flow: Tensor, points: slice) -> Tensor:
-    """Move points before t+1 by their flow so far times their interval to t+1: (A, K) float64, metres."""
+    """Move points by their flow times their sweep intervals to t+1: (A, K) float64, metres."""
     intervals = batch.elapsed.flatten().index_select(0, batch.image[points])
     return (flow[:, points] * intervals).add_(batch.positions[:, points])
 
@@ -80,7 +80,7 @@ class CoarseToFine(SceneFlowModel):
 
 
 def _flow_so_far(batch: Batch, flow: Tensor | None, motion: Motion) -> Tensor:
-    """(A, P) float64, metres per sweep interval: sum of the flow over the scales, for every point before t+1."""
+    """Add the flow of a scale to the flow of the coarser ones: `ProjectedSweeps.flow`. `flow` is overwritten."""
     total = torch.empty_like(batch.positions) if flow is None else flow
     for points in chunks(batch.num_newest, len(batch.image), batch.image.device):
         of_chunk, cluster = total[:, points], motion.cluster(points)

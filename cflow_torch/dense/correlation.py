@@ -22,8 +22,8 @@ from cflow_torch.ops.window_counts import WindowCounts
 
 # Working memory of a pair per sample of its class: spectra, counts and tables.
 _BYTES_PER_SAMPLE = 48
-# Samples of templates in one call of the correlation, and samples of counts in one run. On a CPU both must stay in the
-# cache (we tried 2^14 ... 2^26); a GPU needs few launches.
+# Samples of templates in one call of the correlation, and samples of counts in one run. On a CPU both must fit the
+# cache (we tried 2^14 ... 2^26). A GPU needs few launches.
 _PER_CALL_CPU, _PER_RUN_CPU = 1 << 18, 1 << 21
 _PER_CALL_GPU, _PER_RUN_GPU = 1 << 26, 1 << 26
 
@@ -32,15 +32,15 @@ _PER_CALL_GPU, _PER_RUN_GPU = 1 << 26, 1 << 26
 class Estimates:
     """Motion of M clusters as estimated from each of K other sweeps, nearest sweep first."""
 
-    # (M, K, A) float64, m -> t+1: x, y and z in metres, or, of the verified method, y and x in finest pixels.
+    # (M, K, A) float64, from the sweep to t+1: x, y and z in metres; in the verified method, y and x in finest pixels.
     displacement: Tensor
     score: Tensor  # (M, K) float32, NCC at the peak
     available: Tensor  # (M, K) bool, False = the cluster has no pixel in that sweep; displacement and score are 0 there
-    intervals: Tensor  # (M, K) float64, sweep intervals from m to t+1
+    intervals: Tensor  # (M, K) float64, sweep intervals from the sweep to t+1
 
     @classmethod
     def of(cls, pairs: TemplatePairs, displacement: Tensor, score: Tensor, intervals: Tensor) -> Estimates:
-        """Make them from the estimates of J pairs, (J, A) and (J,)."""
+        """Collect the estimates of J pairs: `displacement` is (J, A), `score` is (J,), `intervals` is (M, K)."""
         (count, num_sources), num_axes = intervals.shape, displacement.shape[1]
         slot = torch.add(pairs.source, pairs.cluster, alpha=num_sources)
         displacements = displacement.new_zeros((count * num_sources, num_axes))
@@ -54,11 +54,11 @@ class Estimates:
         )
 
     def per_interval(self) -> Tensor:
-        """Displacement per sweep interval, (M, K, A) float64; undefined where it is not available."""
+        """Displacement per sweep interval, (M, K, A) float64; undefined where not `available`."""
         return self.displacement / self.intervals[:, :, None]
 
     def newest_score(self) -> Tensor:
-        """(M,) float32, score with the nearest sweep that has the cluster."""
+        """(M,) float32, score with the nearest sweep that has pixels of the cluster."""
         newest = self.available.int().argmax(1, keepdim=True)
         return self.score.gather(1, newest)[:, 0]
 
@@ -88,7 +88,7 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
         any overlap the shift is 0 and the score 0. Counts are integers; we compare them as count^2 / energy in
         float64, so all devices agree.
 
-    Cost: about area log(area) per pair, with the area that is searched; the only Python loop is over size classes.
+    Cost: about A log(A) per pair, A = area of box plus search range. Python loops are over size classes and their runs.
     Source: Eq. norm_correlation, displacement_in_bev, Alg. scene_flow_1view.
     """
     num_pairs, device = pairs.cluster.numel(), pairs.size.device
@@ -158,13 +158,13 @@ def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor
     """Find the shifts that may be the best of their pair: (4, K) int64, packed pair, dy, dx, count.
 
     The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
-    count^2 / target energy and count. A shift whose count is below the largest of these lower bounds cannot win.
+    count^2 / target energy and count. A shift whose count is below such a lower bound of another shift cannot win.
     `target_energy`, (J,) int64, and `radius`, (J,) float64, are in pixels; None = no limit of the radius.
     """
     low, high, stride = search.low[:, run.pairs], search.high[:, run.pairs], search.stride[run.pairs]
     searched = search.searched[run.pairs]
     end = searched.cumsum(0)
-    # Two samples give a lower bound: no shift, and the largest count, moved into the search range if it lies outside.
+    # Two shifts give a lower bound: no shift, and that of the largest count, moved into the search range.
     middle, largest = low[0] * stride + low[1], torch.cat([largest_of_rows(piece) for piece in run.pieces])
     dy, dx = torch.minimum(shift_at(largest, stride, low), high)
     probe = middle + dy * stride + dx
@@ -193,8 +193,8 @@ def _best_of_each_pair(
     """Choose the best candidate of each pair: (4, J) int64, dy, dx, count, energy, all 0 for a pair without candidates.
 
     The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels under the H x W window at
-    that shift. The pair, target and count of each candidate, (K,), and its shift, (2, K), are int64. The candidates of
-    a pair are in order of dy, then of dx. Ties: as in `best_shifts`.
+    that shift. `pair`, `target` and `count`, (K,) int64, and `shift`, (2, K) int64, are those of K candidates, in order
+    of pair, dy and dx. Ties: as in `best_shifts`.
     """
     # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
     parts = [windows.bounds(target[some], shift[:, some]) for some in chunks(0, len(pair), pair.device, 16)]

@@ -36,7 +36,7 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
         label[points] = torch.where(found >= 0, found + num_labels, found).to(label.device)
         num_labels += int(found.max()) + 1 if found.numel() else 0
 
-    # Occupied pixels, once per label and sweep.
+    # Occupied pixels, each once per label and sweep.
     member = (label >= 0).nonzero()[:, 0]
     key = torch.unique(label[member] * num_cells + pixel[member])
     label_of_pixel, image, raster = key // num_cells, key % num_cells // area, key % area

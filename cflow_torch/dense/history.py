@@ -9,18 +9,18 @@ from cflow_torch.ops.segments import masked_median
 
 
 def pool(estimates: Tensor, available: Tensor) -> Tensor:
-    """Return the vectors of the median magnitude and the median orientation of several estimates, (M, 3) float64.
+    """Return a vector for each cluster, (M, 3) float64, with the median magnitude and orientation of its estimates.
 
-    `estimates` are (M, K, 3) float64, metres per sweep interval, nearest sweep first. z is pooled by itself.
-    `available`, (M, K), is False where the cluster is empty in that sweep. At least one per row is True.
+    `estimates` are (M, K, 3) float64, metres per sweep interval, nearest sweep first. z has a median of its own.
+    `available`, (M, K) bool, is False where the cluster is empty in that sweep. At least one per row is True.
 
     Convention:
         A single estimate is returned unchanged. Even counts: mean of the middle two (for orientations: the direction
         half-way between them). Orientations are ordered by their angle from the circular mean; an estimate of
-        length zero has a magnitude but no orientation. We use no trigonometric function, because additions, products,
-        divisions and square roots round identically on every device.
+        length zero has a magnitude but no orientation. We use only additions, products, divisions and square roots,
+        because trigonometric functions round differently on other devices.
 
-    Source: Sec. leverage_past_pcs; the paper does not define the even count and the angular median.
+    Source: Sec. leverage_past_pcs; the paper defines neither the median of an even count nor the angular median.
     """
     num_estimates = estimates.shape[1]
     first = available.int().argmax(1)
@@ -39,7 +39,7 @@ def pool(estimates: Tensor, available: Tensor) -> Tensor:
 
 
 def _angular_median(unit: Tensor, oriented: Tensor) -> Tensor:
-    """(M, 2) median direction of the `oriented` ones among (M, K, 2) unit vectors; 0 if there is none."""
+    """(M, 2) median direction of the (M, K, 2) unit vectors that are `oriented`, (M, K); 0 if none is."""
     rows = torch.arange(len(unit), device=unit.device)
     mean = torch.zeros_like(unit[:, 0])
     for step in range(unit.shape[1]):  # one after the other, because the order of a float sum changes its last bits

@@ -16,10 +16,10 @@ from cflow_torch.types import CFlowError, as_numpy
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
 from cflow_torch.windows.memory import require_memory
 
-# An image that fits is laid out as one line of this many samples, whatever its height and width: most clusters are
-# small, and few classes need few kernel launches. Larger images are rare. They keep two dimensions, because their 2D
-# transforms are cheaper than those of a line, and have classes of their own by height and width. On a GPU the lines are
-# longer, so that a batch of many windows has no more classes than one window.
+# We lay out an image as one line, whatever its height and width, and pad it to the next of these lengths. So the many
+# small clusters have few size classes, and few kernel launches. Images too large for a line are rare. They keep two
+# dimensions, because their 2D transforms are cheaper, and have classes by height and width. On a GPU the lengths are
+# farther apart, so that a batch of many windows has no more classes than one window.
 _LINES_CPU = tuple(144 << k for k in range(8))  # square clusters of 8, 11, 16, ... 90 pixels
 _LINES_GPU = tuple(144 << 2 * k for k in range(9))
 # Spectra, counts and tables of the largest image, which is correlated alone.
@@ -40,7 +40,7 @@ class Search:
 
 
 def shift_at(sample: Tensor, stride: Tensor, low: Tensor) -> Tensor:
-    """(2, K) int64, dy and dx at one sample (K,) int64 of each image; undefined beyond `high`."""
+    """(2, K) int64, dy and dx that belong to one sample, (K,) int64, of each image; undefined beyond `high`."""
     row = sample // stride
     return torch.stack((row, sample - row * stride)) - low
 
@@ -63,7 +63,7 @@ class SizeClass(NamedTuple):
 
 @dataclass(frozen=True)
 class Packing:
-    """Templates and targets in the shape of their class, class after class, templates before targets."""
+    """J templates and N targets in the shapes of their classes, class after class, templates before targets."""
 
     samples: Tensor  # (A,) bool, all images
     classes: list[SizeClass]  # size classes, in order
@@ -103,7 +103,7 @@ def pack(pairs: TemplatePairs) -> Packing:
         np.maximum.at(bound[:, 0], cluster, farthest)
         low, high = np.minimum(low, bound), np.minimum(high, bound)
 
-    # The class of each target, which is also that of its templates.
+    # Templates have the class of their target.
     rows, width = (size + low).T
     lines = _LINES_CPU if device.type == "cpu" else _LINES_GPU
     is_line = rows * width <= lines[-1]
@@ -153,6 +153,6 @@ def pack(pairs: TemplatePairs) -> Packing:
 
 
 def _at_least(lengths: Sequence[int], values: np.ndarray) -> np.ndarray:
-    """Round each value up to one of the ascending lengths; the last one if there is none."""
+    """Round each value up to one of the ascending lengths; larger values get the last one."""
     table = np.asarray(lengths)
     return table[np.searchsorted(table, values).clip(max=len(table) - 1)]

@@ -20,9 +20,9 @@ def add_sectional_view(
 ) -> Estimates:
     """Add f_z to the estimates of M clusters, and correct f_x and f_y along the heading (Alg. scene_flow_1obj).
 
-    `cluster` is that of each point, (P,), M = none. The points of the sweeps have three axes. The heading is the
-    direction of (f_x, f_y), or the x axis if both are zero. All X-Z images lie on one grid through the origin, and each
-    is cut to the bounding box of its pair. Ties: smallest shift, then smallest dz, then smallest dx'.
+    `cluster` is the cluster of each point, (P,) int, M = none. The points have three axes. The heading is the direction
+    of (f_x, f_y), or the x axis if both are zero. All X-Z images lie on one grid through the origin, and each is cut to
+    the bounding box of its pair. Ties: smallest shift, then smallest dz, then smallest dx'.
     """
     available, positions, pixel_size = estimates.available, sweeps.positions(), sweeps.grid.pixel_size
     step = sweeps.batch.image % sweeps.batch.num_steps
@@ -42,7 +42,7 @@ def add_sectional_view(
     moved = positions[:, older].clone()
     moved[:2] += flow.t()[:2, template_pair]
     newest = (member & (step == 0)).nonzero()[:, 0]
-    # Each pair rotates the target of its cluster by its own heading, so every pair needs its own copy of the points.
+    # Each pair rotates the target by its own heading, so it needs its own copy of the points.
     copies = available.sum(1)[cluster[newest]]
     target = positions[:, newest.repeat_interleave(copies)]
     target_pair = concat_ranges(torch.searchsorted(slots // num_sources, cluster[newest]), copies)

@@ -25,20 +25,20 @@ class Images:
 class TemplatePairs:
     """J pairs of a template and its target, in order of cluster, then of sweep, nearest sweep first."""
 
-    # J images, a cluster in an earlier sweep; rows and columns count from the corner of the cluster's box.
+    # J images, each of a cluster in an earlier sweep. Rows and columns count from the corner of the cluster's box.
     template: Images
-    target: Images  # M images, each cluster at t+1; rows and columns count from the same corner
-    cluster: Tensor  # (J,) int64, cluster of each pair, which is also its target
+    target: Images  # M images, one of each cluster at t+1. Rows and columns count from the same corner
+    cluster: Tensor  # (J,) int64, cluster of each pair, which is also the index of its target
     source: Tensor  # (J,) int64, sweep of the template: 0 = t, 1 = t-1, ...
     size: Tensor  # (M, 2) int64, height and width of each cluster's box, and so of its images
     radius: Tensor | None = None  # (J,) float64, pixels, longest shift that is searched; None = half the box
-    pixel: Tensor | None = None  # (P,) int64, number of each pixel of the templates in the clusters; None = unknown
+    pixel: Tensor | None = None  # (P,) int64, index of each template pixel into `Clusters.pixels`; None = unknown
 
 
 def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max_speed: float | None) -> TemplatePairs:
     """Make a pair for every cluster and every earlier sweep in which it has pixels.
 
-    `pixel_size`, in metres, is one for all M clusters, or (M,) float64. `max_speed` is in m/s; None = no bound.
+    `pixel_size` is in metres, one for all M clusters or (M,) float64. `max_speed` is in m/s; None = half of the box.
     """
     num_sources, pixels = batch.num_steps - 1, clusters.pixels
     num_slots = clusters.window.numel() * num_sources
