@@ -33,7 +33,7 @@ def densify(
 ) -> DenseShift:
     """Find the shift of every occupied pixel of sweep t.
 
-    `images` are those of sweep t, (B, H, W) bool. `matched` are the key points that have `matches`: flat indices into
+    `images` are the images of sweep t, (B, H, W) bool. `matched` are the key points of `matches` as flat indices into
     the images, (M,) int64, ascending.
 
     Returns:
@@ -43,7 +43,7 @@ def densify(
         point and the pixels nearest to it.
 
     Convention:
-        Medians of an even number are the mean of the middle two. Ties of the nearest key point: first in raster order.
+        Even counts: the median is the mean of the middle two. Ties of the nearest key point: first in raster order.
 
     Source: Sec. From sparse scene flow to dense scene flow; Table keypoint_sparse2dense.
     """

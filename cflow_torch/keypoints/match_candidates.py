@@ -19,19 +19,19 @@ from cflow_torch.ops.indices import concat_ranges, flat_nonzero, gather, index_i
 from cflow_torch.ops.morphology import erode_cross
 from cflow_torch.windows.collation import Batch
 
-# Rows and columns of a tile, rows of a band, key points in a group. Of the settings that we counted for groups of 16,
-# these have the fewest pairs (key point, candidate): on the AV2 pair 1.55 for each pair within the radius. Groups of 8
-# have fewer pairs, but fetch twice as many descriptors for each.
+# Rows and columns of a tile, rows of a band, key points in a group. We tried several tiles and bands for groups of 16,
+# and these give the fewest pairs (key point, candidate): on the AV2 pair, 1.55 for each pair within the radius. Groups
+# of 8 have fewer pairs, but fetch twice as many descriptors per pair.
 _TILE_ROWS, _TILE_COLS = 12, 64
 _BAND = 4
 _GROUP = 16
-# Pairs that are compared together: they should fit the cache of a CPU; a GPU needs many.
+# Pairs that we compare together. They should fit the cache of a CPU; a GPU needs many.
 _PAIRS_AT_ONCE_CPU = 1 << 17
 _PAIRS_AT_ONCE_GPU = 1 << 26
 _BYTES_PER_PAIR = 64
-# Lists of candidates that are compared together are padded to the longest of them, rounded up to a multiple of this.
+# Lists of candidates that we compare together are padded to the longest one, rounded up to a multiple of this.
 _LENGTH_STEP = 8
-# `gate_radius` is the longest distance of a match in this time.
+# `gate_radius` is the longest distance of a match between sweeps that are this far apart.
 _GATE_SECONDS = 0.1
 
 
@@ -48,12 +48,12 @@ class KeyPoints:
 
 
 def detect(occupancy: Tensor) -> Tensor:
-    """Find the key points of (..., H, W) bool images: pixels at distance 1 from the background or the outside."""
+    """Find the key points of (..., H, W) bool images: set pixels at distance 1 from the background or the outside."""
     return occupancy & ~erode_cross(occupancy)
 
 
 def describe(images: Tensor, patch_size: int) -> KeyPoints:
-    """Find the key points of one sweep and describe each by the L x L pixels around it (Sec. Descriptor).
+    """Find the key points of one sweep per window, and describe each by the L x L pixels around it (Sec. Descriptor).
 
     The images are (B, H, W) bool; patches are zero outside. Cost: K L^2 bytes, written one row of a patch at a time.
     """
@@ -63,7 +63,7 @@ def describe(images: Tensor, patch_size: int) -> KeyPoints:
     half = patch_size // 2
     padded = F.pad(images.byte(), (half, half, half, half))
     _, height, width = padded.shape
-    runs = padded.flatten().unfold(0, patch_size, 1)  # a view: the `patch_size` pixels from each one on
+    runs = padded.flatten().unfold(0, patch_size, 1)  # a view: `patch_size` pixels, starting at each pixel
     first = (window * height + row) * width + col
     rows = (first[:, None] + torch.arange(patch_size, device=images.device) * width).flatten()
     patches = runs.index_select(0, rows).view(-1, patch_size * patch_size)
@@ -74,7 +74,7 @@ def describe(images: Tensor, patch_size: int) -> KeyPoints:
 
 
 def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Tensor:
-    """(B,) float64, pixels: longest distance of a match in each window, which is speed times the time from t to t+1."""
+    """(B,) float64, pixels: longest distance of a match in each window, by `gate_radius` and `max_speed`."""
     seconds = batch.seconds[:, 1]
     size = torch.full_like(seconds, pixel_size)  # a GPU would multiply by the reciprocal of a Python number
     reach = config.gate_radius * (seconds / torch.full_like(seconds, _GATE_SECONDS)) / size
@@ -95,7 +95,8 @@ class Pairing:
 
 
 def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
-    """Find the candidates among `target` of groups of `source`, all within `reach` pixels and a few more."""
+    """Group the key points of `source`, and find the candidates of each group: all key points of `target` within
+    `reach`, (B,) float64 pixels, of a key point of the group, and some farther ones."""
     key, order = _band_key(target.window, target.row // _BAND, target.col).sort()
     groups = _group(source)
     window = source.window.take(groups[:, :1])
@@ -122,13 +123,13 @@ def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
 
 
 def pairs_at_once(device: torch.device, max_memory: float | None) -> int:
-    """Number of pairs (key point, candidate) that are compared together."""
+    """Number of pairs (key point, candidate) that we compare together."""
     number = _PAIRS_AT_ONCE_CPU if device.type == "cpu" else _PAIRS_AT_ONCE_GPU
     return number if max_memory is None else min(number, int(max_memory) // _BYTES_PER_PAIR)
 
 
 def chunks(pairing: Pairing, num_pairs: int) -> Iterator[tuple[slice, int]]:
-    """Groups that are compared together, and the length that their lists of candidates are padded to."""
+    """Yield ranges of groups that we compare together, and the length to which we pad their lists of candidates."""
     counts = pairing.count.tolist()
     begin = 0
     while begin < len(counts) and counts[begin] > 0:  # the remaining groups have no candidate
@@ -139,7 +140,7 @@ def chunks(pairing: Pairing, num_pairs: int) -> Iterator[tuple[slice, int]]:
 
 
 def _group(points: KeyPoints) -> Tensor:
-    """(G, _GROUP) int64, groups of key points of the same tile, in order of columns; padded with K."""
+    """(G, _GROUP) int64, groups of key points of one tile each, in order of columns; padded with K."""
     tile = (points.window << 24) + (points.row // _TILE_ROWS << 12) + points.col // _TILE_COLS
     tile, order = ((tile << 16) + points.col).sort(stable=True)
     tile >>= 16
@@ -151,5 +152,5 @@ def _group(points: KeyPoints) -> Tensor:
 
 
 def _band_key(window: Tensor, band: Tensor, col: Tensor) -> Tensor:
-    """Sorts by window, band, column; bands may lie up to 2^13 below the image."""
+    """A key that sorts by window, band, column. Bands may lie up to 2^13 below the image."""
     return (((window << 16) + band) << 17) + col

@@ -20,16 +20,16 @@ from cflow_torch.ops.indices import flat_nonzero, gather
 
 # The ratio rho is used to four decimals, so that the ratio test compares integers.
 _RATIO_UNIT = 10_000
-# Two pixels of a descriptor are packed into one number, a + 128 b, and those of the other descriptor into 128 a' + b'.
-# Their product is a b' + 128 (a a' + b b') + 128^2 b a', so the count is the middle digit: 7 bits for at most 126
-# pixels, with half as many multiplications. Nothing is rounded, because 1, 128 and 129 fit bfloat16 and TF32, which a
-# matrix product may fall back to, and the sum fits float32. Longer descriptors are cut into strips.
+# We pack two pixels of a descriptor into one number, a + 128 b, and two of the other descriptor into 128 a' + b'. The
+# product is a b' + 128 (a a' + b b') + 128^2 b a', so the count is the middle digit. It has 7 bits, enough for 126
+# pixels, and takes half as many multiplications. Nothing is rounded: 1, 128 and 129 fit bfloat16 and TF32, which matrix
+# products may fall back to, and the sum fits float32. We cut longer descriptors into strips.
 _DIGIT_BITS = 7
 _STRIP_NUMBERS = 63
 _COUNT_BITS = 127 << _DIGIT_BITS
-# Until the last decision, values count^2 / energy are float32. This bound exceeds their rounding.
+# We find contenders by count^2 / energy in float32. This bound exceeds its relative rounding error.
 _ROUNDING = 2.0**-20
-# Contenders that are decided together; on a CPU `pairs_at_once` is less.
+# Contenders that we compare exactly at once; on a CPU `pairs_at_once` is less.
 _CONTENDERS_AT_ONCE = 1 << 22
 
 
@@ -45,11 +45,11 @@ class Matches:
 def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> Matches:
     """Find the best match of every key point of t and apply the ratio test (Eq. descriptor_ncc, best_match).
 
-    `reach` is (B,) float64, pixels, the longest distance of a match in each window. Scores are compared exactly, as
-    count^2 / energy of the candidate. A match is accepted if R > rho R' holds in integers for the second best R'. Ties:
-    rejected. A match without a second candidate is accepted.
+    `reach` is (B,) float64, pixels, the longest distance of a match in each window. We compare scores exactly, as
+    count^2 / energy of the candidate. We accept the best match, of score R, if R > rho R' for the second-best score R',
+    in integers, or if there is no second candidate. Ties: rejected.
 
-    Cost: time (key points x match candidates) x L^2; memory a fixed number of pairs, plus L^2 bytes a point.
+    Cost: time (pairs of a key point and a candidate) x L^2; memory a fixed number of pairs, plus L^2 bytes per point.
     """
     num_source = pc0.row.numel()
     accepted = [torch.zeros((3, 0), dtype=torch.int64, device=reach.device)]
@@ -86,15 +86,15 @@ def _contenders(
 ) -> Iterator[tuple[Tensor, ...]]:
     """Yield pairs of key points of `source` and `target`, and their counts, (N,) int64 each.
 
-    A pair is yielded if its count^2 / energy is at least `share` times the largest one of its key point of `source`.
-    All pairs of a key point of `source` come at once.
+    We keep a pair if its count^2 / energy is at least `share` times the largest one of its key point of `source`. All
+    pairs of a key point of `source` come at once.
     """
     if source.row.numel() == 0 or target.row.numel() == 0:
         return
     pairing = pair(source, target, reach)
     num_target = target.row.numel()
     members = pairing.member
-    # One more key point, the last one, fills the groups and the lists of candidates.
+    # An additional last key point pads the groups and the lists of candidates.
     row0, col0 = gather(members.flatten(), *(F.pad(values.int(), (0, 1)) for values in (source.row, source.col)))
     row0, col0 = row0.view(*members.shape, 1), col0.view(*members.shape, 1)
     row1, col1, energy1 = (F.pad(values, (0, 1), value=1) for values in (target.row, target.col, target.energy))
@@ -110,8 +110,8 @@ def _contenders(
         candidate.masked_fill_((slot >= pairing.count[groups, None]).flatten(), num_target)
         overlap = _overlap(patch0, member, patch1, candidate)
 
-        # Clear the overlap of pairs out of reach: dy^2 + dx^2 - limit - 1, term by term, is negative within reach. The
-        # terms may exceed 31 bits, their sum does not. Masks of bits are ten times faster than masks of truth values.
+        # Clear the overlap of pairs out of reach. dy^2 + dx^2 - limit - 1 is negative within reach; its terms may
+        # exceed 31 bits, their sum does not. Masks of bits are ten times faster than bool masks.
         row, col = row1.index_select(0, candidate).view(shape), col1.index_select(0, candidate).view(shape)
         inside = (row * row).addcmul_(col, col) + offset[groups]
         inside.addcmul_(row, row0[groups], value=-2).addcmul_(col, col0[groups], value=-2).bitwise_right_shift_(31)

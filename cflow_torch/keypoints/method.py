@@ -20,8 +20,8 @@ class CorrelationFlowKeypoints(CoarseToFine):
         config: a `KeypointsConfig`. `CorrelationFlowKeypoints.from_preset` makes one from a preset.
 
     Convention:
-        The paper matches one pair of sweeps at one scale. Several `pixel_sizes` work as in the dense method; this is
-        our extension.
+        The paper matches one pair of sweeps at one scale. With several `pixel_sizes`, which are our extension, the
+        method works coarse to fine, like the dense one.
 
     Examples:
         >>> from cflow_torch import CorrelationFlowKeypoints, Sweep, Window
