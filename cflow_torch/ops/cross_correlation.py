@@ -16,7 +16,7 @@ from torch import Tensor
 # eps * log2(points) * |template| * |target|, which we multiply by a margin.
 _FFT_ERROR_MARGIN = 8.0
 _FFT_LARGEST_ERROR = 0.25
-# Lengths for which FFT libraries are fast, in steps of at most a quarter, most of them an eighth.
+# Lengths for which FFT libraries are fast. Each is at most a quarter above the one before, most are about an eighth.
 FAST_LENGTHS = tuple(sorted(n << k for k in range(14) for n in (8, 9, 10, 12, 15, 21, 22, 25, 27, 28)))
 
 
@@ -30,7 +30,7 @@ def cross_correlate(
         num_templates: J.
         target: (J,) int64, target of each template. The spectrum of a target serves all its templates.
         engine: "fft" or "conv" (conv2d).
-        most: no image has more ones; None = unknown, then we count the ones of large images.
+        most: upper bound of the ones in an image. None = unknown; then we count the ones of large images.
 
     Returns:
         (J, Y, X) float, within 1/2 of the sum over p of template[j](p) * target(p + (y, x)). The caller rounds it.
@@ -52,7 +52,7 @@ def cross_correlate(
 
 
 def _fft_dtype(images: Tensor, most: int | None) -> torch.dtype:
-    # The number of samples bounds the norms without a synchronisation.
+    # The number of samples is a bound of the ones that needs no synchronisation.
     samples = math.prod(images.shape[1:])
     error = _FFT_ERROR_MARGIN * torch.finfo(torch.float32).eps * math.log2(samples)
     if error * samples > _FFT_LARGEST_ERROR:
@@ -61,7 +61,7 @@ def _fft_dtype(images: Tensor, most: int | None) -> torch.dtype:
 
 
 def _by_conv(images: Tensor, num_templates: int, target: Tensor) -> Tensor:
-    height, width = (images.amax(0).nonzero().amax(0) + 1).tolist()  # all images are empty beyond
+    height, width = (images.amax(0).nonzero().amax(0) + 1).tolist()  # the rest is empty in all images
     templates, targets = images[:num_templates, :height, :width], images[num_templates:, :height, :width]
     padded = F.pad(targets, (0, width - 1, 0, height - 1)).index_select(0, target)
     # One group per template. Sums of products of zeros and ones are exact in float32 up to 2^24, also with TF32.

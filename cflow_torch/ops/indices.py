@@ -20,8 +20,8 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
 def flat_nonzero(mask: Tensor) -> Tensor:
     """Flat indices of the True elements of (...) bools, (K,) int64, ascending: `mask.flatten().nonzero()[:, 0]`.
 
-    Cost: one pass and, on a GPU, one synchronisation. On the CPU we call NumPy, which is about five times
-    faster than torch for a sparse mask of half a million pixels.
+    Cost: one pass and, on a GPU, one synchronisation. On the CPU we call NumPy, which is about five times as fast as
+    torch for a sparse mask of half a million pixels.
     """
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
@@ -76,7 +76,7 @@ def members_of(groups: Tensor, group: Tensor, num_groups: int) -> tuple[Tensor, 
         num_groups: G.
 
     Returns:
-        The positions of the selected members, (M,) int64, ascending, and the position of the group of each in `groups`.
+        The positions of the selected members, ascending, and the position in `groups` of their groups, (M,) int64 each.
     """
     number = renumber(groups, num_groups).index_select(0, group)
     kept = flat_nonzero(number < groups.numel())
@@ -107,10 +107,10 @@ def concat_ranges(start: Tensor, count: Tensor) -> Tensor:
 
 
 def lazy_zeros(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(size,) zeros, of which only a small part will be written or read.
+    """(size,) zeros, for callers that write or read only a small part.
 
-    Cost: on the CPU that of the touched pages. NumPy requests large, zeroed pages from the system, which is several
-    times faster than `torch.zeros` for tens of megabytes.
+    Cost: on the CPU, the pages that are used. NumPy gets zeroed pages from the system, which for tens of megabytes is
+    several times as fast as `torch.zeros`.
     """
     if device.type == "cpu":
         return torch.from_numpy(np.zeros(size, torch.empty(0, dtype=dtype).numpy().dtype))
@@ -118,7 +118,7 @@ def lazy_zeros(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def lazy_empty(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(size,) undefined values, of which only a small part will be written. Cost: as for `lazy_zeros`."""
+    """(size,) undefined values, for callers that write only a small part. Cost: as for `lazy_zeros`."""
     if device.type == "cpu":
         return torch.from_numpy(np.empty(size, torch.empty(0, dtype=dtype).numpy().dtype))
     return torch.empty(size, dtype=dtype, device=device)
@@ -137,7 +137,7 @@ def largest_of_rows(values: Tensor) -> Tensor:
 
 
 def occupied(image: Tensor) -> Tensor:
-    """Indices, (K,) int64, ascending, of the elements of an (N,) uint8 image that are not 0; most are 0.
+    """Indices, (K,) int64, ascending, of the nonzero elements of an (N,) uint8 image that is mostly 0.
 
     Cost: one pass over the image, on the CPU eight elements at a time; on a GPU, one synchronisation.
     """
@@ -153,7 +153,7 @@ def occupied(image: Tensor) -> Tensor:
 def floor_divide(index: Tensor, divisor: int) -> Tensor:
     """`index // divisor`, (...) int64, of (...) int64 and a number of at least 1.
 
-    Cost: one pass. On the CPU NumPy is four times as fast as torch, because it multiplies and shifts.
+    Cost: one pass. On the CPU NumPy is four times as fast as torch, because it multiplies and shifts to divide.
     """
     if index.device.type == "cpu":
         return torch.from_numpy(np.asarray(index.numpy() // divisor))  # asarray, because 0-d arrays become numbers

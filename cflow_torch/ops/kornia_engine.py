@@ -1,4 +1,4 @@
-"""Morphology and labelling by kornia on dense images (`labeling=kornia`), identical to the sparse engine's results."""
+"""Morphology and labelling by kornia on dense images (`labeling=kornia`), with the results of the sparse engine."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity:
         CFlowError: kornia is older than 0.9 and has no exact labelling (its iterative one splits long components).
 
     Convention:
-        kornia labels with 8-connectivity. For connectivity 4 we label an image of twice the size, in which a link pixel
-        lies between two set pixels that share a side; there the two connectivities agree.
+        kornia labels with 8-connectivity. For connectivity 4 we label an image of twice the size, in which we set the
+        pixel between two set pixels that share a side. In that image, both connectivities give the same components.
 
     Cost: linear in B * H * W.
     """

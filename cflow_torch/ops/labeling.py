@@ -1,12 +1,12 @@
-"""Label the connected components of sparse binary images, many images at once, in a handful of tensor operations.
+"""Label the connected components of sparse binary images, many images at once, in a few tensor operations.
 
 Two pixels are linked if they are within `reach` of each other (Chebyshev distance). With connectivity 4 the corner
-offsets |dx| = |dy| = reach do not link. `reach=1` is plain labelling. `reach=3` gives the labels of an image that was
-dilated with a 3 x 3 square first, because two dilated squares touch exactly at these offsets. We need no dilated image.
+offsets |dx| = |dy| = reach do not link. `reach=1` is plain labelling. `reach=3` gives the labels of the image after a
+3 x 3 dilation, without a dilated image, because two dilated pixels touch or overlap exactly at these offsets.
 
-Idea: in a block with sides of `reach + 1` pixels (`reach` for connectivity 4) all pixels are linked. So a block is one
-node of a graph, and only adjacent blocks can be linked. One table lookup on the bit masks of two blocks tells whether
-they are. Union-find then works on a few thousand blocks instead of pixels.
+Idea: in a block with sides of `reach + 1` pixels (`reach` for connectivity 4), all pixels are linked. So a block is one
+node of a graph, and only adjacent blocks can be linked. Table lookups on the bit masks of two blocks tell whether they
+are. Union-find then works on a few thousand blocks instead of pixels.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from torch import Tensor
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, split_index
 from cflow_torch.ops.segments import first_of_segment
 
-# Half of the eight neighbours of a block. The links to the other half are those of the other block.
+# Half of the eight neighbours of a block. Links to the other half are found from the other block.
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
-# We pad images so that blocks of every side (1 ... 4) fill them and leave an empty row and column of blocks. Then
-# neighbours need no bounds checks.
+# We pad images so that whole blocks of any side (1 ... 4) fill them and the last row and column of blocks are empty.
+# Then neighbours need no bounds checks.
 _GRAIN, _FREE = 12, 4
-# We read one row of a block as one number; rows of three pixels get an empty fourth.
+# We read one row of a block as one number. Rows of three pixels get an empty fourth pixel.
 _WORD = {1: torch.int8, 2: torch.int16, 3: torch.int32, 4: torch.int32}
-# Rounds of union-find before the first test for convergence, and jumps per round. LiDAR images are labelled after three
-# to five rounds, and further ones are tested one by one.
+# Rounds of union-find before the first test for convergence, and pointer jumps per round. LiDAR images need three to
+# five rounds. After the first test, we test after every round.
 _ROUNDS, _JUMPS = 3, 3
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Component of every block of padded images."""
+    """Components of the blocks of a set of padded images."""
 
     side: int  # pixels per side of a block
     cols: int  # blocks per row
-    first: int  # smallest possible component of these images
-    num_components: int  # V, larger than every component
+    first: int  # no component of these images has a smaller number
+    num_components: int  # V, larger than the number of every component
     component: Tensor  # (all blocks,) int64, 0 ... V - 1; undefined for blocks without set pixels
 
     def of_pixel(self, row: Tensor, col: Tensor) -> Tensor:
@@ -87,7 +87,7 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
         is the same for all sets, and the components of a set follow those of the set before.
 
     Cost: one pass over the images, a few rounds of union-find over their blocks, and some host synchronisations. The
-    number of operations hardly grows with the number of sets.
+    number of kernel launches hardly grows with the number of sets.
 
     Source: Sec. clustering; contraction of blocks as in block-based labelling (bolelli2022connected).
     """
@@ -100,7 +100,7 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
     node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=device)
     node_of_block.scatter_(0, nodes, torch.arange(nodes.numel(), device=device))
 
-    # Four lookups per block tell which pixels of its neighbours it reaches.
+    # One lookup for each half of a block tells which pixels of its four neighbours it reaches.
     own = masks.index_select(0, nodes).int()
     own |= own >> 4  # two columns of at most four bits in a byte
     offsets, tables = _neighbourhoods(tuple(sides), tuple(cols), connectivity, tuple(r for _, r in images), device)
@@ -145,7 +145,7 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
         reach: 1 (plain) or 3 (as after a 3 x 3 dilation).
 
     Returns:
-        (P,) int64: the position in `pixels` of the first (in raster order) pixel of the same component.
+        (P,) int64: the position in `pixels` of the first pixel, in raster order, of the component of each pixel.
 
     Convention:
         Components never join across images. The result does not depend on thread count or device.
@@ -167,8 +167,8 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
     the component of each node.
 
     Cost: a few rounds (about log V), each linear in V + E, with one host synchronisation after three rounds and after
-    each further one. The parent of a node only changes to a smaller node of its component. Once both ends of every
-    edge have the same parent, that parent is the root.
+    each further one. A parent only changes to a smaller node of the same component. Once both ends of every edge have
+    the same parent, that parent is the root.
     """
     parent = torch.arange(num_nodes, device=sources.device)
     ends, low, high, num_rounds = torch.cat((sources, targets)), sources, targets, _ROUNDS

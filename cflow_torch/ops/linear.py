@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def adjugate(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Adjugate and determinant of symmetric 3 x 3 matrices; their ratio is the inverse.
+    """Adjugate and determinant of symmetric 3 x 3 matrices. The inverse is the adjugate over the determinant.
 
     Args:
         matrix: (3, 3, K) float64.

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-UNKNOWN = 1 << 29  # height of an empty cell; its sums still fit an int32
+UNKNOWN = 1 << 29  # height of an empty cell; sums with it still fit an int32
 _SUPPORT = 300  # height difference of similar neighbours, mm; low points without such neighbours are multipath
 _STEEP, _GENTLE = 164, 51  # mm per cell: 16 % for hills, 5 % about the smoothed hills (cells of a metre)
 _ROUGH = 70  # mm; cells up to this height above the surface belong to it
@@ -30,7 +30,7 @@ def lower_surface(low: Tensor) -> Tensor:
     is_supported = _is_supported(low)
     hills = _box_mean(_gentlest(low.masked_fill(~is_supported, UNKNOWN), _STEEP))
     rest = low - hills
-    # A point without neighbours counts unless it is a hole in the hills, because far rings have many such points.
+    # Far rings have many points without similar neighbours. Such a point counts unless it is a hole in the hills.
     is_trusted = (is_supported | (rest >= -_SUPPORT)).logical_and_(low < UNKNOWN)
     return _gentlest(rest.masked_fill_(~is_trusted, UNKNOWN), _GENTLE).add_(hills)
 
@@ -50,7 +50,7 @@ def _is_supported(low: Tensor) -> Tensor:
 
 
 def _gentlest(heights: Tensor, slope: int) -> Tensor:
-    """The surface of limited slope through all heights that are not too high above the others, defined everywhere.
+    """The surface of limited slope through all heights at most `_ROUGH` above `_cone`, defined everywhere.
 
     Between known cells, it is the mean of the highest and the lowest possible surface. The slope is in mm per cell.
     """

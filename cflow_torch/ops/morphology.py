@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def close_3x3(padded: Tensor, height: int, width: int) -> Tensor:
-    """Dilation, then erosion, with a 3 x 3 square of ones.
+    """Dilate, then erode, with a 3 x 3 square of ones.
 
     Args:
         padded: (B, H', W') bool, images with an empty margin to the right and below, at least a pixel wide.
@@ -22,7 +22,7 @@ def close_3x3(padded: Tensor, height: int, width: int) -> Tensor:
         Pixels outside the image are background for the dilation and foreground for the erosion, so that no pixel is
         lost, not even at the border.
 
-    Cost: eight passes over the image (the square is separable), no floating-point numbers.
+    Cost: eight passes over the images, because the square is separable; no floating-point numbers.
     """
     closed = padded
     for combine, outside in ((torch.bitwise_or, True), (torch.bitwise_and, False)):
@@ -35,7 +35,7 @@ def close_3x3(padded: Tensor, height: int, width: int) -> Tensor:
 
 
 def _with_both_neighbours(combine: Callable[..., Tensor], values: Tensor, distance: int) -> Tensor:
-    """(N,): combine each of (N,) values with those `distance` before and after it, if they exist."""
+    """(N,): combine each value with the values `distance` before and after it, if they exist."""
     pairs = combine(values[:-distance], values[distance:])
     result = torch.empty_like(values)
     combine(pairs[:-distance], pairs[distance:], out=result[distance:-distance])

@@ -36,7 +36,7 @@ def segment_minmax(values: Tensor, index: Tensor, num_segments: int) -> tuple[Te
 
 
 def first_of_segment(index: Tensor, num_segments: int) -> Tensor:
-    """Position of the first element of the segment of each element, (N,) int64. Args as for `segment_amin`."""
+    """For each element, the position of the first element of its segment, (N,) int64. Args as for `segment_amin`."""
     position = torch.arange(index.numel(), device=index.device)
     return segment_amin(position, index, num_segments, index.numel()).index_select(0, index)
 
@@ -79,7 +79,7 @@ def segment_median(values: Tensor, index: Tensor, num_segments: int) -> Tensor:
     ordered = values.index_select(0, order)
     count = torch.bincount(index, minlength=num_segments)
     start = count.cumsum(0) - count
-    last = values.numel() - 1  # only empty segments point beyond it
+    last = values.numel() - 1  # only empty segments would start after it
     low = ordered.index_select(0, (start + (count - 1).clamp(min=0) // 2).clamp(max=last))
     high = ordered.index_select(0, (start + count // 2).clamp(max=last))
     return ((low + high) / 2).masked_fill_(count == 0, 0)

@@ -1,4 +1,4 @@
-"""Limit torch to one thread. More threads in one window gain nothing, and are slow when other processes run."""
+"""Limit torch to one thread. More threads do not speed a window up, and slow it down when other processes run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Count the set pixels of binary images of different sizes inside shifted windows. Each is as large as its image."""
+"""Count the set pixels of binary images inside shifted windows. Each window has the size of its image."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from cflow_torch.ops.indices import concat_ranges, scatter_count, take_columns
 
 
 class WindowCounts:
-    """Tables of N images from their set pixels.
+    """Tables for counting, made from the set pixels of N images.
 
     Args:
         image, row, col: (P,) int64, image and position of each pixel, each pixel once.
-        size: (N, 2) int64, height and width H, W of each image; an array, because the lengths of tables depend on it.
+        size: (N, 2) int64, height H and width W of each image; on the host, because table lengths depend on it.
 
     Cost: linear in the area of the images.
     """
@@ -30,7 +30,7 @@ class WindowCounts:
         # Number of pixels above every row, and to the left of every column. The pixels of earlier images cancel.
         line = torch.stack((row, col)).add_(edge).add_(1)
         self._before = scatter_count(line.flatten(), int(edges.sum())).cumsum(0)
-        # Running sum over rows of W + 1 samples, of which the first is empty.
+        # Running sum over all rows. Each row has W + 1 samples, of which the first is empty.
         table = torch.zeros(int(area.sum()), dtype=torch.int32, device=image.device)
         self._table = table.index_fill_(0, stride.mul_(row).add_(start).add_(col).add_(1), 1).cumsum(0)
 
