@@ -1,4 +1,4 @@
-"""The settings of each method, and the presets, which list only what they change."""
+"""The settings of each method, and the presets, which list only the settings that they change."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _method(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Config:
-    """Settings that all methods have. Each method adds its own, see `CONFIGS`. `make_config` makes one from a preset.
+    """Settings that all methods have. Each method adds its own (`CONFIGS`). `make_config` makes them from a preset.
 
     An invalid value raises `CFlowError`. `cflow settings` lists the meaning and the bounds of every field.
     """
@@ -79,11 +79,11 @@ class Config:
         return self.num_history + 2 + self.num_future
 
     def replace(self: Kind, **overrides: Any) -> Kind:
-        """Copy the settings with some fields changed. An unknown field raises `CFlowError`, which lists the fields."""
+        """Copy the settings with some fields changed. An unknown field raises a `CFlowError` that lists the fields."""
         return replace(self, **_known(type(self), overrides))
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain dictionary for YAML or JSON. `config_from` reads it."""
+        """A plain dictionary for YAML or JSON, which `config_from` reads."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
@@ -157,13 +157,13 @@ class KeypointsConfig(ClusteringConfig):
 
 @dataclass(frozen=True)
 class VerifiedConfig(_WithHistory):
-    """Settings of `VerifiedFlow`: motion candidates of all scales at once, verified at the finest pixels."""
+    """Settings of `VerifiedFlow`, which verifies motion candidates of all scales at the finest pixels."""
 
     method: str = _method("verified")
     num_future: int = setting(  # type: ignore[assignment]
         0,
-        "number of sweeps after t+1, for recordings. They decide the motion of an object that is in them more than "
-        "twice as often as in the sweeps before t. The method then takes twice the time",
+        "number of sweeps after t+1, for recordings. They decide the motion of an object that is seen in more than "
+        "twice as many of them as of the sweeps before t. The method then takes twice the time",
         low=0,
     )
     max_object_length: Optional[float] = setting(
@@ -182,7 +182,7 @@ class VerifiedConfig(_WithHistory):
     min_height: Optional[float] = setting(
         0.4,
         "metres: where the ground is known, the method ignores pixels that rise less than this above the ground around "
-        "them, unless a taller pixel is near. None = it ignores none",
+        "them, unless a higher pixel is near. None = it ignores none",
         optional=True,
         above=0,
         high=1000,
@@ -210,7 +210,7 @@ _DEFAULT = {
     "point_cloud_range": _REGION,
     "max_speed": 60.0,
 }
-# The method of each preset, and its changes to the defaults of the method.
+# The method of each preset, and the changes of the preset to the defaults of the method.
 PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
     "offline": ("verified", {**_DEFAULT, "num_future": 4}),
@@ -229,7 +229,7 @@ PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 _PRESET_OF_METHOD = {"dense": "paper", "keypoints": "keypoints", "verified": "default"}
 
-# Presets and settings of the version before this one, and their replacement.
+# Presets and settings of the version before this one, and what to use instead.
 REMOVED_PRESETS = {"fast": "use default with num_history=2"}
 REMOVED = {
     "thorough": "leave it out, every step of the method is always on",
@@ -243,7 +243,7 @@ def make_config(preset: str | None = None, method: str | None = None, **override
     Args:
         preset: "default", "offline", "paper" or "keypoints"; None = the preset of the method, or "default".
         method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "offline"); None = the
-            method of the preset. "keypoints" with preset "paper" gives the paper's key-point settings.
+            method of the preset. Method "keypoints" with preset "paper" gives the paper's key-point settings.
         **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 
     Returns:

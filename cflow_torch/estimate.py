@@ -51,10 +51,10 @@ def estimate_flow(
         pc0: points of sweep t, (N0, 3+) float of any width, array or tensor. Columns after z are ignored. Or a `Sweep`,
             which also contains mask, pose and times; then all of `pc0`, `pc1`, `pch` and `pcf` are sweeps.
         pc1: points of sweep t+1, (N1, 3+).
-        T_ego1_ego0: (4, 4), maps coordinates of the ego frame at t to the one at t+1 (pose1^-1 pose0). None = pc0 is
-            already in the frame of t+1.
+        T_ego1_ego0: (4, 4), maps the ego frame at t to the ego frame at t+1 (pose1^-1 pose0). None = pc0 is already in
+            the frame of t+1.
         gm0, gm1: ground masks, (N,) bool, True = ground; None = see `ground`.
-        pch: older sweeps t-1, t-2, ...; the nearest `num_history` of them are used.
+        pch: older sweeps t-1, t-2, ...; we use the nearest `num_history` of them.
         T_ego1_egoh: (4, 4) for each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`, or empty.
         dt0, dt1: times of the points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
@@ -66,7 +66,7 @@ def estimate_flow(
         preset: "default", "offline", "keypoints" or "paper"; None = the preset of the method, or "default".
         config: settings from `make_config`, instead of `method` and `preset`.
         ground: what to do with sweeps without a mask. "grid" = find their ground (`find_ground`); "auto" = the same,
-            with a warning; "patchwork" = find it with Patchwork++ (`pip install pypatchworkpp`); None = they have none.
+            with a warning; "patchwork" = use Patchwork++ (`pip install pypatchworkpp`); None = no point is ground.
         device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
         **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
 
@@ -78,8 +78,8 @@ def estimate_flow(
         `is_valid` False. Empty sweeps give an empty or all-zero result.
 
     Warns:
-        CFlowWarning: the ground was found (`ground="auto"`); a likely mistake in the input, see
-            `SceneFlowModel.forward`; or `is_valid` is False for all points of pc0.
+        CFlowWarning: a sweep has no mask, so we found its ground (`ground="auto"`); a likely mistake in the input, see
+            `SceneFlowModel.forward`; `is_valid` is False for all points of pc0.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
@@ -101,9 +101,9 @@ def estimate_flow(
         raise CFlowError("config is the result of make_config, and replaces preset and method: leave these out")
     elif overrides:
         config = config.replace(**overrides)
-    moved = None if T_ego1_ego0 is None else "T_ego1_ego0"  # the transform that is given
-    if moved is None and any(transform is not None for transform in (*T_ego1_egoh, *T_ego1_egof)):
-        moved = "another transform"
+    given = None if T_ego1_ego0 is None else "T_ego1_ego0"  # name of a transform that is given
+    if given is None and any(transform is not None for transform in (*T_ego1_egoh, *T_ego1_egof)):
+        given = "another transform"
     if isinstance(pc0, Sweep) or isinstance(pc1, Sweep):
         extra = [name for name in _NOT_WITH_SWEEPS if arguments[name] is not None and len(arguments[name]) > 0]
         if extra:
@@ -111,19 +111,19 @@ def estimate_flow(
         window = Window(pc0, pc1, tuple(pch), tuple(pcf))  # type: ignore[arg-type]  # it refuses arrays
     else:
         window = Window(
-            pc0=_sweep("0", moved, pc0, gm0, T_ego1_ego0, dt0),
-            pc1=_sweep("1", moved, pc1, gm1, None, dt1),
-            pch=_sweeps(moved, "h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth),
-            pcf=_sweeps(moved, "f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf),
+            pc0=_sweep("0", given, pc0, gm0, T_ego1_ego0, dt0),
+            pc1=_sweep("1", given, pc1, gm1, None, dt1),
+            pch=_sweeps(given, "h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth),
+            pcf=_sweeps(given, "f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf),
         )
     window = _find_ground(keep_nearest(window, config.num_history), ground, device)
     return make_model(config, device)([window])[0]
 
 
 def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
-    """Make the method for some settings: `CorrelationFlow`, `CorrelationFlowKeypoints` or `VerifiedFlow`.
+    """Make the method of a config: `CorrelationFlow`, `CorrelationFlowKeypoints` or `VerifiedFlow`.
 
-    `make_config` returns the settings. `device` is as for `estimate_flow`.
+    `make_config` makes the config. `device` is as for `estimate_flow`.
     """
     methods = {method.method: method for method in (CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow)}
     if not isinstance(config, Config):
@@ -152,10 +152,10 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
 
 
 def _sweep(
-    name: str, moved: str | None, points: Array, is_ground: Any, transform: Array | None, times: Array | None
+    name: str, given: str | None, points: Array, is_ground: Any, transform: Array | None, times: Array | None
 ) -> Sweep:
-    """A sweep whose world is the ego frame at t+1, so its pose is T_ego1_ego. No sweep has a pose if none is moved."""
-    pose = None if moved is None else np.eye(4) if transform is None else transform
+    """A sweep whose world is the ego frame at t+1, so its pose is `transform`. If none is given, it has no pose."""
+    pose = None if given is None else np.eye(4) if transform is None else transform
     try:
         return Sweep(points, is_ground, pose, point_times=times)
     except CFlowError as error:
@@ -165,11 +165,11 @@ def _sweep(
         raise CFlowError(message) from None
 
 
-def _sweeps(moved: str | None, side: str, clouds: Sequence[Any], **others: Sequence[Any]) -> tuple[Sweep, ...]:
-    """The sweeps of one side, "h" (history) or "f" (future), from lists with one entry per sweep, or none."""
-    if moved is not None and len(clouds) > 0 and len(others["T_ego1_ego"]) == 0:
+def _sweeps(given: str | None, side: str, clouds: Sequence[Any], **others: Sequence[Any]) -> tuple[Sweep, ...]:
+    """The sweeps of one side, "h" (history) or "f" (future), from lists that are empty or have an entry per sweep."""
+    if given is not None and len(clouds) > 0 and len(others["T_ego1_ego"]) == 0:
         raise CFlowError(
-            f"{moved} is given but T_ego1_ego{side} is not: give one transform per sweep of pc{side} "
+            f"{given} is given but T_ego1_ego{side} is not: give one transform per sweep of pc{side} "
             "(None for a sweep that is already in the frame of t+1)"
         )
     for name, values in others.items():
@@ -178,4 +178,4 @@ def _sweeps(moved: str | None, side: str, clouds: Sequence[Any], **others: Seque
                 f"{name}{side} has {len(values)} entries for {len(clouds)} sweeps of pc{side}: give one per sweep"
             )
     columns = (values if len(values) > 0 else [None] * len(clouds) for values in others.values())
-    return tuple(_sweep(f"{side}[{i}]", moved, *row) for i, row in enumerate(zip(clouds, *columns)))
+    return tuple(_sweep(f"{side}[{i}]", given, *row) for i, row in enumerate(zip(clouds, *columns)))

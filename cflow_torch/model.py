@@ -1,4 +1,4 @@
-"""The class that all methods share: collate windows, estimate the motion of their points, return results."""
+"""The base class of all methods: collate windows, estimate the motion of their points, return results."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Motion:
     cluster_id: Tensor  # (M + 1,) int64, counted from 0 in each window
     score: Tensor  # (M + 1,) float32
     confidence: Tensor | None = None  # (M + 1,) float32, see `FlowResult`; None = the method does not estimate it
-    # (A, P) float64, metres per sweep interval, flow of each point from coarser scales; None = no such scale.
+    # (A, P) float64, metres per sweep interval, sum of the flow of each point at coarser scales; None = no such scale.
     before: Tensor | None = None
 
     def cluster(self, points: slice) -> Tensor:
@@ -37,7 +37,7 @@ class Motion:
         return self.cluster_of_cell.index_select(0, self.cell_of_point[points])
 
     def flow_of(self, cluster: Tensor, out: Tensor) -> Tensor:
-        """Write x, y (and z) of the flow of K clusters to `out`, (A, K) float64."""
+        """Write x, y (and z) of the flow of K clusters to `out`, (A, K) float64, and return it."""
         for values, of_cluster in zip(out.unbind(0), self.flow.unbind(1)):
             torch.index_select(of_cluster, 0, cluster, out=values)
         return out
@@ -59,14 +59,14 @@ class Motion:
 
 
 class SceneFlowModel(nn.Module):
-    """Base class of the methods. They set the class attributes and implement `motion`, and have no state.
+    """Base class of the methods. A method sets the class attributes and implements `motion`. It has no state.
 
     Args:
         config: settings of the method; `from_preset` makes them from a preset.
         device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
 
     Raises:
-        CFlowError: not settings, or settings of another method.
+        CFlowError: `config` is not a `Config`, or that of another method.
     """
 
     method = ""
@@ -94,8 +94,8 @@ class SceneFlowModel(nn.Module):
     def from_preset(cls: type[Any], preset: str | None = None, device: Any = "auto", **overrides: Any) -> Any:
         """Make the method with the settings of a preset, with some fields replaced.
 
-        `preset` is a preset of this method; None = its first one. `overrides` are settings of the method. A preset or
-        field that is unknown, a preset of another method, or an invalid value is a `CFlowError`.
+        `preset` is a preset of this method; None = "default", "paper" or "keypoints". `overrides` are settings of the
+        method. An unknown preset or field, a preset of another method or an invalid value is a `CFlowError`.
         """
         return cls(make_config(preset, cls.method, **overrides), device)
 
@@ -108,7 +108,7 @@ class SceneFlowModel(nn.Module):
         raise NotImplementedError
 
     def grid(self, pixel_size: float) -> Grid:
-        """The BEV grid of a pixel size, metres. It contains `point_cloud_range`; only points there have results."""
+        """The BEV grid of a pixel size, metres. It contains `point_cloud_range`, and only points there get flow."""
         bounds = self.config.point_cloud_range
         return Grid(pixel_size, bounds[:3], bounds[3:])
 
@@ -127,7 +127,7 @@ class SceneFlowModel(nn.Module):
             CFlowWarning: likely mistakes in the windows, see `Inspection`.
             NoActivePoints: no point of a pc0 is active.
 
-        Cost: one CPU thread, whatever number torch is set to. To use more cores, start more processes.
+        Cost: one CPU thread, whatever the number of threads of torch. To use more cores, start more processes.
 
         Raises:
             CFlowError: bad input, see `make_batch`.
@@ -152,7 +152,7 @@ class SceneFlowModel(nn.Module):
 
 
 def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
-    """One result per window, for all rows of its pc0. Inactive rows have residual flow 0. The results share memory."""
+    """One result per window, for all rows of its pc0. The results share memory with each other."""
     points = slice(batch.rows[0].start, batch.rows[-1].stop)
     cluster, is_valid = motion.cluster(points), batch.has_result[points].clone()
     residual = motion.residual_flow(points, batch.positions[:, points]).add_(0.0)  # turns -0.0 into 0.0

@@ -12,14 +12,14 @@ from cflow_torch.errors import CFlowError
 
 # Whole numbers stay below this, because they are compared with tensors of int64 and of float64.
 LIMIT = 2**53
-# Names of the types of values in error messages.
+# Names of types in error messages.
 _NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers"}
 
 
 def setting(default: Any, help: str, *, kind: type | None = None, **limits: Any) -> Any:
-    """Make a field of a `Config` with its default value, its meaning and unit, and its `bounds`.
+    """Make a field of a `Config`: its default, its `help` (meaning and unit), and the `limits` of `bounds`.
 
-    `kind` None = the type of the default.
+    If `kind` is None, the value has the type of the default.
     """
     return field(default=default, metadata={"help": help, **bounds(kind or type(default), **limits)})
 
@@ -33,11 +33,11 @@ def bounds(
     high: float = math.inf,
     choices: tuple[Any, ...] = (),
 ) -> dict[str, Any]:
-    """What is allowed as the value of a setting.
+    """Describe the allowed values of a setting.
 
     `kind` is int, float, bool, str, tuple (of floats) or object (any of the choices). If `optional`, the value None is
-    allowed. `low` and `high` are the smallest and the largest value, both allowed. `above` is a lower bound that is not
-    allowed itself. `choices` are all allowed values, if these can be listed.
+    allowed. `low` and `high` are the smallest and the largest allowed value. `above` is a lower bound that is not
+    allowed itself. `choices` are all allowed values, or empty if they cannot be listed.
     """
     return {"kind": kind, "optional": optional, "low": low, "above": above, "high": high, "choices": choices}
 
@@ -55,7 +55,7 @@ def describe(limits: Mapping[str, Any]) -> str:
 
 
 def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
-    """Return a setting as int, float, bool, str, tuple or None. One that is not allowed raises a `CFlowError`."""
+    """Return a value as int, float, bool, str, tuple or None. A value that is not allowed raises a `CFlowError`."""
     kind = limits["kind"]
     if value is None and limits["optional"]:
         return None

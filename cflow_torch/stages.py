@@ -19,7 +19,7 @@ _watched = threading.local()
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Name a block of work, and add its seconds to an open `stage_seconds` of this thread."""
+    """Name a block of work, and add its seconds to the innermost open `stage_seconds` of this thread."""
     with record_function(name):
         start = time.perf_counter()
         yield
@@ -30,7 +30,7 @@ def stage(name: str) -> Iterator[None]:
 
 @contextmanager
 def stage_seconds() -> Iterator[dict[str, float]]:
-    """Collect the seconds of each stage by the host's clock. On a GPU this is the time to queue the work."""
+    """Collect the seconds of each stage by the clock of the host. On a GPU, this is the time to queue the work."""
     before, _watched.seconds = getattr(_watched, "seconds", None), {}
     try:
         yield _watched.seconds
@@ -59,7 +59,7 @@ class TimedModel:
         self.pairs: list[tuple[float, dict[str, float]]] = []  # seconds of each call, and of its stages
 
     def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
-        """The results of the method."""
+        """Return the results of the method, and record the seconds."""
         with stage_seconds() as stages:
             start = time.perf_counter()
             results = self.model(windows)

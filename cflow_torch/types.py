@@ -18,7 +18,7 @@ from cflow_torch.errors import import_optional
 Array = Union[np.ndarray, Tensor]
 # Names in flow files and data frames -> fields of `FlowResult`.
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}
-# No sweep has so many columns. An array with more is a transposed one, (3, N) or (4, N).
+# No sweep has more columns than this, so a wider array is a transposed one, (3, N) or (4, N).
 _MOST_COLUMNS = 1000
 _OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8")
 _OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence")
@@ -33,7 +33,7 @@ def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
 
 
 def point_rows(name: str, values: Array, count: int | None = None) -> np.ndarray:
-    """Check an array with a row per point, and return it as (N, 3) float64. None as `count` allows any N."""
+    """Check an array with a row per point, and return it as (N, 3) float64. `count` is N; None = any N."""
     array = as_numpy(values)
     if array.ndim != 2 or array.shape[1] < 3 or (count is not None and len(array) != count):
         wanted = "(N, 3)" if count is None else f"({count}, 3)"
@@ -45,7 +45,7 @@ def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str
     """Check the type, shape (None = any length) and dtype of a dense array or tensor.
 
     `kinds` are the allowed kinds of dtypes: "b" for bool, "iu" for integers, "f" for floats, or several of these. The
-    message names the array and says what is `wanted`.
+    error message contains `name` and `wanted`.
     """
     if not isinstance(array, (np.ndarray, Tensor)):
         raise CFlowError(f"{name} is {type(array).__name__}: give {wanted}, a NumPy array or a torch tensor")
@@ -60,14 +60,14 @@ def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str
 
 
 def _kind(dtype: Any) -> str:
-    """The letter of NumPy for a kind of dtype, also of torch's."""
+    """NumPy's letter for the kind of a NumPy or torch dtype."""
     if not isinstance(dtype, torch.dtype):
         return str(dtype.kind)
     return "b" if dtype == torch.bool else "f" if dtype.is_floating_point else "c" if dtype.is_complex else "i"
 
 
 def check_points(points: Any, name: str) -> None:
-    """Check that these are (N, 3+) floats."""
+    """Check that points are (N, 3+) floats."""
     check_array(points, name, (None, None), "f", "(N, 3+) floating-point metres, columns x, y, z")
     if points.shape[1] < 3:
         raise CFlowError(f"{name} has shape {tuple(points.shape)}: give (N, 3+), columns x, y, z in metres")
@@ -86,9 +86,9 @@ class Sweep:
             then no sweep of the window may have a pose.
         timestamp_ns: time of the sweep in nanoseconds; None = unknown.
         point_times: (N,) float, seconds from the instant of the sweep to the measurement of each point, negative =
-            before it; None = all points at that instant. `timestamp_ns` and `pose` are those of this instant, and the
-            points must already be compensated for the motion of the vehicle until this instant. The verified method
-            uses the times if every sweep of a window has them.
+            before it; None = unknown, treated as 0. The instant is that of `timestamp_ns` and `pose`. The points must
+            already be compensated for the motion of the vehicle until this instant. The verified method uses the times
+            if every sweep of a window has them.
 
     Raises:
         CFlowError: wrong type, shape or dtype.
@@ -125,7 +125,7 @@ class Window:
         pcf: sweeps t+2, t+3, ..., nearest first; may be shorter than `num_future`.
 
     Raises:
-        CFlowError: one of them is not a `Sweep`.
+        CFlowError: pc0, pc1 or an entry of pch or pcf is not a `Sweep`.
     """
 
     pc0: Sweep
@@ -152,22 +152,23 @@ def named_sweeps(window: Window) -> list[tuple[str, Sweep]]:
 class FlowResult:
     """Flow from t to t+1, with a row for every point of pc0 in its order, also for ground and points out of range.
 
-    The flow of a point is the displacement of its object from the instant of sweep t to that of sweep t+1. For a point
-    with a time of its own it is the displacement over one sweep interval, from the position of the measurement.
+    The flow of a point is the displacement of its object from the instant of sweep t to the instant of sweep t+1. If
+    the point has a time, it is the displacement over one sweep interval, from the position at the measurement.
 
     Args:
         residual_flow: (N, 3) float32, metres per sweep interval, axes of ego1: motion of objects.
-        pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p: apparent motion from the motion of the sensor.
+        pose_flow: (N, 3) float32, metres, T_ego1_ego0 p - p: apparent motion that ego motion alone causes.
         flow: (N, 3) float32, metres, total flow, the sum of the two.
         cluster_id: (N,) int64, 0 ... M-1 in raster order of each cluster's first pixel; -1 = in no cluster that has
             points both at t+1 and before.
-        score: (N,) float32 in [0, 1], how well the cluster at t, moved by its flow, agrees with t+1: its normalised
-            cross-correlation at the peak (finest scale). It is not a probability. 0 where cluster_id is -1.
-        is_valid: (N,) bool, True for active points: finite, neither ground nor of the vehicle itself
-            (`Config.ego_box`), inside the region.
-        confidence: (N,) float32 in [0, 1] by the verified method, else None: estimated probability that the end-point
-            error of the residual flow is below 0.1 m per sweep interval, for static and dynamic points; 0 where
-            is_valid is False. It comes from a table fitted on simulated drives, see docs/verified.md.
+        score: (N,) float32 in [0, 1], normalised cross-correlation of the cluster with t+1 at the peak (finest scale;
+            verified method: scale of the object). It is not a probability. It is 0 where cluster_id is -1 and for
+            objects that were not correlated, such as most static objects of the verified method.
+        is_valid: (N,) bool, True for active points: finite, not ground, not of the vehicle itself (`Config.ego_box`),
+            and inside the region.
+        confidence: (N,) float32 in [0, 1], estimated probability that the end-point error of the residual flow is
+            below 0.1 m per sweep interval, for static and dynamic points; 0 where is_valid is False; None unless the
+            method is the verified one. Its table was fitted on simulated drives, see docs/verified.md.
     """
 
     residual_flow: Tensor
@@ -187,7 +188,7 @@ class FlowResult:
         return {name: value.detach().cpu().numpy() for name, value in self._given().items()}
 
     def columns(self) -> dict[str, np.ndarray]:
-        """One array per number of a row, with the names of flow files: flow_tx_m ... pose_tz_m, cluster_id, ..."""
+        """Return the columns of a flow file, by name, as arrays: flow_tx_m ... pose_tz_m, cluster_id, ..."""
         vectors = {field: name for name, field in VECTORS.items()}
         columns: dict[str, np.ndarray] = {}
         for name, values in self.numpy().items():
@@ -198,8 +199,8 @@ class FlowResult:
     def to_pandas(self, points: Array | None = None) -> Any:
         """Return a `pandas.DataFrame` with a row per point and the columns of `columns`.
 
-        If you pass the points of pc0, (N, 3+), the columns x, y and z come first. If pandas is not installed, or the
-        number of points differs, that is a `CFlowError`.
+        If you pass the points of pc0, (N, 3+), the columns x, y and z come first. It is a `CFlowError` if pandas is not
+        installed, or if the number of points differs.
         """
         need = "to_pandas needs pandas: pip install pandas; columns() returns the same as arrays"
         pandas = import_optional("pandas", need)
@@ -209,8 +210,8 @@ class FlowResult:
     def to_open3d(self, points: Array) -> Any:
         """Return an `open3d.t.geometry.PointCloud` with an attribute for every field that is not None.
 
-        `points` are those of pc0, (N, 3+), in metres. If Open3D is not installed, or the number of points differs, that
-        is a `CFlowError`.
+        `points` are the points of pc0, (N, 3+), in metres. It is a `CFlowError` if Open3D is not installed, or if the
+        number of points differs.
 
         Example:
             >>> cloud = result.to_open3d(points)
@@ -238,14 +239,14 @@ class FlowResult:
         Returns:
             (K,) structured array, sorted by id, in the ego frame at t+1. `id`: cluster_id. `centre`: (3,) metres, of
             the box. `size`: (3,) metres, length along the heading, width, height. `velocity`: (3,) m/s over ground,
-            mean of the points. `heading`: radians from +x to the left, direction of the velocity. `num_points`: number
-            of points. `confidence`: mean of the points, NaN if the method has none.
+            mean over the points. `heading`: direction of the velocity, radians from +x to the left. `num_points`:
+            number of points. `confidence`: mean over the points, NaN if the method has none.
 
         Convention:
             The box encloses the points of sweep t, moved by their flow. If only one side of an object is visible, the
             box encloses that side. On simulated drives, objects of 50 points and more have their centre inside the true
-            box and their velocity within 0.75 m/s, except for a turning articulated lorry (4 m/s). Many smaller ones
-            are pieces of the static world; nearly all of these have a confidence below 0.7, and `track` removes them.
+            box and their velocity within 0.75 m/s, except for a turning articulated lorry (4 m/s). Many smaller objects
+            are parts of the static world. Nearly all of these have a confidence below 0.7, and `track` removes them.
 
         Raises:
             CFlowError: the number of points differs, or the result is from a file without flow or clusters.
@@ -290,7 +291,7 @@ class FlowResult:
 
     @classmethod
     def load(cls, path: str | Path) -> FlowResult:
-        """Read a file that `save` wrote. A missing or different file is a `CFlowError`. Nothing in it is executed."""
+        """Read a file that `save` wrote. A missing or different file is a `CFlowError`. No code in it is executed."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 return cls.of({name: torch.from_numpy(file[name]) for name in file.files})
@@ -299,12 +300,12 @@ class FlowResult:
 
     @classmethod
     def of(cls, fields_given: dict[str, Tensor]) -> FlowResult:
-        """Make a result of some of the fields, by name. The others are None."""
+        """Make a result from some of the fields, by name. The other fields are None."""
         values: dict[str, Any] = {**dict.fromkeys(f.name for f in fields(cls)), **fields_given}
         return cls(**values)
 
     def _positions(self, points: Array) -> np.ndarray:
-        """(N, 3) float64 of pc0."""
+        """The points of pc0, checked, as (N, 3) float64."""
         return point_rows("pc0", points, len(next(iter(self._given().values()))))
 
     def _given(self) -> dict[str, Tensor]:
