@@ -66,7 +66,7 @@ class SceneFlowModel(nn.Module):
         device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
 
     Raises:
-        CFlowError: `config` is not a `Config`, or that of another method.
+        CFlowError: `config` is not a `Config`, or it is the config of another method.
     """
 
     method = ""

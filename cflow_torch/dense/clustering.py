@@ -41,7 +41,7 @@ class Clusters:
 
 
 def find_clusters(sweeps: ProjectedSweeps, config: ClusteringConfig) -> tuple[Clusters, Tensor, Tensor]:
-    """Aggregate the sweeps of each window, dilate, label, split oversized components, keep those at t+1 and before.
+    """Aggregate, dilate and label the sweeps of each window, split long components, keep those at t+1 and before.
 
     All engines of `labeling` return identical clusters.
 

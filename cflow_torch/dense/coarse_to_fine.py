@@ -1,4 +1,4 @@
-"""Coarse to fine (the paper's multi-scale strategy): warp the sweeps by the flow found so far, project, estimate."""
+"""Coarse to fine (the paper's multi-scale strategy): at each scale, warp by the flow so far, project, and estimate."""
 
 from __future__ import annotations
 

@@ -36,10 +36,10 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
     """Compare every pixel in place with every other sweep of its window.
 
     Convention:
-        A slice is missing if none of the 3 x 3 pixels around its position has it. Slices repeat every 2 m, so its
-        height is ambiguous: we start at the layer of the lowest point of its pixel, go up to the first layer with this
-        slice, and take the middle. A sweep saw a position if a return in its direction is at least as far away. The
-        position is occluded if all returns in its direction are nearer. Without a return, it is neither.
+        A slice is missing if none of the 3 x 3 pixels around its position has it. Slices repeat every 2 m, so the
+        height of a slice is ambiguous. From the lowest point of the pixel, we go up to the first 0.5 m layer that is in
+        this slice, and take its middle. A sweep saw a position if a return in its direction is at least as far away.
+        The position is occluded if all returns in its direction are nearer. Without a return, it is neither.
 
     Cost: a lookup for each pixel and sweep, and a range image of every sweep.
     """

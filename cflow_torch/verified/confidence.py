@@ -40,10 +40,10 @@ class MotionMargin(NamedTuple):
     # (G,) float64. The motion matches this many more slices than its best displaced copy, in standard deviations of
     # noise. 0 = the motion is not better, or the object is static.
     z: Tensor
-    # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line; its won slices outnumber
-    # those lost plus those found in place; and the motion is better than its displaced copies, or at least twice as
-    # long as the displacement. Copies of such a long motion are motions, too. A line needs z, because beams hit a rail
-    # at positions that move with the vehicle.
+    # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line; the motion wins more slices
+    # than are lost or found in place; it is better than its displaced copies, or at least twice as long as the
+    # displacement. Copies of such a long motion are motions, too. A line needs z, because beams hit a rail at positions
+    # that move with the vehicle.
     is_dynamic: Tensor
 
 

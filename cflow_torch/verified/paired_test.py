@@ -23,7 +23,7 @@ from cflow_torch.verified.height_slices import NUM_SLICES, REACH, HeightSlicedSw
 
 # Comparisons (pixel x sweep x candidate) at once; each needs about 64 bytes of temporaries.
 _AT_ONCE_CPU, _AT_ONCE_GPU = 1 << 18, 1 << 24
-_FAR = 2  # pixels in y or in x; for motions from this length on, absence is tested in 3 x 3 pixels
+_FAR = 2  # pixels in y or in x; for shifts of this length or more, absence is tested in 3 x 3 pixels
 _NEAR_Z = 2.0  # factor of z for near counts, which are correlated, because one slice matches several neighbours
 _COVERED = 65  # per cent
 _CHANGED_Z = 4.0  # z for nodes of changed pixels
@@ -102,8 +102,8 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
 class Wins(NamedTuple):
     """Paired counts of M components with C candidate motions each."""
 
-    # (2, M, C) int64, numbers of slices. Index 1 has the near counts: for motions of at least two pixels, a slice also
-    # counts as found if it is in the 3 x 3 pixels around a position.
+    # (2, M, C) int64, numbers of slices. Index 1 has the near counts: if the target is at least two pixels away, a
+    # slice also counts as found if it is in the 3 x 3 pixels around a position.
     won: Tensor
     lost: Tensor
     # (2, M, 2) int64, numbers of slices. Last axis: slices of the other sweeps, then slices of t+1. First axis: all of
@@ -128,10 +128,10 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
 
     For each slice of a pixel, we check two positions in another sweep: the target of the motion, and the position of
     the pixel itself. The motion wins the slice if it is found only at the target, and loses it if it is found only in
-    place; slices found at both or at neither are ignored. For motions of two pixels or more, "not found" means absent
-    from all 3 x 3 pixels around the position. Otherwise a static surface would seem to leave its position, because
-    beams sample it differently in each sweep. For the near counts of such motions, "found" means found in any of the
-    3 x 3 pixels, because the sparse points of far objects rarely fall into the same pixels again.
+    place; slices found at both or at neither are ignored. If the target is at least two pixels away in y or in x, "not
+    found" means absent from all 3 x 3 pixels around the position. Otherwise a static surface would seem to leave its
+    position, because beams sample it differently in each sweep. For the near counts of such targets, "found" means
+    found in any of the 3 x 3 pixels, because the sparse points of far objects rarely hit the same pixels again.
 
     Args:
         members: K pixels of components.
