@@ -79,7 +79,7 @@ class RangeImages:
     """Range images of all sweeps: the distance of the farthest return in each direction.
 
     Args:
-        sweeps: we draw their active points, which exclude the ground.
+        sweeps: we use their active points (see `FlowResult.is_valid`).
 
     Convention: bins are computed without trigonometry, so that they are the same on every device. The azimuth is
     measured by y / (|x| + |y|), in bins of 0.32 to 0.64 degrees, and the elevation by height over distance. Distances
