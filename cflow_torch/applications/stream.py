@@ -101,10 +101,11 @@ class FlowStream:
             point_times: (N,) float, seconds of each point after the time stamp; None = unknown.
 
         Returns:
-            Flow t -> t+1 of the points of the sweep before; None if there is no such sweep, or this one is skipped.
+            Flow t -> t+1 of the points of the sweep before. None if there is no such sweep, or if this one comes late
+            or repeats a time stamp.
 
         Raises:
-            CFlowError: the input is not valid. The sweep is then skipped, and you can push the next one.
+            CFlowError: the input is not valid. The sweep is not added, and you can push the next one.
 
         Cost: the method for one window and, where needed, the ground and pose of one sweep.
         """

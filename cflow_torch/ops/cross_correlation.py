@@ -30,7 +30,7 @@ def cross_correlate(
         num_templates: J.
         target: (J,) int64, target of each template. The spectrum of a target serves all its templates.
         engine: "fft" or "conv" (conv2d).
-        most: upper bound of the ones in an image. None = unknown; then we count the ones of large images.
+        most: upper bound of the ones of an image, to choose the precision of large FFTs; None = we count the ones.
 
     Returns:
         (J, Y, X) float, within 1/2 of the sum over p of template[j](p) * target(p + (y, x)). The caller rounds it.

@@ -97,7 +97,7 @@ def confidence_of(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMoti
     `margin`, (G,) float64, is `MotionMargin.z`. Rotations are ignored: all pixels of an object move as its centre does.
 
     Returns:
-        (P + 1,) float32; entry P is for points whose pixel was not drawn. Undefined for pixels of sweeps other than t.
+        (P + 1,) float32; entry P is for points with no pixel in `sweeps`. Undefined for pixels of sweeps other than t.
 
     Cost: one lookup for each pixel of t, and nine for those that move.
     """

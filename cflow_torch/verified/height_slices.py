@@ -240,7 +240,7 @@ def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Te
 
 def count_slices(slices: Tensor) -> Tensor:
     """Count the set bits in both halves of uint8 values: int64, the count of the lower four bits, plus 2^32 times that
-    of the upper four. The two share a number because sums cost more than lookups."""
+    of the upper four. So one sum adds up both counts."""
     return constant(_COUNTS, torch.int64, slices.device).index_select(0, slices.reshape(-1).int()).view(slices.shape)
 
 

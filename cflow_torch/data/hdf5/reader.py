@@ -127,7 +127,7 @@ class HDF5Log(Log):
         """Read the array that sweep `index` stores under a key. Columns (N, 1) become (N,).
 
         A key that the sweep does not have is a `CFlowError`, which lists those that it has. Keys are for example
-        `lidar` (N, 3+), `ego_motion` (4, 4) of the ego frame to the next sweep as stored, `flow_instance_id` (N,) with
+        `lidar` (N, 3+), `ego_motion` (4, 4) from the ego frame to that of the next sweep, `flow_instance_id` (N,) with
         0 = background, `lidar_id` (N,), `lidar_dt` (N,) in seconds, `lidar_center` (L, 4, 4) ego_T_sensor, `dufo`,
         `cluster`, and the name of a result, (N, 3) total flow.
         """
