@@ -89,7 +89,7 @@ class Config:
 
 @dataclass(frozen=True)
 class ClusteringConfig(Config):
-    """Settings of the paper's clustering, for the dense and the key-point method."""
+    """Settings of the paper's clustering (its Alg. clustering), for the dense and the key-point method."""
 
     connectivity: int = setting(
         8, "4: pixels join along their sides, 8: also across their corners (Sec. clustering)", choices=(4, 8)
