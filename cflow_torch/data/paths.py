@@ -95,7 +95,7 @@ def forget_listings(path: Any) -> None:
 def read_bytes(path: Path) -> bytes:
     """Read a file, in one request if it is remote.
 
-    A device or pipe, which an unpacked archive can contain, and an unreachable file system raise an OSError, too.
+    A missing file, a device, a pipe and an unreachable file system raise an OSError.
     """
     if not is_remote(path):
         check_file(path)
