@@ -36,7 +36,7 @@ class EvalFrame:
         flow: (N, 3) float, predicted total flow, axes of ego1.
         pose_flow: (N, 3) float, T_ego1_ego0 p - p; None = computed from `T_ego1_ego0`. Give at least one of the two.
         T_ego1_ego0: (4, 4) float, maps ego coordinates of t to those of t+1. Definitions with `region_axes="t+1"`
-            or `residual_axes="t"` need it.
+            or `residual_axes="t"` need it, and so does a `residual_flow` in the axes of t.
         is_ground: (N,) bool, True = ground; None = no point is ground.
         eval_mask: (N,) bool, True = scored; None = all.
         residual_axes: axes of `residual_flow`, "t+1" or "t". This package predicts in "t+1".
