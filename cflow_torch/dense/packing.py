@@ -40,7 +40,7 @@ class Search:
 
 
 def shift_at(sample: Tensor, stride: Tensor, low: Tensor) -> Tensor:
-    """(2, K) int64, dy and dx that belong to one sample, (K,) int64, of each image; undefined beyond `high`."""
+    """(2, K) int64, dy and dx of sample number `sample`, (K,) int64, of each image; invalid above `Search.high`."""
     row = sample // stride
     return torch.stack((row, sample - row * stride)) - low
 
