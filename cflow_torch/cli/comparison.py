@@ -27,7 +27,7 @@ _SCORES = {
 
 
 class Comparison(Callback):
-    """At the end of a sweep, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv."""
+    """After a run with `-m`, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv."""
 
     def on_multirun_end(self, config: Any, **kwargs: Any) -> None:
         from cflow_torch.data.atomic import write_text

@@ -36,7 +36,7 @@ def for_each_pair(
     """Estimate the flow of pairs, and call `use` with the log, index, window and result of each pair, in order.
 
     The pairs of a log must follow one another. A bad pair is reported and skipped. The times of all pairs are added to
-    the model. Results do not depend on the number of processes.
+    the model.
     """
     failures: Failures = []
     for (log, index), answer in _answers(pairs, model):

@@ -83,12 +83,13 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
         score: (J,) float32, NCC at that shift, 0 ... 1.
 
     Convention:
-        The search range is dy in [-(H // 2), H - 1 - H // 2] and dx in [-(W // 2), W - 1 - W // 2], which is u in
-        [0, W) x [0, H) of Alg. scene_flow_1view. Ties: smallest |shift|, then smallest dy, then smallest dx. Without
-        any overlap the shift is 0 and the score 0. Counts are integers; we compare them as count^2 / energy in
-        float64, so all devices agree.
+        In a cluster's box of H x W pixels, the search range is dy in [-(H // 2), H - 1 - H // 2] and dx in
+        [-(W // 2), W - 1 - W // 2], which is u in [0, W) x [0, H) of Alg. scene_flow_1view. Ties: smallest |shift|,
+        then smallest dy, then smallest dx. Without any overlap the shift is 0 and the score 0. Counts are integers; we
+        compare them as count^2 / energy in float64, so all devices agree.
 
-    Cost: about A log(A) per pair, A = area of box plus search range. Python loops are over size classes and their runs.
+    Cost: about A log(A) per pair, A = area of box plus search range. We loop in Python over size classes, in parts of
+    limited size.
     Source: Eq. norm_correlation, displacement_in_bev, Alg. scene_flow_1view.
     """
     num_pairs, device = pairs.cluster.numel(), pairs.size.device

@@ -70,7 +70,7 @@ def _interval(begin: int | None, end: int | None) -> float:
 
 
 class ViewerFrame:
-    """The ego frame at the end of the first pair with a pose: viewers use float32, so their origin must be near."""
+    """The ego frame at t+1 of the first pair with poses. Viewers use float32, so points must be near their origin."""
 
     def __init__(self) -> None:
         self.T_world_viewer: np.ndarray | None = None
