@@ -103,7 +103,7 @@ class Shard:
         """
         begin, end = (Fraction(edge * len(sources), self.count) for edge in (self.index, self.index + 1))
         logs = range(math.floor(begin), math.ceil(end))
-        pieces = -(-_UNITS_PER_WORKER * workers // len(logs)) if workers > 1 else 1
+        pieces = -(-_UNITS_PER_WORKER * workers // len(logs)) if logs and workers > 1 else 1
         units: list[Unit] = []
         for log in logs:
             first, last = max(begin - log, Fraction(0)), min(end - log, Fraction(1))

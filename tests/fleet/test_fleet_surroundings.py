@@ -40,6 +40,7 @@ def test_shards_and_units_cover_every_frame_once(lengths: list[int], count: int,
 def test_a_shard_opens_only_its_own_logs() -> None:
     units = Shard(1, 3).units(list("abcdef"))
     assert [(unit.source, unit.first, unit.last) for unit in units] == [("c", 0, 1), ("d", 0, 1)]
+    assert Shard().units([], 2) == []
     units = Shard(1, 4).units(list("ab"))
     assert [(unit.source, unit.first, unit.last) for unit in units] == [("a", Fraction(1, 2), 1)]
 
