@@ -26,7 +26,7 @@ _PER_METRE, _HIGHEST = 256, 8192  # bins of height: number per metre; number abo
 
 
 class ChangedPixels(NamedTuple):
-    """The change of P pixels; all False in windows without history, because a single other sweep would decide there."""
+    """The change of P pixels. All are False in windows of two sweeps, where only one other sweep could decide."""
 
     is_missing: Tensor  # (P,) bool, a slice is missing in another sweep and not occluded there
     has_changed: Tensor  # (P,) bool, a slice is missing in another sweep that saw its position
