@@ -61,7 +61,7 @@ class ChildProcess:
         yield from self._answers()
 
     def stop(self) -> None:
-        """Tell this call and later ones to end soon. Another thread may be in `call`."""
+        """Tell running and later calls to end soon. Another thread may be in `call`."""
         if self._process is not None:
             with suppress(OSError):
                 self._pipe.send(None)

@@ -48,7 +48,7 @@ class MotionMargin(NamedTuple):
 
 
 def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> MotionMargin:
-    """Return the margins of objects from their motion.
+    """Return the margin of each object's motion.
 
     Cost: five lookups for each pixel of the moving objects and each sweep.
     """

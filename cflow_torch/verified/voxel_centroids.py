@@ -116,7 +116,7 @@ class Voxels:
 
         Returns:
             voxel: (K,) int64, V = not found. Ties: the first slice of the first pixel in raster order.
-            is_near: (K,) bool, it is found and at most `farthest` away, whose square is rounded to square units.
+            is_near: (K,) bool, found and at most `farthest` away. The square of `farthest` is rounded to square units.
 
         Cost: 9 L lookups for each position.
         """

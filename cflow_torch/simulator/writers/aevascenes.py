@@ -49,7 +49,7 @@ def write_aevascenes_sequence(log: Recording, root: str | Path, layout: str = "v
         The sequence folder, which `AevaScenesLog` takes.
 
     Convention:
-        - Points are float32 in the frame of their unit. Poses and boxes are JSON numbers, exact float64. Poses are
+        - Points are float32 in the frame of their LiDAR. Poses and boxes are JSON numbers, exact float64. Poses are
           quaternions, relative to the first pose.
         - Only the compensated clouds are written, because a recording has no others.
         - Every point has a class name: "road" on the ground, the class of the box that holds it, or "other_structure".
