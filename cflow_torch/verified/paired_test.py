@@ -73,11 +73,11 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
 
     Args:
         motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = static.
-        num_levels: L, the level of nodes of changed pixels.
+        num_levels: L. Nodes of changed pixels have level L.
 
-    Convention: we test the pixels around moving nodes of changed pixels, at most two rows and columns away. A pixel
-        joins the node if the motion wins more slices than it loses in the tested pixels of the 3 x 3 around it. Ties:
-        the first of several nodes; with as many slices won as lost, the pixel does not join.
+    Convention: we test the pixels around moving nodes of changed pixels, at most two rows and columns away. We test a
+        pixel near several nodes only for the first. It joins the node if the motion wins more slices than it loses in
+        the tested pixels of the 3 x 3 around it.
 
     Cost: 25 lookups for each pixel of these nodes, and the paired test of the pixels around them.
     """

@@ -78,7 +78,7 @@ def write_index_files(folder: str | Path) -> None:
 
 
 def check_result_name(name: str) -> None:
-    """Raise a `CFlowError` for a result name that is taken or that a viewer's command line cannot carry."""
+    """Raise a `CFlowError` if a result name is reserved, or is not a letter followed by up to 63 of `A-Za-z0-9_.-`."""
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise CFlowError(f"{name!r} is not a result name: use up to 64 letters, digits, '_', '-', '.', a letter first")
     if name in RESERVED_KEYS:

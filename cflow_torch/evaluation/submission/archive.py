@@ -91,7 +91,7 @@ def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]
 
 
 def is_complete(folder: str | Path, name: str, rows: int, version: SubmissionVersion) -> bool:
-    """Check that the file of a frame exists, has this number of rows, and passes all other checks."""
+    """Check that the file of a frame exists, has this number of rows, and passes the checks of `check_submission`."""
     return not _check_file(name, partial(read_bytes, Path(folder) / name), rows, version)
 
 
