@@ -52,8 +52,8 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     horizontal plane is compared. The points of the later sweep above ground, 2.5 to 50 m away, become Gaussian patches
     in cells of 1 m. A Gauss-Newton fit with robust weights (for moving objects) finds the shift and rotation that align
     the older sweep with them. Along a wall without corners no shift is detected. If the LiDAR is not where the poses
-    assume it, a shift appears only when the vehicle turns. It is the distance between the two positions times the
-    rotation: 12 cm for 1.35 m and 5 degrees.
+    assume it, a shift appears only when the vehicle turns. It is the offset of the LiDAR times the rotation: 12 cm
+    for 1.35 m and 5 degrees.
 
     Cost: reads two sweeps and takes about 0.15 s on one core.
 

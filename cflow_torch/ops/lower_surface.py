@@ -22,8 +22,8 @@ def lower_surface(low: Tensor) -> Tensor:
     Returns:
         (B, H, W) int32, mm, defined everywhere.
 
-    Convention: we fit twice, first with slopes as steep as hills, then with gentle ones about the smoothed result. All
-    numbers are integers, so the bits are the same on any device.
+    Convention: the first fit allows slopes as steep as hills. We smooth its surface. The second fit allows gentle
+    slopes relative to it. All numbers are integers, so the bits are the same on any device.
 
     Cost: about sixty passes over the maps.
     """

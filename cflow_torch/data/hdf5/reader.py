@@ -40,7 +40,7 @@ class HDF5Log(Log):
         file: `<scene>.h5`.
         ego_T_lidar: (4, 4), maps the frame of the stored points to the frame of the stored poses; None = they are the
             same; "auto" = recognise it (see Convention).
-        needs_poses: False = sweeps of a scene without poses have the pose None, for `with_poses`; True = an error.
+        needs_poses: True = a sweep of unknown pose is an error; False = its pose is None, as `with_poses` expects.
 
     Attributes:
         timestamps: names of the groups as integers, ascending, in nanoseconds or microseconds as the data set has

@@ -37,8 +37,8 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
         ego_T_lidar: (4, 4); None = identity; "auto" = `recognized_extrinsics` of the sweep.
 
     Convention:
-        We apply a ground mask that has a row for each point of its sweep. If instead it has a non-ground row for each
-        point, the harness has already applied it (to pc0, pc1 and some or all of the history).
+        We apply a ground mask with as many rows as its sweep has points. If only its non-ground rows are as many as the
+        points, the harness has already removed the ground of this sweep.
         Rows with NaN are ignored: they are padding, or beams without a return. We never read "flow" and other truth. A
         `CFlowError` names the key of a value that is missing, has a wrong shape, or is not a rigid motion.
     """
