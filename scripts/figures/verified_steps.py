@@ -40,7 +40,8 @@ COLUMNS = (
     ("2  changed pixels", "All sweeps. Red pixels are missing\nin a sweep that saw their cell."),
     ("3  components", "A colour is a finest component that\nmay move. Boxes: solid = coarser,\n"
      "dotted = group of changed pixels,\ndashed = lies under an overhang."),
-    ("4  cut", "A colour is an object selected to\nmove. Grey stays static. A striped\nobject lies under an overhang."),
+    ("4  selection", "A colour is an object selected to\nmove. Grey stays static. A striped\n"
+     "object lies under an overhang."),
     ("5  flow", f"Sweep t, after refinement. Grey\nmoves at most {MOVING:g} m per sweep.\n"
      f"Arrows: displacement in {ARROW_STEPS} sweeps."),
 )  # fmt: skip
