@@ -1,7 +1,7 @@
 """The fixed simulated benchmark: drives from fixed seeds, written once in the format of each sensor's data set.
 
-Seeds 300 and above are for scores. Seeds 100 ... 103, 200 ... 209 and 400 ... 409 were used to choose settings and must
-not be scored.
+Seeds 300 ... 319 and 750 ... 751 are held out for scores. Do not score on the seeds that docs/benchmarks.md lists as
+those on which we chose settings.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class Format:
     """The writer and reader of a sensor's drives.
 
     Args:
-        data_set: the reader, a name in `catalog.DATA_SETS`, and the module of the writer in `writers`.
-        function: the writer (drive, root) -> path.
-        settings: of the reader, for every drive.
+        data_set: name of the reader in `catalog.DATA_SETS`, and of the writer's module in `writers`.
+        function: name of the writer in that module, a function (drive, root) -> path.
+        settings: options of the reader, for every drive.
     """
 
     data_set: str
@@ -51,12 +51,12 @@ FORMATS: dict[str, Format] = {
 
 
 def format_of(profile: str) -> Format:
-    """Format of a simulated sensor; that of Argoverse 2 for sensors without a data set."""
+    """Format of a sensor profile. Profiles without a data set of their own use the format of Argoverse 2."""
     return FORMATS.get(profile, FORMATS["av2"])
 
 
 def generator_key() -> str:
-    """Digest of the code that makes the drives. Cached drives of other code are not used."""
+    """Digest of the simulator's source code. We never reuse cached drives that other code made."""
     digest = hashlib.sha256()
     for file in sorted(_HERE.rglob("*.py")):
         digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
@@ -66,24 +66,24 @@ def generator_key() -> str:
 def benchmark_logs(
     cache: str | Path, profile: str, seeds: Sequence[int], num_sweeps: int, scenes: Sequence[str] = ("street",)
 ) -> list[Any]:
-    """Return the benchmark's drives of one sensor as sources for `catalog.open_log`; make drives that are not cached.
+    """Return the benchmark's drives of one sensor as sources for `catalog.open_log`. Simulate those not yet cached.
 
     Args:
         cache: folder for the drives: `cache/<generator key>-<sweeps>/<log id>`.
         profile: a sensor, a name in `profiles.PROFILES`.
-        seeds: one drive each.
+        seeds: of the drives, one seed per drive.
         num_sweeps: sweeps per drive that the reader returns; we simulate more if it skips some (`sweep_step`).
         scenes: kinds of scene, assigned to the seeds in rotation.
 
     Returns:
         One source per drive.
 
-    Convention: a drive appears in the cache whole or not at all, even when several processes make it at once.
+    Convention: the cache holds complete drives only, even if several processes write the same drive at once.
 
     Raises:
-        CFlowError: a profile, scene or seed does not exist.
+        CFlowError: no profile or scene has that name, a seed is negative, or `num_sweeps` is less than 1.
 
-    Cost: about 2 s and 40 MB per drive of 20 sweeps of 100,000 points, once.
+    Cost: about 2 s and 40 MB for a new drive of 20 sweeps of 100,000 points.
     """
     folder = Path(cache) / f"{generator_key()}-{num_sweeps}"
     chosen = format_of(profile)
@@ -93,7 +93,7 @@ def benchmark_logs(
     )
     found: list[Any] = []
     for number, seed in enumerate(tqdm(seeds, unit="drive", desc=profile, disable=None, file=sys.stderr)):
-        # This is cheap: sweeps are simulated when they are written.
+        # This is cheap: the writer simulates the sweeps.
         drive = make_drive(seed, num_simulated, profile, scenes[number % len(scenes)])
         target = folder / drive.log_id
         if not target.is_dir():
@@ -103,7 +103,7 @@ def benchmark_logs(
                 write(drive, scratch)
                 os.rename(scratch, target)
             except OSError:
-                if not target.is_dir():  # else another process was faster, and made the same drive
+                if not target.is_dir():  # else another process has just written the same drive
                     raise
             finally:
                 shutil.rmtree(scratch, ignore_errors=True)

@@ -14,11 +14,11 @@ from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
 from cflow_torch.simulator.trajectories import Route
 
-HALF_SIZE = 55.0  # of the paved square, metres
-AISLES = (-34.0, -17.0, 0.0, 17.0, 34.0)  # y of the middles of the aisles, metres
-ROW = 5.6  # middle of a row of cars from the middle of its aisle, metres
-BAY = 2.9  # width, metres
-FREE_X = (15.0, 24.0)  # lane across the rows
+HALF_SIZE = 55.0  # half the side of the paved square, metres
+AISLES = (-34.0, -17.0, 0.0, 17.0, 34.0)  # y of the middle of each aisle, metres
+ROW = 5.6  # distance of the middle of a row of cars from the middle of its aisle, metres
+BAY = 2.9  # width of a bay, metres
+FREE_X = (15.0, 24.0)  # x of the two edges of the lane across the rows, metres
 
 
 def build_car_park(rng: np.random.Generator) -> Scene:
@@ -34,7 +34,7 @@ def build_car_park(rng: np.random.Generator) -> Scene:
 
 
 def _cars(rng: np.random.Generator) -> Iterator[Body]:
-    """Rows of cars with nose or tail to the aisle; one bay in five is empty, and a few cars back out."""
+    """Rows of cars parked nose or tail first, with a fifth of the bays empty, and cars that back out or drive."""
     for number, aisle in enumerate(AISLES):
         driver = rng.uniform(-30, 5)
         for side, heading in ((-1, NORTH), (1, SOUTH)):
@@ -64,10 +64,10 @@ def _people(rng: np.random.Generator) -> Iterator[Body]:
     for x in rng.uniform(-35, 45, size=8).tolist():
         y = float(rng.choice(AISLES)) + rng.uniform(2.4, 2.5) * (1 if 0 < x < 20 else rng.choice((-1, 1)))
         yield objects.pedestrian(rng, Route(x, y, float(rng.choice((EAST, WEST))), speed=rng.uniform(0.9, 1.6)))
-    for x in rng.uniform(-30, 40, size=6).tolist():  # in the gap between two rows, tail to tail
-        bay = BAY * (round((x + 50) / BAY) + 0.5) - 50
+    for x in rng.uniform(-30, 40, size=6).tolist():  # between two neighbouring cars of a row
+        between = BAY * (round((x + 50) / BAY) + 0.5) - 50
         y = float(rng.choice(AISLES)) + ROW
-        yield objects.pedestrian(rng, Route(bay, y, float(rng.choice((NORTH, SOUTH))), speed=rng.uniform(0.5, 1.0)))
+        yield objects.pedestrian(rng, Route(between, y, float(rng.choice((NORTH, SOUTH))), speed=rng.uniform(0.5, 1.0)))
     for x in rng.uniform(-30, 40, size=5).tolist():
         speed = float(rng.choice((0.0, 1.2)))
         yield objects.pedestrian(rng, Route(x, HALF_SIZE + rng.uniform(2, 4.5), EAST, speed=speed))

@@ -1,4 +1,4 @@
-"""A crossing without lights: traffic from all four sides that turns, stops and starts, and people on the zebras."""
+"""A crossing without traffic lights: vehicles from all four sides turn, stop and start, and people cross."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, PAVEMENT, SOUTH, WEST, furniture, houses, lane
 from cflow_torch.simulator.trajectories import Route
 
-HALF_WIDTH = 7.0  # of both streets, metres
-STOP = HALF_WIDTH + 5.5  # of the stop lines from the middle, metres
+HALF_WIDTH = 7.0  # half the width of both streets, metres
+STOP = HALF_WIDTH + 5.5  # distance of the stop lines from the middle of the crossing, metres
 
 
 def build_crossing(rng: np.random.Generator) -> Scene:
@@ -27,25 +27,25 @@ def build_crossing(rng: np.random.Generator) -> Scene:
     if right:  # a turn to the right, then down the cross street
         speed, radius = rng.uniform(4, 6), 7.5
         ego = Route(-1.75 - radius, -1.75, EAST, start=-4.0, speed=speed, radius=radius, angle=-math.pi / 2)
-    else:  # from a rolling stop straight across
+    else:  # straight across, after a rolling stop
         ego = Route(-16.0, -1.75, EAST, speed=rng.uniform(3, 5), acceleration=rng.uniform(1.0, 2.0))
     bodies = (*_traffic(rng), *_people(rng), *_parked(rng), *houses(rng, ground), *furniture(rng, ground))
     return Scene(ground, ego, bodies)
 
 
 def _traffic(rng: np.random.Generator) -> Iterator[Body]:
-    """Vehicles. Crossing ones are clear of the ego lane for the first seconds, waiting ones are at their stop line."""
+    """In the first seconds, vehicles in the cross street stay clear of the ego lane or wait at their stop line."""
     # Ahead of the ego car, behind it, and towards it.
     yield from lane(rng, -1.75, EAST, rng.uniform(9, 14), 14, 27, 45)
     yield objects.car(rng, Route(-27.0, -1.75, EAST, speed=6.0, acceleration=-1.2))
     yield from lane(rng, 1.75, WEST, rng.uniform(8, 12), -18, -33, -52)
     yield objects.car(rng, Route(34.0, 1.75, WEST, speed=12.0, acceleration=-3.5))
     yield objects.van(rng, Route(55.0, 1.75, WEST, speed=10.0, acceleration=-1.0))
-    # One turns left across the oncoming lane, a truck swings out of the street to the north.
+    # A car turns left across the ego lane. A truck is parked among the houses in the north-west.
     yield objects.car(rng, Route(9.0, 5.1, WEST, rng.uniform(4, 7), rng.uniform(4, 6), 11.0, math.pi / 2))
     truck = Route(-1.75 - 12 - 3.5, HALF_WIDTH + 20.0, SOUTH, speed=0.0)
     yield from objects.articulated_truck(truck)
-    # Cross street, northbound and southbound.
+    # In the cross street, northbound and southbound.
     for x, heading, first in ((1.75, NORTH, 13.0), (-1.75, SOUTH, -13.0)):
         speed = rng.uniform(8, 14)
         for number in range(3):
@@ -61,10 +61,10 @@ def _traffic(rng: np.random.Generator) -> Iterator[Body]:
 
 
 def _people(rng: np.random.Generator) -> Iterator[Body]:
-    """On all four zebras, at the corners waiting, along the houses."""
+    """People on the zebra crossings of the east and north arms, at the corners, and along the houses."""
     zebra = HALF_WIDTH + 2.8
     for k in range(4):
-        # Across the street along y (east and west arm), then across the street along x.
+        # One on the zebra crossing of the east arm, one on that of the north arm.
         y = rng.uniform(-6, 6)
         yield objects.pedestrian(rng, Route(zebra + 0.6 * k - 1, y, rng.choice((NORTH, SOUTH)), speed=1.3))
         x = rng.uniform(3.5, 6.5) * rng.choice((-1, 1))

@@ -34,9 +34,9 @@ SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
     "car_park": build_car_park,
 }
 _FIRST_STAMP_NS = 315_970_000_000_000_000
-_CACHED_SWEEPS = 8  # a window of five and its neighbours; a sweep of 100,000 points takes 3 MB
-_BOX_SLACK = 0.1  # metres by which annotation boxes are larger than bodies, so that range noise stays inside
-_ROUNDING = 1e-4  # metres, so that boxes hold their points after rounding to float32
+_CACHED_SWEEPS = 8  # a window of five sweeps and its neighbours; a sweep of 100,000 points takes 3 MB
+_BOX_SLACK = 0.1  # metres by which boxes are larger than bodies, so that they hold noisy points
+_ROUNDING = 1e-4  # metres by which boxes are enlarged to hold their points after rounding to float32
 _RASTER_STEP = 0.3  # metres per cell of the ground raster, as in Argoverse 2
 T = TypeVar("T")
 
@@ -45,15 +45,15 @@ class Drive(Log):
     """A drive through a simulated scene. Writers take it as a `recording.Recording`.
 
     Each sweep is simulated on demand from its own random stream, so sweeps do not depend on the order of the calls. In
-    the profiles av2 and demo a sweep is instantaneous. In the others every shot has its own time. Where the data set
-    compensates the ego motion within a sweep, we do so, too; moving objects stay distorted, and their boxes are
+    the profiles av2 and demo, all shots of a sweep are simultaneous. In the others, every shot has its own time. We
+    compensate the ego motion within a sweep if the data set does. Moving objects stay distorted, and their boxes are
     enlarged to hold the distorted points.
 
     Args:
         scene: ground, bodies and the route of the recording vehicle.
         profile: the LiDARs.
-        seed: of the noise.
-        num_sweeps: at the rate of the profile.
+        seed: seed of the noise and of the track ids.
+        num_sweeps: number of sweeps, at the rate of the profile.
         log_id: name of the log.
 
     Attributes:
@@ -85,7 +85,7 @@ class Drive(Log):
 
     def sweep(self, index: int) -> Sweep:
         """Sweep `index`: (N, 3) float32 points in its ego frame, exact ground mask, float64 pose and time stamp. It has
-        point times if the sensor profile has a rolling shutter, as `av2_rolling`."""
+        point times if the profile is rolling (`LidarProfile.is_rolling`)."""
         returns = self.returns(index)
         return Sweep(
             points=returns.points.numpy().copy(),
@@ -98,12 +98,11 @@ class Drive(Log):
     def labels(self, index: int) -> FlowLabels | None:
         """Ground truth of the pair (index, index + 1), None for the last sweep.
 
-        A point belongs to the body that its ray hit. It moves with the body's track from one time stamp to the next,
-        even if it was measured before or after the time stamp. Legs do not swing in the truth. A body with a
-        category is annotated in a sweep if its middle is within the LiDAR's range. Its points are invalid unless it is
-        annotated in both sweeps of the pair. If it is not annotated at `index`, they also have category 0.
-
-        A point p moves to p' = inv(pose1) B1 inv(B0) pose0 p, with the body's poses B0, B1 in the world, in float64.
+        A point belongs to the body that its ray hit. It moves with this body from one time stamp to the next, even if
+        it was measured before or after the time stamp: p' = inv(pose1) B1 inv(B0) pose0 p in float64, where B0, B1 are
+        the poses `T_world_body`. We ignore the swing of legs. A body with a category is annotated in a sweep if its
+        middle is within the LiDARs' range. Points of a body are invalid unless it is annotated in both sweeps. Points
+        of a body that is not annotated at `index` have category 0.
         """
         returns = self.returns(index)
         if index == len(self.timestamps) - 1:
@@ -147,7 +146,7 @@ class Drive(Log):
         return {name: getattr(returns, name).numpy() for name in ("intensity", "laser_number", "offset_ns")}
 
     def units(self, index: int) -> list[UnitReturns]:
-        """Returns of each LiDAR in sweep `index`. In this order, their rows are those of `sweep(index)`."""
+        """Returns of each LiDAR in sweep `index`. Concatenated in this order, they match the rows of `sweep(index)`."""
         returns = self.returns(index)
         velocity = self._motion.radial_velocity(self._seconds[index], returns)
         if self._profile.velocity_noise:
@@ -220,7 +219,7 @@ class Drive(Log):
         return scan(self._profile, solids_now, ground, pose, generator)
 
     def _extent(self, index: int, returns: Returns) -> np.ndarray:
-        """(num_bodies, 3) float64 size of the smallest upright box, centred on a body's axis, that holds its points."""
+        """(num_bodies, 3) float64 size of the smallest box around each body's vertical axis that holds its points."""
         points = returns.points.numpy().astype(np.float64)
         if not self._profile.is_deskewed:
             moved = np.linalg.inv(self.poses[index]) @ self.poses_at(index, returns.offset_ns.numpy())
@@ -235,11 +234,11 @@ class Drive(Log):
         return extent + _ROUNDING
 
     def _body_of(self, returns: Returns) -> np.ndarray:
-        """(N,) int64 index of each point's body; the number of bodies = the ground."""
+        """(N,) int64 index of each point's body; ground points have the number of bodies."""
         return np.append(self.scene.body_of_solid, len(self.scene.bodies))[returns.solid.numpy()]
 
     def _annotated(self, scene: Scene) -> np.ndarray:
-        """(num_sweeps, num_bodies) bool: within range, so that an annotator would see it; background always."""
+        """(num_sweeps, num_bodies) bool: the body is background, or its middle is within the LiDARs' range."""
         offset = self._body_poses[:, :, :2, 3] - self.poses[:, None, :2, 3]
         is_background = np.array([body.category is None for body in scene.bodies])
         return is_background | (np.hypot(offset[..., 0], offset[..., 1]) < self._profile.max_range)
@@ -253,8 +252,8 @@ def make_drive(
     Args:
         seed: >= 0; the same seed gives the same bytes on the same machine.
         num_sweeps: >= 1, at the rate of the profile. After the first seconds, vehicles may drive through each other.
-        profile: LiDARs of one of five data sets: `av2`, `nuscenes`, `truckscenes`, `waymo`, `aevascenes`; or `demo`
-            (28,800 rays), `av2_rolling` (av2 with a time for every shot).
+        profile: the LiDARs of a data set, `av2`, `nuscenes`, `truckscenes`, `waymo` or `aevascenes`; `demo` (one LiDAR
+            with 28,800 rays); or `av2_rolling` (as av2, but every shot has its own time).
         scene: `street`, `highway`, `crossing`, `narrow`, `car_park`.
         weather: `clear`, `rain`, `snow`, `fog`.
 

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-NOWHERE = 1e5  # metres; the middle of a cross street that no ray reaches
-_BISECTIONS = 12  # between pavement level and road level: they find a kerb face to the millimetre
+NOWHERE = 1e5  # `crossing_x` of a scene without a cross street: no ray reaches it, metres
+_BISECTIONS = 12  # of a ray between pavement level and road level, which find the kerb to a millimetre
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Ground:
         slope: rise per metre along x and y.
         curvature: change of the slope per metre along x, 1/m (a crest or a dip).
         kerb: height of the pavement above the road, metres.
-        half_widths: half the width between the kerbs of the street along x and of the one along y, metres.
+        half_widths: half the distance between the kerbs, of the street along x and of the street along y, metres.
         crossing_x: centre of the street along y, metres.
         corner_radius: radius of the kerbs at the crossing, metres.
     """
@@ -60,8 +60,8 @@ class Ground:
             yaw: (...,) heading, radians.
 
         Returns:
-            (..., 4, 4) float64 `T_world_body`: x axis ahead, z axis normal to the ground, origin on the ground. Across
-            a kerb the height changes over half a metre instead of in one step, as for legs and tyres.
+            (..., 4, 4) float64 `T_world_body`: x axis ahead, z axis normal to the ground, origin on the ground. At a
+            kerb, the height rises over half a metre, not in one step, so that bodies do not jump.
         """
         slope_x, slope_y = self.slope[0] + self.curvature * x, np.broadcast_to(self.slope[1], x.shape)
         depth = self.pavement_depth(torch.from_numpy(x), torch.from_numpy(y)).numpy()
@@ -88,7 +88,7 @@ class Ground:
         """
         x, y, z = (value.numpy() for value in origin)
         slope_x = torch.from_numpy(np.asarray(self.slope[0] + self.curvature * x)).to(directions.dtype)
-        # On the road surface lifted by some amount, a + b t + c t**2 = 0.
+        # A ray meets the road surface, raised by `lift`, at the range t where a + b t + c t**2 = 0.
         b = directions[2] - slope_x * directions[0] - self.slope[1] * directions[1]
         c = -0.5 * self.curvature * directions[0] ** 2
 
@@ -102,7 +102,7 @@ class Ground:
         low, root = meet(0.0)
         cosine = root.nan_to_num()
         hits_pavement = self._is_pavement_along(origin, directions, raised)
-        # A ray that is above the road at pavement height and below the pavement at road height hits the kerb between.
+        # A ray hits a kerb if it is beside the pavement at pavement level, but under the pavement at road level.
         hits_kerb = ~hits_pavement & self._is_pavement_along(origin, directions, low)
         if bool(hits_kerb.any()):
             rays = directions[:, hits_kerb]

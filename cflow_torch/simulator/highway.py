@@ -13,9 +13,9 @@ from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, WEST
 from cflow_torch.simulator.trajectories import Route
 
-LANES = (2.9, 6.6, 10.3)  # of the middles of the lanes from the median, fast lane first, metres
-EDGE = 13.5  # where the grass begins
-REACH = 420.0  # how far the road is furnished, metres
+LANES = (2.9, 6.6, 10.3)  # distance of each lane's middle from the median, fast lane first, metres
+EDGE = 13.5  # distance of the grass from the median, metres
+REACH = 420.0  # rails, signs and trees stand at |x| up to this, metres
 
 
 def build_highway(rng: np.random.Generator) -> Scene:
@@ -30,16 +30,16 @@ def build_highway(rng: np.random.Generator) -> Scene:
 
 
 def _traffic(rng: np.random.Generator, ego_speed: float) -> Iterator[Body]:
-    """Lanes of constant speed, a breakdown on the shoulder, and cars that brake and accelerate on a ramp."""
+    """Lanes of constant speed, a broken-down car on the shoulder, and cars that brake and accelerate on a ramp."""
     for side, heading in ((-1, EAST), (1, WEST)):
         for lane, (low, high) in zip(LANES, ((29, 35), (23, 29))):
             is_ego_lane = side < 0 and lane == LANES[1]
             speed = ego_speed if is_ego_lane else rng.uniform(low, high)
-            for x in _gaps(rng, 28, 70):
+            for x in _positions(rng, 28, 70):
                 if not (is_ego_lane and abs(x) < 20):
                     yield objects.car(rng, Route(x, side * lane + rng.uniform(-0.2, 0.2), heading, speed=speed))
         speed = rng.uniform(21, 24)
-        for number, x in enumerate(_gaps(rng, 45, 80)):
+        for number, x in enumerate(_positions(rng, 45, 80)):
             route = Route(x, side * LANES[2], heading, speed=speed)
             if number % 3 == 0:
                 yield from objects.articulated_truck(route)
@@ -54,8 +54,8 @@ def _traffic(rng: np.random.Generator, ego_speed: float) -> Iterator[Body]:
     yield objects.car(rng, Route(rng.uniform(-60, -30), -EDGE - 5.0, EAST, speed=12, acceleration=2.5))
 
 
-def _gaps(rng: np.random.Generator, low: float, high: float) -> Iterator[float]:
-    """Positions of vehicles along a lane."""
+def _positions(rng: np.random.Generator, low: float, high: float) -> Iterator[float]:
+    """x of the vehicles of a lane, `low` to `high` metres from middle to middle."""
     x = -220 + rng.uniform(0, high)
     while x < 300:
         yield float(x)

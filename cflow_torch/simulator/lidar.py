@@ -21,20 +21,20 @@ FOLIAGE_RETURN = 0.75  # share of the shots at foliage that return, because leav
 
 @dataclass(frozen=True)
 class Returns:
-    """The N returns of a vehicle's LiDARs (its units) in one sweep, one unit after the other.
+    """The N returns of the LiDARs (*units*) of a vehicle in one sweep, one unit after the other.
 
     Args:
-        points: (N, 3) float32, metres, ego frame; motion-compensated if the profile is (`is_deskewed`).
+        points: (N, 3) float32, metres, ego frame; motion-compensated if `LidarProfile.is_deskewed`.
         solid: (N,) int64, index of the solid that was hit; -1 = the ground.
         intensity: (N,) uint8.
-        laser_number: (N,) uint8, which continues from unit to unit (modulo 256).
-        offset_ns: (N,) int32, time of the shot after the time stamp; 0 in instantaneous sweeps.
+        laser_number: (N,) uint8, counted through all units, modulo 256.
+        offset_ns: (N,) int32, time from the time stamp to the shot; 0 in instantaneous sweeps.
         unit: (N,) int64, index of the unit; ascending.
-        local: (N, 3) float32, metres, the points in the frame of their unit.
+        local: (N, 3) float32, metres, the same points in the frame of their unit.
         ring: (N,) int32, index of the beam, lowest first.
-        column: (N,) int32, index of the azimuth step in the order of time.
+        column: (N,) int32, index of the azimuth step, counted in the direction of rotation.
 
-    Convention: the columns of a unit are sorted by time in rolling profiles, and by azimuth in others. The rows of a
+    Convention: the rows of a unit are sorted by time in rolling profiles, and by azimuth in others. Rows of the same
     column are sorted from the lowest beam up.
     """
 
@@ -55,9 +55,9 @@ class EgoMotion:
 
     Args:
         T_world_ego: (4, 4) float64 at the time stamp.
-        T_world_unit: for each unit (C, 4, 4) float64, its poses when it fires its columns.
-        seconds: for each unit (C,) float64, the times of its columns.
-        speed: (2,) upper bounds, m/s and rad/s.
+        T_world_unit: for each unit (C, 4, 4) float64, its poses when it fires its C active columns.
+        seconds: for each unit (C,) float64, the times of these columns.
+        speed: (2,) upper bounds of the speed (m/s) and the rotation rate (rad/s) of all units.
     """
 
     T_world_ego: Tensor
@@ -69,14 +69,14 @@ class EgoMotion:
 def scan(
     profile: LidarProfile, solids: Solids, ground: Ground, T_world_ego: Tensor, generator: torch.Generator
 ) -> Returns:
-    """Simulate a sweep of all LiDARs (units) of a vehicle, in which all shots are taken at the same instant.
+    """Simulate an instantaneous sweep: all LiDARs (units) of a vehicle fire all shots at the same time.
 
     Args:
         profile: the units and their quality.
         solids: everything in the world except the ground.
         ground: height of the ground in the world.
         T_world_ego: (4, 4) float64.
-        generator: source of noise, drop-out and the azimuth at which the sweep begins.
+        generator: source of the noise, the lost returns and the azimuth of the first column.
     """
     of_units = []
     T_solid_ego = torch.linalg.inv(solids.pose) @ T_world_ego
@@ -104,17 +104,17 @@ def scan(
 def scan_rolling(
     profile: LidarProfile, solids: MovingSolids, ground: Ground, ego: EgoMotion, generator: torch.Generator
 ) -> Returns:
-    """Simulate a sweep of all units of a vehicle. Every shot has its own time. Args: as for `scan`."""
+    """Simulate a rolling sweep of all units of a vehicle: every column of shots has its own time and ego pose."""
     of_units = []
     for number, unit in enumerate(profile.units):
         first, end = unit.active_columns or (0, unit.num_columns)
         step = math.radians(unit.span) / unit.num_columns
-        early = torch.rand((), generator=generator, dtype=torch.float64).item() if unit.has_jitter else 0.5
+        phase = torch.rand((), generator=generator, dtype=torch.float64).item() if unit.has_jitter else 0.5
         columns = torch.arange(first, end)
         T_world_unit = ego.T_world_unit[number].clone()
         T_world_unit[:, :3, 3] -= solids.origin
         shots = Shots(
-            azimuth=math.radians(unit.start) + step * (columns.double() + early),
+            azimuth=math.radians(unit.start) + step * (columns.double() + phase),
             seconds=ego.seconds[number],
             T_world_sensor=T_world_unit,
             elevation=torch.tensor(unit.elevations, dtype=torch.float64).deg2rad().sort().values,
@@ -128,7 +128,7 @@ def scan_rolling(
         T_ego_sensor = torch.from_numpy(unit.T_ego_sensor).float()
         R, t = T_ego_sensor[:3, :3], T_ego_sensor[:3, 3:]
         if profile.is_deskewed and not unit.is_virtual:
-            # From the end of the ray in the world to the frames at the time stamp.
+            # Transform the point that was hit from the world to the frames at the time stamp.
             T_ego_world = torch.linalg.inv(ego.T_world_ego)
             T_ego_world[:3, 3] += T_ego_world[:3, :3] @ solids.origin
             origins = T_world_unit[:, :3, 3].T.float().contiguous()
@@ -158,10 +158,10 @@ def _measure(
     """Add noise along the ray, and drop returns that are too near, too far, too weak, or lost at random.
 
     Args:
-        cosine_at: returns the cosines of the angles of incidence for rays (n,) that hit solids.
+        cosine_at: maps rays (n,) that hit solids to the cosines of their angles of incidence.
 
     Returns:
-        (N,) int64 rays that returned; (N,) float32 measured range; (N,) float32 share of the light reflected.
+        (N,) int64 rays that returned; (N,) float32 measured range; (N,) float32 reflected share of the light.
     """
     max_range = min(unit.max_range or profile.max_range, profile.max_range)
     hit = ((image.distance > profile.min_range) & (image.distance < max_range)).nonzero()[:, 0]
@@ -174,11 +174,11 @@ def _measure(
     distance, solid, cosine = (values.index_select(0, hit) for values in (image.distance, image.solid, image.cosine))
     on_solid = (solid >= 0).nonzero()[:, 0]
     cosine[on_solid] = cosine_at(hit.index_select(0, on_solid))
-    # Solid -1, the ground, reads the last row.
+    # The ground has index -1, which takes the last element.
     albedo = torch.cat([solids.albedo, torch.tensor([GROUND_ALBEDO])]).take(solid)
     is_foliage = torch.cat([solids.is_foliage, torch.tensor([False])]).take(solid)
     reflected = cosine * albedo
-    # The light decreases with 1 / range^2; the threshold is soft.
+    # The received light decreases with 1 / range^2. The detection threshold is soft.
     margin = reflected * ((unit.reach or profile.reach) / distance) ** 2
     if profile.extinction:
         margin = margin * torch.exp(-2 * profile.extinction * distance)

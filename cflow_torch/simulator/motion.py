@@ -1,4 +1,4 @@
-"""Poses at every moment of a sweep: of the ego vehicle, its LiDARs, and all solids."""
+"""Poses of the ego vehicle, its LiDARs and all solids at any time during a sweep."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from cflow_torch.simulator.rolling import MovingSolids
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile
 
-_NUM_INTERVALS = 4  # of a sweep, in which poses are interpolated element by element: a leg's swing to 0.3 mm
-_DERIVATIVE_STEP = 1e-3  # seconds, of central differences
+_NUM_INTERVALS = 4  # per sweep; poses are interpolated within each, element by element: legs are exact to 0.3 mm
+_DERIVATIVE_STEP = 1e-3  # half the interval of central differences, seconds
 
 
 class Motion:
@@ -21,7 +21,7 @@ class Motion:
 
     Args:
         scene: ground, ego vehicle and bodies.
-        profile: the LiDARs: their mountings and the times of their shots.
+        profile: mountings and shot times of the LiDARs.
         stamps: (S,) float64 seconds, time stamps of the sweeps.
     """
 
@@ -54,14 +54,14 @@ class Motion:
             poses.append(torch.from_numpy(ego @ unit.T_ego_sensor))
             times.append(torch.from_numpy(shots))
         route = self._scene.ego
-        # Acceleration changes the speed only a little within a sweep.
+        # An upper bound for any time up to a second after the time stamp.
         speed = abs(route.speed) + abs(route.acceleration) * (seconds + 1)
         yaw_rate = speed * (1 / route.radius + abs(self._scene.ground.curvature))
         return EgoMotion(torch.from_numpy(stamped), poses, times, (1.1 * speed + 6 * yaw_rate, 1.1 * yaw_rate))
 
     @cached_property
     def _dynamic_poses(self) -> np.ndarray:
-        """(S, K + 1, M, 4, 4) float64 poses of the dynamic bodies at the knots of all sweeps; slow, so done once."""
+        """(S, K + 1, M, 4, 4) float64 poses of the dynamic bodies at the knots of all sweeps; cached: it is slow."""
         knots = np.stack([self._knots(stamp) for stamp in self._stamps.tolist()])
         poses = self._dynamic.body_poses(knots.ravel())
         return poses.reshape(*knots.shape, *poses.shape[1:])
@@ -81,20 +81,20 @@ class Motion:
             is_own=self._is_own,
             origin=torch.from_numpy(origin),
             knots=torch.from_numpy(knots),
-            static=torch.from_numpy(_from(self._T_static_world, origin)),
+            static=torch.from_numpy(_relative_to(self._T_static_world, origin)),
             row=torch.from_numpy(self._row),
-            dynamic=torch.from_numpy(_from(dynamic, origin)),
+            dynamic=torch.from_numpy(_relative_to(dynamic, origin)),
         )
 
     def radial_velocity(self, seconds: float, returns: Returns) -> np.ndarray:
-        """(N,) float32 m/s, speed over ground of each surface that was hit, along its ray; positive = receding."""
+        """(N,) float32 m/s, speed over ground along each ray of the surface that it hit; positive = receding."""
         row_of_hit = np.append(self._row, -1)[returns.solid.numpy()]
         velocity = np.zeros(len(row_of_hit), np.float32)
         rows = np.flatnonzero(row_of_hit >= 0)
         if not len(rows):
             return velocity
         knots = self._knots(seconds) if self._profile.is_rolling else np.array([seconds])
-        # The velocity of a point that is fixed to a dynamic solid is a linear function of its position in the world.
+        # The velocity of a point on a rigid solid is a linear function of the point's position in the world.
         spread = np.add.outer(knots, (-_DERIVATIVE_STEP, 0.0, _DERIVATIVE_STEP))
         bodies = self._dynamic.body_poses(spread.ravel())
         poses = np.stack([self._dynamic.solids(t, p).pose.numpy() for t, p in zip(spread.ravel().tolist(), bodies)])
@@ -120,7 +120,7 @@ class Motion:
     def _ray_ends(
         self, seconds: float, shot: np.ndarray, returns: Returns, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 3) float64 world position of the LiDAR at each shot, and of the point that it hit."""
+        """(n, 3) float64 each: world positions of the LiDAR at its shots, and of the points that they hit."""
         profile, stamped = self._profile, self.ego_poses(np.array([seconds]))[0]
         unit = returns.unit.numpy()[rows]
         is_virtual = np.array([u.is_virtual for u in profile.units])[unit]
@@ -144,8 +144,8 @@ def _inverse(poses: np.ndarray) -> np.ndarray:
     return np.concatenate([rotation, -rotation @ poses[..., :3, 3:]], -1)
 
 
-def _from(transforms: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(..., 3, 4) transforms for coordinates relative to `origin` (3,)."""
+def _relative_to(transforms: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(..., 3, 4) the same transforms, for world coordinates relative to `origin` (3,)."""
     moved = transforms.copy()
     moved[..., 3] += transforms[..., :3] @ origin
     return moved

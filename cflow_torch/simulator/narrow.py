@@ -13,9 +13,9 @@ from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.street import EAST, NORTH, SOUTH, WEST
 from cflow_torch.simulator.trajectories import Route
 
-HALF_WIDTH = 3.1  # metres
-PAVEMENT = 1.5
-REACH = 90.0
+HALF_WIDTH = 3.1  # of the road, metres
+PAVEMENT = 1.5  # width, metres
+REACH = 90.0  # the houses stand at |x| up to this, metres
 
 
 def build_narrow(rng: np.random.Generator) -> Scene:
@@ -45,21 +45,21 @@ def _traffic(rng: np.random.Generator) -> Iterator[Body]:
 
 
 def _people(rng: np.random.Generator) -> Iterator[Body]:
-    """People close to the walls, in doorways, and people who step out from behind parked cars."""
+    """People close to the walls, and people who step into the road, three of them from behind parked cars."""
     front = HALF_WIDTH + PAVEMENT
     for side in (-1, 1):
         for x in rng.uniform(-30, 60, size=7).tolist():
             y = side * (front - rng.uniform(0.38, 0.6))
             speed = float(rng.choice((0.0, 1.0, 1.4, 1.8)))
             yield objects.pedestrian(rng, Route(x, y, float(rng.choice((EAST, WEST))), speed=speed))
-    # Occluded by the parked cars at first; they step into the road one after the other, far enough ahead.
+    # Parked cars hide these people until they step into the road, far enough ahead of the ego car.
     for x in (15.6, 22.8, 44.4):
         yield objects.pedestrian(rng, Route(x, HALF_WIDTH + rng.uniform(0.4, 1.6), SOUTH, speed=rng.uniform(1.1, 1.8)))
     yield objects.pedestrian(rng, Route(29.0, -front + 0.7, NORTH, speed=0.7))
 
 
 def _fixed(rng: np.random.Generator) -> Iterator[Body]:
-    """Houses without gaps except gateways, posts, dustbins."""
+    """Rows of houses with a few gateways, posts, dustbins and bushes."""
     front, depth = HALF_WIDTH + PAVEMENT, 7.0
     for side in (-1, 1):
         x = -REACH

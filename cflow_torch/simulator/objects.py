@@ -15,7 +15,7 @@ from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID
 from cflow_torch.simulator.trajectories import Route, Towed
 
 Vector = Tuple[float, float, float]
-HIP = 0.9  # height about which legs swing, metres
+HIP = 0.9  # height of the axis about which legs swing, metres
 
 
 class Solid(NamedTuple):
@@ -24,12 +24,12 @@ class Solid(NamedTuple):
     Args:
         kind: BOX, CYLINDER or ELLIPSOID.
         centre: metres, body frame.
-        half: half size along its own axes, metres.
-        pitch, roll: radians about y, then x: rotation of the solid in the body.
+        half: half size along the axes of the solid, metres.
+        pitch, roll: rotation of the solid in the body, radians: first by roll about x, then by pitch about y.
         albedo: share of the light that is reflected.
-        is_foliage: returns flicker from sweep to sweep.
-        swing: amplitude of a leg's swing about the hip's y axis, radians.
-        stride: steps per second; phase: radians at time 0.
+        is_foliage: returns are lost at random (`lidar.FOLIAGE_RETURN`).
+        swing: amplitude of a leg's swing about the y axis through the hip, radians; 0 = no leg.
+        stride: periods of the swing per second (two steps each); phase: of the swing at time 0, radians.
     """
 
     kind: int
@@ -51,8 +51,8 @@ class Body:
     Args:
         solids: its shape.
         trajectory: a function of (T,) seconds that returns (T, 3) world x, y, yaw.
-        category: Argoverse 2 category name, None = background (never labelled, never moves).
-        size: length, width, height, from the ground up, metres.
+        category: Argoverse 2 category name. None = never labelled: background, which never moves, or the own truck.
+        size: length, width and height above ground, metres.
     """
 
     solids: Sequence[Solid]
@@ -62,12 +62,12 @@ class Body:
 
     @property
     def is_static(self) -> bool:
-        """True if the body never moves."""
+        """True if the body never moves. A trailer counts as moving, even behind a parked tractor."""
         return isinstance(self.trajectory, Route) and self.trajectory.is_static
 
 
 def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, albedo: float) -> Solid:
-    """A box from its six faces, metres, body frame."""
+    """A box, given by the coordinates of its six faces in the body frame, metres."""
     centre = ((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2)
     return Solid(BOX, centre, ((x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2), albedo=albedo)
 
@@ -94,13 +94,13 @@ def car(rng: np.random.Generator, route: Route) -> Body:
 
 
 def bus(route: Route) -> Body:
-    """Twelve metres of bus."""
+    """A bus 12 m long."""
     solids = [box(-6, 6, -1.27, 1.27, 0.35, 3.1, 0.6), *_wheels((-3.2, 3.3), 1.27, 0.48)]
     return Body(solids, route, "BUS", (12.0, 2.54, 3.1))
 
 
 def articulated_truck(route: Route) -> list[Body]:
-    """A tractor and a trailer, which are two tracks."""
+    """A tractor and a trailer. Each is a body with its own track."""
     cab = [
         box(0.4, 2.8, -1.2, 1.2, 0.5, 3.3, 0.7),
         box(-2.8, 0.4, -0.6, 0.6, 0.6, 1.0, 0.3),
@@ -126,7 +126,7 @@ def van(rng: np.random.Generator, route: Route) -> Body:
 
 
 def own_truck(route: Route) -> list[Body]:
-    """The recording truck itself: a cab and a trailer between its LiDARs. `route` is that of its rear axle."""
+    """The recording truck, a cab and a trailer. `route` is the route of the cab's rear axle."""
     cab = [box(2.6, 5.0, -1.25, 1.25, 0.4, 3.1, 0.5), box(-1.0, 2.6, -0.6, 0.6, 0.3, 0.9, 0.3)]
     trailer = [box(-6.3, 6.0, -1.25, 1.25, 1.1, 4.0, 0.7), *_wheels((-4.4, -3.1, -1.8), 1.25, 0.5)]
     return [Body(cab, route), Body(trailer, Towed(route, hitch=-0.3, wheelbase=7.6, middle=4.7))]
@@ -179,12 +179,12 @@ def cyclist(rng: np.random.Generator, route: Route) -> Body:
 
 
 def wall(x: float, y: float, length: float, depth: float, height: float, albedo: float = 0.45) -> Body:
-    """A box aligned with the world axes (building, garden wall or hoarding) that reaches a metre into the ground."""
+    """A building, garden wall or hoarding: a box along the world axes that reaches a metre into the ground."""
     return Body([box(-length / 2, length / 2, -depth / 2, depth / 2, -1.0, height, albedo)], Route(x, y))
 
 
 def pole(x: float, y: float, height: float, radius: float, sign: float = 0.0) -> Body:
-    """A lamp post. With `sign` > 0, it is a sign post with a square plate of that side, metres, at its top."""
+    """A lamp post, or with `sign` > 0 a sign post: its top has a square plate with sides of `sign` metres."""
     solids = [Solid(CYLINDER, (0, 0, height / 2), (radius, radius, height / 2), albedo=0.4)]
     if sign:
         solids.append(box(-0.03, 0.03, -sign / 2, sign / 2, height - sign, height, 0.9))
@@ -192,7 +192,7 @@ def pole(x: float, y: float, height: float, radius: float, sign: float = 0.0) ->
 
 
 def tree(rng: np.random.Generator, x: float, y: float, num_leaves: int = 110) -> Body:
-    """A trunk, and a crown of ellipsoids for leaves."""
+    """A trunk, and a crown of leaves (ellipsoids)."""
     spread, bottom = rng.uniform(1.3, 2.1), rng.uniform(2.0, 2.8)
     trunk = Solid(CYLINDER, (0, 0, bottom / 2 + 0.5), (0.14, 0.14, bottom / 2 + 0.5), albedo=0.3)
     crown = _foliage(rng, (spread, spread, 1.3 * spread), bottom + 1.2 * spread, num_leaves, (0.12, 0.35))
@@ -200,7 +200,7 @@ def tree(rng: np.random.Generator, x: float, y: float, num_leaves: int = 110) ->
 
 
 def bush(rng: np.random.Generator, x: float, y: float, num_leaves: int = 40) -> Body:
-    """Leaves from the ground up."""
+    """A bush: leaves (ellipsoids) from the ground up."""
     size = (rng.uniform(0.5, 1.4), rng.uniform(0.4, 0.7), rng.uniform(0.4, 0.8))
     return Body(_foliage(rng, size, size[2], num_leaves, (0.08, 0.2)), Route(x, y))
 
@@ -208,7 +208,7 @@ def bush(rng: np.random.Generator, x: float, y: float, num_leaves: int = 40) -> 
 def _foliage(
     rng: np.random.Generator, radii: Vector, height: float, number: int, leaf: tuple[float, float]
 ) -> list[Solid]:
-    """Small ellipsoids, spread evenly through a large one."""
+    """`number` small ellipsoids at random positions inside a large one, whose middle is at `height`."""
     offsets = rng.normal(size=(number, 3))
     offsets *= rng.uniform(size=(number, 1)) ** (1 / 3) / np.linalg.norm(offsets, axis=1, keepdims=True)
     centres = offsets * radii + (0, 0, height)

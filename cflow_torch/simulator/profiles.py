@@ -1,6 +1,6 @@
 """Sensor profiles of five data sets, and the weather.
 
-Values that no source gives are marked "chosen": they are our own choice.
+"Chosen" marks the values that we chose, because no source gives them.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ import numpy as np
 from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
 
 # Elevations of beams, degrees above the sensor's xy plane. The 32-beam table agrees with a real Argoverse 2 sweep to
-# 0.02 degrees. The other two are published tables that we have not compared with a sweep of the same unit.
-# By laser number: the 32-beam unit of which Argoverse 2 has two.
+# 0.02 degrees. The other two are published tables that we have not compared with real sweeps.
+# The 32-beam unit, by laser number. An Argoverse 2 vehicle has two.
 _VLP_32C = (
     *(7.0, -1.667, 1.667, -0.667, 15.0, -0.333, 3.333, 0.667, 1.333, 0.0, 1.0, 2.333, 0.333, -1.0, 4.667, 10.333),
     *(-6.148, -15.639, -3.0, -2.0, -4.0, -8.843, -4.667, -3.333, -2.667, -5.333, -1.333, -7.254, -3.667, -11.31),
     *(-2.333, -25.0),
 )
-# By row of the range image, highest first: the roof LiDAR of Waymo.
+# Waymo's roof LiDAR, by row of the range image, highest first.
 _WAYMO_TOP = (
     *(2.503, 2.321, 2.160, 1.989, 1.821, 1.650, 1.494, 1.322, 1.163, 0.991, 0.810, 0.648, 0.483, 0.320, 0.165, -0.012),
     *(-0.189, -0.342, -0.505, -0.683, -0.845, -1.020, -1.189, -1.367, -1.541, -1.757, -1.965, -2.189, -2.437, -2.668),
@@ -27,7 +27,7 @@ _WAYMO_TOP = (
     *(-7.646, -8.082, -8.523, -8.957, -9.422, -9.885, -10.369, -10.830, -11.332, -11.823, -12.364, -12.909, -13.438),
     *(-13.984, -14.538, -15.076, -15.689, -16.300, -16.912, -17.547),
 )
-# By channel, highest first.
+# The 64-beam unit of TruckScenes, by channel, highest first.
 _PANDAR_64 = (
     *(14.87, 11.02, 8.047, 5.045, 3.028, 2.016, 1.848, 1.676, 1.51, 1.339, 1.172, 1.001, 0.834, 0.663, 0.496, 0.325),
     *(0.157, -0.012, -0.181, -0.349, -0.52, -0.687, -0.857, -1.025, -1.196, -1.363, -1.534, -1.7, -1.872, -2.04),
@@ -42,13 +42,13 @@ def _uniform(lowest: float, highest: float, number: int) -> tuple[float, ...]:
 
 
 _UP = SpinningLidar("up_lidar", _VLP_32C, 1800, (1.350, 0.0, 1.640), yaw=-0.58)
-# It also spins clockwise seen from above, half a revolution apart from the upper one.
+# Seen from above, it spins clockwise like the upper LiDAR, half a revolution apart.
 _DOWN = SpinningLidar(
     *("down_lidar", _VLP_32C, 1800, (1.347, 0.005, 1.525)), yaw=-11.56, upside_down=True, start=0.0, span=360.0
 )
 _AV2 = LidarProfile((_UP, _DOWN))
 
-# A quarter of the rays of av2, for examples and tests.
+# A quarter of the rays of av2. It is for examples and tests.
 _DEMO = LidarProfile(
     (SpinningLidar("up_lidar", _uniform(-25, 7, 32), 900, (1.35, 0.0, 1.64)),),
     max_range=120.0,
@@ -67,9 +67,9 @@ _NUSCENES = LidarProfile(
 
 
 def _truckscenes() -> LidarProfile:
-    """Chosen: all mountings but that of TOP_FRONT, the fans, the reaches, and the time stamp at the start of a sweep.
+    """Chosen: all mountings except LIDAR_TOP_FRONT's, active columns, reaches, and the time stamp at the sweep's start.
 
-    The azimuth offsets between the beams of the 64-beam units are left out.
+    We ignore the azimuth offsets between the beams of the 64-beam units.
     """
 
     def corner(name: str, side: int) -> SpinningLidar:
@@ -97,9 +97,9 @@ def _truckscenes() -> LidarProfile:
 
 
 def _waymo() -> LidarProfile:
-    """One LiDAR on the roof, and four for short ranges; azimuths on the grid of the range images.
+    """One LiDAR on the roof, and four small ones for short ranges. Azimuths are on the grid of the range images.
 
-    Chosen: the small ones cover 90 degrees and fill three pixels in ten, so that a few per cent of an image are valid.
+    Chosen: the small LiDARs cover 90 degrees and lose 70 % of their returns. A few per cent of an image are valid.
     """
     rows = _uniform(-89.7, 29.7, 200)  # middles of 200 rows from -90 to 30 degrees
 
@@ -168,7 +168,7 @@ PROFILES: dict[str, LidarProfile] = {
     "aevascenes": _aevascenes(),
 }
 
-# Extinction per metre, and the share of returns that are lost at any range.
+# Extinction coefficient, 1/m, and the share of returns that are lost at any range.
 WEATHER: dict[str, tuple[float, float]] = {
     "clear": (0.0, 0.0),
     "rain": (0.004, 0.06),
@@ -178,7 +178,7 @@ WEATHER: dict[str, tuple[float, float]] = {
 
 
 def in_weather(profile: LidarProfile, extinction: float, lost: float) -> LidarProfile:
-    """The profile in rain, snow or fog: distant and dark surfaces are lost first, and a share of returns at random."""
+    """The profile in rain, snow or fog: distant, dark surfaces and a share `lost` of all returns are not seen."""
 
     def dropout(clear: float) -> float:
         return 1 - (1 - clear) * (1 - lost)

@@ -1,4 +1,4 @@
-"""True range images of a LiDAR: the first intersection of each ray with the ground or a solid."""
+"""Range images of a LiDAR without noise: the first intersection of each ray with the ground or a solid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class RangeImage:
     """First intersections of the C * B rays of a unit, without measurement noise. Ray index = column * B + beam.
 
     Args:
-        rays: (3, C * B) float32 unit vectors, in the sensor frame (instantaneous sweeps) or world axes (rolling ones).
+        rays: (3, C * B) float32 unit vectors: sensor frame in instantaneous sweeps, world axes in rolling ones.
         distance: (C * B,) float32 true range, metres, inf = no hit.
         solid: (C * B,) int64 index of the solid, -1 = the ground or no hit.
         cosine: (C * B,) float32 cosine of the angle of incidence, where the ray hits the ground.
@@ -45,7 +45,7 @@ def cast_unit(
 
     Args:
         phase: azimuth of the first column, radians.
-        T_solid_ego: (P, 4, 4) float64, ego coordinates to the solids'.
+        T_solid_ego: (P, 4, 4) float64, from the ego frame to the frame of each solid.
     """
     T_ego_sensor = torch.from_numpy(unit.T_ego_sensor)
     T_world_sensor, T_solid_sensor = T_world_ego @ T_ego_sensor, T_solid_ego @ T_ego_sensor
@@ -77,7 +77,7 @@ def cast_shots(
     directions = level * shots.elevation.cos().float() + up * shots.elevation.sin().float()  # (3, C, B)
     origin = (shots.T_world_sensor[:, :3, 3] + solids.origin).T[..., None]
     ground_distance, cosine = (values.flatten() for values in ground.cast(origin, directions))
-    solid = torch.cat([blocks.solid, torch.tensor([-1])]).take(block)  # block -1 reads the last row
+    solid = torch.cat([blocks.solid, torch.tensor([-1])]).take(block)  # block -1 takes the last element
     solid = solid.masked_fill(ground_distance < distance, -1)
     distance = torch.minimum(distance, ground_distance)
 

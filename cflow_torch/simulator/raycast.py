@@ -1,8 +1,8 @@
 """Ray casting: intersect all rays of a range image with all solids of a scene, without a Python loop over either.
 
-A solid is an affine image of the unit cube, the unit cylinder or the unit ball. As seen from the sensor, it covers a
-block of columns (azimuth) and beams (elevation) of the range image, and only the rays of that block are tested. The
-nearest hit of a ray counts, which gives occlusion.
+A solid is an affine image of a *unit solid*: a cube, cylinder or ball. Its *unit coordinates* are those in which it is
+the unit solid. Seen from the sensor, a solid covers a block of columns (azimuth) and beams (elevation) of the range
+image. We test only the rays of this block. Of the hits of a ray, the nearest counts, so solids occlude each other.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Callable, NamedTuple
 import torch
 from torch import Tensor
 
-BOX, CYLINDER, ELLIPSOID = 0, 1, 2  # unit solids: |x|, |y|, |z| <= 1; x^2 + y^2 <= 1, |z| <= 1; x^2 + y^2 + z^2 <= 1
+BOX, CYLINDER, ELLIPSOID = 0, 1, 2  # |x|, |y|, |z| <= 1; x^2 + y^2 <= 1, |z| <= 1; x^2 + y^2 + z^2 <= 1
 
-_MAX_CANDIDATES = 1 << 15  # (ray, solid) tests at once: a few MB, which stay in the cache
+_MAX_CANDIDATES = 1 << 15  # (ray, solid) tests at once; their few MB stay in the cache of the CPU
 _NO_HIT = torch.iinfo(torch.int64).max
 
 
@@ -27,7 +27,7 @@ class Solids:
     Args:
         kind: (P,) int64, BOX, CYLINDER or ELLIPSOID.
         pose: (P, 4, 4) float64, solid to world.
-        half_size: (P, 3) float64, metres: the unit solid is scaled by it.
+        half_size: (P, 3) float64, metres, by which the axes of the unit solid are scaled.
         albedo: (P,) float32 in (0, 1], share of the light that is reflected.
         is_foliage: (P,) bool.
     """
@@ -56,8 +56,9 @@ class Blocks(NamedTuple):
 
 
 class UnitRays(NamedTuple):
-    """M columns of rays in unit coordinates of a solid: (3, M) float32 origins, and the two parts of the directions,
-    level * cos(elevation) + up * sin(elevation)."""
+    """M columns of rays, each in unit coordinates of a solid. All fields are (3, M) float32.
+
+    The direction of a ray is level * cos(elevation) + up * sin(elevation)."""
 
     origin: Tensor
     level: Tensor
@@ -84,21 +85,21 @@ def cast_solids(
 
     Args:
         kind: (P,) int64, BOX, CYLINDER or ELLIPSOID.
-        T_solid_sensor: (P, 4, 4) float64, rigid, maps coordinates of the sensor to those of the solid.
+        T_solid_sensor: (P, 4, 4) float64, rigid, from the sensor frame to the frame of each solid.
         half_size: (P, 3) float64, metres.
         azimuth: (C,) float64 radians, evenly spaced over one full revolution, ascending.
         elevation: (B,) float64 radians, ascending.
-        max_range: solids that begin beyond it may be skipped, metres.
+        max_range: metres; we may skip solids that are entirely beyond it.
 
     Returns:
         (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 solid, -1 = no hit. Ray index column * B + beam.
 
-    Convention: solids around the sensor are not hit. Ties: the first solid.
+    Convention: a solid that contains the sensor is not hit. Of solids at equal range, the first is hit.
 
-    Cost: time and memory grow with the sum, over the solids, of the rays in the block that each one covers.
+    Cost: time grows with the total number of rays in the blocks of all solids; memory with the largest block.
     """
     blocks = _covered_blocks(T_solid_sensor, half_size, azimuth, elevation, max_range)
-    # Rays in unit coordinates of the solid: origin o, direction d = u(azimuth) cos(elevation) + w sin(elevation).
+    # From the sensor frame to the unit coordinates of each solid.
     to_unit = T_solid_sensor[:, :3] / half_size[:, :, None]
     origin, matrix = to_unit[..., 3].T.float(), to_unit[..., :3].permute(1, 2, 0).float()  # (3, P), (3, 3, P)
     cos_azimuth, sin_azimuth = azimuth.cos().float(), azimuth.sin().float()
@@ -123,13 +124,13 @@ def nearest_hits(
     Args:
         kind: (P,) int64.
         blocks: E blocks.
-        rays_at: maps (M,) blocks and (M,) columns to the rays of that column, in unit coordinates of the block's solid.
+        rays_at: maps (M,) blocks and (M,) columns to the rays of each column in unit coordinates of the block's solid.
         num_columns: C, columns of the range image.
         elevation: (B,) float64 radians, ascending.
 
     Returns:
         (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 block of the solid that was hit, -1 = no hit. Ray
-        index column * B + beam. Ties: the first block.
+        index column * B + beam. At equal range, the first block counts.
     """
     num_beams = len(elevation)
     best = torch.full((num_columns * num_beams,), _NO_HIT, device=elevation.device)
@@ -151,7 +152,7 @@ def nearest_hits(
             direction = take(rays.level, pair) * take(cos_elevation, beam)
             direction += take(rays.up, pair) * take(sin_elevation, beam)
             t = intersect(take(rays.origin, pair), direction)
-            # Range (positive floats sort like their bits) and block in one integer give one exact minimum in any order.
+            # Range and block form one integer, so that the minimum is exact in any order: positive floats sort by bits.
             hit = (t < torch.inf).nonzero()[:, 0]
             pair, offset = take(pair, hit), take(offset, hit)
             key = (take(t, hit).view(torch.int32).long() << 32) | take(block, pair)
@@ -162,20 +163,20 @@ def nearest_hits(
 
 
 def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Repeat row i counts[i] times: the row indices, and 0 ... counts[i] - 1 within each row."""
+    """Repeat each row i counts[i] times. Return the row of each copy, and its number 0 ... counts[i] - 1."""
     row = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     return row, torch.arange(len(row), device=counts.device) - take(counts.cumsum(0) - counts, row)
 
 
 def take(values: Tensor, index: Tensor) -> Tensor:
-    """values[..., index]; `index_select` is several times faster than indexing on a CPU."""
+    """values[..., index], but several times faster on a CPU."""
     return values.index_select(-1, index)
 
 
 def _covered_blocks(
     T_solid_sensor: Tensor, half_size: Tensor, azimuth: Tensor, elevation: Tensor, max_range: float
 ) -> Blocks:
-    """One block per solid, which holds all rays that can meet its bounding box."""
+    """For each solid, the block of all rays that can meet its bounding box."""
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64, device=azimuth.device)] * 3)
     corners = signs * half_size[:, None] - T_solid_sensor[:, None, :3, 3]
     x, y, z = (corners @ T_solid_sensor[:, :3, :3]).unbind(-1)  # (P, 8) each, sensor frame
@@ -229,10 +230,10 @@ def _hit_ball(origin: Tensor, direction: Tensor) -> Tensor:
 
 
 def _chord(origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Ranges at which rays enter and leave |x| <= 1 (circle or ball); NaN where they pass by."""
+    """Ranges at which rays enter and leave the unit circle or ball; NaN if they miss it."""
     a = (direction * direction).sum(0)
     to_nearest = -(origin * direction).sum(0) / a
-    # The nearest point, unlike the discriminant, is accurate in float32 even for a small ball far away.
+    # Even for a small ball far away, the nearest point is accurate in float32. The discriminant is not.
     nearest = origin + to_nearest * direction
     half = ((1 - (nearest * nearest).sum(0)) / a).sqrt()
     return to_nearest - half, to_nearest + half
@@ -242,7 +243,7 @@ def incidence(solids: Solids, T_solid_sensor: Tensor, solid: Tensor, rays: Tenso
     """Cosine of the angle between rays and the normals of the surfaces that they hit.
 
     Args:
-        T_solid_sensor: (P, 4, 4) float64, sensor coordinates to the solid's.
+        T_solid_sensor: (P, 4, 4) float64, from the sensor frame to the frame of each solid.
         solid: (N,) int64, the solid that was hit.
         rays: (3, N) float32 unit vectors, sensor frame.
         distance: (N,) float32 range of the hit, metres.
@@ -262,8 +263,8 @@ def cosine_of_incidence(kind: Tensor, at: Tensor, direction: Tensor, inverse_hal
     """Cosine of the angle between rays and the normals of the solids that they hit.
 
     Args:
-        kind: (N,) int64, of the solid.
-        at: (3, N) float32, the point that was hit, unit coordinates of the solid.
+        kind: (N,) int64, kind of the solid that was hit.
+        at: (3, N) float32, the point that was hit, in unit coordinates of the solid.
         direction: (3, N) float32 unit vectors, axes of the solid.
         inverse_half: (3, N) float32, 1 / half size of the solid.
 

@@ -19,7 +19,7 @@ class Boxes:
         category: (M,) Argoverse 2 names.
         size: (M, 3) float64 length, width, height, metres.
         pose: (M, 4, 4) float64 `T_ego_box`, origin in the middle of the box.
-        num_points: (M,) int64 LiDAR points on the object.
+        num_points: (M,) int64, number of LiDAR points on the object.
     """
 
     track_id: tuple[str, ...]
@@ -34,7 +34,7 @@ class GroundRaster:
     """Ground height on a grid.
 
     Args:
-        height: (H, W) world z in metres at the middle of each cell, row from y, column from x; NaN = unknown.
+        height: (H, W) world z of the middle of each cell, metres; row from y, column from x; NaN = unknown.
         origin: world x, y of the outer corner of cell (0, 0), metres.
         step: side of a cell, metres.
     """
@@ -50,13 +50,13 @@ class UnitReturns:
 
     Args:
         name: the unit's name in the data set, for example "LIDAR_TOP".
-        T_ego_sensor: (4, 4) float64, coordinates of the unit to those of the ego frame.
-        points: (N, 3) float32, metres, frame of the UNIT, after the motion compensation of the data set.
+        T_ego_sensor: (4, 4) float64, from the unit's frame to the ego frame.
+        points: (N, 3) float32, metres, frame of the UNIT; motion-compensated if the data set's points are.
         ring: (N,) int32, row of the unit's table of elevations; row 0 is the lowest beam.
-        column: (N,) int32, index of the azimuth step in the order of time.
-        offset_ns: (N,) int64, time of the shot after the sweep's time stamp; may be negative.
+        column: (N,) int32, index of the azimuth step, counted in the direction of rotation.
+        offset_ns: (N,) int64, time from the sweep's time stamp to the shot; may be negative.
         intensity: (N,) uint8.
-        radial_velocity: (N,) float32, m/s, of the surface that was hit, over ground along the ray; positive = receding.
+        radial_velocity: (N,) float32, m/s, speed over ground of the surface along the ray; positive = receding.
         num_rings, num_columns: size of the unit's range image.
     """
 
@@ -73,7 +73,7 @@ class UnitReturns:
 
 
 class Recording(Log, Protocol):
-    """A log with all data that writers need: ground masks, truth, calibration, returns per LiDAR, and boxes."""
+    """A log with all that writers need: ground masks, true flow, calibration, returns of each LiDAR, and boxes."""
 
     poses: np.ndarray
     """(num_sweeps, 4, 4) float64 `T_world_ego` at each time stamp."""
@@ -82,16 +82,16 @@ class Recording(Log, Protocol):
 
     def units(self, index: int) -> Sequence[UnitReturns]:
         """Returns of each LiDAR in sweep `index`. Their points, transformed to the ego frame and concatenated in this
-        order, are the rows of `sweep(index)` and of `labels(index)`."""
+        order, are the points of `sweep(index)`, and `labels(index)` has the same rows."""
 
     def elevations(self, unit: str) -> np.ndarray:
         """(num_rings,) float64 radians, elevation of each ring of the LiDAR named `unit`, lowest first."""
 
     def boxes(self, index: int) -> Boxes:
-        """Annotation boxes of sweep `index`, ego frame, category by Argoverse 2 name."""
+        """Annotation boxes of sweep `index`."""
 
     def channels(self, index: int) -> Mapping[str, np.ndarray]:
-        """(N,) uint8 intensity, uint8 laser_number, int32 offset_ns of every point; only Argoverse 2 stores them."""
+        """(N,) uint8 intensity, uint8 laser_number, int32 offset_ns of every point; only the av2 writer calls it."""
 
     def ground_raster(self) -> GroundRaster:
-        """Ground height of the whole drive; only Argoverse 2 stores it."""
+        """Ground height of the whole drive; only the av2 writer calls it."""

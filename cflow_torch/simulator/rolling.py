@@ -1,4 +1,4 @@
-"""Rays of a LiDAR in a rolling sweep: every column has its own time, and vehicle and bodies move during the sweep."""
+"""Rays of a LiDAR in a rolling sweep: every column has its own time, and the vehicle and bodies move meanwhile."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cflow_torch.simulator.raycast import ELLIPSOID, Blocks, UnitRays, cosine_of_incidence, take
 
-_ROUNDS = 2  # of finding the column whose shots meet a solid, and its pose then; each divides the error by 6 or more
+_ROUNDS = 2  # of refining which column meets a solid and where the solid is then; each divides the error by 6 or more
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,12 @@ class MovingSolids:
     Args:
         kind: (P,) int64.
         half_size: (P, 3) float64, metres.
-        albedo, is_foliage, is_own: (P,) float32, (P,) bool, (P,) bool = part of the recording vehicle.
+        albedo, is_foliage: (P,) float32, (P,) bool, as in `Solids`.
+        is_own: (P,) bool, part of the recording vehicle.
         origin: (3,) float64, world metres.
         knots: (K + 1,) float64 seconds, evenly spaced, K >= 1.
-        static: (P, 3, 4) float64, world (relative to `origin`) to solid, at the first knot.
-        row: (P,) int64, row of `dynamic` of each solid, -1 = static.
+        static: (P, 3, 4) float64, world to solid; only valid for static solids.
+        row: (P,) int64, index of each solid in the second dimension of `dynamic`, -1 = static.
         dynamic: (K + 1, M, 3, 4) float64, world to solid at the knots; elements are interpolated in between.
     """
 
@@ -48,7 +49,7 @@ class MovingSolids:
             seconds: (E,) float64.
 
         Returns:
-            (E, 3, 4) float64, transforms; (E, 3, 4) float64, their derivatives, per second.
+            (E, 3, 4) float64 transforms; (E, 3, 4) float64 derivatives, per second.
         """
         transform = self.static.index_select(0, solid)
         change = torch.zeros_like(transform)
@@ -61,7 +62,7 @@ class MovingSolids:
     def dynamic_at(self, row: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
         """Return the transforms from the world to E moving solids, and their derivatives: (E, 3, 4) float64 each.
 
-        `row` is (E,) int64, the row of `dynamic` of each solid.
+        `row` (E,) int64 has their indices in `dynamic`, `seconds` (E,) float64 their times.
         """
         step = float(self.knots[1] - self.knots[0])
         after = seconds - self.knots[0]
@@ -79,19 +80,19 @@ class MovingSolids:
 
     @property
     def middle(self) -> Tensor:
-        """() float64 seconds, the middle between the first and the last knot."""
+        """() float64 seconds, midway between the first and the last knot."""
         return 0.5 * (self.knots[0] + self.knots[-1])
 
     @cached_property
     def centres(self) -> tuple[Tensor, Tensor]:
-        """(P, 3) float64 centres of the solids at `middle`; (P,) upper bound of the speed of any part of them, m/s."""
+        """(P, 3) float64 centres of the solids at `middle`; (P,) upper bound of the speed of their points, m/s."""
         count = len(self.kind)
         transform, _ = self.at(torch.arange(count), self.middle.expand(count))
         centre = rotate(transform[:, :, :3].transpose(1, 2), -transform[:, :, 3])
         speed = torch.zeros(count, dtype=torch.float64)
         moving = (self.row >= 0).nonzero()[:, 0]
         arm = self.half_size[moving].norm(dim=1)
-        for knot in self.knots[:-1]:  # every interval, because legs swing
+        for knot in self.knots[:-1]:  # the velocity differs between intervals, because legs swing
             _, change = self.dynamic_at(self.row[moving], knot.expand(len(moving)))
             at_centre = rotate(change[:, :, :3], centre[moving]) + change[:, :, 3]
             rotation = change[:, :, :3].flatten(1).norm(dim=1) * arm
@@ -101,10 +102,10 @@ class MovingSolids:
 
 @dataclass(frozen=True)
 class Shots:
-    """The columns of shots of a unit in one sweep.
+    """The C columns of B shots that a unit fires in one sweep.
 
     Args:
-        azimuth: (C,) float64 radians, evenly spaced in the order of time, sensor frame.
+        azimuth: (C,) float64 radians, sensor frame, in the order of time, evenly spaced.
         seconds: (C,) float64, evenly spaced.
         T_world_sensor: (C, 4, 4) float64, relative to the `origin` of the solids.
         elevation: (B,) float64 radians, ascending.
@@ -126,15 +127,15 @@ class Shots:
 
 
 def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Blocks:
-    """Blocks of the range image that hold all rays which can meet a solid's bounding box (bounding sphere of a ball).
+    """Find the blocks of all rays that can meet a solid's bounding box (for an ellipsoid, its bounding sphere).
 
-    Convention: a solid near the azimuth at which the sweep begins has a block at the beginning and one at the end.
+    Convention: a solid at the azimuth where the sweep begins and ends has a block at either end of the image.
     """
     num_columns = len(shots.azimuth)
     step = float(shots.azimuth[1] - shots.azimuth[0])
     interval = float(shots.seconds[1] - shots.seconds[0])
     revolution = 2 * math.pi / abs(step)
-    # The bounding sphere of the solid in mid-sweep, and how far it may have moved at the time of a shot.
+    # `travel`: radius of a sphere around the mid-sweep centre of a solid, which holds the solid during the sweep.
     middle = num_columns // 2
     centre, speed = solids.centres
     late = abs(float(shots.seconds[middle] - solids.middle)) + 0.5 * interval * num_columns
@@ -149,7 +150,7 @@ def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Bloc
     height = torch.atan2(z, rho)
     is_seen = (height + slack > shots.elevation[0]) & (height - slack < shots.elevation[-1])
     column = ((torch.atan2(y, x) - shots.azimuth[0]) / step) % revolution
-    # The azimuth is not reliable near the sensor's axis.
+    # Near the sensor's axis, the azimuth of a solid is not reliable.
     slack = torch.where(rho < 2 * travel, math.pi, 2 * slack).clamp(max=math.pi) / abs(step)
     solid, guess = [], []
     for shift in (-revolution, 0, revolution):
@@ -163,7 +164,7 @@ def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Bloc
 def _blocks_near(
     solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor, speed: Tensor, max_range: float
 ) -> Blocks:
-    """Blocks of `solid` (E,), which the unit meets near column `guess` (E,)."""
+    """One block for each `solid` (E,), which the unit meets near column `guess` (E,)."""
     num_columns = len(shots.azimuth)
     step = float(shots.azimuth[1] - shots.azimuth[0])
     interval = float(shots.seconds[1] - shots.seconds[0])
@@ -174,14 +175,14 @@ def _blocks_near(
         T_world_sensor = shots.T_world_sensor.index_select(0, column)
         to_solid, _ = solids.at(solid, take(shots.seconds, column))
         rotation = to_solid[:, :, :3] @ T_world_sensor[:, :3, :3]  # sensor axes to the solid's
-        origin = rotate(to_solid[:, :, :3], T_world_sensor[:, :3, 3]) + to_solid[..., 3]  # of the sensor, in the solid
+        origin = rotate(to_solid[:, :, :3], T_world_sensor[:, :3, 3]) + to_solid[..., 3]  # of the sensor
         centre = rotate(rotation.transpose(1, 2), -origin)
         azimuth = torch.atan2(centre[:, 1], centre[:, 0])
         expected = shots.azimuth[0] + step * guess
         guess = guess + torch.remainder((azimuth - expected) / step + 0.5 * num_around, num_around) - 0.5 * num_around
 
     rho = torch.hypot(centre[:, 0], centre[:, 1])
-    spread = half.amax(1)  # horizontal radius of a ball; that of boxes and cylinders follows from their corners
+    spread = half.amax(1)  # horizontal radius of an ellipsoid's bounding sphere; corrected below for the rest
     low, high, side = centre[:, 2] - spread, centre[:, 2] + spread, (spread / rho.clamp(min=1e-6)).clamp(max=1).asin()
     side = torch.stack([-side, side])
     cornered = (solids.kind[solid] != ELLIPSOID).nonzero()[:, 0]
@@ -195,7 +196,7 @@ def _blocks_near(
         corner_side = torch.atan2(y * cos - x * sin, x * cos + y * sin)
         side[:, cornered] = torch.stack([corner_side.amin(1), corner_side.amax(1)])
 
-    # While its block is measured, the solid moves by at most `drift` from its position in the middle of that time.
+    # While the unit scans its block, a solid moves by at most `drift` from its position in the middle of the block.
     width = (side[1] - side[0]).clamp(max=2 * math.pi)
     relative = speed[solid] + shots.speed[0] + shots.speed[1] * centre.norm(dim=1)
     drift = relative * interval * (0.6 * width / abs(step) + 2)
@@ -210,7 +211,7 @@ def _blocks_near(
     end = torch.where(around, num_columns, end).clamp(0, num_columns)
     count = (end - first).clamp(min=0).masked_fill(nearest > max_range, 0)
 
-    # A solid around the sensor's axis can come nearer by its motion during the whole sweep.
+    # The block of a solid around the sensor's axis has all columns, so its motion during the whole sweep counts.
     whole = torch.where(around, relative * interval * num_columns, drift)
     nearest = torch.where(around, 1e-6, nearest)
     bottom, top = low - whole, high + whole
@@ -222,14 +223,14 @@ def _blocks_near(
 
 
 class RollingRays:
-    """Rays of blocks and columns, in unit coordinates of the solid of each block, for `raycast.nearest_hits`."""
+    """The callable `rays_at` of `raycast.nearest_hits`: rays of a column in unit coordinates of the block's solid."""
 
     def __init__(self, solids: MovingSolids, shots: Shots, blocks: Blocks) -> None:
         middle = blocks.first_column + blocks.num_columns // 2
         seconds = shots.seconds[middle.clamp(0, len(shots.seconds) - 1)]
         to_solid, change = solids.at(blocks.solid, seconds)
         half = solids.half_size[blocks.solid][..., None]
-        # A block is measured within milliseconds, in which the velocity is constant.
+        # Within a block, the velocity is constant: it takes milliseconds to scan most blocks.
         self._to_unit = (to_solid / half).flatten(1).T.float().contiguous()  # (12, E)
         self._change = (change / half).flatten(1).T.float().contiguous()
         self._moves = solids.row[blocks.solid] >= 0
@@ -258,7 +259,7 @@ class RollingRays:
         """Cosine of the angle between rays and the normals of the surfaces that they hit.
 
         Args:
-            block, column, beam: (N,) int64, the block of the solid that was hit, and the ray.
+            block, column, beam: (N,) int64: block of the solid that was hit, column and beam of the ray.
             distance: (N,) float32 range of the hit, metres.
 
         Returns:
@@ -271,5 +272,5 @@ class RollingRays:
 
 
 def rotate(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """(E, 3, 3) times (E, 3)."""
+    """Multiply each matrix (E, 3, 3) by its vector (E, 3)."""
     return (matrices @ vectors[..., None])[..., 0]

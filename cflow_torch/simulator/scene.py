@@ -17,14 +17,13 @@ from cflow_torch.simulator.trajectories import Route
 
 @dataclass(frozen=True)
 class Scene:
-    """A street with traffic.
+    """The world of a drive.
 
     Args:
-        ground: the ground.
+        ground: height of the ground.
         ego: route of the recording vehicle's rear axle.
-        bodies: everything else.
-        num_own: how many bodies, at the end of `bodies`, form the recording vehicle. They occlude other bodies, but
-            have no returns.
+        bodies: all objects and background.
+        num_own: the last `num_own` bodies form the recording vehicle. They occlude other bodies, but return nothing.
     """
 
     ground: Ground
@@ -49,7 +48,7 @@ class Scene:
         return self.ground.pose(paths[..., 0], paths[..., 1], paths[..., 2])
 
     def dynamic_part(self) -> tuple[Scene, np.ndarray]:
-        """A scene of the moving bodies only, and the index in `self` of each of its solids, (P',) int64."""
+        """A scene of the moving bodies only; (P',) int64 index in this scene of each solid of the new one."""
         is_dynamic = np.array([not body.is_static for body in self.bodies])
         chosen = tuple(body for body, moves in zip(self.bodies, is_dynamic) if moves)
         return Scene(self.ground, self.ego, chosen), np.flatnonzero(is_dynamic[self.body_of_solid])
@@ -58,11 +57,11 @@ class Scene:
         """All solids at one time.
 
         Args:
-            seconds: time, which moves the legs.
+            seconds: the time, which determines the swing of legs.
             body_poses: (num_bodies, 4, 4) float64 `T_world_body` at that time.
         """
         of = self._columns
-        # In the body: rotate about x, about y, move to the centre; a leg then swings about the y axis through the hip.
+        # In the body frame: rotate about x, then y; move to the centre; swing about the y axis through the hip.
         angle = of["swing"] * np.sin(2 * math.pi * of["stride"] * seconds + of["phase"])
         hip = np.where(angle[:, None] == 0, 0, (0, 0, HIP))
         pose = _rotation(1, of["pitch"]) @ _rotation(0, of["roll"])

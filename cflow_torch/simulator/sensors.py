@@ -23,10 +23,10 @@ class SpinningLidar:
         start: azimuth in the sensor frame at which a sweep begins, degrees: the outer edge of the first column.
         span: degrees of azimuth per sweep, positive = counter-clockwise about the sensor's z axis.
         active_columns: first column that fires, and the one after the last; None = all. The range image has all
-            columns. Column -1 is its last one, but fires before column 0.
-        has_jitter: each sweep begins up to a column early, like a free-running motor; False = on a fixed grid.
-        is_virtual: the shots are given as if the vehicle had been static at the time stamp (Waymo's small LiDARs).
-        max_range, reach, dropout: values of this unit, None = those of the `LidarProfile`.
+            columns. A negative column, which fires before column 0, is at the end of the image.
+        has_jitter: shift all azimuths of a sweep at random within a column; False = shoot at the column's middle.
+        is_virtual: take all shots from the ego pose at the time stamp, like the images of Waymo's small LiDARs.
+        max_range, reach, dropout: as in `LidarProfile`, whose values apply where these are None.
     """
 
     name: str
@@ -47,7 +47,7 @@ class SpinningLidar:
 
     @property
     def T_ego_sensor(self) -> np.ndarray:
-        """(4, 4) float64, sensor coordinates to ego."""
+        """(4, 4) float64, from the sensor frame to the ego frame."""
         cos, sin = math.cos(math.radians(self.yaw)), math.sin(math.radians(self.yaw))
         level, down = math.cos(math.radians(self.pitch)), math.sin(math.radians(self.pitch))
         flip = -1.0 if self.upside_down else 1.0
@@ -58,10 +58,10 @@ class SpinningLidar:
 
 @dataclass(frozen=True)
 class LidarProfile:
-    """All LiDARs of a vehicle, and their common quality.
+    """All LiDARs of a vehicle, and what they have in common.
 
     Args:
-        units: the sensors; laser numbers continue from unit to unit.
+        units: the LiDARs; laser numbers count through all of them.
         min_range, max_range: metres; returns outside are lost.
         range_noise: standard deviation along the ray, metres.
         dropout: probability that a return is lost, whatever it hit.
@@ -69,12 +69,12 @@ class LidarProfile:
         sweep_interval_ns: time from sweep to sweep, and duration of a sweep.
         is_rolling: every shot has its own time, and the scene moves during the sweep. False = all shots are taken at
             the time stamp.
-        reference: position of the time stamp in the sweep: 0 = first shot, 1 = one column after the last.
-        is_deskewed: points are moved by the motion of the ego vehicle from the time of their shot to the time stamp.
-        ego_height: of the ego frame's origin above the ground, metres.
+        reference: position of the time stamp within the sweep: 0 = first column, 1 = one column after the last.
+        is_deskewed: the ego motion between each shot and the time stamp is compensated. Only for rolling profiles.
+        ego_height: height of the ego frame's origin above the ground, metres.
         has_trailer: the vehicle is an articulated truck; returns from the truck itself are lost.
         velocity_noise: standard deviation of the radial velocity, m/s.
-        extinction: share of the light that the air absorbs per metre.
+        extinction: extinction coefficient of the air, 1/m.
     """
 
     units: tuple[SpinningLidar, ...]

@@ -19,7 +19,7 @@ from cflow_torch.simulator.trajectories import Route
 
 EAST, NORTH, WEST, SOUTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
 PAVEMENT = 4.0  # width, metres
-REACH = 110.0  # how far the streets are furnished, metres
+REACH = 110.0  # houses and trees stand up to this far along each street, metres
 
 
 def build_street(rng: np.random.Generator) -> Scene:
@@ -27,14 +27,14 @@ def build_street(rng: np.random.Generator) -> Scene:
     bend = float(rng.choice((-1, 1)) * rng.uniform(2e-4, 7e-4))
     ground = Ground(slope=(rng.uniform(-0.03, 0.03), rng.uniform(-0.02, 0.02)), curvature=bend)
     crossing = ground.crossing_x
-    # From lane y = -1.6 into lane x = crossing + 1.75; a metre before the bend at time 0.
+    # From the lane at y = -1.6 into the one at x = crossing + 1.75. At time 0, the bend is a metre ahead.
     ego = Route(crossing - 16.25, -1.6, EAST, start=-1.0, speed=rng.uniform(5, 7), radius=18.0, angle=math.pi / 2)
     bodies = (*_traffic(rng, crossing), *_people(rng, crossing), *_parked(rng, ground), *_fixed(rng, ground))
     return Scene(ground, ego, bodies)
 
 
 def lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs: float) -> Iterator[Body]:
-    """Cars in a lane along x, all at the same speed."""
+    """Cars near `xs` in a lane along x, all at the same speed."""
     for x in xs:
         route = Route(x + rng.uniform(-1.2, 1.2), y + rng.uniform(-0.12, 0.12), heading, speed=speed)
         yield objects.car(rng, route)
@@ -42,19 +42,19 @@ def lane(rng: np.random.Generator, y: float, heading: float, speed: float, *xs: 
 
 def _traffic(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
     """Cars, a bus, an articulated truck and cyclists on the road."""
-    # Eastbound: fast cars far ahead, one behind the ego car, a bus and a car in the outer lane.
+    # Eastbound: fast cars far ahead, a car behind the ego car, and in the outer lane a bus with two cars behind it.
     yield from lane(rng, -1.6, EAST, rng.uniform(15, 20), crossing + 14, crossing + 29, crossing + 45)
     yield from lane(rng, -1.6, EAST, 4.5, -14)
     yield from lane(rng, -4.6, EAST, rng.uniform(9, 14), crossing + 35, crossing + 50)
     bus_speed = rng.uniform(3, 6)
     yield objects.bus(Route(-11.0, -4.6, EAST, speed=bus_speed))
     yield from lane(rng, -4.6, EAST, bus_speed, -26, -38)
-    # Westbound: cars that leave beyond the crossing, and cars that wait before it.
+    # Westbound: cars that have passed the crossing, and cars that wait before it.
     yield from lane(rng, 1.6, WEST, rng.uniform(8, 13), 5, -14, -31, -52)
     yield from lane(rng, 4.6, WEST, rng.uniform(6, 10), -6, -24, -42)
     yield from lane(rng, 1.6, WEST, 0.0, crossing + 14, crossing + 21.5, crossing + 29)
     yield from lane(rng, 4.6, WEST, 0.0, crossing + 14, crossing + 21.5)
-    # Out of the cross street: a car turns right (west), an articulated truck turns right (east).
+    # From the cross street, a car turns right (to the west) and an articulated truck turns right (to the east).
     arc = {"radius": 9.0, "angle": -math.pi / 2}
     route = Route(crossing - 1.75, 4.6 + 9.0, SOUTH, start=rng.uniform(0, 4), speed=rng.uniform(4, 6), **arc)
     yield objects.car(rng, route)
@@ -73,7 +73,7 @@ def _people(rng: np.random.Generator, crossing: float) -> Iterator[Body]:
                 heading = EAST if rng.uniform() < 0.5 else WEST
                 y = side * rng.uniform(9.5, 11.8)
                 yield objects.pedestrian(rng, Route(x, y, heading, speed=rng.choice((0.0, 1.0, 1.4, 1.8))))
-    # Close along a wall (houses begin at 12.5), a group of three, two who cross the main street, two the cross street.
+    # One close to a wall (houses begin at y = 12.5), a group of three, and two who cross each street.
     yield objects.pedestrian(rng, Route(-4.0, 12.15, EAST, speed=1.4))
     for k in range(3):
         yield objects.pedestrian(rng, Route(crossing - 9.2 + 0.1 * k, 17 + 0.75 * k, NORTH, speed=1.3))
@@ -101,7 +101,7 @@ def _fixed(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     """Houses, walls, poles, trees, bushes."""
     yield from houses(rng, ground)
     main, crossing = ground.half_widths[0], ground.crossing_x
-    # A hoarding next to moving cars (gap 0.2-0.4 m), a garden wall that parked cars almost touch.
+    # A hoarding 0.2-0.6 m from moving cars, and a garden wall that parked cars almost touch.
     yield objects.wall(-24.0, 5.95, 20.0, 0.1, 2.0, albedo=0.7)
     yield objects.wall(crossing + 36.0, -main - 0.1, 24.0, 0.15, 1.1)
     yield from furniture(rng, ground)

@@ -1,4 +1,4 @@
-"""Trajectories of bodies: routes at constant speed or acceleration, and trailers that follow them."""
+"""Trajectories of bodies: routes at constant speed or acceleration, and those of trailers."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Route:
-    """A trajectory of a straight, an arc and a straight, at constant speed or acceleration.
+    """A straight line, an arc and a straight line, at constant speed or acceleration.
 
     Args:
-        x, y: beginning of the arc (any point, if angle is 0), world metres.
-        yaw: heading there, radians.
+        x, y: beginning of the arc, world metres; if `angle` is 0, any point of the line.
+        yaw: heading at (x, y), radians.
         start: position along the route at time 0, metres from the beginning of the arc; negative = before it.
         speed: m/s at time 0; negative = in reverse.
-        radius: of the arc, metres.
-        angle: of the arc, radians, positive = left.
-        acceleration: m/s^2; a body that brakes to a standstill stays there.
+        radius: radius of the arc, metres.
+        angle: angle of the arc, radians, positive = left.
+        acceleration: m/s^2. A body that has braked to a standstill stays there.
     """
 
     x: float
@@ -40,7 +40,7 @@ class Route:
         if self.acceleration == 0:
             return np.asarray(self.start + self.speed * seconds)
         stop = -self.speed / self.acceleration
-        # A braking body stays at its stop; one that starts up before time 0 was static until then.
+        # A braking body stays where it stops. An accelerating one stood still until `stop` <= 0.
         seconds = np.minimum(seconds, stop) if self.speed * self.acceleration < 0 else np.maximum(seconds, stop)
         return np.asarray(self.start + self.speed * seconds + 0.5 * self.acceleration * seconds**2)
 
@@ -66,10 +66,10 @@ class Towed:
     """The trajectory of a trailer: its axle follows the hitch along a tractrix.
 
     Args:
-        tractor: route of the tractor's middle.
-        hitch: how far behind that middle the hitch is, metres.
-        wheelbase: hitch to axle, metres.
-        middle: hitch to the trailer's middle, metres.
+        tractor: route of the origin of the tractor's body frame.
+        hitch: distance of the hitch behind this origin, metres; negative = ahead of it.
+        wheelbase: distance from the hitch to the trailer's axle, metres.
+        middle: distance from the hitch to the trailer's middle, metres.
     """
 
     tractor: Route
@@ -80,7 +80,7 @@ class Towed:
     def __call__(self, seconds: np.ndarray) -> np.ndarray:
         """(T, 3) float64 world x, y, yaw of the trailer's middle at `seconds` (T,)."""
         wanted = self.tractor.distance(seconds)
-        # Four wheelbases of straight run-in settle the angle; 5 cm steps follow the true curve to a millimetre.
+        # A straight run of four wheelbases first settles the angle. Steps of 5 cm are accurate to a millimetre.
         begin = min(float(wanted.min()), 0.0) - 4 * self.wheelbase
         distance = np.linspace(begin, float(wanted.max()), 2 + int((float(wanted.max()) - begin) / 0.05))
         poses = self.tractor.at(distance)

@@ -31,7 +31,7 @@ CLASS_OF: dict[str, str] = {
 """Argoverse 2 category -> class of AevaScenes."""
 
 _BACKGROUND, _ON_GROUND = "other_structure", GROUND[0]
-_CLASSES = tuple(CATEGORY_NAME)  # the position is the written index; the table of the real data is not published
+_CLASSES = tuple(CATEGORY_NAME)  # we write the position as the class index, because Aeva's own table is not published
 _FOLDER = "pointcloud_compensated"
 _PATH_KEY = {"v2": "point_cloud_compensated_path", "v0.1": "point_cloud_path"}
 _XYZ = ("x", "y", "z")
@@ -43,18 +43,18 @@ def write_aevascenes_sequence(log: Recording, root: str | Path, layout: str = "v
     Args:
         log: the recording.
         root: folder of the split, made if it does not exist.
-        layout: "v2", or "v0.1" with its older key for the paths of the clouds.
+        layout: "v2", or "v0.1", which has another key for the paths of the clouds.
 
     Returns:
-        The sequence folder, which `AevaScenesLog` takes.
+        The sequence folder, for `AevaScenesLog`.
 
     Convention:
-        - Points are float32 in the frame of their LiDAR. Poses and boxes are JSON numbers, exact float64. Poses are
-          quaternions, relative to the first pose.
-        - Only the compensated clouds are written, because a recording has no others.
+        - Points are float32 in the frame of their LiDAR. Poses and boxes are exact float64 JSON numbers. Rotations are
+          quaternions. Ego poses are relative to the first one.
+        - We write only motion-compensated clouds, because a recording has no others.
         - Every point has a class name: "road" on the ground, the class of the box that holds it, or "other_structure".
-          `semantic_labels_idx` is the position of the name in `CATEGORY_NAME`, which is not Aeva's table.
-        - Boxes have no velocities, which the reader does not use.
+          `semantic_labels_idx` is the position of the name in `CATEGORY_NAME`. Aeva's own numbers may differ.
+        - Boxes have no velocities, because the reader does not use them.
 
     Raises:
         CFlowError: the sequence exists already, the folder name or the layout is not valid, a shot is before its
@@ -127,7 +127,7 @@ def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str)
 
 
 def _classes(log: Recording, index: int, boxes: Boxes) -> np.ndarray:
-    """(N,) int64, index in `_CLASSES` of the class of every point of a sweep."""
+    """(N,) int64, class of every point of a sweep, as an index of `_CLASSES`."""
     sweep = log.sweep(index)
     points = np.asarray(sweep.points)[:, :3]
     classes = np.full(len(points), _CLASSES.index(_BACKGROUND), np.int64)

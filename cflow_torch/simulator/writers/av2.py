@@ -1,4 +1,4 @@
-"""Write a recording in the layout of Argoverse 2, which every tool for that data set can read."""
+"""Write a recording in the layout of Argoverse 2, so that all tools for this data set can read it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Boxes, GroundRaster, Recording
 
-CITY = "SYN"  # in place of Argoverse 2's code of the city
-_DYNAMIC = 0.05  # metres per sweep from which a point counts as dynamic in Argoverse 2
+CITY = "SYN"  # code of the city in file names; real logs have PIT, MIA, ...
+_DYNAMIC = 0.05  # Argoverse 2 calls a point dynamic if its residual flow is at least this, metres per sweep
 
 
 def write_av2_log(log: Recording, root: str | Path) -> Path:
@@ -30,10 +30,10 @@ def write_av2_log(log: Recording, root: str | Path) -> Path:
 
     Convention:
         - Points are rounded to float16, as in Argoverse 2: steps of 8 mm at 8-16 m, 31 mm at 32-64 m.
-        - Beyond Argoverse 2: `flow_labels/<ns>.feather` per pair, rows in the order of the points of sweep t, columns
-          of Argoverse 2's flow labels (total flow, axes of ego1) and `is_valid`.
-        - `is_ground_0` is the log's own ground mask. The raster holds the true height. With Argoverse 2's rule
-          (|z - h| <= 0.3 m or below), the lowest 0.3 m of every object counts as ground, too.
+        - We add `flow_labels/<ns>.feather` for each pair: a row per point of sweep t, in its order, with the columns
+          of Argoverse 2's flow labels (total flow, axes of the ego frame at t+1) and `is_valid`.
+        - `is_ground_0` is the log's own ground mask. The raster has the true height h. By Argoverse 2's rule
+          (z <= h + 0.3 m), the lowest 0.3 m of every object would be ground, too.
 
     Raises:
         CFlowError: the log exists already, or its name cannot be used as a folder name.
@@ -93,7 +93,7 @@ def _write_map(folder: Path, log_id: str, raster: GroundRaster) -> None:
     rows, columns = raster.height.shape
     folder.mkdir()
     np.save(folder / f"{log_id}_ground_height_surface____{CITY}.npy", raster.height.astype(np.float16))
-    # Pixel = s (R city + t), so t is in metres.
+    # Pixel = s (R x + t) at the world position x, so t is in metres.
     sim2 = {"R": [1.0, 0.0, 0.0, 1.0], "t": [-x0, -y0], "s": 1.0 / step}
     (folder / f"{log_id}___img_Sim2_city.json").write_text(json.dumps(sim2))
     x1, y1 = x0 + columns * step, y0 + rows * step

@@ -40,18 +40,18 @@ def write_nuscenes(recording: Recording, root: str | Path, key_frame_interval: f
     """Write `recording` to `root/<log_id>`, a data root of nuScenes with one scene of that name.
 
     Args:
-        recording: the recording. If none of its LiDARs is called LIDAR_TOP, the first one gets that name.
+        recording: the recording. If no LiDAR is called LIDAR_TOP, the first one gets this name.
         root: folder, made if it does not exist.
-        key_frame_interval: seconds between samples; only samples have boxes. The first and the last sweep are samples,
-            so that every pair has truth.
+        key_frame_interval: seconds between samples (key frames). Only they have boxes. The first and the last sweep
+            are samples, so that boxes can be interpolated for every sweep.
 
     Returns:
         The data root.
 
     Convention:
-        - All 13 tables are complete enough for the official devkit; `attribute` is empty, visibility is the highest.
+        - The official devkit can load all 13 tables. `attribute` is empty. All boxes have the highest visibility.
         - Points are float32 in the frame of their LiDAR, with intensity and ring, in the order of the recording.
-        - Time stamps are truncated to microseconds. Poses keep their height (the real data set has z = 0).
+        - Time stamps are truncated to microseconds. Unlike in the real data set, ego poses have a height.
         - The format has no ground mask and no flow.
 
     Raises:
@@ -86,7 +86,7 @@ class SceneWriter:
     Args:
         recording: the recording.
         folder: data root.
-        reference: channel of the first LiDAR, unless another one has that name.
+        reference: channel name for the first LiDAR, if no LiDAR has this name.
         names: Argoverse 2 category -> category of the format.
     """
 
@@ -101,19 +101,19 @@ class SceneWriter:
             raise CFlowError(f"log {recording.log_id}: time stamps must ascend by a microsecond or more")
 
     def token(self, *what: object) -> str:
-        """Token of 32 hex characters, which depends on the log and on `what` only."""
+        """Token of 32 hex characters, which depends only on `log_id` and `what`."""
         return hashlib.md5(repr((self.recording.log_id, *what)).encode()).hexdigest()
 
     def write(self, file_name: str, write_points: Any, key_frame_interval: float) -> dict[str, Table]:
-        """Write all sweeps.
+        """Write the points of all sweeps. Return the tables, which the caller writes.
 
         Args:
             file_name: pattern with {name} of the log, {channel}, {stamp} in microseconds.
-            write_points: called with each file, the returns of its LiDAR and its time stamp in nanoseconds.
-            key_frame_interval: seconds.
+            write_points: writes a file; takes its path, the returns of a LiDAR, and the time stamp in nanoseconds.
+            key_frame_interval: seconds between samples.
 
         Returns:
-            The rows of each table, by its name.
+            Table name -> rows.
         """
         keys = self._key_frames(key_frame_interval)
         tables = self._fixed_tables(keys)
@@ -162,7 +162,7 @@ class SceneWriter:
         return keys if keys[-1] == last else [*keys, last]
 
     def _fixed_tables(self, keys: Sequence[int]) -> dict[str, Table]:
-        """All tables except those of sweeps and boxes."""
+        """The tables of the scene, its samples and sensors, and empty tables to fill."""
         token, scene = self.token, self.token("scene")
         samples = [token("sample", key) for key in keys]
         links = zip(samples, keys, ["", *samples[:-1]], [*samples[1:], ""])
@@ -200,7 +200,7 @@ class SceneWriter:
         }
 
     def _annotate(self, keys: Sequence[int], tables: dict[str, Table]) -> None:
-        """Add categories, instances and the boxes of the samples."""
+        """Add the tables of categories, instances, and boxes of the samples."""
         tracks: dict[str, Table] = {}  # track -> its boxes
         category_of: dict[str, str] = {}
         for key in keys:

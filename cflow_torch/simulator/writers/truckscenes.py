@@ -1,4 +1,4 @@
-"""Write a recording in the layout of MAN TruckScenes: JSON tables and PCD sweeps with a time per point."""
+"""Write a recording in the layout of MAN TruckScenes: JSON tables, and PCD sweeps with a time for every point."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
 
 _VERSION, _KEY_FRAME_INTERVAL = "v1.2-mini", 0.5  # seconds
-# Tables that the devkit requires in addition to those of nuScenes; a simulated truck has no data for them.
+# The devkit also requires these tables, which nuScenes does not have. A simulated truck has no data for them.
 _EMPTY = ("ego_motion_cabin", "ego_motion_chassis", "weather_annotation")
 TRUCKSCENES_NAMES: dict[str, str] = {
     **NUSCENES_NAMES,
@@ -26,14 +26,14 @@ def write_truckscenes(recording: Recording, root: str | Path) -> Path:
     """Write `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
 
     Args:
-        recording: the recording. If none of its LiDARs is called LIDAR_LEFT, the first one gets that name.
+        recording: the recording. If no LiDAR is called LIDAR_LEFT, the first one gets this name.
         root: folder, made if it does not exist.
 
     Returns:
         The data root.
 
     Convention:
-        - All 14 tables are complete enough for the official devkit; cabin and chassis motion and weather are empty.
+        - The official devkit can load all 14 tables. Those of cabin motion, chassis motion and weather are empty.
         - Fields of a sweep: x, y, z, intensity float32; timestamp uint64, microseconds of each shot since 1970.
         - Points are in the frame of their LiDAR, in the order of the recording, without motion compensation.
         - The format has no ground mask and no flow.

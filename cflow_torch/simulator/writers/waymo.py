@@ -36,11 +36,11 @@ BOX_TYPE: dict[str, int] = {
     **dict.fromkeys(("SIGN", "STOP_SIGN"), 3),
     **dict.fromkeys(("BICYCLE", "BICYCLIST", "WHEELED_DEVICE", "WHEELED_RIDER"), 4),
 }
-"""Argoverse 2 category -> Waymo's box type. Motorcycles are vehicles; trains and untyped categories are left out."""
+"""Argoverse 2 category -> Waymo's box type. Motorcycles are vehicles. Boxes of all other categories are left out."""
 del BOX_TYPE["RAILED_VEHICLE"]
 
 _XYZ = ("x", "y", "z")
-# Component -> the columns that the reader reads, as the official classes print them.
+# For each component, the columns that our reader needs, named as in the official classes.
 _IMAGE, _SHAPE, _TRANSFORM = pa.list_(pa.float32()), pa.list_(pa.int32(), 3), pa.list_(pa.float64(), 16)
 _SEGMENT = "key.segment_context_name"
 _FRAME_KEYS: list[tuple[str, Any]] = [(_SEGMENT, pa.string()), (TIME, pa.int64())]
@@ -83,28 +83,28 @@ def write_waymo_segment(log: Recording, root: str | Path) -> Path:
     """Write `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
 
     Args:
-        log: the recording. Units with a name of `LASERS` keep it. If no unit has one, they become TOP, FRONT, ... in
-            their order.
+        log: the recording. Units whose names are in `LASERS` keep them. If no name is, the units become TOP, FRONT,
+            ... in their order.
         root: folder of the split, made if it does not exist.
 
     Returns:
-        The file of the component `lidar`, which `WaymoLog` takes.
+        The file of the component `lidar`, for `WaymoLog`.
 
     Convention:
         - TOP: each pixel has the vehicle's pose at the time of its shot, interpolated between the poses of the sweeps.
-          Where that is too inaccurate, it is the recording's own pose, if it has poses between sweeps. The pose is
-          shifted so that the pixel's point is exactly where the recording has it, except for the rounding of poses
-          and ranges to float32: 5e-5 m up to 1 km from the world's origin.
+          If this misplaces a point by more than 1 m, the frame has the true poses of `log.poses_at` instead, if it
+          exists. We shift each pose so that its point is exact, except for the rounding of poses and ranges to
+          float32: 5e-5 m up to 1 km from the world's origin.
         - Other lasers: the images are as if the vehicle stood still at the pose of the frame, and their pixels have no
-          poses. Returns on the rays of their pixels keep float32 accuracy, 5e-6 m at 75 m; others are moved onto the
-          ray, by up to 5 mm.
-        - Times are rounded to microseconds. Boxes keep their heading only, without roll and pitch.
+          poses. Returns on the rays of their pixels keep float32 accuracy, 5e-6 m at 75 m. We move other returns onto
+          the ray, by up to 5 mm.
+        - Times are rounded to microseconds. Boxes keep their heading, but not roll and pitch.
         - There are no second returns, no elongation, no no-label zones and no speeds of boxes.
 
     Raises:
-        CFlowError: the segment exists already, its name cannot be used for a file, there are more than five units, a
-            return is too far from its pixel's ray, two returns share a pixel, or time stamps are less than a
-            microsecond apart.
+        CFlowError: the segment exists already, its name cannot be used for a file, there are more than five units, only
+            some of their names are in `LASERS`, a return is too far from its pixel's ray, two returns share a pixel,
+            or two time stamps are rounded to the same microsecond.
     """
     root = Path(root)
     name = safe_name(f"{log.log_id}.parquet", "the file of log_id")
@@ -171,7 +171,7 @@ def _laser_numbers(names: Sequence[str]) -> list[int]:
 
 
 def _calibration(unit: UnitReturns, elevations: np.ndarray) -> LaserCalibration:
-    """Calibration of a unit. Evenly spaced beams are stored by their outer edges, as in Waymo's side lasers."""
+    """Calibration of a unit. As for Waymo's small lasers, evenly spaced beams are given by their outer edges only."""
     T_ego_sensor, elevations = np.asarray(unit.T_ego_sensor, np.float64), np.asarray(elevations, np.float64)
     steps = np.diff(elevations)
     if len(steps) and np.ptp(steps) < 1e-12 and unit.name != "TOP":
@@ -205,6 +205,6 @@ def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str,
 
 
 def _write_rows(writer: pq.ParquetWriter, rows: Sequence[dict[str, Any]]) -> None:
-    """Add one row group; missing columns become null."""
+    """Append one row group. Columns that a row lacks become null."""
     arrays = [pa.array([row.get(field.name) for row in rows], field.type) for field in writer.schema]
     writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema), row_group_size=max(len(rows), 1))

@@ -1,4 +1,4 @@
-"""Encode returns as Waymo's range images: pixels, ranges and, for the laser on the roof, poses of the pixels."""
+"""Encode returns as Waymo's range images, and for the laser on the roof as images of pixel poses."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from cflow_torch.data.waymo.range_image import (
 from cflow_torch.simulator.recording import Recording, UnitReturns
 from cflow_torch.types import CFlowError
 
-_NODES = 4  # sweeps whose poses are interpolated: a cubic is exact for constant jerk
-# Metres of a pixel's pose from the interpolated one. Where a car begins to turn, the cubic is off by 0.3 m at 75 m
+_NODES = 4  # sweeps whose poses we interpolate by a cubic, which is exact for constant jerk
+# Largest accepted error of interpolated poses, metres. Where a car begins to turn, the cubic is off by 0.3 m at 75 m
 # in the street (0.4 rad/s), by 1.5 m at the crossing (0.8 rad/s), and by more at the ends of a drive.
 _MAX_POSE_SHIFT = 1.0
-_MAX_SHIFT = 0.005  # metres of the returns of the other lasers, whose pixels have no poses
+_MAX_SHIFT = 0.005  # largest accepted distance of a return from its pixel's ray if pixels have no poses, metres
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class ShotPoses:
 
     Args:
         of_shot: (N, 6) roll, pitch, yaw, x, y, z of `T_world_ego`; the angles are rounded to float32.
-        of_frame: (6,) those of the frame.
-        T_world_ego: (4, 4) float64 pose of the frame.
+        of_frame: (6,) the same values for the pose of the frame.
+        T_world_ego: (4, 4) float64, pose of the frame.
     """
 
     of_shot: np.ndarray
@@ -39,7 +39,7 @@ class ShotPoses:
     T_world_ego: np.ndarray
 
     def to_shot(self, points: np.ndarray, T_ego_sensor: np.ndarray) -> np.ndarray:
-        """Transform points (N, 3) in the laser's frame from the pose of the frame to the pose of their shot."""
+        """Transform points (N, 3) from the laser's frame at the pose of the frame to its frame at their shot."""
         world = self._world(points, T_ego_sensor)
         ego = np.einsum("nji,nj->ni", rotations_from_angles(self.of_shot[:, :3]), world - self.of_shot[:, 3:])
         return (ego - T_ego_sensor[:3, 3]) @ T_ego_sensor[:3, :3]
@@ -74,7 +74,7 @@ def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray) -> ShotPos
 
 
 def true_poses_of_shots(log: Any, index: int, offset_ns: np.ndarray) -> ShotPoses:
-    """Return the poses at the times of shots, from a recording that has poses between its sweeps (`Drive.poses_at`)."""
+    """Return the true poses at the times of shots, from a recording that has `poses_at`, such as a `Drive`."""
     of_shot = pose_angles(log.poses_at(index, offset_ns))
     of_shot[:, :3] = of_shot[:, :3].astype(np.float32)
     return ShotPoses(of_shot, pose_angles(log.poses[index]), log.poses[index])
@@ -87,9 +87,9 @@ def encode_images(
     shot_poses: ShotPoses | None,
     true_poses: Callable[[], ShotPoses] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Range images of both returns (the second is empty) and, given poses of the shots, the image of pixel poses.
+    """Return the images `first`, `second` (empty) and, if `shot_poses` are given, `poses`.
 
-    `true_poses` are used where `shot_poses` are too inaccurate for the pixels.
+    If `shot_poses` are too inaccurate for a pixel, we encode the unit again with `true_poses`.
     """
     height, width = unit.num_rings, unit.num_columns
     points = np.asarray(unit.points, np.float64)  # laser frame, at the pose of the frame
@@ -101,7 +101,7 @@ def encode_images(
     column = (azimuths[0] - np.arctan2(seen[:, 1], seen[:, 0])) / (2 * np.pi) * width
     column = np.rint(column).astype(np.int64) % width
     if shot_poses is not None and len(column):
-        # Interpolated poses may be wrong by a pixel. The recording's columns differ from the image's by an offset only.
+        # Interpolated poses may be wrong by a pixel. So take the recording's columns, which differ by an offset only.
         start = np.bincount((column - unit.column) % width).argmax()
         column = (np.asarray(unit.column, np.int64) + start) % width
     rays = directions(azimuths[column], calibration.row_inclinations(height)[row])
