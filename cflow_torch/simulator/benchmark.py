@@ -1,7 +1,7 @@
 """The fixed simulated benchmark: drives from fixed seeds, written once in the format of each sensor's data set.
 
-Seeds 300 ... 319 and 750 ... 751 are held out for scores. Do not score on the seeds that docs/benchmarks.md lists as
-those on which we chose settings.
+Seeds 300 ... 319 and 750 ... 751 are held out for scores. docs/benchmarks.md lists the seeds on which we chose
+settings. Do not score on those.
 """
 
 from __future__ import annotations

@@ -219,7 +219,7 @@ class Drive(Log):
         return scan(self._profile, solids_now, ground, pose, generator)
 
     def _extent(self, index: int, returns: Returns) -> np.ndarray:
-        """(num_bodies, 3) float64 size of the smallest box around each body's vertical axis that holds its points."""
+        """(num_bodies, 3) float64 size of the smallest upright box, centred on a body's axis, that holds its points."""
         points = returns.points.numpy().astype(np.float64)
         if not self._profile.is_deskewed:
             moved = np.linalg.inv(self.poses[index]) @ self.poses_at(index, returns.offset_ns.numpy())

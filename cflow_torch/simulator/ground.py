@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 NOWHERE = 1e5  # `crossing_x` of a scene without a cross street: no ray reaches it, metres
-_BISECTIONS = 12  # of a ray between pavement level and road level, which find the kerb to a millimetre
+_BISECTIONS = 12  # along a ray from pavement level to road level; they find the kerb face to a millimetre
 
 
 @dataclass(frozen=True)

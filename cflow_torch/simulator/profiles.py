@@ -178,7 +178,7 @@ WEATHER: dict[str, tuple[float, float]] = {
 
 
 def in_weather(profile: LidarProfile, extinction: float, lost: float) -> LidarProfile:
-    """The profile in rain, snow or fog: distant, dark surfaces and a share `lost` of all returns are not seen."""
+    """The profile in bad weather. It loses distant and dark surfaces first, and a share `lost` of all returns."""
 
     def dropout(clear: float) -> float:
         return 1 - (1 - clear) * (1 - lost)

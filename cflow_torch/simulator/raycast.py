@@ -96,7 +96,7 @@ def cast_solids(
 
     Convention: a solid that contains the sensor is not hit. Of solids at equal range, the first is hit.
 
-    Cost: time grows with the total number of rays in the blocks of all solids; memory with the largest block.
+    Cost: time grows with the total number of rays in the blocks of all solids, memory with the size of the image.
     """
     blocks = _covered_blocks(T_solid_sensor, half_size, azimuth, elevation, max_range)
     # From the sensor frame to the unit coordinates of each solid.

@@ -92,9 +92,9 @@ def write_waymo_segment(log: Recording, root: str | Path) -> Path:
 
     Convention:
         - TOP: each pixel has the vehicle's pose at the time of its shot, interpolated between the poses of the sweeps.
-          If this misplaces a point by more than 1 m, the frame has the true poses of `log.poses_at` instead, if it
-          exists. We shift each pose so that its point is exact, except for the rounding of poses and ranges to
-          float32: 5e-5 m up to 1 km from the world's origin.
+          If this misplaces a point by more than 1 m, we use the true poses of `log.poses_at`, if there are any. We
+          shift each pose so that its point is exact, except for the rounding of poses and ranges to float32: 5e-5 m
+          up to 1 km from the world's origin.
         - Other lasers: the images are as if the vehicle stood still at the pose of the frame, and their pixels have no
           poses. Returns on the rays of their pixels keep float32 accuracy, 5e-6 m at 75 m. We move other returns onto
           the ray, by up to 5 mm.
