@@ -50,9 +50,9 @@ def slides_along_itself(
         points along it, and its displacement over the window is at least 1.2 m.
 
     Convention:
-        Moments are sums of integers; all else is elementwise float64 in the written order. The positions of the pixels
-        of a line have a standard deviation of at most 0.3 m across and at least 1 m along it; those of a rail, at least
-        2 m along it, and fewer than two slices per pixel on average. Zero motion never slides.
+        Moments are sums of integers; all else is elementwise float64 in the written order. The pixels of a line have a
+        standard deviation of at most 0.3 m across it and at least 1 m along it. A rail is a line with at least 2 m
+        along it, and fewer than two slices per pixel on average. Zero motion never slides.
 
     Cost: some passes over the pixels.
     """
@@ -82,8 +82,8 @@ def principal_axes(
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Return which of A components are lines, (A,) bool, and the variances of their pixels at t+1.
 
-    The first one is the largest variance in any direction. Then come the variance in y, the covariance and the variance
-    in x. Each is (A,) float64, square pixels. `component` is (Q,) int64, of each pixel; `row_col` is (2, Q) int64.
+    These are the largest variance of all directions, then the variance in y, the covariance, the variance in x. Each is
+    (A,) float64, square pixels. `component`, (Q,) int64, is the component of each pixel; `row_col` is (2, Q) int64.
     """
     one_y_x = torch.cat((torch.ones_like(row_col[:1]), row_col))  # `F.pad` of torch 2.0 fails without pixels
     moments = scatter_count(component, num_components, (one_y_x[:, None] * one_y_x).view(9, -1)).view(3, 3, -1)
@@ -108,7 +108,7 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     Returns:
         (V,) bool, False for components that are not tested. True if, between t+1 and the sweep farthest in time, the
         ends moved at least 1.2 m on average in one direction along the component, and their displacements differ by at
-        most a tenth of their sum. At t+1, it must be at most 60 m long, with two slices per pixel or more on average.
+        most a tenth of their sum. At t+1, the component is at most 60 m long and has two or more slices per pixel.
 
     Convention:
         The direction of a component is y, x or one of the diagonals: the one in which its pixels at t+1 reach farthest.

@@ -46,8 +46,8 @@ def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, co
     """Return the candidates of all nodes, each correlated at its own pixel size.
 
     Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
-        We take the median of y and the median of x, if the batch has at least two other sweeps. A median of one
-        estimate is that estimate, so sweeps that a window lacks do not affect the choice.
+        We take the median of y and the median of x if any window has at least two sweeps besides t+1. The median of a
+        single estimate is that estimate, so a pair gets the same motion in any batch.
 
     Source: adapted from Sec. leverage_past_pcs, which takes the medians of magnitude and of orientation.
     """
@@ -101,7 +101,7 @@ class _NodeImages(NamedTuple):
         area = size.prod(1) * sweeps.num_steps
         end = area.cumsum(0)
 
-        # Several finest pixels may coincide at the scale of their node. We draw all and keep any one of them.
+        # Several finest pixels may fall into one pixel of the scale. They are equal there, so any of them may remain.
         begin = end - area
         table = torch.stack((begin, block, *size.unbind(1), *first.unbind(1)))
         of_member = take_columns(table, node)

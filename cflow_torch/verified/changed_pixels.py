@@ -26,7 +26,7 @@ _PER_METRE, _HIGHEST = 256, 8192  # bins of height: number per metre; number abo
 
 
 class ChangedPixels(NamedTuple):
-    """The change of P pixels. All are False in windows of two sweeps, where only one other sweep could decide."""
+    """The change of P pixels. All values are False in windows of two sweeps, where one other sweep is too few."""
 
     is_missing: Tensor  # (P,) bool, a slice is missing in another sweep and not occluded there
     has_changed: Tensor  # (P,) bool, a slice is missing in another sweep that saw its position
@@ -39,7 +39,7 @@ def find_changed(sweeps: HeightSlicedSweeps) -> ChangedPixels:
         A slice is missing if none of the 3 x 3 pixels around its position has it. Slices repeat every 2 m, so the
         height of a slice is ambiguous. From the lowest point of the pixel, we go up to the first 0.5 m layer that is in
         this slice, and take its middle. A sweep saw a position if a return in its direction is at least as far away.
-        The position is occluded if all returns in its direction are nearer. Without a return, it is neither.
+        The position is occluded if all returns in its direction are nearer. Without a return, neither holds.
 
     Cost: a lookup for each pixel and sweep, and a range image of every sweep.
     """
@@ -100,7 +100,7 @@ class RangeImages:
         self._farthest = farthest
 
     def farther(self, sweep: Tensor, positions: Tensor) -> Tensor:
-        """Return the distance of the farthest return in the direction of each position, minus that of the position.
+        """Return the distance of the farthest return in the direction of each position, minus the position's own.
 
         (K,) float32, metres; -infinity = no return. Sweeps are window * S + step, (K,) int64. Positions are (3, K).
         """

@@ -73,7 +73,7 @@ class Nodes:
     parent: Tensor  # (N,) int64, the next coarser node around the node; N = none
     window: Tensor  # (N,) int64
     travels: Tensor  # (N,) bool, the node is longer than `max_object_length`, and both of its ends move
-    pixel: Tensor  # (A,) int64, positions in the list of the pixels of all nodes; a pixel of several nodes is repeated
+    pixel: Tensor  # (A,) int64, pixels of all nodes, as positions in the list; a pixel of several nodes is repeated
     node: Tensor  # (A,) int64, node of each entry of `pixel`
 
     @property
@@ -130,7 +130,7 @@ def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: S
 
     firsts = (*(blocks_of.first for blocks_of in found), count)[: len(roots) + 1]
     root = torch.cat((roots[-1], changed_root))
-    # The first sum counts pixels and, times 2^32, those at t+1; the second those with a missing slice or no history.
+    # Sums: pixels, plus 2^32 for each one at t+1; pixels with a missing slice, or in windows without history.
     is_missing = change.is_missing | ~sweeps.has_history.index_select(0, pixels.window)
     codes = torch.stack((((pixels.step == 0) << 32) + 1, is_missing))
     sums = scatter_count(root, count + 1, torch.cat((codes, codes.index_select(1, changed)), 1))
@@ -162,7 +162,7 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
 
     Components longer than `longest` metres at t+1 may move only if both of their ends move. None = no such test.
 
-    Convention: a plain component that equals its dilated parent is not listed twice.
+    Convention: a plain component with as many pixels as its dilated parent is the same one, and not listed again.
 
     Cost: linear in the pixels of the nodes.
     """
@@ -172,7 +172,6 @@ def movable_nodes(sweeps: HeightSlicedSweeps, components: Components, longest: f
     may_move = may_move & (travels | ~is_long)
     first_plain, first_changed = components.firsts[-2:]
     may_move[first_changed:].logical_and_(length[first_changed:] <= _LOCAL)
-    # A plain component with as many pixels as its parent is the same component.
     plain, parent = slice(first_plain, first_changed), components.parent
     size, is_node = F.pad(components.size, (0, 1)), F.pad(may_move, (0, 1))
     is_node[plain].logical_and_(size[plain] != size.index_select(0, parent[plain]))
@@ -210,8 +209,8 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
         belongs to its finest component, or to no object if that component is not linked. The pixel of a copy belongs to
         its node if that node has evidence, else to no object.
 
-    Convention: a child counts with its own evidence or that of its children together, whichever is more, minus
-        `_PRICE`, at least 0. Ties: the children win.
+    Convention: the value of a child is its own evidence or the sum of its children's values, whichever is more, minus
+        `_PRICE`, but at least 0. Ties: the children win.
 
     Cost: a few passes over the nodes for each level, and over the pixels.
     """
@@ -244,7 +243,7 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
 
 
 def number_objects(name: Tensor, num_names: int) -> Objects:
-    """Number the objects. `name` is the component that each pixel belongs to, (P,) int64; `num_names` = none."""
+    """Number the objects. `name` is the component that each pixel belongs to, (P,) int64; `num_names` is none."""
     is_used = torch.zeros(num_names + 1, dtype=torch.bool, device=name.device).index_fill_(0, name, True)
     component = flat_nonzero(is_used[:-1])
     position = torch.arange(len(name), device=name.device)

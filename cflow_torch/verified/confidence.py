@@ -40,10 +40,10 @@ class MotionMargin(NamedTuple):
     # (G,) float64. The motion matches this many more slices than its best displaced copy, in standard deviations of
     # noise. 0 = the motion is not better, or the object is static.
     z: Tensor
-    # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line; the motion wins more slices
-    # than are lost or found in place; it is better than its displaced copies, or at least twice as long as the
-    # displacement. Copies of such a long motion are motions, too. A line needs z, because beams hit a rail at positions
-    # that move with the vehicle.
+    # (G,) bool. True if z is at least 1, or if all of this holds: the object is not a line; slices won exceed slices
+    # lost plus slices found in place; the motion is better than its displaced copies, or at least twice as long as the
+    # displacement. Copies of so long a motion are far from static, too. A line needs z >= 1, because beams hit a rail
+    # at positions that move with the vehicle.
     is_dynamic: Tensor
 
 
@@ -135,7 +135,7 @@ def _bin(values: Tensor, bounds: list[float]) -> Tensor:
 def _neighbourhood(sweeps: HeightSlicedSweeps, pixels: Pixels, motion: Tensor) -> tuple[Tensor, Tensor]:
     """Count the slices of t in the block of each of K pixels, and those that t+1 has at their target, (K,) int64 each.
 
-    `motion` is that of each pixel, (K, 2) float64, (y, x), finest pixels per interval.
+    `motion`, (K, 2) float64, (y, x), finest pixels per interval, is the motion of each pixel.
     """
     side = max(1, round(_BLOCK / sweeps.grid.pixel_size))
     height, width = -(-sweeps.grid.height // side), -(-sweeps.grid.width // side)

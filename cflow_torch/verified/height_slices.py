@@ -234,7 +234,7 @@ def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Te
     """Return the slices of heights, (N,) float64, metres: floor(z / slice_height) mod n, (N,) uint8; 0 for NaN. n is a
     power of 2, at most 16."""
     layer = (z / constant((slice_height,), z.dtype, z.device)).floor_()  # see `Grid.pixel`
-    layer.clamp_(-(2.0**56), 2.0**56).nan_to_num_(0.0)  # beyond, all are multiples of 16, so no slice changes
+    layer.clamp_(-(2.0**56), 2.0**56).nan_to_num_(0.0)  # larger float64 are multiples of 16: slice 0 as well
     return (layer.long() & (num_slices - 1)).to(torch.uint8)
 
 
@@ -250,7 +250,7 @@ def _slices(of_point: Tensor, height_slice: Tensor, num_pixels: int) -> Tensor:
     lanes = torch.zeros((num_pixels + 1) * NUM_SLICES, dtype=torch.bool, device=height_slice.device)
     lanes.index_fill_(0, torch.add(height_slice, of_point, alpha=NUM_SLICES), True)
     # A pixel is four bytes that are 0 or 1. Read as one number, these are its bits 0, 8, 16 and 24.
-    # The product moves them to bits 24 ... 27; other terms are below or overflow, and no two of them meet.
+    # The product moves them to bits 24 ... 27. Other terms lie lower or overflow, and no two terms share a bit.
     word = lanes.view(torch.int32)[:num_pixels] * 0x01020408
     return (word >> 24).bitwise_and_(OWN).to(torch.uint8)
 
@@ -282,7 +282,7 @@ def _is_outside(at: Tensor, grid: Grid) -> Tensor:
 
 def _is_near_tall(image: Tensor, pixel: Tensor, grid: Grid) -> Tensor:
     """Return whether a tall pixel, of value 2, is at most `REACH` rows and columns away from each pixel, (P,) bool.
-    Low pixels are often ground that a ground mask misses. It seems to move, because it differs in every sweep."""
+    Low pixels are often ground that the mask misses. Such ground seems to move, as it differs in every sweep."""
     answer = image.index_select(0, pixel) == 2
     low = flat_nonzero(~answer)
     line, col = split_index(pixel.index_select(0, low), grid.width)

@@ -3,8 +3,8 @@
 Connected components at several pixel sizes are hypotheses for rigid objects. Each one gets motion candidates: its
 correlation peak with every sweep, the median of these peaks, and the medians of the coarser components around it. The
 paired test compares the candidates with "static" at the finest pixels of all sweeps, and selects the best one. In the
-tree of components, a component wins if its motion has more evidence than those of its children together. Refinement
-corrects the winning motions to centimetres.
+tree of components, a component wins if its motion has more evidence than its children together. Refinement corrects
+the winning motions to centimetres.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from cflow_torch.verified.rigid_motion import RotatingMotion, motion_by_pixel
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
-# Metres around the region that we also process, so that objects at its border are complete. An object at 40 m/s covers
-# 4 m in a sweep.
+# We also process a margin of this many metres around the region, so that objects at its border are complete. An object
+# at 40 m/s covers 4 m in a sweep.
 _MARGIN = 4.0
 
 
@@ -57,7 +57,7 @@ class VerifiedFlow(SceneFlowModel):
 
     @property
     def bytes_per_point(self) -> int:  # type: ignore[override]
-        """Working memory if every point has its own pixel. Sub-pixel motion needs most of it."""
+        """Bytes of working memory per point if every point has its own pixel. Sub-pixel motion needs most of them."""
         return int(super().bytes_per_point) + 170 + subpixel_motion.BYTES_PER_POINT
 
     def grid(self, pixel_size: float) -> Grid:

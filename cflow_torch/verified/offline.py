@@ -1,8 +1,8 @@
-"""Sweeps after t+1, for recordings: they show objects that have just appeared, and all objects at the start of a log.
+"""Sweeps after t+1, for recordings. They help if an object has just appeared, and at the start of a log.
 
 Past and future are two windows of one batch. A point of t takes its motion from the future only if the future shows its
-object in more than twice as many sweeps as the past. In our tests, a motion from a single past sweep was hardly better
-than one from no past sweep, and where all past sweeps showed the object, the future gave no better motion.
+object in more than twice as many sweeps as the past. In our tests, a single past sweep hardly improved a motion. Where
+all past sweeps showed the object, the future gave no better motion.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from cflow_torch.verified.paired_test import best_candidate, count_wins, evidenc
 from cflow_torch.verified.rigid_motion import RotatingMotion
 from cflow_torch.windows.collation import Batch
 
-# The future must show an object in more than this many times as many sweeps as the past. At 1, façades that are
-# uncovered as the ego vehicle moves get more false motion (simulated drives).
+# The future must show an object in more than this many times as many sweeps as the past. With a ratio of 1, façades
+# that come into view as the ego vehicle moves get more false motion (simulated drives).
 _RATIO = 2
 
 
 def choose_side(batch: Batch, motion: RotatingMotion) -> RotatingMotion:
-    """Return the motion in which each point of t takes its pixel from the past or from the future (`_RATIO`)."""
+    """Assign each point of t to its pixel in the past or in the future window (`_RATIO`), and return that motion."""
     window, step = split_index(batch.image.long(), batch.num_steps)
     number = 1 + motion.cluster_id.index_select(0, motion.cluster(slice(None)))  # 0 = no object
     most = int(number.amax()) + 1 if number.numel() else 1

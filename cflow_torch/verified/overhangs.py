@@ -29,9 +29,9 @@ from cflow_torch.verified.component_tree import Components, Nodes
 from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps
 
 _CELL = 0.4  # metres, side of a cell; it is as high as a slice
-_NUM_SLICES = 32  # from the lowest cell of a window up, with an empty one at each end; higher points are in the highest
-_GAP = 3  # least distance, in slices, of a cell from the next one above it; the body and the roof of a car are closer
-_LARGEST = 10  # largest distance, in slices, of the lowest and the highest cell of an object; it suffices for a bus
+_NUM_SLICES = 32  # of a window, from its lowest point up. The ends stay empty; the last but one takes all higher points
+_GAP = 3  # slices from a cell to the next one above it, at least; the body and the roof of a car are closer
+_LARGEST = 10  # slices from the lowest to the highest cell of an object, at most; this suffices for a bus
 
 
 def add_overhung(sweeps: HeightSlicedSweeps, components: Components, nodes: Nodes) -> tuple[HeightSlicedSweeps, Nodes]:

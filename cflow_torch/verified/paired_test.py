@@ -75,9 +75,9 @@ def add_unchanged(sweeps: HeightSlicedSweeps, nodes: Nodes, motion: Tensor, num_
         motion: (N, 2) float64, (y, x), finest pixels per sweep interval; 0 = static.
         num_levels: L. Nodes of changed pixels have level L.
 
-    Convention: we test the pixels around moving nodes of changed pixels, at most two rows and columns away. We test a
-        pixel near several nodes only for the first. It joins the node if the motion wins more slices than it loses in
-        the tested pixels of the 3 x 3 around it.
+    Convention: we test the pixels around moving nodes of changed pixels, at most two rows and columns away. A pixel
+        near several nodes is tested only for the first. It joins this node if the motion wins more slices than it loses
+        in the tested pixels among the 3 x 3 around it.
 
     Cost: 25 lookups for each pixel of these nodes, and the paired test of the pixels around them.
     """
@@ -106,8 +106,8 @@ class Wins(NamedTuple):
     # slice also counts as found if it is in the 3 x 3 pixels around a position.
     won: Tensor
     lost: Tensor
-    # (2, M, 2) int64, numbers of slices. Last axis: slices of the other sweeps, then slices of t+1. First axis: all of
-    # them, then those that the compared sweep has in place plus, times 2^32, those that it has in the 3 x 3 pixels.
+    # (2, M, 2) int64, numbers of slices. Last axis: slices of the other sweeps, then slices of t+1. First axis: all
+    # slices, then those found in place, plus 2^32 for each one found in the 3 x 3 pixels around its position.
     of_static: Tensor
 
     @property
@@ -167,7 +167,7 @@ def count_wins(sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, c
     ends = constant((sweeps.grid.height - 1, sweeps.grid.width - 1), torch.int64, device)[:, None]
     border = torch.minimum(*torch.minimum(at, ends - at))
     table = torch.stack((component, first, move, border))
-    # For each candidate, slices lost and, times 2^32, won; then the near counts; then `Wins.of_static`.
+    # Slices lost, plus 2^32 times slices won, by each candidate. Then the near counts likewise, then `Wins.of_static`.
     sums = torch.zeros((2 * num_candidates + 2, 2 * count), dtype=torch.int64, device=device)
     size = max(1, (_AT_ONCE_CPU if device.type == "cpu" else _AT_ONCE_GPU) // num_candidates)
     # Every other sweep is compared with t+1, and t+1 with every other sweep.

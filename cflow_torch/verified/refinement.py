@@ -31,11 +31,11 @@ _FARTHEST = 0.2  # metres, between the voxels of a pair
 _FAR = 3.0  # squared distance of a pair, in variances of both surfaces, at which its weight is a quarter
 MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _WEIGHT, _ARM = 256, 16  # weights are multiples of 1/256, arms of 16 units, so sums are exact in any order
-# Weights of x, y and the tangent of half the angle. They keep the translation near the given one, as two pairs of
-# points without a surface would, and the rotation near zero, as five pairs 1 m from the centre would.
+# Weights that hold x and y near the given translation, and the tangent of half the angle near zero: as firmly as two
+# pairs of voxels with equal spread in all directions, and five such pairs 1 m from the centre.
 _HELD = (2.0 * _WEIGHT, 2.0 * _WEIGHT, 5.0 * _WEIGHT * (2 * UNITS) ** 2)
-# A quarter less than 1 is a quarter turn of the sensor. An object that passes it in an interval would be nearer than
-# its own length. So a smaller ratio means that we saw it at the end of one sweep and at the start of the next.
+# At 0.75, the beam hits the object a quarter turn earlier than in the sweep before. To move that far around the
+# sensor, it would have to be nearer than its own length. So at smaller ratios, the seam between sweeps crosses it.
 _LEAST_STRETCH = 0.75
 
 
@@ -47,7 +47,7 @@ def refine(
     `motion` is (G, 2) float64, (y, x), finest pixels per sweep interval. Static objects longer than `longest` metres at
     t+1 stay static. None = no bound.
     """
-    # A static object of a pair is a whole component. Objects of copies get length 0; they move, so it does not matter.
+    # A static object of a pair is a whole component. Objects of copies get length 0, which has no effect, as they move.
     length = lookup(components.length, objects.component.clamp(max=components.count))
     start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
     points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
@@ -133,8 +133,8 @@ class VoxelPairs:
         variance = (NOISE * UNITS) ** 2
         noise = constant(tuple(variance if i % 4 == 0 else 0.0 for i in range(9)), torch.float64, device)
         self._own_spread = take_columns(spread, self._voxel) + noise[:, None]
-        # Derivatives of (x, y, z) at t+1: by x and by y of the motion per interval, k or 0; by the tangent of half the
-        # angle, 2 k times the arm, rotated by a right angle.
+        # Derivatives of the position (x, y, z) at t+1. By the motion per interval in x or in y: k or 0. By the tangent
+        # of half the angle: the arm, rotated by a right angle, times 2 k.
         axes = constant(((1.0, 0.0), (0.0, 1.0), (0.0, 0.0)), torch.float64, device)
         self._by_flow, self._by_tangent = axes[..., None] * self._k, self._k * (2 * _ARM)
 
@@ -167,7 +167,7 @@ class VoxelPairs:
         return RigidMotion((motion[:2] / UNITS).t(), motion[2], centre)
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
-        """Return the ratio of the time between two measurements of an object to the time between their sweeps.
+        """Return the time between two measurements of an object, divided by the time between their sweeps.
 
         Args:
             rigid: apparent motion of the objects, the result of `register`. The points have times.
@@ -251,7 +251,7 @@ def deskew(
     grid, num_steps, object_id = sweeps.grid, sweeps.num_steps, points.object_id
     time, (window, step) = points.time.double(), take_columns(sweeps.pixels.table[1:3], points.pixel)
     flow, centre = (torch.view_as_complex(values.index_select(0, object_id)) for values in (rigid.flow, rigid.centre))
-    # `centre` is that at t, so we move it to the instant of the sweep.
+    # `centre` is the centre at t. We move it to the instant of the sweep.
     image = torch.add(step, window, alpha=num_steps)
     since_t = (sweeps.elapsed[:, 1:2] - sweeps.elapsed).flatten().index_select(0, image)
     at_instant = torch.complex(*points.position[:2]) - flow * time

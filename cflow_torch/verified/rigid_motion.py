@@ -50,7 +50,7 @@ def rotate(rotation: Tensor, arm: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class RotatingMotion(Motion):
-    """Motion of clusters that may rotate, along the ground."""
+    """Motion along the ground, of clusters that may rotate."""
 
     rotation: Tensor = torch.empty(0)  # (M + 1,) float64, as in `RigidMotion`
     centre: Tensor = torch.empty(0)  # (M + 1, 2) float64, likewise
@@ -79,12 +79,12 @@ def motion_by_pixel(
     """Return the motion of G objects by pixel; the clusters of the result are the P pixels.
 
     Args:
-        rigid: their motion in the plane. The slope of the ground around their centre gives the z of the flow.
+        rigid: motion of the objects in the plane. The slope of the ground around them gives the z of the flow.
         score: (G,) float32.
         confidence: (P + 1,) float32.
         is_weak: (G,) bool, objects whose points take the motion of their copies under an overhang, if those move.
 
-    Convention: within a window, the ids of objects of copies follow those of the other objects.
+    Convention: within a window, objects of copies have the last ids.
     """
     window = sweeps.pixels.window.index_select(0, objects.first)
     ordered, order = (window % len(sweeps.batch.rows)).sort(stable=True)

@@ -18,7 +18,7 @@ from cflow_torch.verified.voxel_centroids import UNITS, Voxels, points_of_object
 
 _BIAS_Z, _LEAST_BIAS = 3, 0.1  # least |a - b| of `_is_biased`: in standard deviations of noise, as a share of slices
 _NUM_LAYERS = 16  # layers of cubes, after which their numbers repeat
-# Number of steps, and their length. It is above 1, because the nearest partners change with each step.
+# Number and length of the steps. The length is above 1, because the nearest cubes change with each step.
 NUM_STEPS, STEP_LENGTH = 4, 1.4
 _Z, _LEAST_GAIN = 4.0, 0.05  # standard deviations of noise; gain per cube, as a share of a perfect match
 _SIGMA = 0.07  # metres, of the Gaussian that weights two centroids by their distance
@@ -29,8 +29,8 @@ def subpixel_motion(sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor
     """Return the motion of all objects, including slow objects of pairs.
 
     Args:
-        motion: (G, 2) float64, (y, x), finest pixels per sweep interval; 0 = static. Windows with history keep theirs.
-        may_be_slow: (G,) bool, the static objects to test. The others stay static.
+        motion: (G, 2) float64, (y, x), finest pixels per sweep interval; 0 = static.
+        may_be_slow: (G,) bool, the static objects to test. Those in windows with history are not tested.
 
     Returns:
         (G, 2) float64, x and y, metres per sweep interval.
@@ -92,19 +92,19 @@ def _significant_shift(voxels: Voxels, num_objects: int) -> Tensor:
     ahead = take_columns(voxels.position[:2], near.view(-1)).view(2, *near.shape) - position[:, None]
     ahead = ahead.clamp_(-4096, 4096).mul_((2 * step - 1).double())  # for t+1, all signs change
 
-    weights, shift = _meeting_weights(step.device), position.new_zeros((2, num_objects))
-    weight, error = _meet(ahead, weights)
+    weights, shift = _match_weights(step.device), position.new_zeros((2, num_objects))
+    weight, error = _nearest_match(ahead, weights)
     unshifted = weight
     for _ in range(NUM_STEPS):
         sums = scatter_count(of, num_objects, torch.cat((weight[None], weight * error)))
         shift += (STEP_LENGTH * sums[1:] / sums[0].clamp(min=1 / 256)).round_()  # the least weight above 0
-        weight, error = _meet(ahead - take_columns(shift, of)[:, None], weights)
+        weight, error = _nearest_match(ahead - take_columns(shift, of)[:, None], weights)
     gain = weight - unshifted
     gain, square, count = scatter_count(of, num_objects, torch.stack((gain, gain * gain, torch.ones_like(gain))))
     return shift.t() * ((gain > _Z * square.sqrt()) & (gain >= _LEAST_GAIN * count))[:, None]
 
 
-def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def _nearest_match(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Return the weight of the nearest of 25 cubes, (K,) float64, and its offset, (2, K); `ahead` is (2, 25, K)."""
     slot = constant(tuple(range(ahead.shape[1])), torch.float64, ahead.device)[:, None]
     # Square and slot share one number, because taking the minimum is several times faster than argmin.
@@ -113,7 +113,7 @@ def _meet(ahead: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     return weight, ahead.gather(1, (key & 31).expand(2, 1, -1))[:, 0]
 
 
-def _meeting_weights(device: torch.device) -> Tensor:
+def _match_weights(device: torch.device) -> Tensor:
     """Return the weights exp(-d^2 / (2 sigma^2)) of centroids at distance d, (2049,) float64, multiples of 1/256. Entry
     i is for d^2 from 64 i to 64 (i + 1) square units; the last entry, 0, is for larger distances."""
     square = 64 * torch.arange(2048, dtype=torch.float64) + 32
