@@ -114,8 +114,8 @@ class PixelIndices:
 def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: ClusteringConfig) -> Tensor:
     """Label the components of dilated images; erode those that are too long and label them again (Alg. clustering).
 
-    `image` is (B, H, W) bool. `pixels` are the flat indices of its set pixels, (P,) int64, ascending. The result is the
-    position in `pixels` of the first pixel, in raster order, of the component of each pixel, (P,) int64.
+    `image` is (B, H, W) bool. `pixels` are the flat indices of its set pixels, (P,) int64, ascending. The result, (P,)
+    int64, names each pixel's component by the position in `pixels` of its first pixel in raster order.
     """
     _, height, width = image.shape
     padded = pad([image])
@@ -131,7 +131,7 @@ def components_by_size(
 ) -> tuple[Tensor, int]:
     """Return the component of each set pixel, (P,) int64, and a number above the largest component.
 
-    `height` and `width` are those of the images without padding. We erode all oversized components together. They do
+    `height` and `width` are H and W of the images without padding. We erode all oversized components together. They do
     not affect each other, because no 3 x 3 square inside the dilated components has pixels of two of them.
     """
     component, count = _components(padded, indices, 3, config)
@@ -156,7 +156,7 @@ def components_by_size(
 
 
 def _components(padded: Tensor, indices: PixelIndices, reach: int, config: ClusteringConfig) -> tuple[Tensor, int]:
-    """Label once, after a 3 x 3 dilation if `reach` is 3. The result is that of `components_by_size`."""
+    """Label once, after a 3 x 3 dilation if `reach` is 3. Returns as for `components_by_size`."""
     if config.labeling == "kornia":
         component = connected_components_kornia(padded, indices.pixel, config.connectivity, reach)
         return component, indices.pixel.numel()

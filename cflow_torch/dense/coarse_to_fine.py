@@ -23,7 +23,7 @@ class ProjectedSweeps:
     # (A, P) float64, metres per sweep interval: flow found so far of each point; undefined at t+1. None = no flow yet.
     flow: Tensor | None
     occupancy: Tensor  # (B, S, H, W) bool; index 0 of S is sweep t+1
-    pixel: Tensor  # (P,) int64, flat index into `occupancy`; its size for ignored points
+    pixel: Tensor  # (P,) int64, flat index into `occupancy`; B * S * H * W for ignored points
 
     def positions(self) -> Tensor:
         """Return the warped positions of all points, (A, P) float64, metres, frame of t+1."""
@@ -36,7 +36,7 @@ class ProjectedSweeps:
 def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
     """Warp every sweep by its flow so far times its intervals to t+1, and draw it (Eq. 3d_to_bev).
 
-    `flow` is as in `ProjectedSweeps`. We ignore points that are warped out of the images at this scale.
+    `flow` is as in `ProjectedSweeps`. At this scale, we ignore points that are warped out of the images.
     """
     num_images, num_points = batch.num_windows * batch.num_steps, len(batch.image)
     pixel = torch.empty(num_points, dtype=torch.int64, device=batch.image.device)

@@ -165,7 +165,7 @@ def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor
     low, high, stride = search.low[:, run.pairs], search.high[:, run.pairs], search.stride[run.pairs]
     searched = search.searched[run.pairs]
     end = searched.cumsum(0)
-    # Two shifts give a lower bound: no shift, and that of the largest count, moved into the search range.
+    # Two shifts give a lower bound: shift 0, and the shift of the largest count, clamped to the search range.
     middle, largest = low[0] * stride + low[1], torch.cat([largest_of_rows(piece) for piece in run.pieces])
     dy, dx = torch.minimum(shift_at(largest, stride, low), high)
     probe = middle + dy * stride + dx
@@ -174,7 +174,7 @@ def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor
         probe = torch.where(dy * dy + dx * dx <= square, probe, middle)
     start = end - searched
     bound = torch.maximum(run.counts.index_select(0, start + middle), run.counts.index_select(0, start + probe))
-    # We subtract 1, because the quotient is rounded; a count of 0 is never better than no shift.
+    # We subtract 1, because the quotient is rounded. A count of 0 never beats shift 0.
     needed = (bound * bound / target_energy[run.pairs] - 1).clamp_(min=0.5)[:, None]
     needed_of_piece = needed.split([len(piece) for piece in run.pieces])
     sample = flat_nonzero(torch.cat([(piece > least).view(-1) for piece, least in zip(run.pieces, needed_of_piece)]))
@@ -194,8 +194,8 @@ def _best_of_each_pair(
     """Choose the best candidate of each pair: (4, J) int64, dy, dx, count, energy, all 0 for a pair without candidates.
 
     The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels under the H x W window at
-    that shift. `pair`, `target` and `count`, (K,) int64, and `shift`, (2, K) int64, are those of K candidates, in order
-    of pair, dy and dx. Ties: as in `best_shifts`.
+    that shift. `pair`, `target` and `count`, (K,) int64, and `shift`, (2, K) int64, describe K candidates, in order of
+    pair, dy and dx. Ties: as in `best_shifts`.
     """
     # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
     parts = [windows.bounds(target[some], shift[:, some]) for some in chunks(0, len(pair), pair.device, 16)]
@@ -207,8 +207,8 @@ def _best_of_each_pair(
     energy = windows.count(target, torch.stack((dy, dx)))
     value = square.index_select(0, kept) / energy
     best_value = value.new_zeros(num_pairs).scatter_reduce_(0, pair, value, "amax")
-    # One number orders shifts by length, then as they are given, which is by dy, then by dx. It fits, as images have at
-    # most 2^15 pixels a side.
+    # One number orders shifts by length, then by position in the list, that is by dy, then dx. It fits an int64, as
+    # images have at most 2^15 pixels a side.
     mask, none = (1 << 31) - 1, (1 << 62) + len(kept)
     order = torch.add(torch.arange(len(kept), device=pair.device), dy * dy + dx * dx, alpha=1 << 31)
     order.masked_fill_(value < best_value.index_select(0, pair), none)

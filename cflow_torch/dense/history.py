@@ -11,7 +11,7 @@ from cflow_torch.ops.segments import masked_median
 def pool(estimates: Tensor, available: Tensor) -> Tensor:
     """Return a vector for each cluster, (M, 3) float64, with the median magnitude and orientation of its estimates.
 
-    `estimates` are (M, K, 3) float64, metres per sweep interval, nearest sweep first. z has a median of its own.
+    `estimates` are (M, K, 3) float64, metres per sweep interval, nearest sweep first. z has its own median.
     `available`, (M, K) bool, is False where the cluster is empty in that sweep. At least one per row is True.
 
     Convention:

@@ -17,7 +17,7 @@ from cflow_torch.windows.bev_grid import LONGEST_SIDE
 from cflow_torch.windows.memory import require_memory
 
 # We lay out an image as one line, whatever its height and width, and pad it to the next of these lengths. So the many
-# small clusters have few size classes, and few kernel launches. Images too large for a line are rare. They keep two
+# small clusters have few size classes and need few kernel launches. Images too large for a line are rare. They keep two
 # dimensions, because their 2D transforms are cheaper, and have classes by height and width. On a GPU the lengths are
 # farther apart, so that a batch of many windows has no more classes than one window.
 _LINES_CPU = tuple(144 << k for k in range(8))  # square clusters of 8, 11, 16, ... 90 pixels
@@ -80,8 +80,8 @@ def pack(pairs: TemplatePairs) -> Packing:
     """Pack all templates and targets. A cluster that is too long or needs too much memory is a `CFlowError`.
 
     An image takes H + low_y rows of W + low_x samples, and a target begins at row low_y and column low_x. Then sample
-    (dy + low_y) * stride + dx + low_x of the correlation belongs to shift (dy, dx), and no other pair of pixels adds to
-    the samples in the search range, neither across the end of a row nor across the end of the image.
+    (dy + low_y) * stride + dx + low_x of the correlation belongs to shift (dy, dx). In the search range, no other pair
+    of pixels adds to this sample, neither across the end of a row nor across the end of the image.
     """
     device, num_pairs, num_targets = pairs.size.device, len(pairs.cluster), len(pairs.size)
     template, target = pairs.template, pairs.target

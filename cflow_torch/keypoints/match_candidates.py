@@ -1,7 +1,7 @@
 """Key points, their descriptors, and match candidates: the key points of t+1 within a radius of a key point of t.
 
 We group the key points of t by small tiles of the image. The key points of t+1 are sorted by band of rows, then by
-column, so those within the radius of a group are a few ranges of that list. No tensor ever holds all pairs of key
+column, so those within the radius of a group are a few ranges of this list. No tensor ever holds all pairs of key
 points of t and t+1.
 """
 
@@ -19,8 +19,8 @@ from cflow_torch.ops.indices import concat_ranges, flat_nonzero, gather, index_i
 from cflow_torch.ops.morphology import erode_cross
 from cflow_torch.windows.collation import Batch
 
-# Rows and columns of a tile, rows of a band, key points in a group. We tried several tiles and bands for groups of 16,
-# and these give the fewest pairs (key point, candidate): on the AV2 pair, 1.55 for each pair within the radius. Groups
+# Rows and columns of a tile, rows of a band, key points in a group. We tried several tiles and bands for groups of 16.
+# These give the fewest pairs (key point, candidate): on the AV2 pair, 1.55 times the number within the radius. Groups
 # of 8 have fewer pairs, but fetch twice as many descriptors per pair.
 _TILE_ROWS, _TILE_COLS = 12, 64
 _BAND = 4
@@ -31,7 +31,7 @@ _PAIRS_AT_ONCE_GPU = 1 << 26
 _BYTES_PER_PAIR = 64
 # Lists of candidates that we compare together are padded to the longest one, rounded up to a multiple of this.
 _LENGTH_STEP = 8
-# `gate_radius` is the longest distance of a match between sweeps that are this far apart.
+# `gate_radius` is the longest distance of a match between sweeps that are this many seconds apart.
 _GATE_SECONDS = 0.1
 
 

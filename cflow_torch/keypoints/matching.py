@@ -22,12 +22,12 @@ from cflow_torch.ops.indices import flat_nonzero, gather
 _RATIO_UNIT = 10_000
 # We pack two pixels of a descriptor into one number, a + 128 b, and two of the other descriptor into 128 a' + b'. The
 # product is a b' + 128 (a a' + b b') + 128^2 b a', so the count is the middle digit. It has 7 bits, enough for 126
-# pixels, and takes half as many multiplications. Nothing is rounded: 1, 128 and 129 fit bfloat16 and TF32, which matrix
-# products may fall back to, and the sum fits float32. We cut longer descriptors into strips.
+# pixels. Packing halves the number of multiplications. Nothing is rounded: 1, 128 and 129 fit bfloat16 and TF32, which
+# matrix products may fall back to, and the sum fits float32. We cut longer descriptors into strips.
 _DIGIT_BITS = 7
 _STRIP_NUMBERS = 63
 _COUNT_BITS = 127 << _DIGIT_BITS
-# We find contenders by count^2 / energy in float32. This bound exceeds its relative rounding error.
+# Bound of the relative rounding error of count^2 / energy in float32, by which we find contenders.
 _ROUNDING = 2.0**-20
 # Contenders that we compare exactly at once; on a CPU `pairs_at_once` is less.
 _CONTENDERS_AT_ONCE = 1 << 22
@@ -86,8 +86,8 @@ def _contenders(
 ) -> Iterator[tuple[Tensor, ...]]:
     """Yield pairs of key points of `source` and `target`, and their counts, (N,) int64 each.
 
-    We keep a pair if its count^2 / energy is at least `share` times the largest one of its key point of `source`. All
-    pairs of a key point of `source` come at once.
+    We keep a pair if its count^2 / energy is at least `share` times the largest one of the same key point of `source`.
+    All pairs of a key point of `source` come in the same tensors.
     """
     if source.row.numel() == 0 or target.row.numel() == 0:
         return
