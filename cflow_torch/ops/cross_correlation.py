@@ -30,7 +30,7 @@ def cross_correlate(
         num_templates: J.
         target: (J,) int64, target of each template. The spectrum of a target serves all its templates.
         engine: "fft" or "conv" (conv2d).
-        most: upper bound of the ones of an image, to choose the precision of large FFTs; None = we count the ones.
+        most: upper bound of the number of ones in an image, for the precision of large FFTs; None = we count them.
 
     Returns:
         (J, Y, X) float, within 1/2 of the sum over p of template[j](p) * target(p + (y, x)). The caller rounds it.
@@ -52,7 +52,7 @@ def cross_correlate(
 
 
 def _fft_dtype(images: Tensor, most: int | None) -> torch.dtype:
-    # The number of samples is a bound of the ones that needs no synchronisation.
+    # The number of samples bounds the number of ones without a synchronisation.
     samples = math.prod(images.shape[1:])
     error = _FFT_ERROR_MARGIN * torch.finfo(torch.float32).eps * math.log2(samples)
     if error * samples > _FFT_LARGEST_ERROR:

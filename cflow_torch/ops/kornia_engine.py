@@ -20,7 +20,7 @@ def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity:
     """Label the set pixels by kornia's union-find. Arguments and result are those of `connected_components`.
 
     Raises:
-        CFlowError: kornia is older than 0.9 and has no exact labelling (its iterative one splits long components).
+        CFlowError: kornia is older than 0.9 and has no exact labelling (the iterative one splits long components).
 
     Convention:
         kornia labels with 8-connectivity. For connectivity 4 we label an image of twice the size, in which we set the

@@ -188,7 +188,7 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
 def _neighbourhoods(
     sides: tuple[int, ...], cols: tuple[int, ...], connectivity: int, reaches: tuple[int, ...], device: torch.device
 ) -> tuple[Tensor, Tensor]:
-    """(sets, 4) int64 offsets of the neighbours of a block, and (512 sets, 4) int32 tables `_reachable`."""
+    """(sets, 4) int64 offsets of the neighbours of a block, and (512 sets, 4) int32 tables of `_reachable`."""
     offsets = torch.tensor([[down * width + right for down, right in _NEIGHBOURS] for width in cols], device=device)
     tables = [_reachable(side, connectivity, reach, device) for side, reach in zip(sides, reaches)]
     return offsets, torch.cat(tables)

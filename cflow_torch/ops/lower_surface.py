@@ -14,23 +14,23 @@ _SMOOTH = 10  # cells on each side over which we smooth the hills
 
 
 def lower_surface(low: Tensor) -> Tensor:
-    """Fit the highest surface of limited slope below the heights. Objects on the ground are steeper than the ground.
+    """Fit the highest surface of limited slope below the heights, apart from low outliers. Objects rise more steeply.
 
     Args:
-        low: (B, H, W) int32, mm, low height of each cell, above which the surface must not lie; `UNKNOWN` = empty.
+        low: (B, H, W) int32, mm, a low height of each cell, such as its tenth percentile; `UNKNOWN` = empty.
 
     Returns:
         (B, H, W) int32, mm, defined everywhere.
 
-    Convention: the first fit allows slopes as steep as hills. We smooth its surface. The second fit allows gentle
-    slopes relative to it. All numbers are integers, so the bits are the same on any device.
+    Convention: the first fit allows slopes as steep as hills, and we smooth its surface. The second fit allows gentle
+    slopes relative to the smoothed surface. All numbers are integers, so the bits are the same on any device.
 
     Cost: about sixty passes over the maps.
     """
     is_supported = _is_supported(low)
     hills = _box_mean(_gentlest(low.masked_fill(~is_supported, UNKNOWN), _STEEP))
     rest = low - hills
-    # Far rings have many points without similar neighbours. Such a point counts unless it is a hole in the hills.
+    # Far rings have many cells without similar neighbours. Such a cell counts unless it is far below the hills.
     is_trusted = (is_supported | (rest >= -_SUPPORT)).logical_and_(low < UNKNOWN)
     return _gentlest(rest.masked_fill_(~is_trusted, UNKNOWN), _GENTLE).add_(hills)
 

@@ -27,7 +27,7 @@ class WindowCounts:
         self._numbers = torch.from_numpy(numbers).to(image.device)
         numbers_of_pixel = take_columns(self._numbers[2:], image)
         edge, (start, stride) = numbers_of_pixel[:2], numbers_of_pixel[2:]
-        # Number of pixels above every row, and to the left of every column. The pixels of earlier images cancel.
+        # Number of pixels above every row, and to the left of every column. In differences, earlier images cancel.
         line = torch.stack((row, col)).add_(edge).add_(1)
         self._before = scatter_count(line.flatten(), int(edges.sum())).cumsum(0)
         # Running sum over all rows. Each row has W + 1 samples, of which the first is empty.
