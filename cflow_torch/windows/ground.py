@@ -51,9 +51,10 @@ def find_ground(points: Array, method: str = "grid", threshold: float = THRESHOL
         (N,) bool, True = ground. An array for an array, a tensor on the same device for a tensor.
 
     Convention:
-        All False if, within 32 m, fewer than 20 pairs of flat spots (2 m x 2 m) lie 4 m apart, or fewer than one pair
-        for every six spots with points. NaN, infinite points and those with |x| or |y| >= 131 m are not ground. The
-        order of points, the other sweeps and shifts by whole millimetres in z do not change the result.
+        Two flat spots (2 m x 2 m) 4 m apart are a pair if the slope between them is at most 25 %. All False if there
+        are fewer than 20 pairs within 32 m, or fewer than one for every six spots with 4 or more points. NaN, infinite
+        points and those with |x| or |y| >= 131 m are not ground. The order of points, the other sweeps and shifts by
+        whole millimetres in z do not change the result.
 
     Raises:
         CFlowError: wrong shape, dtype, method or threshold; Patchwork++ is not installed.

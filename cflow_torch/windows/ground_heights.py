@@ -1,4 +1,4 @@
-"""Height and slope of the ground around a point. We use the ground points of t, because harnesses give no others."""
+"""Height and slope of the ground around a point, from the ground points of t: harnesses may give no other masks."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class GroundHeights:
                 is_used = is_known & ((height - (plane[:, :, None] * design.t()[:, None]).sum(0)).abs() <= _FARTHEST)
             sums = ((terms * is_used[:, None]) @ design).permute(1, 2, 0)
             inverse, det = adjugate(sums[:3])
-            plane = (inverse * sums[3]).sum(1) / det  # undefined where it is not flat
+            plane = (inverse * sums[3]).sum(1) / det  # undefined where `is_flat` is False
             fits.append((sums[0, 0], det))
         n, det = (torch.stack(of_fits) for of_fits in zip(*fits))
         is_flat = ((n >= _FEWEST_BLOCKS) & (4 * det >= n**3)).all(0)

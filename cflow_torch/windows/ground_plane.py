@@ -18,7 +18,7 @@ _FARTHEST_HEIGHT = 1e7  # metres; the largest that fits the sort key
 _TRIM = 10  # the lowest tenth of the points of a cell is ignored, because of multipath
 _FLAT, _FLAT_POINTS = 250, 4  # a cell of 4 or more points is flat if median - tenth percentile is at most 250 mm
 _LAYER = 300  # flat cells of the ground differ by at most this (kerbs), mm
-# There is ground if at least 20 pairs of flat cells are level, and a sixth as many pairs as cells of 4 points or more.
+# There is ground if at least 20 pairs of flat cells are level, and at least one per six cells of 4 or more points.
 # Simulated drives (seeds 400-409) have at least three times as many pairs, and at most a tenth without their ground.
 _FEWEST_PAIRS, _SMALLEST_SHARE = 20, 6
 
@@ -57,7 +57,7 @@ def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int
     unknown = torch.iinfo(torch.int64).max // 2
     heights = (low - rise).masked_fill_(~is_flat, unknown).flatten(1).sort(1).values
     rank = torch.arange(heights.shape[1], device=low.device)
-    in_layer = torch.searchsorted(heights, heights + _LAYER, right=True) - rank  # cells from each to a layer above it
+    in_layer = torch.searchsorted(heights, heights + _LAYER, right=True) - rank  # flat cells up to `_LAYER` above each
     in_layer.masked_fill_(heights == unknown, 0)
     most = in_layer.amax(1)
     first = torch.where(in_layer == most[:, None], rank, heights.shape[1]).amin(1)

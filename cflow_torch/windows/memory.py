@@ -80,7 +80,7 @@ def split_windows(
 
     The grid is that of the finest scale, whose images are the largest. `max_memory` is in bytes per group; None = no
     limit on a GPU, 512 MiB on a CPU, where large groups are slower. A window that needs more is a group of its own. One
-    that does not fit into free memory is a `CFlowError`."""
+    that exceeds free memory is a `CFlowError`."""
     groups: list[list[Window]] = []
     if max_memory is None and device.type == "cpu":
         max_memory = _BYTES_ON_CPU

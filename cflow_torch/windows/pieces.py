@@ -108,7 +108,7 @@ def _of_points(
 
 
 def _select(values: Any, row: Tensor | None) -> Any:
-    """Select the values of some points; None = of all. A number, which is the value of every point, stays."""
+    """Select the values of the points `row`, None = all. A number is the value of every point, and stays."""
     return values if row is None or not isinstance(values, Tensor) else values.index_select(0, row)
 
 

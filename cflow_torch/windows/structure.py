@@ -13,9 +13,9 @@ _BLUR = 0.03  # metres, smallest thickness of a patch: range noise and calibrati
 _CLEARANCE = 0.4  # metres above the lowest point of a cell, below which a point may be ground
 _STEPS = 10  # of the Gauss-Newton fit
 _PRIOR = np.diag([1.0, 1.0, 100.0])  # 1 / (m^2, m^2, rad^2), for directions that the scene leaves open (a long wall)
-FEWEST_IN_PLACE = 150  # with a smaller product of the agreement and the number of points, we do not judge
-# Inverted motion must fit better by this factor. Correct poses of real and simulated drives gave less; inverted ones
-# gave 1.3 to 3.
+FEWEST_IN_PLACE = 150  # least agreement times number of points from which we judge poses
+# Inverted motion must fit better by this factor. Correct poses of real and simulated drives gave smaller factors;
+# inverted poses gave 1.3 to 3.
 _BETTER = 1.25
 
 
@@ -91,7 +91,7 @@ class Patches:
         return np.array([x, y]), float(rotation), self.agreement(_rotated(xy, rotation) + (x, y))
 
     def _pairs(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which points fall on a patch, (N,) bool, their offsets from its mean, (M, 2), and its precision."""
+        """Return which points fall on a patch, (N,) bool. For these: offset from its mean, (M, 2); its precision."""
         if not len(self.cell):
             return np.zeros(len(xy), bool), np.zeros((0, 2)), np.zeros((0, 2, 2))
         key = _cells(xy, _CELL)

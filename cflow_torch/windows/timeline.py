@@ -14,7 +14,7 @@ from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import rigid_transform
 from cflow_torch.windows.validation import have_same_points, keep_nearest
 
-# Largest plausible distance between two poses of a window, metres: 2 s at 50 m/s.
+# Largest plausible distance of an ego position from the one at t+1, metres: 2 s at 50 m/s.
 _FARTHEST_POSE = 100.0
 
 
@@ -62,7 +62,7 @@ class Timeline:
             window, of_window = windows[number], [source.sweep for source in given[number]]
             times = elapsed_times(window, sources, config)
             table[:2, index, 1 : 1 + len(sources)] = np.transpose(times)
-            # If a sweep lacks times of points, times of the others would shift them against it.
+            # If one sweep lacks times of points, de-skewing the others would shift them against it.
             has_times = all(sweep.point_times is not None for sweep in (window.pc1, *of_window))
             interval = times[0][1] / times[0][0] if needs_times and has_times else None
             pose1, transform = window.pc1.pose, None
@@ -78,7 +78,7 @@ class Timeline:
 
 
 def source_sweeps(window: Window, config: Config) -> list[Source]:
-    """List pc0, the history and then the sweeps after t+1. We skip a sweep that repeats an earlier one of the list."""
+    """List pc0, the history, then the sweeps after t+1. We skip repeats of a listed sweep and, after t+1, of pc1."""
     if len(window.pcf) > config.num_future:
         raise CFlowError(
             f"the window has {len(window.pcf)} future sweeps but num_future={config.num_future}: raise num_future, or "

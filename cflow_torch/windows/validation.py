@@ -1,4 +1,4 @@
-"""Check windows: their types, the resolution of their points, devices. Then read points, masks and times as tensors."""
+"""Check the types, point resolution and devices of windows, and read points, masks and times as tensors."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def read_ground(sweeps: Sequence[Sweep], device: torch.device) -> Tensor:
 
 
 def _together(columns: Sequence[Array], dtype: Any, device: torch.device) -> Tensor:
-    """Concatenate (..., N) arrays or tensors on the device. Arrays share an upload, because the host waits for each."""
+    """Concatenate (..., N) arrays or tensors on the device. Arrays share an upload, as the host waits for each."""
     if not any(isinstance(values, Tensor) for values in columns):
         shape = (*columns[0].shape[:-1], sum(values.shape[-1] for values in columns))
         return torch.from_numpy(np.concatenate(columns, -1, out=np.empty(shape, dtype))).to(device)
