@@ -1,4 +1,4 @@
-"""The settings of each method, and the presets, which list only the settings that they change."""
+"""The settings of each method, and the presets. A preset lists only the settings that it changes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _method(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Config:
-    """Settings that all methods have. Each method adds its own (`CONFIGS`). `make_config` makes them from a preset.
+    """Settings that all methods have. Each method adds its own ones (`CONFIGS`). `make_config` makes all from a preset.
 
     An invalid value raises `CFlowError`. `cflow settings` lists the meaning and the bounds of every field.
     """

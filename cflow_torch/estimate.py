@@ -49,7 +49,7 @@ def estimate_flow(
 
     Args:
         pc0: points of sweep t, (N0, 3+) float of any width, array or tensor. Columns after z are ignored. Or a `Sweep`,
-            which also contains mask, pose and times; then all of `pc0`, `pc1`, `pch` and `pcf` are sweeps.
+            which also contains mask, pose and times; then all of `pc0`, `pc1`, `pch` and `pcf` must be sweeps.
         pc1: points of sweep t+1, (N1, 3+).
         T_ego1_ego0: (4, 4), maps the ego frame at t to the ego frame at t+1 (pose1^-1 pose0). None = pc0 is already in
             the frame of t+1.
@@ -154,7 +154,7 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
 def _sweep(
     name: str, given: str | None, points: Array, is_ground: Any, transform: Array | None, times: Array | None
 ) -> Sweep:
-    """A sweep whose world is the ego frame at t+1, so its pose is `transform`. If none is given, it has no pose."""
+    """Make a sweep in a world that is the ego frame at t+1: its pose is `transform`, or None if none is given."""
     pose = None if given is None else np.eye(4) if transform is None else transform
     try:
         return Sweep(points, is_ground, pose, point_times=times)

@@ -29,7 +29,7 @@ class Motion:
     cluster_id: Tensor  # (M + 1,) int64, counted from 0 in each window
     score: Tensor  # (M + 1,) float32
     confidence: Tensor | None = None  # (M + 1,) float32, see `FlowResult`; None = the method does not estimate it
-    # (A, P) float64, metres per sweep interval, sum of the flow of each point at coarser scales; None = no such scale.
+    # (A, P) float64, metres per sweep interval, flow of each point summed over coarser scales; None = no coarser scale.
     before: Tensor | None = None
 
     def cluster(self, points: slice) -> Tensor:
@@ -73,7 +73,7 @@ class SceneFlowModel(nn.Module):
     num_axes = 2  # coordinates of points that the method needs; 2 = x and y
     needs_ground = False  # the method needs the heights of ground points
     needs_times = False  # the method needs the times of points
-    bytes_per_point = 160  # working memory before clusters are known: positions, pixels, temporaries
+    bytes_per_point = 160  # of working memory before clusters are known: positions, pixels, temporaries
 
     def __init__(self, config: Config, device: Any = "auto") -> None:
         super().__init__()

@@ -86,8 +86,8 @@ class Sweep:
             then no sweep of the window may have a pose.
         timestamp_ns: time of the sweep in nanoseconds; None = unknown.
         point_times: (N,) float, seconds from the instant of the sweep to the measurement of each point, negative =
-            before it; None = unknown, treated as 0. The instant is that of `timestamp_ns` and `pose`. The points must
-            already be compensated for the motion of the vehicle until this instant. The verified method uses the times
+            before it; None = unknown, treated as 0. `timestamp_ns` and `pose` are for this instant, and the points must
+            already be compensated for the motion of the vehicle until then. The verified method uses the times
             if every sweep of a window has them.
 
     Raises:
@@ -150,7 +150,7 @@ def named_sweeps(window: Window) -> list[tuple[str, Sweep]]:
 
 @dataclass(frozen=True)
 class FlowResult:
-    """Flow from t to t+1, with a row for every point of pc0 in its order, also for ground and points out of range.
+    """Flow from t to t+1, one row per point of pc0 in the same order, also for ground and points out of range.
 
     The flow of a point is the displacement of its object from the instant of sweep t to the instant of sweep t+1. If
     the point has a time, it is the displacement over one sweep interval, from the position at the measurement.
@@ -167,8 +167,8 @@ class FlowResult:
         is_valid: (N,) bool, True for active points: finite, not ground, not of the vehicle itself (`Config.ego_box`),
             and inside the region.
         confidence: (N,) float32 in [0, 1], estimated probability that the end-point error of the residual flow is
-            below 0.1 m per sweep interval, for static and dynamic points; 0 where is_valid is False; None unless the
-            method is the verified one. Its table was fitted on simulated drives, see docs/verified.md.
+            below 0.1 m per sweep interval; 0 where is_valid is False; None unless the method is the verified one. The
+            probabilities were fitted on simulated drives, see docs/verified.md.
     """
 
     residual_flow: Tensor
