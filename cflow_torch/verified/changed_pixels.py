@@ -1,7 +1,7 @@
 """Changed pixels: pixels with a slice that is missing in another sweep, although that sweep saw its position.
 
-Near objects cast shadows on the background, and the shadows move with the sensor. So a missing slice counts only if the
-other sweep has a return in the same direction that is at least as far away.
+Near objects cast shadows on the background, and the shadows move with the sensor. So a missing slice is a change only
+if the other sweep has a return in the same direction that is at least as far away.
 """
 
 from __future__ import annotations

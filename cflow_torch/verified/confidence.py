@@ -1,7 +1,7 @@
 """The margin of motions, and the confidence of the flow of each point (docs/verified.md).
 
-The margin of a motion measures how much worse a displaced copy of it explains the sweeps. If a motion fits no better
-than a displaced copy, the object is static, such as a wall that seems to slide or a trunk of few points.
+The margin of a motion measures how much worse displaced copies of it explain the sweeps. An object with a low margin
+is usually static, for example a wall that seems to slide or a trunk of few points.
 
 A table gives each point a probability from counts that need no ground truth. For a moving object, the probability
 depends on its margin. For a static point, it depends on the share of its neighbourhood that t+1 matches. A static point

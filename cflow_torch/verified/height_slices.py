@@ -181,7 +181,7 @@ class HeightSlicedSweeps:
 
     @cached_property
     def intervals(self) -> Tensor:
-        """(B, 2 S - 1) float64, sweep intervals from t+1 to the steps S - 1 ... 1, 0, then from 1 ... S - 1 to t+1."""
+        """(B, 2 S - 1) float64, sweep intervals from t+1 to step S - 1 ... 1, 0, then from step 1 ... S - 1 to t+1."""
         return torch.cat((-self.elapsed.flip(1), self.elapsed[:, 1:]), 1)
 
     @cached_property
@@ -204,7 +204,7 @@ class HeightSlicedSweeps:
         """Set the index of each pixel outside the images to the last entry of `image`. Return (...) int64.
 
         Args:
-            index: (...) int64, flat indices into `image`; those of pixels outside may be wrong.
+            index: (...) int64, flat indices into `image`; the indices of pixels outside may be wrong.
             at: (2, ...) int64, rows and columns of the same pixels, any value.
         """
         is_above_or_below, is_beside = _is_outside(at, self.grid)
@@ -239,8 +239,8 @@ def slice_of(z: Tensor, slice_height: float, num_slices: int = NUM_SLICES) -> Te
 
 
 def count_slices(slices: Tensor) -> Tensor:
-    """Count the set bits in both halves of uint8 values: int64, the count of the lower four bits, plus 2^32 times that
-    of the upper four. So one sum adds up both counts."""
+    """Count the set bits in both halves of uint8 values: int64, the count of the lower four bits, plus 2^32 times the
+    count of the upper four. So one sum adds up both counts."""
     return constant(_COUNTS, torch.int64, slices.device).index_select(0, slices.reshape(-1).int()).view(slices.shape)
 
 

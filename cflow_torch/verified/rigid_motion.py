@@ -112,7 +112,7 @@ def motion_by_pixel(
 
 def _pixel_of_result(sweeps: HeightSlicedSweeps, is_moving: Tensor, is_sure: Tensor) -> Tensor:
     """Return the pixel whose motion each point takes, (N,) int64, P = none. A point takes the pixel of its copy if that
-    pixel moves and its own pixel is not sure. `is_moving` and `is_sure` are (P + 1,) bool."""
+    pixel moves, unless its own pixel is sure, that is, moves and is not weak. Both masks are (P + 1,) bool."""
     num_points = sweeps.batch.image.numel()
     pixel, copy = sweeps.pixel_of_point[:num_points], sweeps.pixel_of_point[num_points:]
     own = pixel.index_select(0, sweeps.copied)
