@@ -64,8 +64,8 @@ class GroundHeights:
         """Return the slopes of the ground around objects, (G, 2) float64, metres of height per metre in x and in y.
 
         `centre` has x and y of each object, (G, 2) float64, metres, frame of t+1, in or outside the region. We fit a
-        plane to the mean heights of the blocks around it. The slope is 0 if the plane is steeper than 0.3, if fewer
-        than five blocks are known, or if they lie nearly on a line. `window` is (G,); B + w stands for window w.
+        plane to the mean heights of the blocks around it. The slope is 0 if the plane is steeper than 0.3, if a fit
+        has fewer than five blocks, or if they lie nearly on a line. `window` is (G,); B + w stands for window w.
 
         Convention: block heights are whole millimetres, rounded down, so all sums are exact.
         """

@@ -64,7 +64,7 @@ class Inspection:
 
 
 def repeats(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether two sweeps have the same 100 or more points. False for tensors on a GPU, to avoid waiting for it."""
+    """Test whether two sweeps have the same points, at least 100. False for tensors on a GPU, so as not to wait."""
     for points in (pc0.points, pc1.points):
         if len(points) < _FEWEST_REPEATED or (isinstance(points, torch.Tensor) and points.device.type != "cpu"):
             return False

@@ -47,9 +47,9 @@ def move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
 def is_better_inverted(given: float, none: float, inverted: float) -> bool:
     """Test whether the given motion between two sweeps is inverted.
 
-    The arguments are the agreements of the sweeps under the given motion, no motion and the inverse motion. The motion
-    is inverted only if they increase in this order, and the last is more than 1.25 times the first. On a highway, where
-    most structure belongs to vehicles of the same speed, no motion has the largest agreement.
+    The arguments are the agreements of the sweeps under the given, zero and inverse motion. The motion is inverted only
+    if they increase in this order, and the last is more than 1.25 times the first. On a highway, where most structure
+    belongs to vehicles of the same speed, zero motion has the largest agreement.
     """
     return given < none < inverted and inverted > _BETTER * given
 
