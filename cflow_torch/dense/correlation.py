@@ -160,7 +160,7 @@ def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor
 
     The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
     count^2 / target energy and count. A shift whose count is below such a lower bound of another shift cannot win.
-    `target_energy`, (J,) int64, and `radius`, (J,) float64, are in pixels; None = no limit of the radius.
+    `target_energy`, (J,) int64, and `radius`, (J,) float64, are in pixels; no radius = no limit.
     """
     low, high, stride = search.low[:, run.pairs], search.high[:, run.pairs], search.stride[run.pairs]
     searched = search.searched[run.pairs]
