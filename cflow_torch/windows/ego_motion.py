@@ -59,8 +59,8 @@ def relative_transform(pose1: Any, pose: Any) -> np.ndarray:
 def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -> Tensor:
     """Transform positions to the frame of t+1 (Eq. def_scene_flow), and return their first A = `num_axes` axes, (A, N).
 
-    Positions are (3, N) float64, metres. The transform is (4, 4) float64, or (3, 4, N), one per point; None = positions
-    are in the frame of t+1 already. A point that is not finite has no finite coordinate after a transform.
+    Positions are (3, N) float64, metres. The transform is float64, (4, 4) or (3, 4, 1), or (3, 4, N), one per point;
+    None = positions are in the frame of t+1 already. A point that is not finite has no finite coordinate afterwards.
 
     Convention: we compute ((R0 x + R1 y) + R2 z) + t with one rounding per operation, not as a matrix product. So every
     device returns the same bits.
