@@ -96,7 +96,7 @@ class AevaScenesLog(BoxLog):
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`. Its mask or times are None if one of its clouds lacks class names or times."""
+        """Read sweep `index`. If a cloud lacks class names, the mask is None; if a cloud lacks times, the times are."""
         names = self._column(index, "semantic_labels", np.str_) if self._ground else None
         times = self._column(index, "time_offset_ns", np.int64)
         is_ground = None if names is None else np.isin(names, GROUND)
@@ -106,8 +106,8 @@ class AevaScenesLog(BoxLog):
     def radial_velocity(self, index: int) -> np.ndarray:
         """Read the (N,) float32 radial velocities of sweep `index`, m/s, positive = moving away from the LiDAR.
 
-        In compensated clouds the motion of the vehicle is removed, so static points have about 0. The sign is that
-        which third parties measured. A comment in the SDK states the opposite.
+        In compensated clouds the motion of the vehicle is removed, so static points have about 0. Third parties
+        measured this sign. A comment in the SDK states the opposite.
         """
         return np.concatenate([cloud.column("velocity", np.float32) for cloud in self._clouds_of(index)])
 
@@ -171,7 +171,7 @@ class Cloud:
         self.points = points.astype(np.float32, copy=False)
 
     def column(self, key: str, dtype: Any) -> np.ndarray:
-        """Return one value per point, (N,) of `dtype`; np.str_ = texts as objects."""
+        """Return one value per point, (N,) of `dtype`; np.str_ gives an object array of strings."""
         with file_errors(f"{self.file}: {key}", _HINT):
             values = self._texts(key) if dtype is np.str_ else self._arrays[key].astype(dtype)
             return values.reshape(len(self.points))

@@ -1,4 +1,4 @@
-"""Write files, local or remote (fsspec), and local folders that take their name only when they are complete."""
+"""Write files (local, or remote by fsspec) and local folders. Each takes its name only when it is complete."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _ABANDONED = 3600.0  # seconds without a change after which we assume that no pr
 
 @contextmanager
 def atomic_file(path: PathLike) -> Iterator[Any]:
-    """Open a binary file for writing that takes its name only when everything is written.
+    """Open a binary file for writing. It takes its name only when everything is written.
 
-    If the block raises, the new file is removed and an older one stays. Missing folders are created. Local files get a
+    If the block raises, we remove the new file and keep an older one. Missing folders are created. Local files get a
     temporary name in the same folder, `.NAME.<random>.tmp`, and are renamed at the end. Only a killed process leaves
-    the temporary file behind (`remove_stale` removes it). Remote files are in memory until the end. An object store
+    the temporary file behind (`remove_stale` removes it). Remote files stay in memory until the end. An object store
     receives them under their final name. On other file systems we write them under a temporary name and move them.
     """
     path = as_path(path)
@@ -80,9 +80,9 @@ def _put(path: Any, content: bytes) -> None:
 
 @contextmanager
 def new_folder(root: PathLike, name: str) -> Iterator[Path]:
-    """Create the folder `root/name`, which takes its name when the block ends. If that raises, we remove the folder.
+    """Create the folder `root/name`, which takes its name when the block ends. If the block raises, we remove it.
 
-    A folder that exists, a remote folder and a name that is not safe are a `CFlowError`.
+    If the folder exists or is remote, or its name is not safe, that is a `CFlowError`.
     """
     folder = as_path(root) / safe_name(name, "log_id")
     if is_remote(folder):
@@ -120,7 +120,7 @@ def remove_stale(folder: PathLike) -> None:
 
 
 def _is_abandoned(path: Path) -> bool:
-    with suppress(Exception):  # some remote file systems have no times of change
+    with suppress(Exception):  # some remote file systems have no modification times
         return time.time() - path.stat().st_mtime > _ABANDONED
     return False
 

@@ -60,7 +60,7 @@ class GroundRaster(NamedTuple):
 
 
 def read_ground_raster(map_folder: Path) -> GroundRaster | None:
-    """Read the ground raster in the folder `map` of a log; None = it has none. Several are a `CFlowError`."""
+    """Read the ground raster in the folder `map` of a log; None = it has none. More than one is a `CFlowError`."""
     names = ("*_ground_height_surface____*.npy", "*___img_Sim2_city.json")
     rasters, alignments = (sorted(map_folder.glob(name)) for name in names)
     if not rasters:

@@ -27,8 +27,8 @@ class DataSet(NamedTuple):
     log: str  # name of the reader's class, which opens a source as a `Log`
     what: str  # what one log is, for messages
     marks: tuple[str, ...] = ()  # patterns of the ends of paths by which we recognise the format
-    # Name of the function of the reader's module that finds the sources below a root. "" = the sources are the folders
-    # that hold the first mark, at most `depth` levels below the root. Without marks, the root is the source.
+    # Function of the reader's module that finds the sources below a root. "" = the sources are the folders that hold
+    # the first mark, at most `depth` levels below the root. Without marks, the root is the only source.
     find: str = ""
     depth: int = 0
 
@@ -94,7 +94,7 @@ def _has_logs(name: str, root: Any) -> bool:
 
 
 def find_user_sources(target: str, settings: Mapping[str, Any]) -> list[UserSource]:
-    """Return one source for `open_log` per log that your own reader returns. No log is a `CFlowError`.
+    """Return one source for `open_log` per log of your own reader. If it returns none, that is a `CFlowError`.
 
     `target` is the "package.module.name" of the reader, a class or function. It returns a log (`data.log.Log`) or a
     sequence of logs, which may open them lazily. `settings` are its keyword arguments; those of `open_log` are ignored.
@@ -157,8 +157,8 @@ def open_log(
         **settings: keyword arguments of the reader.
 
     Raises:
-        CFlowError: the log cannot be read; its name cannot be the name of a folder; the reader does not know a setting
-            (the message lists those that it knows) or cannot use the value.
+        CFlowError: the log cannot be read; its `log_id` cannot be the name of a folder; the reader does not know a
+            setting (the message lists the known ones), or cannot use its value.
     """
     if find_ground not in CHOICES:
         raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")

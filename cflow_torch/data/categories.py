@@ -6,7 +6,7 @@ import numpy as np
 
 from cflow_torch.types import CFlowError
 
-# Category -> its meta class. Animals, signs, sign trailers, bollards, cones and barrels have none and are not scored.
+# Category -> its meta class. Animals, signs, sign trailers, bollards, cones and barrels have none.
 _META_CLASS = {
     "NONE": "BACKGROUND",
     "ANIMAL": "",

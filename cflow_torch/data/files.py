@@ -1,4 +1,4 @@
-"""What readers share: one error for all unreadable files, .npy and JSON files, settings, and the search for logs."""
+"""Helpers of the readers: errors of unreadable files, .npy and JSON files, changes of settings, search for logs."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def flatten(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:
-    """List the settings of two nested dictionaries that differ, as "key was A, is B; ..."; "" if none does.
+    """List the settings that differ between two nested dictionaries, as "key was A, is B; ..."; "" if none do.
 
     The keys `ignored`, joined by dots as in `flatten`, may differ.
     """

@@ -25,8 +25,8 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
     Args:
         path: file name, by convention `<log id>/<time stamp of sweep t>.feather`.
         result: flow of one window.
-        contents: names of `CONTENTS` and `ON_REQUEST`. You can compute pose flow and total flow from the poses; a file
-            without them is about 17 times smaller.
+        contents: names in `CONTENTS` and `ON_REQUEST`. A file without pose flow and total flow is about 17 times
+            smaller. You can compute both from the residual flow and the poses.
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of

@@ -28,8 +28,8 @@ class KissICPLog(Log):
 
     Attributes:
         log_id: name of the file or folder, and the sequence.
-        timestamps: 0, 1, 2, ... Sweeps have no times, because the loaders have no common way to return them. We assume
-            0.1 s per sweep.
+        timestamps: 0, 1, 2, ... Sweeps have no times, because the loaders have no common way to return them. Models
+            assume `sweep_interval` (0.1 s) between them.
 
     Convention: points and poses are those of the loader, in the frame of the LiDAR. The poses are the data set's own
         (`gt_poses`); None if it has none.

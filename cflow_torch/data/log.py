@@ -75,7 +75,7 @@ class Log(Protocol):
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
         """Read the other columns of the points of sweep `index`, such as intensity, ring and time.
 
-        Models ignore them; `CleanLog` and `write_array_log` keep them.
+        Models ignore them; `write_array_log` and `cflow clean` (`CleanLog`) keep them.
 
         Returns:
             Name -> (N,) bool, integers or floats, as stored; empty if the reader has no such columns.

@@ -16,16 +16,16 @@ from cflow_torch.windows.ground_plane import REACH
 from cflow_torch.windows.inspection import BACKWARD, REPEATED, UPSIDE_DOWN, has_moved, is_backward, repeats
 from cflow_torch.windows.structure import FEWEST_IN_PLACE, Patches, is_better_inverted, move, structure
 
-BASELINE = 5  # we compare sweeps this far apart, because the vehicle must turn to show the error of a wrong frame
-_PAIRS = 2  # compared per log
+BASELINE = 5  # sweeps from the older to the later one of a pair: only a turn of the vehicle shows a wrong frame
+_PAIRS = 2  # pairs per log
 _MOST_POINTS = 8000  # of the older sweep
 # Tolerances. With correct poses, the shift was at most 13 mm on a real drive without de-skewing and 7 mm on simulated
 # drives. At the beginning of a turn without de-skewing, it was 58 mm, with a rotation of 0.7 degrees.
 _SHIFT, _SHIFT_PER_METRE, _SHIFT_PER_RADIAN = 0.03, 0.01, 10.0
 _ROTATION = np.radians(1.5)
-_BETTER, _GOOD = 2.0, 0.15  # poses do not fit if no motion agrees by this factor better, and at least this well
-# Poses do not fit, either, if both agreements are lower than these shares of `own`: that under the poses (correct poses
-# gave 0.27 in that turn, else more than 0.5), and that after alignment (a LiDAR at a wrong position gave 0.7 or more).
+_BETTER, _GOOD = 2.0, 0.15  # poses do not fit if the identity agrees better by this factor, and at least this well
+# They do not fit, either, if both agreements (before, after alignment) are below these shares of the best possible.
+# Correct poses gave 0.27 in that turn, else above 0.5. A LiDAR at a wrong position gave 0.7 or more after alignment.
 _HOPELESS, _ALIGNED = 0.2, 0.5
 
 
@@ -35,11 +35,11 @@ class StaticResidual:
 
     index: int
     later: int
-    # (2,) float64, x and y, metres, frame of `later`. It moves the structure of `index`, transformed by the poses, onto
-    # the structure of `later`, together with the `rotation`.
+    # (2,) float64, x and y, metres, frame of `later`. After the transform by the poses, `rotation` and `shift` move the
+    # structure of `index` onto the structure of `later`.
     shift: np.ndarray
     rotation: float  # radians about z
-    # 0 ... 1, how well the structures coincide under the poses: 0.3 to 0.5 on a street. NaN = too little to compare.
+    # 0 ... 1, how well the structures coincide under the poses: 0.3 to 0.5 on a street. NaN = too few points to judge.
     agreement: float
     aligned: float  # agreement after `shift` and `rotation` are removed
     verdict: str  # the likely mistake, "" = none
@@ -68,8 +68,8 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
     moved = move(source, T_1_0)
     agreement, (shift, rotation, aligned) = patches.agreement(moved), patches.fit(moved)
-    own = patches.agreement(target)  # an upper bound for other sweeps
-    if own * min(len(source), len(target)) < FEWEST_IN_PLACE:
+    best = patches.agreement(target)  # of the later sweep with itself: an upper bound for other sweeps
+    if best * min(len(source), len(target)) < FEWEST_IN_PLACE:
         return StaticResidual(index, index + baseline, shift, rotation, float("nan"), float("nan"), "")
     inverted = patches.agreement(move(source, pose1 @ np.linalg.inv(pose0)))
     unmoved = patches.agreement(source[:, :2])
@@ -77,7 +77,7 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
     verdict = ""
     if is_better_inverted(agreement, unmoved, inverted):
         verdict = "The poses seem to be inverted. They must map ego coordinates to the world (T_world_ego)."
-    elif unmoved > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < own:
+    elif unmoved > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < best:
         verdict = (
             "The sweeps do not fit. Do the poses have another log, other axes (a camera's), times or units? Or are the "
             "points already in one common frame (then pass no poses)?"
@@ -99,9 +99,9 @@ def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> Sta
 def check_static_world(log: Log) -> list[StaticResidual]:
     """Measure whether the static world moves between two sweeps of a log, and warn if it does.
 
-    We compare two pairs of sweeps and return their residuals. If the log has `poses`, these are the pairs over which
-    the vehicle turns most, otherwise the first and the last pair. A log of one sweep has no pair. One warning gives the
-    verdict on the worst pair.
+    We compare up to two pairs of sweeps and return their residuals. If the log has the attribute `poses`, we choose the
+    pairs over which the vehicle turns most, otherwise the first and the last pair. A log of one sweep has no pair. The
+    warning gives the verdict on the worst pair.
 
     Cost: reads two sweeps per pair; 0.15 s each.
     """

@@ -29,8 +29,8 @@ def poses_from_odometry(log: Log) -> np.ndarray:
     Poses of the sweeps are ignored. Ground points are used, because they constrain height and tilt.
 
     Convention: KISS-ICP runs with its default settings, but without de-skewing, and on one thread, so that the poses do
-        not depend on the number of threads. It needs a few sweeps to adapt to the speed. So we take the first five
-        steps from a second run, backwards from the eleventh sweep.
+        not depend on the number of threads. KISS-ICP needs a few sweeps to adapt to the speed. So we take the first
+        five steps from a second run, which goes backwards from the eleventh sweep.
 
     Cost: one registration per sweep and eleven more, 0.13 s each for 120,000 points; reads as many sweeps.
 
@@ -69,8 +69,8 @@ class Odometry:
     def next_pose(self, points: np.ndarray, name: str) -> np.ndarray:
         """Return the (4, 4) float64 `T_world_ego` of the next sweep; the world is the ego frame of the first.
 
-        The (N, 3+) points are in metres; fewer than 100 finite ones in range are a `CFlowError` with the `name` of the
-        sweep.
+        `points` are (N, 3+), metres. Fewer than 100 finite ones within 100 m are a `CFlowError` that contains
+        `name`, the name of the sweep.
         """
         points = points[:, :3].astype(np.float64)
         points = points[np.isfinite(points).all(1)]

@@ -19,7 +19,7 @@ from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 _LIDARS = (0, 1)  # Pandar64, which rotates, and PandarGT, which looks forward
-_EVERY_LIDAR = -1  # sensor_id of a cuboid for both LiDARs; an object that they see at different positions has two
+_EVERY_LIDAR = -1  # sensor_id of a cuboid for both LiDARs; an object may instead have one cuboid for each
 _POSITION, _SIZE = ("position.x", "position.y", "position.z"), ("dimensions.y", "dimensions.x", "dimensions.z")
 
 _LABELS = {
@@ -55,9 +55,9 @@ class PandaSetLog(Log):
         - Points are stored in the world frame, compensated for ego motion. We return them in the frame of the stored
           LiDAR pose (x right, y forward, z up), points of both LiDARs in the order of the file.
         - Ground masks come from the classes of points in `annotations/semseg`; None for a sequence without them.
-        - Truth of a point comes from the tracked cuboids in `annotations/cuboids` for its LiDAR or for both. If points
-          have classes, these are the categories. A point is then valid only if it is in a cuboid and has the class of
-          an object, or neither. Smoke, exhaust, spray and reflections are not valid.
+        - A point moves with the tracked cuboid in `annotations/cuboids` for its LiDAR or for both. If points have
+          classes, these are the categories, and a point is valid only if its class and the cuboids agree on whether
+          it is part of an object. Smoke, exhaust, spray and reflections are not valid.
     """
 
     def __init__(self, folder: PathLike) -> None:
@@ -137,7 +137,7 @@ class PandaSetLog(Log):
             return [str(names.get(str(int(number)), "")) for number in numbers.tolist()], class_of_point
 
     def _boxes(self, cuboids: dict[str, np.ndarray], file: Path, index: int, lidar: int) -> Boxes:
-        """Return the cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is the world's y axis."""
+        """Return the cuboids for the points of a LiDAR, in the frame of sweep `index`. Yaw 0 is along the world's y."""
         with file_errors(file):
             rows = np.flatnonzero(np.isin(cuboids["cuboids.sensor_id"], (_EVERY_LIDAR, lidar)))
             heading_centre = np.stack([cuboids[name][rows] for name in ("yaw", *_POSITION)], axis=1)

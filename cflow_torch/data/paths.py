@@ -87,7 +87,7 @@ def remote_errors(path: Path) -> Iterator[None]:
 
 
 def forget_listings(path: Any) -> None:
-    """Drop the folder listings that fsspec caches, also for `is_file`, because others may have written since."""
+    """Drop the folder listings that fsspec caches, also for `is_file`: other processes may have written since."""
     if is_remote(path):
         path.fs.invalidate_cache()
 

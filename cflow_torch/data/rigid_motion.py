@@ -41,9 +41,9 @@ def poses_from_json(nodes: Sequence[Any], translation: str, rotation: str, what:
 
 
 def poses_at(times: np.ndarray, known_times: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Interpolate (M, 4, 4) poses, M >= 2, at (K,) int64 times; `known_times` (M,) ascend and have the same unit.
+    """Interpolate (M, 4, 4) poses, M >= 2, of (M,) ascending `known_times` at (K,) int64 times of the same unit.
 
-    Before the first and after the last pose the motion continues at a constant rate.
+    Return (K, 4, 4) float64. Before the first and after the last pose, the motion continues at a constant rate.
     """
     left = np.clip(np.searchsorted(known_times, times, side="right") - 1, 0, len(known_times) - 2)
     fraction = (times - known_times[left]) / (known_times[left + 1] - known_times[left])

@@ -45,7 +45,7 @@ class ArraysLog(Log):
             velodyne or clouds that does. Clouds are sorted naturally: 2 before 10.
         poses: "auto" = poses.txt, poses.npy or trajectory.txt in the folder, or KITTI's ../../poses/<name>.txt, if
             there is one; None = no poses; or a file (see `read_poses`), or a (K, 4, 4) array.
-        poses_of: "ego" or "lidar", the frame that has these poses.
+        poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
         times: "auto" = times.txt in the folder; None = none; or a file with one time in seconds per sweep.
@@ -58,7 +58,7 @@ class ArraysLog(Log):
     Attributes:
         files: the clouds, in order.
         timestamps: nanoseconds from `times`, else from file names of 16 digits or more (microseconds, nanoseconds),
-            else from TUM poses, if there is one per cloud. Otherwise 0, 1, 2, ..., and sweeps have no `timestamp_ns`.
+            else from TUM poses, if each cloud has one. Otherwise 0, 1, 2, ..., and sweeps have no `timestamp_ns`.
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
 
     Convention:

@@ -51,8 +51,8 @@ class BagLog(Log):
             frame moves, the only topic of these types, none.
         frame: name of the ego frame; None = base_link if transforms connect it to the LiDAR, else the LiDAR's own.
         ego_T_lidar: (4, 4), maps the frame of the clouds to the ego frame; None = from the transforms.
-        deskew: move each point with the pose of the vehicle at the time of the point, if poses and times of points are
-            known; False: the clouds are already compensated.
+        deskew: transform each point by the pose of the vehicle at the time of the point, if poses and times of points
+            are known; False = the clouds are already de-skewed.
 
     Attributes:
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
@@ -61,8 +61,8 @@ class BagLog(Log):
         topic, frame, deskew: the settings in use.
 
     Convention: points are in the ego frame. Poses are interpolated at the time of the cloud. The world is the root of
-        the transforms, or the world of the topic. A topic has the poses of its `child_frame_id` if transforms connect
-        that to the ego frame, otherwise of the ego frame itself. Times of points: see `messages.seconds_after`.
+        the transforms, or the world of the topic. A topic gives the poses of its `child_frame_id` if transforms connect
+        this frame to the ego frame, otherwise the poses of the ego frame. Times of points: `messages.seconds_after`.
 
     Cost: opening a bag reads all its clouds, poses and transforms once.
     """
@@ -130,7 +130,7 @@ class BagLog(Log):
             rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
             for file in [self.path] if self.path.is_file() else self.path.iterdir():
                 check_file(file)
-            # Bags of ROS 2 before Iron do not describe their messages; these types never changed.
+            # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
             types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
             reader = rosbags.AnyReader([self.path], default_typestore=types_of_old_bags)
             reader.open()

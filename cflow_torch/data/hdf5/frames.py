@@ -1,4 +1,4 @@
-"""Coordinate frames in OpenSceneFlow's scenes: the mounting of the LiDAR, and the ego motion that the harness uses."""
+"""Frames of OpenSceneFlow's scenes: the mounting of the LiDAR, and the ego motion of its scripts (the harness)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cflow_torch.windows.ego_motion import compensate
 
 # Argoverse 2 counts nanoseconds from its own epoch: all its sweeps lie in this range, and no sweep of another data set.
 _ARGOVERSE2_STAMPS = (315_900_000_000_000_000, 316_000_000_000_000_000)
-# Its up_lidar is 2 m above the road, its ego frame 0.35 m: if the ground is lower, points are in the sensor frame.
+# Its up_lidar is 2 m above the road, its ego frame 0.35 m. If the ground is lower than this, points are up_lidar's.
 _ARGOVERSE2_SENSOR_GROUND = -1.2
 # Extrinsics of up_lidar in one log of the set (7fab2350), yaw -0.58 degrees. They differ by log; scenes lack them.
 _ARGOVERSE2_EGO_T_UP_LIDAR = np.array(
@@ -24,7 +24,7 @@ class StoredMotion(NamedTuple):
     """The ego motion that the harness uses for a pair of sweeps."""
 
     T_ego1_ego0: np.ndarray  # (4, 4) float32, from `harness_motion`
-    of_points: bool  # whether the poses are of the frame of the points; False = `ego_T_lidar` leads to their frame
+    of_points: bool  # True: the poses are of the frame of the points; False: of the frame to which `ego_T_lidar` maps
 
 
 def is_argoverse2(timestamp: int) -> bool:
@@ -39,7 +39,7 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndar
     The arguments describe one sweep: its time stamp, its points as stored, (N, 3+) float in metres, and its ground
     mask, (N,) bool, None = unknown. We recognise sweeps of Argoverse 2 by the time stamp. If their ground is more than
     1.2 m below the origin, their points are in the frame of up_lidar, and their poses are of the ego frame. We then
-    return the extrinsics of one log of Argoverse 2, because the scene lacks its own: you can take these from
+    return the extrinsics of one log of Argoverse 2, because the scene lacks its own, which are in the log's
     `calibration/egovehicle_SE3_sensor.feather`. For all other sweeps we return the identity (nuScenes and ZOD have
     poses of the sensor, Waymo and TruckScenes have points in the ego frame).
     """
@@ -74,7 +74,7 @@ def harness_pose_flow(points: Tensor, T_ego1_ego0: np.ndarray) -> Tensor:
 def residual_for_harness(
     residual: Tensor, points: Tensor, T_ego1_ego0: np.ndarray, T_lidar1_lidar0: np.ndarray
 ) -> Tensor:
-    """Return the residual flow that gives the right total flow in the harness, even if its poses are of another frame.
+    """Return the residual flow that gives the right total flow in the harness, even with poses of another frame.
 
     `residual` and `points` are (N, 3) float32, metres; the points are in the frame of the LiDAR at t. `T_ego1_ego0` is
     the result of `harness_motion`. `T_lidar1_lidar0`, (4, 4) float64, is the motion of the frame of the points.

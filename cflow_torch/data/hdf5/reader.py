@@ -49,7 +49,7 @@ class HDF5Log(Log):
 
     Convention:
         - Points, labels and results stay in the frame of the stored points. A sweep's `pose` is the pose of this frame:
-          the stored pose times `ego_T_lidar`. So the static world is static even if the file combines points in the
+          the stored pose times `ego_T_lidar`. So the poses fit the points even if the file combines points in the
           sensor frame with poses of the ego vehicle.
         - A scene without `pose` gets poses from `ego_motion`; the world is then the frame of the first sweep.
         - "auto" uses the file's attribute `ego_T_lidar` if it has one (our writer's files do), otherwise
@@ -62,7 +62,7 @@ class HDF5Log(Log):
         self._chain = [np.eye(4)]  # poses from `ego_motion`, as far as they are known
         self.log_id = self.file.stem
         self._scene = open_scene(self.file)
-        # HDF5 would close the file after the interpreter has ended, which crashes if Python reads the file.
+        # HDF5 would close the file after the interpreter has ended, which crashes if it is a Python file object.
         weakref.finalize(self, self._scene.close)
         with scene_errors(self.file):
             self.timestamps = sorted(int(name) for name in self._scene if is_timestamp(name))

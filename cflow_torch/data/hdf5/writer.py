@@ -37,7 +37,7 @@ def write_hdf5_scene(log: Log, file: str | Path, eval_step: int = 5) -> None:
     """Write a log as one scene in the ego frame: one group per sweep, named by its time stamp.
 
     Args:
-        log: any log with poses; a `Recording` also provides lidar_id, lidar_dt, lidar_center and flow_instance_id.
+        log: any log with poses; a simulated one also gives lidar_id, lidar_dt, lidar_center and flow_instance_id.
         file: `<scene>.h5`.
         eval_step: sweeps 0, `eval_step`, ... get an `eval_mask` (valid and not ground) if they have labels; 0 = none.
 
@@ -109,8 +109,8 @@ def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int,
 
     Convention:
         The flow is float32, compressed as the points of the sweep are. NaN rows are kept (viewers show them white).
-        All results go into a copy next to the file, which replaces it at the end, so the scene is always the old or the
-        new one. Readers that have it open continue with the old one. Only one process may write into a scene at a time.
+        All results go into a copy next to the scene, and the copy replaces the scene at the end. A reader that has the
+        old scene open continues with it. Only one process may write into a scene at a time.
 
     Raises:
         CFlowError: the name, the scene or a result cannot be used. The scene is then unchanged.
@@ -127,7 +127,7 @@ def write_hdf5_labels(
     made_by: str = "",
     overwrite: bool = False,
 ) -> int:
-    """Write labels for self-supervised training into a copy of a scene, which replaces it. Return the number of sweeps.
+    """Write labels for self-supervised training into a copy that then replaces the scene. Return the number of sweeps.
 
     Args:
         file: `<scene>.h5`; every other key keeps its contents.
@@ -142,7 +142,7 @@ def write_hdf5_labels(
 
 
 def labelled_by(file: str | Path) -> str | None:
-    """Return the method that made the labels of a scene; "" = unknown, None = the scene has no labels."""
+    """Return how the labels of a scene were made (`made_by`); "" = unknown, None = the scene has no labels."""
     with open_scene(Path(file)) as scene, file_errors(file):
         has_labels = any(set(scene[stamp]) & set(LABELS) for stamp in scene if is_timestamp(stamp))
         made_by = scene.attrs.get(LABELLED, "" if has_labels else None)

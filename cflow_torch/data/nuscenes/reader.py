@@ -73,8 +73,8 @@ class NuScenesLog(Log):
         lidars: channels to merge; None = every LiDAR of the scene.
         own_vehicle: `Footprint` whose points are removed; "auto" = `OWN_VEHICLE`, None = keep them. Points at the
             sensor itself mean "no return" and are always removed.
-        deskew: move each point with the pose of the vehicle at the time of the point; False: at the time of its LiDAR's
-            sweep. Ignored for nuScenes, whose files have no times of points.
+        deskew: transform each point by the pose of the vehicle at the time of the point; False = at the time of its
+            LiDAR's sweep. Ignored for nuScenes, whose files have no times of points.
 
     Attributes:
         log_id: name of the scene.
@@ -198,7 +198,7 @@ class NuScenesLog(Log):
         return points, None
 
     def _is_own(self, points: np.ndarray, index: int) -> np.ndarray:
-        """Return (N,) bool: above the recording vehicle or in the box of its trailer; points in the ego frame."""
+        """Return (N,) bool: in the footprint of the recording vehicle or the box of its trailer. Points: ego frame."""
         if self._own_vehicle is None:
             return np.zeros(len(points), dtype=bool)
         rear, front, half_width = self._own_vehicle

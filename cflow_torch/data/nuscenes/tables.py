@@ -108,7 +108,7 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
 
 
 class Tables:
-    """The tables of one version, `<data root>/<version>`, read once when they are needed, without cameras and radars.
+    """The tables of one version, `<data root>/<version>`. We read them once, when they are first needed.
 
     Cost: about 5 s per million rows (measured on one core). We drop rows of cameras and radars while we read.
     """
@@ -127,8 +127,8 @@ class Tables:
     def scene(self, name: str) -> tuple[np.ndarray, dict[str, LidarChain], Annotations]:
         """Return the rows of a scene, linked and checked: sample times, LiDARs by channel as in sensor.json, and boxes.
 
-        The times are ascending int64 microseconds. A row that refers to a missing one, and two sweeps of a LiDAR or two
-        samples at one time are a `CFlowError`.
+        The times are ascending int64 microseconds. If a row refers to a missing one, or if two sweeps of a LiDAR or two
+        samples have the same time, that is a `CFlowError`.
         """
         with file_errors(f"{self.folder}, {name}", _COPY):
             if not self._rows:

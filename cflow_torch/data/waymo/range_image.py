@@ -28,7 +28,7 @@ class LaserCalibration(NamedTuple):
     high: float | None = None  # radians, outer edge of the highest row, used if `inclinations` is None
 
     def row_inclinations(self, num_rows: int) -> np.ndarray:
-        """Return (H,) float64 radians above the laser's xy plane; row 0 is the highest. Another H is a `CFlowError`."""
+        """Return (H,) float64 radians above the laser's xy plane; row 0 is the highest. A wrong H is a `CFlowError`."""
         ascending = np.array(self.inclinations, np.float64)
         if self.inclinations is None:
             low, high = np.array([self.low, self.high], np.float64)

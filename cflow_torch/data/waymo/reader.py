@@ -25,7 +25,7 @@ TIME, LASER, TRACK = "key.frame_timestamp_micros", "key.laser_name", "key.laser_
 LIDAR, PIXEL_POSE = "[LiDARComponent].range_image_return", "[LiDARPoseComponent].range_image_return1"
 CALIBRATION, BOX = "[LiDARCalibrationComponent].", "[LiDARBoxComponent]."
 VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
-"""Prefixes of the columns that we read, and one complete name."""
+"""Prefixes of the columns that we read; `VEHICLE_POSE` is a complete name."""
 
 SEARCH_DEPTH = 2  # <root>/<data set>/<split>
 BOX_CATEGORY = {0: "NONE", 1: "REGULAR_VEHICLE", 2: "PEDESTRIAN", 3: "SIGN", 4: "BICYCLIST"}
@@ -66,7 +66,7 @@ class WaymoLog(BoxLog):
     Args:
         file: `<split>/lidar/<segment>.parquet`; the other components lie next to that folder, under the same name.
         lasers: names in `waymo.range_image.LASERS`. Those that the segment does not have are left out.
-        both_returns: also read the second return of each pixel, after all first returns of its laser.
+        both_returns: also read second returns; their points follow all first returns of their laser.
 
     Convention:
         - `timestamps` are the starts of the TOP scans.
@@ -74,7 +74,7 @@ class WaymoLog(BoxLog):
           float64. They are ordered by laser, and by row of the range image.
         - `T_world_ego` is `world_from_vehicle`, about the middle of the TOP scan.
         - The data set has no ground masks: `is_ground` is None.
-        - Truth comes from box tracks. Points in a no-label zone are invalid; boxes of unknown type are background.
+        - Truth comes from box tracks. Points in a no-label zone are invalid. We ignore boxes of unknown type.
 
     Cost: opening reads keys, calibration and vehicle poses. A sweep decodes the row groups that hold its rows; the
         released files are not sorted by time, so that can be the whole file (seconds).
