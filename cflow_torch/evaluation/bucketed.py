@@ -1,7 +1,7 @@
 """Dynamic bucket-normalised end-point error, per class or range, and the range-wise end-point error of SSF.
 
-The first divides the error by the speed and averages over speed buckets. The second is the mean error in metres of
-static and dynamic points, by distance from the sensor.
+The first divides the error by the speed and averages over speed buckets. The second is the mean error, in metres, of
+static and of dynamic points per interval of distance.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class BucketedEPE(BucketedByRange):
         """Return "classes", "mean" and "speed_edges" (metres per frame).
 
         Each class has `static_epe` (metres), `dynamic_error` (ratio), `num_static` and `num_dynamic` (points), and
-        "buckets", each with `count`, `epe`, `speed` and `normalized`. "mean" has the first two, averaged over classes.
+        "buckets", the lists `count`, `epe`, `speed` and `normalized`. "mean" has the first two, averaged over classes.
         """
         return {**bucket_scores(self.count[0], *self.sums[:, 0]), "speed_edges": list(self.definition.speed_edges)}
 

@@ -29,7 +29,7 @@ class Definition:
         region_edges: metres, ascending edges of the ranges that "bucketed_by_range" scores one by one.
         region_axes: ego frame in which the region is measured.
         point_cloud_range: (x0, y0, z0, x1, y1, z1) metres, open interval, in `region_axes`; None = no crop.
-        mask_box: metres; in a frame without an evaluation mask, only points with |x|, |y| <= this (frame of t) are
+        mask_box: metres; in a frame without an evaluation mask, only points with |x|, |y| <= `mask_box` at t are
             scored; None = all.
         residual_axes: axes in which residuals are compared.
         three_way_flow: flow that the three-way scores compare. It affects accuracy and angle, not the end-point error.

@@ -49,7 +49,7 @@ class SceneFlowMetrics:
         self.counts.update(num_frames=1, num_points=len(scored.error), num_nan=scored.num_nan)
 
     def merge(self, other: SceneFlowMetrics) -> None:
-        """Add the frames of another accumulator; a `CFlowError` if its definition is another one."""
+        """Add the frames of another accumulator. If its definition differs, that is a `CFlowError`."""
         if other.definition != self.definition:
             raise CFlowError(f"cannot merge scores of {other.definition.name} into {self.definition.name}")
         for metric, another in zip(self.parts.values(), other.parts.values()):
@@ -72,7 +72,7 @@ class ProtocolScores(NamedTuple):
         overall: unweighted mean over data sets; NaN if anything is missing.
         data_sets: data set -> mean of its ranges; NaN if one of them is missing.
         ranges: range -> unweighted mean over data sets; NaN if one of them is missing.
-        missing: one sentence for each range of a data set without a value; empty if there are none.
+        missing: a message for each missing value, with its data set and range; empty if nothing is missing.
     """
 
     overall: float

@@ -1,4 +1,4 @@
-"""The points of a frame that are scored, the quantities that the metrics use, and sums of these over frames."""
+"""The scored points of a frame, the quantities that the metrics use, and sums of these quantities over frames."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ScoredPoints(NamedTuple):
 
 
 class Accumulator:
-    """Counts points and sums their quantities per cell; frames come in any order.
+    """Counts points and sums their quantities per cell, for example per class and speed bucket, in any order of frames.
 
     `count` is the int64 number of points of each cell. `sums` has a float64 array of the same shape per quantity.
     """
@@ -73,13 +73,13 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     """Select the points of a frame that a definition scores, and compare prediction and truth there.
 
     Rounding follows the evaluator that the definition is named after. Totals and residuals are float32. Like the
-    harnesses, we add the pose flow to a predicted residual and subtract it again. Lengths are computed in `norm_dtype`.
+    evaluators, we add the pose flow to a predicted residual and subtract it again. We compute lengths in `norm_dtype`.
     Rows without a valid label have no effect.
     """
     points, true_total = as_numpy(frame.points), frame.labels.flow
     pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]
     total = _predicted_total(frame)
-    # In the frame in which ranges are measured: float32 at t, float64 at t+1.
+    # Positions in the frame in which ranges are measured are float32 at t and float64 at t+1.
     position = points if definition.region_axes == "t" else transform_points(points, frame.transform())
     keep = _candidates(frame, definition, position)
     has_nan = np.isnan(np.concatenate([total, pose_flow, points, true_total], axis=1)).any(axis=1)

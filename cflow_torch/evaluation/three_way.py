@@ -104,7 +104,7 @@ class ThreeWayEPE(Accumulator):
 
 
 def _values(count: np.ndarray, sums: np.ndarray, count_eps: float = 0.0, iou_eps: float = 0.0) -> np.ndarray:
-    """(4,) float64: mean error of each of `_SETS`, and the IoU of true and predicted dynamic points."""
+    """Return (4,) float64: the mean error of each of `_SETS`, and the IoU of true and predicted dynamic points."""
     predicted, true = sums[-1], count[:, 1].sum()
     with np.errstate(divide="ignore", invalid="ignore"):
         means = [sums[0][cells].sum() / (count[cells].sum() + count_eps) for cells in _SETS.values()]

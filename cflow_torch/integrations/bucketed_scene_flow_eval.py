@@ -43,8 +43,8 @@ class CorrelationFlowEstimator(SequenceFlow):
         """Estimate and score all frames that an `AbstractDataset` scores.
 
         A causal data set scores the frame before the last of each item, a non-causal one every frame but the last.
-        Items that overlap (a causal data set, step 1) share their history. With `subsequence_length=2`, every frame of
-        a log but its last is scored, the first ones with a shorter history.
+        If items overlap (a causal data set, step 1), frames of earlier items are history of later ones. With
+        `subsequence_length=2`, every frame of a log but its last is scored, the first ones with a shorter history.
 
         Returns:
             `dataset.evaluator()` with all flows added. Call its `compute_results()`.
@@ -96,7 +96,7 @@ def _read_frames(frames: Any) -> list[_LogFrame]:
 def _read_frame(name: str, frame: Any, timestamp_ns: int | None) -> _LogFrame:
     points = np.asarray(getattr(frame.pc.full_pc, "points", frame.pc.full_pc))
     check_array(points, f"{name}.pc.full_pc", (None, 3), "f", "(N, 3) floats, metres")
-    if points.dtype == np.float16:  # of the files of Argoverse 2; our own reader converts them as well
+    if points.dtype == np.float16:  # Argoverse 2 stores float16; our own reader converts it, too
         points = points.astype(np.float32)
     mask = np.asarray(frame.pc.mask)
     check_array(mask, f"{name}.pc.mask", (len(points),), "b", f"({len(points)},) bool, one per point")

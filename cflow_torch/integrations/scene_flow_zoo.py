@@ -38,8 +38,8 @@ class CorrelationFlowModel(SequenceFlow):
             K - 2; a non-causal one gets K - 1 flows. The sweeps before a sweep are its history.
             ego_flows: (1 or K - 1, PadN, 3) float32, metres until the next sweep, residual (ego motion removed), in the
                 axes of the sweep's own points; 0 where `full_pc_mask` is 0, NaN in padding rows.
-            valid_flow_mask: float32, `full_pc_mask` as 0 and 1, NaN in padding rows. A flow of 0 outside the method's
-                range is scored like any other.
+            valid_flow_mask: (1 or K - 1, PadN) float32, `full_pc_mask` as 0 and 1, NaN in padding rows. A flow of 0
+                outside the method's range is scored like any other.
 
         A `CFlowError` names a bad field ("batched_sequence[0].full_pc_mask").
         """

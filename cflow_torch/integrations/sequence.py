@@ -1,6 +1,6 @@
-"""Residual flow of sequences of sweeps, in the axes of the points.
+"""Residual flow of sequences of sweeps, in the axes of the points at t.
 
-BucketedSceneFlowEval passes such sequences, and so does SceneFlowZoo, which builds on it.
+BucketedSceneFlowEval and SceneFlowZoo pass such sequences and expect the flow in these axes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Frame:
     timestamp_ns: int | None = None  # nanoseconds, None = unknown
 
     def ego_points(self) -> Array:
-        """Return (N, 3) points in the ego frame of this sweep; float64, unless they already were in that frame."""
+        """Return (N, 3) points in the ego frame of this sweep; float64, unless they are already stored in it."""
         if np.array_equal(self.sensor_to_ego, np.eye(4)):
             return self.points
         device = self.points.device if isinstance(self.points, Tensor) else torch.device("cpu")
@@ -49,8 +49,8 @@ class SequenceFlow(nn.Module):
     Args:
         preset: "default", "offline", "keypoints" or "paper" (`make_config`).
         device: "auto" = that of the given tensors, else a GPU if there is one, else the CPU.
-        ground: None = the masks of the frames exclude the ground (`with_ground=False`). "auto" or "patchwork" = find
-            ground in every sweep, and exclude it, too.
+        ground: None = the masks of the frames exclude the ground (`with_ground=False`). Otherwise the `method` of
+            `find_ground`, by which we find the ground of every sweep and exclude it, too.
         **settings: `method`, or any setting of the method.
     """
 
@@ -67,16 +67,16 @@ class SequenceFlow(nn.Module):
 
         Args:
             sequences: B sequences of at least two frames each, in order of time.
-            firsts: the first i of each sequence whose flow is returned. The frames before it are history only.
+            firsts: for each sequence, the first i whose flow is returned. The frames before it are only history.
 
         Returns:
-            For each sequence and i = firsts ... K - 2: (N, 3) float32, metres until frame i + 1, ego motion removed,
-            in the axes of the points of frame i. Inactive rows are 0.
+            For each sequence of K frames, and each i from its first to K - 2: (N, 3) float32, metres until frame i + 1,
+            ego motion removed, in the axes of the points of frame i. Inactive rows are 0.
 
         Convention:
             The history of frame i is frames i - 1, i - 2, ..., at most `num_history`. Its future (preset "offline") is
-            frames i + 2, i + 3, ... Both may be shorter, so that every pair has a flow. The i-th windows of all
-            sequences are computed together.
+            frames i + 2, i + 3, ... Both may be shorter, so that every pair has a flow. We estimate the first
+            windows of all sequences together, then the second ones, ...
         """
         windows = [self._windows(frames, first) for frames, first in zip(sequences, firsts)]
         flows: list[list[Tensor]] = [[] for _ in sequences]

@@ -1,6 +1,6 @@
 """Submission formats, versions 1 and 3: encode a flow as a file, and write, pack and check files.
 
-Files are written whole or not at all. The same files give the same archive, byte by byte.
+Files are written whole or not at all. The same files give the same bytes (with the same zlib).
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def write_frame(folder: str | Path, name: str, columns: Mapping[str, np.ndarray]
 
 
 def is_complete(folder: str | Path, name: str, rows: int, version: SubmissionVersion) -> bool:
-    """Check that the file of a frame exists, has this number of rows, and passes the checks of `check_submission`."""
+    """Return whether the file of a frame exists, has this number of rows, and passes `check_submission`."""
     return not _check_file(name, partial(read_bytes, Path(folder) / name), rows, version)
 
 

@@ -110,7 +110,7 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> lis
 
 
 def read_frame_list(file: str | Path) -> dict[str, list[int]]:
-    """Read log id -> time stamps from a text file: one `<log>/<time stamp>` a line, # for comments."""
+    """Read log id -> time stamps from a text file: one `<log>/<time stamp>` per line, # for comments."""
     file = Path(file)
     result: dict[str, list[int]] = {}
     with file_errors(file, "pass a text file of frames"):
@@ -127,7 +127,7 @@ def read_frame_list(file: str | Path) -> dict[str, list[int]]:
 
 
 def require_logs(logs: Iterable[Log], listed: Mapping[str, Sequence[int]] | None) -> None:
-    """Raise a `CFlowError` if two logs have one name, or if a listed log is not in the data."""
+    """Raise a `CFlowError` if two logs have the same name, or if a listed log is not in the data."""
     names = [log.log_id for log in logs]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

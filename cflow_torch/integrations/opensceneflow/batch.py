@@ -16,11 +16,11 @@ from cflow_torch.windows.ego_motion import relative_transform, rigid_transform
 class Sample(NamedTuple):
     """One pair of sweeps of a batch, with its history."""
 
-    # Points that are finite and not ground, with the poses of the frame of the points. If the batch has the whole sweep
-    # t as "origin_pc0", its ground points follow those of pc0, with a mask.
+    # Points that are finite and not ground, with the poses of their frame. If the batch has all points of t, as
+    # "origin_pc0", the ground points of t follow the points of pc0 and are masked.
     window: Window
     rows0: Tensor  # (K,) int64, rows of batch["pc0"] that are in `window.pc0`
-    T_ego1_ego0: np.ndarray  # (4, 4) float32, motion that the harness computes from the poses and adds to the flow
+    T_ego1_ego0: np.ndarray  # (4, 4) float32, ego motion that the harness computes from the stored poses
     # (4, 4) float64, motion of the frame of the points; None = `T_ego1_ego0` is that motion.
     T_lidar1_lidar0: np.ndarray | None
 
@@ -32,7 +32,7 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
         batch: as the harness collates it. For each sweep i of 0 and 1: "pc{i}" (B, N, 3) or a list of B (N, 3),
             "pose{i}" (B, 4, 4) or a list of B (4, 4), optionally "gm{i}" (B, N), True = ground. For history, nearest
             first: "pch1", "poseh1", "gmh1", "pch2", ... "origin_pc0" (B, N, 3), all points of t, gives the ground.
-            "auto" also reads "timestamp".
+            `ego_T_lidar="auto"` also reads "timestamp".
         num_history: maximum number of history sweeps; the batch may have fewer.
         ego_T_lidar: (4, 4); None = identity; "auto" = `recognized_extrinsics` of the sweep.
 
@@ -58,7 +58,7 @@ def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: A
     if len(ground):
         is_ground = torch.arange(len(clouds[0]) + len(ground), device=ground.device) >= len(clouds[0])
         whole = Sweep(torch.cat((clouds[0], ground)), is_ground, lidar_poses[0])
-        # At the start of a scene the harness repeats t as history. Copies must stay equal to t, or they would count.
+        # At the start of a scene the harness repeats t as history. Models skip copies only if they stay equal to t.
         for i, (points, pose) in enumerate(zip(clouds, poses)):
             if torch.equal(points, clouds[0]) and np.array_equal(pose, poses[0]):
                 sweeps[i] = whole

@@ -26,7 +26,7 @@ class CFlow(nn.Module):
 
     Args:
         num_frames: sweeps per window, h + 2, because the harness also counts t+1 and t. None = that of the preset: 6
-            for "default", 2 for the others. If the harness passes fewer sweeps, we use those.
+            for "default" and "offline", 2 for the others. If the harness passes fewer sweeps, we use those.
         ego_T_lidar: (4, 4) nested list or array that maps points to the frame whose poses the scenes store. None = the
             same frame. "auto" = recognise scenes of Argoverse 2, whose points are in the frame of up_lidar.
         output: "full" = flow of all rows of pc0, 0 where the method estimates none. "valid" = flow of the valid rows
@@ -96,7 +96,7 @@ class CFlow(nn.Module):
         return {key: [output[key] for output in outputs] for key in outputs[0]}
 
     def _output(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> dict[str, Tensor]:
-        num_points = len(sample.rows0)  # ground points follow them
+        num_points = len(sample.rows0)  # the rows after these are ground points
         residual, is_valid = result.residual_flow[:num_points], result.is_valid[:num_points]
         device = residual.device
         points, rows = batch["pc0"][b][:, :3].detach().to(device).float(), sample.rows0.to(device)
