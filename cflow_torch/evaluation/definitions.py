@@ -33,7 +33,7 @@ class Definition:
             scored; None = all.
         residual_axes: axes in which residuals are compared.
         three_way_flow: flow that the three-way scores compare. It affects accuracy and angle, not the end-point error.
-        half_precision: round truth and prediction of the three-way scores to float16 (the files of the 2023 challenge).
+        half_precision: round truth and prediction of the three-way scores to float16, as the 2023 challenge does.
         foreground: "all": every category but background; "meta": only the four meta classes, others are ignored.
         background: "static": all background points are in bucket 0; "bucketed": each is in the bucket of its speed.
         average: average of the three-way end-point errors and IoU. "points": over all points of all frames, NaN where

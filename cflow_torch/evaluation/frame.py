@@ -17,8 +17,7 @@ from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy, p
 def ego_motion_flow(points: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
     """Compute the flow of static (N, 3) points of t, T p - p: (N, 3) float32, metres, axes of ego1.
 
-    It is computed in float64 and rounded once, because the difference of two float32 positions at 100 m has 1e-5 m of
-    noise.
+    We compute in float64 and round once, because the difference of two float32 positions at 100 m has 1e-5 m of noise.
     """
     return (transform_points(points, np.asarray(T_ego1_ego0, np.float64)) - points).astype(np.float32)
 
@@ -97,7 +96,7 @@ class EvalFrame:
             result: flow of `window.pc0`.
             labels: truth of the pair.
             stored_motion: ego motion as OpenSceneFlow uses it (`HDF5Log.stored_motion`). We subtract it from truth and
-                prediction with the same rounding as there. None = motion of the window.
+                prediction with OpenSceneFlow's rounding. None = motion of the window.
             **parts: further fields, for example `eval_mask`. They take precedence over those of the window.
         """
         pose0, pose1 = window.pc0.pose, window.pc1.pose

@@ -56,7 +56,7 @@ class CorrelationFlowModel(SequenceFlow):
 
 
 def register(name: str = "CorrelationFlow") -> None:
-    """Register the model with `models.construct_model` of the checkout, so that a config can name it."""
+    """Register the model with `models.construct_model` of SceneFlowZoo, so that a config can name it."""
     import_optional("models", _NEED, "name_to_class_lookup")[name.lower()] = CorrelationFlowModel
 
 

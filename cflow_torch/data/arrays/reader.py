@@ -93,7 +93,7 @@ class ArraysLog(Log):
         stamps = self._times(times, trajectory)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        self.poses = None if trajectory is None else self._one_each(trajectory, stamps)
+        self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
         if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
 
@@ -144,7 +144,7 @@ class ArraysLog(Log):
             return trajectory.times_ns.tolist()
         return None
 
-    def _one_each(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
+    def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
         if trajectory.times_ns is not None and stamps is not None:
             return poses_text.covered_poses(trajectory, stamps)
         if len(trajectory.poses) != len(self.files):

@@ -1,4 +1,4 @@
-"""Convert messages to arrays: clouds (PointCloud2) with any fields, and the frames of a robot over time, from /tf."""
+"""Convert ROS messages: PointCloud2 to one array per field, and /tf to a tree of coordinate frames over time."""
 
 from __future__ import annotations
 

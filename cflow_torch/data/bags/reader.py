@@ -153,7 +153,7 @@ class BagLog(Log):
         return found[0]
 
     def _scan(self) -> tuple[dict[int, int], dict[str, list[Any]]]:
-        """Read the arrival time of each cloud and the pose samples of each topic, and set the frames."""
+        """Read all messages once. Return the arrival time of each cloud and the pose samples of each topic."""
         self._lidar = ""
         self._child: dict[str, str] = {}
         arrival: dict[int, int] = {}

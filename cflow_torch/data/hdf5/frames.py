@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cflow_torch.windows.ego_motion import compensate
 
-# Argoverse 2 counts nanoseconds from its own epoch: all its sweeps lie in this range, and no sweep of another data set.
+# Argoverse 2 counts nanoseconds from its own epoch: all its sweeps are in this range, and no others are.
 _ARGOVERSE2_STAMPS = (315_900_000_000_000_000, 316_000_000_000_000_000)
 # Its up_lidar is 2 m above the road, its ego frame 0.35 m. If the ground is lower than this, points are up_lidar's.
 _ARGOVERSE2_SENSOR_GROUND = -1.2

@@ -112,7 +112,7 @@ class HDF5Log(Log):
         return self._values(index, "eval_mask", self._rows(index), np.bool_)
 
     def stored_motion(self, index: int) -> StoredMotion:
-        """Compute the ego motion that the harness uses for the pair (index, index + 1), from the stored poses."""
+        """Compute the ego motion that OpenSceneFlow uses for the pair (index, index + 1), from the stored poses."""
         poses: Any = [self._stored_pose(k, None) for k in (index, index + 1)]
         for pose in poses:
             rigid_transform(pose, f"pose of sweep {index} or {index + 1} of {self.file}")

@@ -44,7 +44,7 @@ def write_hdf5_scene(log: Log, file: str | Path, eval_step: int = 5) -> None:
     Convention:
         lidar, flow, ego_motion, lidar_dt, lidar_center are float32, poses float64, masks bool, flow_category_indices
         and lidar_id uint8, flow_instance_id int16. eval_mask is (N, 1). The last sweep has no flow and no ego_motion.
-        Arrays are neither chunked nor compressed. The attribute `ego_T_lidar`, which the harness's own files lack, is
+        Arrays are neither chunked nor compressed. The attribute `ego_T_lidar`, which OpenSceneFlow's own files lack, is
         the identity. The file appears complete or not at all.
 
     Raises:
@@ -53,12 +53,12 @@ def write_hdf5_scene(log: Log, file: str | Path, eval_step: int = 5) -> None:
     h5py = import_h5py()
     if len(set(log.timestamps)) < len(log.timestamps) or min(log.timestamps, default=0) < 0:
         raise CFlowError(f"log {log.log_id}: time stamps must be distinct and at least 0, because they name the groups")
-    identity: dict[str, int] = {}
+    object_ids: dict[str, int] = {}
     with atomic_name(Path(file)) as new, h5py.File(new, "w") as scene:
         scene.attrs[EXTRINSIC] = np.eye(4)
         for index, stamp in enumerate(log.timestamps):
             group = scene.create_group(str(int(stamp)))
-            for key, value in _sweep(log, index, eval_step, identity).items():
+            for key, value in _sweep(log, index, eval_step, object_ids).items():
                 group.create_dataset(key, data=value)
 
 
@@ -149,8 +149,8 @@ def labelled_by(file: str | Path) -> str | None:
         return None if made_by is None else str(made_by)
 
 
-def _sweep(log: Log, index: int, eval_step: int, identity: dict[str, int]) -> dict[str, np.ndarray]:
-    """Return the keys and values of one group. `identity` holds the object ids of the tracks so far."""
+def _sweep(log: Log, index: int, eval_step: int, object_ids: dict[str, int]) -> dict[str, np.ndarray]:
+    """Return the keys and values of one group. `object_ids` maps the tracks so far to their ids."""
     sweep, labels = log.sweep(index), log.labels(index)
     if sweep.pose is None:
         raise CFlowError(f"sweep {index} of log {log.log_id} has no pose, which the layout needs")
@@ -177,7 +177,7 @@ def _sweep(log: Log, index: int, eval_step: int, identity: dict[str, int]) -> di
     if hasattr(log, "boxes"):
         boxes, instance = log.boxes(index), np.zeros(len(points), np.int16)  # 0 = in no box
         for track, size, T_ego_box in zip(boxes.track_id, boxes.size, boxes.pose):
-            instance[points_in_box(points, size, T_ego_box)] = identity.setdefault(track, len(identity) + 1)
+            instance[points_in_box(points, size, T_ego_box)] = object_ids.setdefault(track, len(object_ids) + 1)
         values["flow_instance_id"] = instance
     return values
 

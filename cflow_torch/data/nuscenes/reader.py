@@ -138,7 +138,7 @@ class NuScenesLog(Log):
         T_ego1_ego0 = self._T_ego_world[index + 1] @ self._poses[index]
         flow = np.zeros((len(points), 3), dtype=np.float32)
         category, is_valid = np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=bool)
-        # A shot hits an object where its box is at the time of the shot, so we take both boxes later by its lag.
+        # A shot hits an object where its box is at the time of the shot, so we add the lag to the times of both boxes.
         slices, group = np.unique(lag // _TIME_SLICE, return_inverse=True)
         for position, middle in enumerate(slices * _TIME_SLICE + (_TIME_SLICE // 2 if lag.any() else 0)):
             rows = np.flatnonzero(group == position)

@@ -96,7 +96,7 @@ def read_table(folder: Path, table: str, key: str = "", values: Collection[str] 
     """
     file = folder / f"{table}.json"
 
-    def use(row: Row) -> Row | None:  # called for each row as it is parsed, so that the rest never needs memory
+    def use(row: Row) -> Row | None:  # called while parsing, so dropped rows and fields need no memory
         chosen = {name: row[name] for name in FIELDS[table]}
         return chosen if not key or row[key] in values else None
 

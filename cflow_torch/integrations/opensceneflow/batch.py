@@ -1,4 +1,4 @@
-"""Windows from the batches of OpenSceneFlow, in every layout that its scripts produce, checked key by key."""
+"""Windows from the batches of OpenSceneFlow (the harness), in every layout of its scripts, checked key by key."""
 
 from __future__ import annotations
 

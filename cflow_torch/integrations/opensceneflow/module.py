@@ -137,8 +137,8 @@ def write_null_checkpoint(file: str | Path, overwrite: bool = False) -> Path:
     tables, and save.py stores its results under this name. A file that exists is a `CFlowError` unless you set
     `overwrite`, because it might contain weights.
     """
-    # Plain containers only, so that `torch.load(weights_only=True)` reads it. There is no `model.target`, because the
-    # harness prefers the settings of a checkpoint to those of the command line, which must win.
+    # Plain containers only, so that `torch.load(weights_only=True)` reads it. We leave out `model.target`, because the
+    # harness would prefer it to the settings on the command line.
     file = Path(file)
     if file.exists() and not overwrite:
         raise CFlowError(f"{file} exists already: give another name, or overwrite it (--overwrite)")
