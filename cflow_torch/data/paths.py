@@ -95,7 +95,7 @@ def forget_listings(path: Any) -> None:
 def read_bytes(path: Path) -> bytes:
     """Read a file, in one request if it is remote.
 
-    A missing file, a device, a pipe and an unreachable file system raise an OSError.
+    A missing file, a device, a pipe and an unreachable file system raise an OSError, a git-lfs pointer a `CFlowError`.
     """
     if not is_remote(path):
         check_file(path)

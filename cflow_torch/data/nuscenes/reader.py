@@ -125,7 +125,7 @@ class NuScenesLog(Log):
         self._tracks = Tracks(sample_times, annotations)
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`: all LiDARs in one ego frame, one after the other in the order of sensor.json."""
+        """Read sweep `index`: all LiDARs in one ego frame, in the order of `lidars`, else of sensor.json."""
         points, lag = self._cloud(index)
         times = lag * 1e-6 if lag.any() else None
         return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000, times)
