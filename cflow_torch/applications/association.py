@@ -11,12 +11,12 @@ from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.ops.indices import concat_ranges, lookup, unique_pairs
 
-_MIN_OVERLAP = 0.1  # intersection over union of the voxels of two groups that match
-_MIN_CLAIM = 0.5  # share of a track's points; with so many points of a group in its box, the track claims the group
-_MIN_STOPPED_SHARE = 0.3  # share of a track's points; with so many static points in its box, the object has stopped
-_MARGIN = 0.2  # metres, added to the sides of these boxes
+_MIN_OVERLAP = 0.1  # least intersection over union of the voxels of two groups that match
+_MIN_CLAIM = 0.5  # a track of N points claims a group if its box holds at least 0.5 N points of the group
+_MIN_STOPPED_SHARE = 0.3  # a track of N points has stopped if its box holds at least 0.3 N static points
+_MARGIN = 0.2  # metres, added to length, width and height of these boxes
 VOXELS = (0.3, 0.6, 1.2)  # metres, sides; sparse groups share only large voxels with the next sweep
-_HEIGHT = 3.0  # height of a voxel over its side: the beams hit an object at different heights in each sweep
+_HEIGHT = 3.0  # ratio of a voxel's height to its side: the beams hit an object at different heights in each sweep
 
 
 class Matches(NamedTuple):
@@ -53,8 +53,8 @@ def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> Mo
 def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGroups:
     """Divide moving groups that hold several confirmed objects, such as two cars side by side.
 
-    An object claims a group if its box holds at least `num_points` / 2 points of the group; the object itself had
-    `num_points`. In a group with several claims, points in a claiming box go to its object, all others to one of these.
+    An object of `num_points` points claims a group if its box holds at least half as many points of the group. If
+    several objects claim a group, we give the points in their boxes to them, and the other points to the last of them.
     """
     moves = groups.group >= 0
     group, box, pair_of_point, count = unique_pairs(groups.group[moves], box[moves])
@@ -68,7 +68,7 @@ def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGrou
 
 
 def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> Matches:
-    """Match tracks with moving groups and static points, given (P, 3) points of the tracks and the track of each."""
+    """Match tracks with a sweep, given the predicted points (P, 3) of the tracks and the track of each point."""
     moves = groups.group >= 0
     track, group = link(points, track_of_point, groups.point[moves], groups.group[moves], _MIN_OVERLAP)
     may_have_stopped = tracks.is_confirmed.clone()
@@ -114,7 +114,7 @@ def _by_overlap(
     both = torch.cat([points0, points1])
     voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
     voxel = torch.unique(voxel, dim=0, return_inverse=True)[1]
-    # One number, voxel * num_groups + group or earlier * num_groups + current, sorts faster than two.
+    # We pack pairs into one number, such as voxel * num_groups + group, because one number sorts faster than two.
     num_groups = 1 + int(torch.cat([group0, group1]).amax()) if len(both) else 1
     key0 = torch.unique(voxel[: len(group0)] * num_groups + group0)
     key1 = torch.unique(voxel[len(group0) :] * num_groups + group1)

@@ -23,7 +23,7 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_arr
 _MARGIN = 0.2  # metres, added to the sides of the box around the visible part of an object
 _SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
 _MAX_DISTANCE = 100.0  # metres from the vehicle to a box, at most
-_MAX_VOXELS = 1 << 20  # largest distance of a map from its first sweep in x, y and z, voxels
+_MAX_VOXELS = 1 << 20  # voxels in x, y and z from the first sweep to a point of a map, at most
 
 
 class CleanLog(Log):
@@ -42,7 +42,7 @@ class CleanLog(Log):
 
     Attributes:
         log_id, timestamps: those of the log.
-        num_stopped: number of points that only `remove_stopped` removes; None without it, or before a sweep is read.
+        num_stopped: number of points that only `remove_stopped` removes; None if it is False or no sweep was read.
 
     Examples:
         >>> write_array_log(CleanLog(log), "outputs/clean")
@@ -156,7 +156,7 @@ class CleanLog(Log):
 def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
     """Accumulate the points of a log in the world, one per voxel of `voxel_size` metres.
 
-    For a map of the static world, pass a `CleanLog`, or the files written from one.
+    For a map of the static world, pass a `CleanLog`, or open the files that were written from one.
 
     Returns:
         (M, 3) float64, metres in the world: the first point of each voxel, in the order of the sweeps.

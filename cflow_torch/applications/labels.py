@@ -1,9 +1,9 @@
 """Write labels for self-supervised training into OpenSceneFlow's scenes: moving points, and groups of points.
 
-A group moves if it has points with a flow of at least `MOVING`, and if the flow of these points is plausible: the sum
-of their confidence (0 ... 1) and their agreement (0 ... 1) is at least `AGREEMENT`. The agreement is the share of them
-for which we find a similar motion at the predicted positions in the sweeps before and after. False motion of a single
-window (leaves, edges that come into view) rarely passes.
+A group moves if some of its points have a residual flow of at least `MOVING`, and the mean confidence of these points
+plus their agreement is at least `AGREEMENT`. The agreement, 0 ... 1, is the share of these points for which we find a
+similar motion at the predicted position, averaged over the sweeps before and after. False motion of a single window
+(leaves, edges that come into view) rarely passes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
 AGREEMENT = 1.3  # we chose it on simulated drives of five sensors, seeds 100 to 103, and on KITTI 0000
 _MAX_DISTANCE = 0.5  # metres from the predicted position of a point to the nearest moving point, at most
-_SIMILAR = (0.1, 0.5)  # two motions agree if they differ by at most so many metres, or by this share of their length
+_SIMILAR = (0.1, 0.5)  # largest difference of motions that agree: metres, or share of the motion if that is more
 _MIN_POINTS = 20  # of a static group, as in OpenSceneFlow's own recipe
 _MAX_GROUPS = 32_767  # the largest int16
 _NND = (0.14, 4.4)  # metres from a point to the nearest one of the next sweep: 5 to 160 km/h at 10 Hz
@@ -69,7 +69,7 @@ def find_labels(
         log: its sweeps have ground masks and poses.
         flows: results of all pairs, in order, by the verified method.
         model: the method that computed `flows`. It also estimates the flow from the last sweep to the one before.
-        workers: threads of the nearest-neighbour searches.
+        workers: threads of the nearest-neighbour search for `nnd`.
 
     Yields:
         (time stamp, labels), in order. The labels of N points are:
@@ -81,13 +81,13 @@ def find_labels(
         `nnd` (N,) uint8, 1 = the nearest point of the next sweep is 0.14 m to 4.4 m away after compensation of ego
         motion. Ground points have it, too.
 
-    Convention: the last sweep has no successor. Its flow and its `nnd` are those to the sweep before, with time
-        reversed. Groups of a sweep after the 32,767th have the number 0.
+    Convention: the last sweep has no successor, so its flow and its `nnd` lead to the sweep before. Groups of a sweep
+        after the 32,767th have the number 0.
 
     Raises:
-        CFlowError: results without confidence, another number of results or of points, or SciPy is not installed.
+        CFlowError: a result has no confidence or not one row per point, results are missing, or SciPy is not installed.
 
-    Cost: reads the log twice; two nearest-neighbour searches a sweep, one of all points, one of the moving points.
+    Cost: reads the log twice. Each sweep takes a nearest-neighbour search of all points, and two of the moving points.
     """
     tree: Callable[..., Any] = import_optional("scipy.spatial", "labels need SciPy: pip install scipy").cKDTree
     log = CachedLog(log, 3)
@@ -126,7 +126,7 @@ def find_labels(
 def flow_back(log: Log, model: FlowModel) -> FlowResult:
     """Estimate the flow of the last sweep to the one before it, by playing the log backwards.
 
-    Earlier sweeps serve as the `num_future` later ones. The flow has the axes of the sweep before the last.
+    Up to `num_future` earlier sweeps take the place of `pcf`. The flow has the axes of the sweep before the last.
     """
     last = len(log.timestamps) - 1
     first = max(last - 1 - model.config.num_future, 0)

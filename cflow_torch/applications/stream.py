@@ -39,9 +39,9 @@ class FlowStream:
         window: the sweeps of the last result, None before the first one. Rows of the result belong to `window.pc0`.
 
     Convention:
-        A sweep with a repeated time stamp, or one older by up to `max_gap` (a late packet), is skipped with a warning.
-        If the time stamp is older by more (the clock was set back) or newer by more (sweeps were lost), the stream
-        starts again. Without time stamps, sweeps are `sweep_interval` apart.
+        We skip a sweep with a warning if it repeats the newest time stamp, or is up to `max_gap` older (a late packet).
+        If it is more than `max_gap` older (the clock was set back) or newer (sweeps were lost), the stream starts
+        again. Without time stamps, sweeps are `sweep_interval` apart.
 
     Raises:
         CFlowError: a setting is unknown, or asks for sweeps after t+1.

@@ -8,15 +8,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-# A track is confirmed by the motion that it has shown, because most short-lived groups are noise of the static world.
+# A track must show motion to be confirmed, because most short-lived groups are noise of the static world.
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
 _NO_CONFIDENCE = 0.7  # log-odds per sweep if the method has no confidence
 _THIN = 0.12  # metres; narrower boxes add no evidence: posts, and strips of a façade at the edge of an occlusion
-_MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # least net displacement: metres, plus a share of its length
-_TRAVEL_FACTOR = 2.0  # largest ratio of the net displacements of its box and of its flow, either way
-# Without that evidence, its box has to move farther, and more exactly as its flow predicts.
-_LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres (or its length, if that is longer); relative; sweeps
-_JUMP, _SMALL = 1.5, 1.5  # if length + _SMALL (metres) changes by the factor _JUMP, the box shows another part
+_MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # least net displacement of the box: metres, plus a share of its length
+_TRAVEL_FACTOR = 2.0  # largest ratio between the displacement of the box and the sum of its flow, either way
+# With less evidence, the box must move farther and follow the flow more closely.
+_LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres (or the box's length if longer); share; sweeps
+_JUMP, _SMALL = 1.5, 1.5  # if length + _SMALL (metres) changes by the factor _JUMP, we see another part
 
 
 _NUMBER, _FLAG = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
@@ -44,7 +44,7 @@ class Tracks(NamedTuple):
     travel: Tensor = _VECTOR  # (K, 3) metres, sum of the flow since `start`
     confidence: Tensor = _SCALAR  # (K,) of the flow when it last moved
     evidence: Tensor = _SCALAR  # (K,) sum of the log-odds of the confidence since `start`
-    num_points: Tensor = _NUMBER  # (K,) int64
+    num_points: Tensor = _NUMBER  # (K,) int64 points when it last moved, or the most seen since then
     num_moving: Tensor = _NUMBER  # (K,) int64 sweeps in which it moved
     missed: Tensor = _NUMBER  # (K,) int64 sweeps since it was last seen
     cluster: Tensor = _NUMBER  # (K,) int64 cluster_id, -1 = static
@@ -94,8 +94,8 @@ class Tracks(NamedTuple):
     def start_again(self, index: Tensor, length: Tensor) -> None:
         """Restart the evidence of motion of the indexed tracks whose box is now much longer or shorter.
 
-        `length` (K,) is that of their boxes in the sweep before. The centre of such a box has jumped, because another
-        part of the object has become visible, or the object was merged with another one.
+        `length` (K,) is the length of each box in the sweep before. If it changes much, the centre of the box has
+        jumped: another part of the object has become visible, or the object was merged with another one.
         """
         ratio = (self.size[index, 0] + _SMALL) / (length + _SMALL)
         index = index[(ratio > _JUMP) | (ratio < 1 / _JUMP)]

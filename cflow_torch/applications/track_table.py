@@ -36,7 +36,7 @@ def join_tables(tables: Sequence[Table]) -> Table:
 
 
 def confirmed(table: Table) -> Table:
-    """Keep all rows of tracks that are confirmed at any time, including the rows before that."""
+    """Keep all rows of each track that is confirmed in any sweep, also the earlier rows."""
     is_kept = np.isin(table["id"], table["id"][table["is_confirmed"]])
     return {name: values[is_kept] for name, values in table.items()}
 

@@ -37,7 +37,7 @@ class Tracked(NamedTuple):
 class Tracker:
     """Track moving objects sweep by sweep.
 
-    The flow moves the points of a group to the next sweep. The group of that sweep that shares most voxels with them is
+    The flow moves the points of a group to the next sweep. There, the group that shares the most voxels with them is
     the same object. We track a stopped object as long as there are points in its box. If an object is not seen for up
     to three sweeps, we predict its position from its velocity. Memory: the points of the current tracks.
 
@@ -151,7 +151,7 @@ class Tracker:
 
         is_new = torch.ones_like(groups.count, dtype=torch.bool)
         is_new[matches.group] = False
-        number = is_new.cumsum(0) - 1  # of a new track among the new ones
+        number = is_new.cumsum(0) - 1  # index of a new track among the new ones
         track_of_group = len(tracks.id) + number
         track_of_group[matches.group] = matches.track
         new = track_of_group[is_new]
