@@ -88,7 +88,7 @@ def save_animation(figures: Iterable[Figure], path: str | Path, *, frames_per_se
         CFlowError: there is no figure, sizes differ, the ending or the rate is not allowed, or a package is missing.
         OSError: the file cannot be written. An error of a generator of figures is passed on.
 
-    Cost: a .gif keeps one byte per pixel and picture until the end, a .mp4 nothing.
+    Cost: memory of one byte per pixel and picture for a .gif, and of one picture for a .mp4.
     """
     path = checked_path(path, ".gif", ".mp4")
     if not 0 < frames_per_second < np.inf:

@@ -35,7 +35,7 @@ def plot_flow(
         points: (N, 3+), metres, ego frame of sweep t.
         result_or_residual: the `FlowResult` of these points, or their residual flow (N, 3), metres per sweep.
         is_ground: (N,) bool; ground is drawn very faintly. None = no point is ground.
-        point_cloud_range: (x0, y0, z0, x1, y1, z1), metres; points outside are not drawn. None = that of `Config`.
+        point_cloud_range: (x0, y0, z0, x1, y1, z1), metres; points outside are not drawn. None = that of `DenseConfig`.
         max_flow: residual flow at the rim of the colour wheel, metres per sweep; None = the longest one drawn, rounded
             up to 0.1 m.
         title: one line above the picture.

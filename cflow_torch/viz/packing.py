@@ -20,11 +20,11 @@ from cflow_torch.viz.wheel import flow_to_rgb
 _UNIT = 0.01  # metres; 16 bits reach to 327 m
 _REACH = 32000 * _UNIT
 _SORT = 2.0  # metres, side of a cell; we store the points of a cell together, which compresses better
-_FLOOR_RADIUS = 15.0  # metres; the range rings lie at the height of the ground this near the vehicle
+_FLOOR_RADIUS = 15.0  # metres; the points this near the vehicle give the height of the range rings
 STATIC, GROUND, UNKNOWN, FIRST = 0, 1, 2, 3  # indices of greys that the page chooses; a palette begins at FIRST
-_HUES, _LEVELS = 36, 6  # of the colour wheel; one more level is for flow longer than max_flow
+_HUES, _LEVELS = 36, 6  # hues, and levels of length; one more level is for flow longer than max_flow
 _PALEST = 0.35  # least saturation, so that slow motion is visible on a light page
-_FADED, _GREY = 0.15, 140  # static objects: share of their colour; the rest is this grey, visible in both themes
+_FADED, _GREY = 0.15, 140  # we mix this share of a static object's colour with a grey that both themes show
 _STEPS = 64  # colours of a ramp
 _RAMP = np.array([(66, 125, 245), (38, 190, 205), (112, 205, 80), (250, 200, 40), (235, 60, 45)], float)
 
@@ -98,7 +98,7 @@ class PackedDrive:
         )
 
     def add_tracks(self, tracks: Mapping[str, np.ndarray]) -> None:
-        """Add the boxes of tracks, and give the points of a track its colour in all sweeps."""
+        """Add the boxes of tracks. The points of a track get the same colour in all sweeps."""
         for frame, (_, entries, cluster) in zip(self.frames, self.points):
             is_now = tracks["sweep"] == frame["sweep"]
             rows = {name: values[is_now] for name, values in tracks.items()}
@@ -148,7 +148,7 @@ class PackedDrive:
 
 
 def _planes(units: np.ndarray, entries: Sequence[np.ndarray]) -> bytes:
-    """Return the bytes of a frame: per axis all low, then all high bytes of differences of points; then the entries."""
+    """Return the low, then the high bytes of the steps from point to point, axis by axis; then the entries."""
     steps = np.diff(units, axis=0, prepend=np.zeros((1, 3), np.int16)).astype("<i2")
     axes = [steps[:, axis].copy().view(np.uint8).reshape(-1, 2).T.tobytes() for axis in range(3)]
     return b"".join(axes + [entry.tobytes() for entry in entries])

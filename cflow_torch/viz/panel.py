@@ -25,7 +25,7 @@ FLOW_CAPTION = (
 )
 EGO_OUTLINE = ((2.4, 0.0), (-1.9, 1.15), (-1.0, 0.0), (-1.9, -1.15))  # metres
 _RING, _MOST_RINGS = 10.0, 20  # metres between two rings; a view with more rings gets wider steps
-_HIGHEST = 2.0  # largest height of a panel over its width; the smallest height is that of two colour wheels
+_HIGHEST = 2.0  # largest ratio of a panel's height to its width; it is at least as high as two colour wheels
 
 _SLOW_RIM, _FAST_RIM = np.array((0.62, 0.66, 0.70)), np.array((0.10, 0.12, 0.15))
 _SLATE = (80 / 255, 90 / 255, 110 / 255)  # background of errors: black (none) and white (large) are visible on it
@@ -52,7 +52,7 @@ def new_figure(
     from matplotlib.patches import Circle
 
     farthest = float(np.abs(view).max())
-    step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding takes off up to three fifths
+    step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding down takes off up to 3/5
     radii = np.arange(step, farthest + 1e-9, step).tolist() if has_rings else []
     panels = []
     for i, name in enumerate(names):
@@ -77,8 +77,8 @@ def draw_ground(axes: Axes, position: np.ndarray) -> None:
 def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.ndarray | None, max_flow: float) -> None:
     """Draw static points in grey, moving points in colour, one arrow per moving cluster, and the ego vehicle.
 
-    Positions (N, 3) are in metres, residual flow (N, 3) in metres per sweep; NaN is drawn as static. Clusters (N,) are
-    -1 = none; without them, moving points near each other form groups. `max_flow` has full colour.
+    Positions (N, 3) are in metres, residual flow (N, 3) in metres per sweep; NaN is drawn as static. `cluster` is (N,),
+    -1 = none. If it is None, moving points near each other form groups. Flow of `max_flow` has full colour.
     """
     moves = np.linalg.norm(flow, axis=1) > MOVING  # False for NaN
     dot = dot_area(axes)
@@ -123,7 +123,7 @@ def group_medians(group: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np
     """Return the number of each group, (G,), the medians of its values, (G, C), and its count of rows, (G,).
 
     `group` is the number of the group of each row, (N,), negative = in no group; `values` are (N, C). Groups are in
-    ascending order. The median of an even count is the upper one of the middle two.
+    ascending order. The median of an even number of values is the upper one of the middle two.
     """
     values, group = values[group >= 0], group[group >= 0]
     number, start, count = np.unique(np.sort(group), return_index=True, return_counts=True)

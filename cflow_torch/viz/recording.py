@@ -52,12 +52,12 @@ def record_log(
         Number of pairs in the recording.
 
     Convention:
-        The origin of the world is the ego vehicle at the end of the first pair. world/trajectory is the path of the
-        vehicle, and world/tracks has the boxes of `tracks`. world/ego_vehicle moves through the world; its frame is the
-        ego frame at t+1. It holds arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long) and these points:
+        The frame of `world` is the ego frame at t+1 of the first pair with poses. world/trajectory is the path of the
+        vehicle, and world/tracks has the boxes of `tracks`. The frame of world/ego_vehicle is the ego frame at t+1 of
+        the current pair. It holds arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long) and these points:
         - lidar/cflow: points of t, moved by the ego motion and coloured by residual flow, grey up to `panel.MOVING`
         - lidar/ground_truth: points of t with known truth, coloured by the true residual flow
-        - lidar/clusters, lidar/ground: points of t; lidar/next_sweep: points of t+1
+        - lidar/clusters, lidar/ground: points of t, moved likewise; lidar/next_sweep: points of t+1
         Timelines: `sweep`, the index; `time`, if sweeps have time stamps.
 
     Raises:

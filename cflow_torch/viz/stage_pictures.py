@@ -29,12 +29,12 @@ _MARGIN = 2.0  # metres around the object in the close-up
 _SMALLEST = 4.0  # metres, least half side of the close-up
 _COLORMAP = "viridis"
 _PEAK = "#e6194b"
-_MOST_LINES = 160  # of the surface along each axis
+_MOST_LINES = 160  # lines of the surface along each axis, at most
 _HALF_VIEW = np.array((5.0, 3.6))  # metres, half width and height of the view
 _CELL = 4.0  # metres, side of the cells in which matches are added up to choose the view
 _POINT_COLOR = "#ffb000"
-_ALONG = 9  # points of a line that a legend should not cover
-_FADE = 0.72  # of the pixels behind the matches
+_ALONG = 9  # points on each line of a match that a legend should not cover
+_FADE = 0.72  # how far the pixels behind the matches fade to white, 0 ... 1
 
 
 def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int | None = None) -> Figure:
@@ -44,12 +44,12 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
         window: sweeps.
         config: settings of a method of the paper; None = the preset "paper" with pixels of 0.4, 0.2 and 0.1 m, without
             older sweeps.
-        cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
+        cluster_id: as in `FlowResult`; None = the one where number of points times length of median flow is largest.
 
     Returns:
-        Figure, 1600 pixels wide. Above, close up on one cluster: sweep t moved by the flow of the coarser scales, and
-        t+1; in the last column t moved by the whole flow. Below: the flow so far, in the colours of the wheel; in the
-        last column the flow of the finest pixels alone.
+        Figure, 1600 pixels wide. The upper row is a close-up of one cluster: t+1, and t moved by the flow of coarser
+        scales. The last column moves t by the whole flow. The lower row has the flow after each scale, in the colours
+        of the wheel. Its last column has the flow of a run with the finest pixels alone.
 
     Convention: metres, frame of t+1.
 
@@ -141,7 +141,7 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
     Args:
         window: sweeps.
         config: a `DenseConfig` with `clustering="components"`; None = the preset "paper", without older sweeps.
-        cluster_id: as in `FlowResult`; None = the cluster with the largest product of points and metres of flow.
+        cluster_id: as in `FlowResult`; None = the one where number of points times length of median flow is largest.
 
     Returns:
         Figure, 1600 pixels wide: the cluster at t, at t+1, and both with t moved by the chosen shift, in metres, frame

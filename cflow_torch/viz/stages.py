@@ -153,9 +153,9 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
 
 
 def choose_cluster(of_point: np.ndarray, flow: np.ndarray, cluster_id: int | None = None) -> int | None:
-    """Return the given cluster, else the one with the largest product of points and metres of flow; None = no cluster.
+    """Return the given cluster, else the one where points times length of median flow is largest; None = no cluster.
 
-    `of_point` is the (N,) cluster of each point, -1 = none, and `flow` its residual flow.
+    `of_point` is the cluster of each point, (N,), -1 = none, and `flow` the residual flow of the points, (N, 3).
     """
     numbers, median, count = group_medians(of_point, flow)
     if cluster_id is None:

@@ -49,7 +49,7 @@ def flow_to_rgb(flow: Array, max_flow: float | None = None) -> np.ndarray:
 
 
 def wheel_image(size: int) -> np.ndarray:
-    """Draw the wheel, +x right, +y up, `max_flow` at the rim: (size, size, 4) uint8 RGBA, transparent outside."""
+    """Draw the wheel, +x right, +y up, full hues at the rim: (size, size, 4) uint8 RGBA, transparent outside."""
     axis = (np.arange(size) + 0.5) * (2 / size) - 1
     flow = np.stack(np.meshgrid(axis, -axis), axis=-1)
     distance = np.hypot(flow[..., 0], flow[..., 1])
