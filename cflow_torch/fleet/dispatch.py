@@ -20,8 +20,8 @@ from cflow_torch.types import CFlowError
 _POLL_S = 0.2  # how soon a signal is noticed
 _GRACE_S = 20.0  # after a signal, time to finish the frames that have begun; schedulers kill after 30 s or more
 _MAX_FAILED_STARTS = 3  # in a row; then we give up the worker
-# If so many processes die on one unit, we leave its rest. Perhaps all its frames are too large for the memory, and each
-# new process takes seconds to start.
+# If so many processes die on one unit, we give up the rest of it: perhaps all its frames are too large for the memory,
+# and each new process takes seconds to start.
 _MAX_DEATHS = 10
 
 
@@ -54,12 +54,12 @@ def dispatch(
 ) -> Iterator[Event]:
     """Do all units, and yield events as they happen. If no worker can start, that is a `CFlowError`.
 
-    When a process dies, its unit is repeated, then each of the unit's frames by itself, `retries` times each. To repeat
-    them does no harm: files are written as a whole or not at all, and complete ones are skipped.
+    When a process dies, we repeat its unit, up to `retries` times. Then each missing frame runs by itself, with as many
+    retries. This does no harm: files are written as a whole or not at all, and complete ones are skipped.
 
     Args:
-        processes: one per worker, not started yet, whose calls take a unit and yield its events. Each is used by a
-            thread of its own, except for `stop` and `close`.
+        processes: one per worker, not started yet. A call takes a unit and yields its events. A thread of its own
+            starts and calls each process; the caller's thread stops and closes it.
         units: numbered from 0.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
     """

@@ -13,7 +13,7 @@ from cflow_torch.fleet.machine import AUTO
 from cflow_torch.types import CFlowError
 
 # Units per worker, so that the last unit does not keep the other workers waiting for long. A log is divided only if
-# there are too few logs, because each piece reads h + 1 sweeps that its neighbour reads as well.
+# there are too few logs, because each piece reads num_history + 1 sweeps that its neighbour reads as well.
 _UNITS_PER_WORKER = 2
 
 
@@ -26,7 +26,7 @@ class Job:
     reader: str  # data set, a key of `catalog.DATA_SETS`
     settings: dict[str, Any]  # of its reader
     output: str  # folder of the results; a path, or the address of an object store
-    contents: tuple[str, ...] = CONTENTS  # of a flow file, names of `flow_file.CONTENTS` and `ON_REQUEST`
+    contents: tuple[str, ...] = CONTENTS  # what a flow file has: names in `flow_file.CONTENTS` and `ON_REQUEST`
     batch: int = 1  # windows that are computed together
     redo: bool = False  # compute frames again that exist already
 
@@ -36,7 +36,7 @@ class Unit:
     """Consecutive frames of one log: the work that a worker gets at once."""
 
     number: int  # index among the units of a run
-    source: Any  # one of `catalog.find_sources`
+    source: Any  # its log, one of `catalog.find_sources`
     first: Fraction = Fraction(0)  # share of the log's pairs before the first frame, 0 ... 1
     last: Fraction = Fraction(1)  # share of the log's pairs before the end of the unit
     only: frozenset[int] | None = None  # time stamps of the frames to do; None = all of them
@@ -57,7 +57,7 @@ class Opened(NamedTuple):
 
 
 class Done(NamedTuple):
-    """A frame is on disk. `seconds` by stage: those of "compute" are of its batch, divided by the number of frames."""
+    """A frame is on disk. `seconds` by stage; "compute" is the time of its batch, divided by the number of frames."""
 
     unit: int
     timestamp: int
@@ -65,7 +65,7 @@ class Done(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """A frame has no result; `timestamp` None: the unit, or the rest of it, has none."""
+    """A frame has no result. If `timestamp` is None, the unit or the rest of it has none."""
 
     unit: int
     name: str
@@ -131,7 +131,7 @@ def _from_environment(environ: Mapping[str, str]) -> Shard:
     """Return the shard that torchrun or SLURM gives this process, or the only one.
 
     A SLURM batch script is not a task of a step: only `srun` sets SLURM_STEP_NUM_TASKS. Without `srun`, a script with
-    `--ntasks=8` must not compute one eighth.
+    `--ntasks=8` runs once, so it must compute everything.
     """
     index, count = 0, 1
     if "SLURM_ARRAY_TASK_ID" in environ:

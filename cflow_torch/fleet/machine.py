@@ -15,8 +15,8 @@ from cflow_torch.windows.memory import available_memory, control_groups
 AUTO = "auto"
 # Bytes of one worker: nearly twice the most that we measured with `default`, see docs/fleet.md.
 WORKER_MEMORY = 1_500_000_000
-# Windows that are computed together. On a CPU up to 4 are faster (fewer small operations), more are slower (caches). We
-# have not measured the number for a GPU.
+# Windows that are computed together. On a CPU, up to 4 are faster, because there are fewer small operations; more are
+# slower, because they exceed the caches. We have not measured the number for a GPU.
 CPU_BATCH, GPU_BATCH = 4, 32
 
 

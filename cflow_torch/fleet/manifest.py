@@ -2,7 +2,7 @@
 
 OUTPUT/manifest.json              identity of the run (method, data settings, contents, versions) and its hash
 OUTPUT/<log id>/manifest.json     time stamps of the log, digests of its first, middle and last sweep
-OUTPUT/<log id>/<ns>.feather      a complete frame; a file gets this name when it is on disk
+OUTPUT/<log id>/<ns>.feather      a frame; its file gets this name when it is complete
 OUTPUT/<log id>/tracks.parquet    moving objects of a log whose frames are all complete
 """
 
@@ -69,7 +69,7 @@ def check_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwr
     why = describe_changes(before, identity, ["hash"])
     if why or not (resume or overwrite):
         why = f"({why})" if why else "with the same settings (resume=true continues it)"
-        # No shard knows whether another one has removed the older results already.
+        # A shard does not know whether another one has already replaced the older results.
         remedy = "remove the folder, or give output=FOLDER" if overwrite else _REMEDY
         raise CFlowError(f"{output} has results of another run {why}: {remedy}")
 
@@ -105,7 +105,7 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
 
 
 def _describe_log(log: Log, run: str) -> dict[str, Any]:
-    """Return the manifest of a log. A sweep that cannot be read has no digest, and its frames will fail."""
+    """Return the manifest of a log. A sweep that cannot be read has no digest; its frames fail later."""
     stamps = [int(stamp) for stamp in log.timestamps]
     digests = {}
     for index in sorted({0, len(stamps) // 2, len(stamps) - 1} & set(range(len(stamps)))):

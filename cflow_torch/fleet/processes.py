@@ -1,4 +1,4 @@
-"""Child processes that do calls, and the signals that end a run."""
+"""Child processes that answer calls, and the signals that end a run."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class WorkerDied(CFlowError):
 
 
 class ChildProcess:
-    """A child process that does one call at a time. It ignores `SIGNALS` and ends when its parent does.
+    """A child process that answers one call at a time. It ignores `SIGNALS` and ends when its parent does.
 
     Args:
-        make: called in the child process; returns the generator function that does the calls. That function gets the
-            arguments of a call, then a function that returns True after `stop`.
+        make: called in the child process; returns the generator function that answers calls. Its arguments are those
+            of the call and, as the last one, a function that returns True after `stop`.
         arguments: of `make`. They are pickled, like the arguments and results of calls.
         timeout: seconds after which a process that has not answered is ended; None = no limit.
     """
@@ -96,7 +96,7 @@ class ChildProcess:
 
 
 def _serve(pipe: Any, make: Callable[..., Any], arguments: Any) -> None:
-    """Make the function and do calls until the parent closes the pipe or ends."""
+    """Make the function, then answer calls until the parent closes the pipe or ends."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)  # the parent receives them as well and says when to stop
     function, is_stopped = None, False

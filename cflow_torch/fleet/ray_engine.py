@@ -66,7 +66,7 @@ def run_ray(
     _connect(ray, settings)
     try:
         _check_room(ray, needs)
-        options = {"num_cpus": needs["CPU"], "num_gpus": needs["GPU"], "max_concurrency": 2}  # `run` and `stop`
+        options = {"num_cpus": needs["CPU"], "num_gpus": needs["GPU"], "max_concurrency": 2}  # `stop` during `run`
         actor = ray.remote(_Actor).options(**options)
         device = "cuda" if is_gpu else "cpu"  # a worker sees only the GPUs that Ray gives it
         processes = [_Process(ray, actor, os.getcwd(), job, device) for _ in layout.devices]
@@ -122,7 +122,7 @@ class _Process(ChildProcess):
 
     def close(self) -> None:
         if self._actor is not None:
-            with suppress(Exception):  # if its cluster has ended, the actor has, too
+            with suppress(Exception):  # the actor has ended with its cluster
                 self._ray.kill(self._actor)
 
     def _get(self, answer: Any) -> Any:

@@ -23,7 +23,7 @@ from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.work import describe, source_name
 from cflow_torch.types import CFlowError
 
-_SHOWN_NOTES = 3  # how often a message is shown; the report names all logs that it is about
+_SHOWN_NOTES = 3  # how often a message is shown; the report names every log with this message
 _SHOWN_FAILURES = 20  # that are listed at the end; the report has them all
 ENGINES: dict[str, Any] = {"local": run_local, "ray": run_ray}
 
@@ -118,7 +118,7 @@ def forecast(job: Job, units: Sequence[Unit]) -> str:
 
 
 class Counters:
-    """Counts the frames of a run, from all its units."""
+    """Counts frames and collects failures and notes, from the events of a run."""
 
     def __init__(self, units: Sequence[Unit]) -> None:
         self.failures: list[tuple[str, str]] = []  # (frame or log, message)
@@ -159,11 +159,11 @@ class Counters:
         """Return all figures of a run that took `seconds`. `signal_name` is the signal that stopped it, "" = none.
 
         Returns:
-            "status": "complete", "incomplete" (something failed or is missing) or "interrupted"; "frames": the counts
-            "total", "complete_before", "computed", "failed" and "waiting" (of opened logs, not done), and the counts of
-            logs or parts of logs "failed_logs" and "unopened_units"; "frames_per_s" of those computed; "stages":
-            seconds per computed frame, summed over the workers, which work at the same time; lists of
-            "failures" and of "waiting" frames; "notes": log, message and how often.
+            "status": "complete", "incomplete" (something failed or is missing) or "interrupted".
+            "frames": numbers of frames: "total", "complete_before", "computed", "failed" and "waiting" (not done, of
+            opened logs); numbers of logs or parts of logs: "failed_logs" and "unopened_units".
+            "frames_per_s": computed frames. "stages": seconds per computed frame, summed over all workers.
+            "failures" and "waiting": lists of frames. "notes": log, message and how often.
         """
         computed = self.total - self.num_before - self.num_failed - len(self.waiting)
         return {

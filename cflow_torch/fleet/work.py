@@ -88,7 +88,7 @@ class Worker:
         yield Opened(unit.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
         checks = bool(self._job.settings.get("check", True))
         if checks and 0 in todo:
-            with suppress(Exception):  # the frames of a sweep that cannot be read will fail
+            with suppress(Exception):  # if a sweep cannot be read, its frames fail below
                 for text in find_problems(log):
                     yield Noted(unit.number, log.log_id, text)
         for frame in self._pass(log, folder, todo, stop):
@@ -145,7 +145,7 @@ class Worker:
                 good[0].content = error.with_traceback(None)
                 self._check_device()
         if results is None:
-            # This is after the except block: until its end, the traceback keeps the memory of the batch on the GPU.
+            # We retry here, not in the except block, where the traceback still keeps the batch in the GPU's memory.
             for frame in good if len(good) > 1 else []:
                 self._compute([frame])
             return frames
@@ -156,7 +156,7 @@ class Worker:
         return frames
 
     def _check_device(self) -> None:
-        """Find out if CUDA still works: after an error inside a kernel it refuses all later work of the process."""
+        """Raise `WorkerDied` if CUDA refuses all further work, as it does after an error inside a kernel."""
         try:
             torch.zeros(1, device=self._device).item()
         except RuntimeError as error:
@@ -176,7 +176,7 @@ def make_worker(
 ) -> Callable[[Unit, Callable[[], bool]], Iterator[Event]]:
     """Make the worker of this process, and return its `run`.
 
-    On a CPU it computes on one thread: other workers use the other cores. `memory` limits the bytes of address space.
+    On a CPU, it uses one thread, because other workers use the other cores. `memory` limits its address space, bytes.
     """
     if memory is not None:
         import resource  # not available on Windows
