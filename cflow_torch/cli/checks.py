@@ -1,4 +1,4 @@
-"""Settings as Hydra gets them: register the presets, check values, and explain in one line what is rejected and why.
+"""Register the presets with Hydra, check settings, and explain in one line why a call is rejected.
 
 This module does not import torch.
 """
@@ -18,9 +18,9 @@ from cflow_torch.config import CONFIGS, PRESETS, REMOVED_PRESETS, Config, config
 from cflow_torch.errors import CFlowError
 from cflow_torch.setting import bounds, checked
 
-# Settings of the last version; those of the methods are in `config.REMOVED`.
+# Settings of commands that the last version had; for those of the methods, see `config.REMOVED`.
 _REMOVED = {"standing": "use remove_stopped", "residual_axes": "leave it out"}
-# Values that are allowed besides the default. Settings that are not listed have the type of their default.
+# Values that are allowed besides the default. A setting that is not listed must have the type of its default.
 _FROM_0, _FROM_1 = bounds(int, low=0), bounds(int, low=1)
 _ABOVE_0 = bounds(float, above=0, high=1e12)
 _ALLOWED = {
@@ -66,7 +66,7 @@ def check_settings(cfg: Any, command: str, choices: Mapping[str, Any]) -> None:
         if limits is not None and value != default:
             for one in value if isinstance(default, list) and OmegaConf.is_list(value) else [value]:
                 checked(name, one, limits)
-    for name in ("first", "step"):  # also with your own reader, of which we know no other setting
+    for name in ("first", "step"):  # your own reader has them, too; we know no other setting of it
         checked(f"data.{name}", cfg.data.get(name, 1), _ALLOWED[name])
     if "_target_" in cfg.data:
         return

@@ -14,7 +14,7 @@ import cflow_torch.configs
 from cflow_torch.config import PRESETS, make_config
 
 CONFIGS = Path(cflow_torch.configs.__path__[0])
-PREFIXES = {"data": "data.", "engine": "engine.", "picture": ""}  # of the settings of a group
+PREFIXES = {"data": "data.", "engine": "engine.", "picture": ""}  # group -> prefix of its settings
 
 
 def groups(command: str) -> dict[str, list[str]]:
@@ -60,20 +60,20 @@ def own_settings(file: Path) -> dict[str, Any]:
 
 @lru_cache(maxsize=None)  # commands share files
 def _load(file: Path) -> dict[str, Any]:
-    """Read a YAML file without Hydra and OmegaConf, which take longer to import than help takes to print."""
+    """Read a YAML file without Hydra and OmegaConf: importing them takes longer than printing help."""
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     return yaml.load(file.read_text(encoding="utf-8"), loader) or {}  # type: ignore[no-any-return]
 
 
 def near(word: str, known: Iterable[str]) -> str:
-    """Return the hint " (did you mean X?)" with the most similar name, with or without group; "" if none is similar."""
+    """Return the hint " (did you mean X?)", "" if no name is similar. We compare names with and without their group."""
     names = {form: name for name in known for form in (name.rpartition(".")[2], name)}
     found = get_close_matches(word, names, 1)
     return f" (did you mean {names[found[0]]}?)" if found else ""
 
 
 def settings_help(command: str) -> str:
-    """Return the settings for the help of a command: its YAML file, and the choices of its groups."""
+    """List the settings of a command for its help: those of its YAML file, and the choices of its groups."""
     text = (CONFIGS / f"{command}.yaml").read_text(encoding="utf-8")
     own = re.sub(r"^((defaults|hydra):.*\n( .*\n)+|#.*\n)", "", text, flags=re.MULTILINE).strip()
     lines = [*own.splitlines(), *(f"{group}={'|'.join(names)}" for group, names in groups(command).items())]

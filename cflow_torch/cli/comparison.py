@@ -14,7 +14,7 @@ from hydra.experimental.callback import Callback
 
 RESULTS = "results.json"
 TABLE = "comparison.csv"
-# The scores of a class with fewer dynamic points are uncertain. One pedestrian has about so many in ten sweeps.
+# The scores of a class with fewer dynamic points are uncertain. One pedestrian has about 1000 in ten sweeps.
 _FEW = 1000
 # A setting and its value in the name of a job's folder.
 _SWEPT = re.compile(r"(?:^|,)([^=,]+)=(.*?)(?=,[^=,]+=|$)")
@@ -47,8 +47,8 @@ class Comparison(Callback):
 def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
     """Compare all jobs with results below a folder: a header, and a row for each job.
 
-    A row has the swept settings, the digest of the scored data if the jobs have scored different data, then the scores;
-    "" = no value.
+    A row has the swept settings, then the scores; "" = no value. If the jobs have scored different data, the digest of
+    the data is between them.
     """
     jobs: list[tuple[dict[str, str], list[Any]]] = []
     for file in sorted(output.glob(f"*/**/{RESULTS}")):

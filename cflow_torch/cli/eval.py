@@ -87,7 +87,7 @@ class Scores:
     ) -> dict[str, Any]:
         """Print and return the scores, and write `folder/results.json` and `folder/config.yaml`.
 
-        The seconds are those of `TimedModel.report`.
+        `seconds` is the result of `TimedModel.report`.
         """
         results = self.metrics.compute()
         record = {
@@ -112,7 +112,7 @@ class Scores:
 
 
 def finished_results(cfg: DictConfig, folder: Path) -> dict[str, Any] | None:
-    """Read the record of an earlier run with the same settings and versions; None if there is none or with `overwrite`.
+    """Read the record of an earlier run with the same settings and versions; None without one, or with `overwrite`.
 
     Results of other settings are a `CFlowError`.
     """

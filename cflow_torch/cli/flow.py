@@ -1,19 +1,19 @@
 """Estimates the flow of every pair of sweeps: OUTPUT/<log id>/<time stamp of sweep t>.feather.
 
 Each file has one row per point of sweep t. Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of objects,
-pose_t{x,y,z}_m ego motion (float32, metres until the next sweep, in the ego frame at t+1), cluster_id, score, is_valid.
-There is also a column confidence, unless model=paper or keypoints. contents=[residual,is_valid] writes only these
-columns. Files are then much smaller; ego motion and total flow follow from the poses.
+pose_t{x,y,z}_m ego motion (float32, metres per sweep, axes of the ego frame at t+1), cluster_id, score, is_valid. There
+is also a column confidence, unless model=paper or keypoints. contents=[residual,is_valid] writes only these columns.
+Files are then much smaller; ego motion and total flow follow from the poses.
 
-OUTPUT/config.yaml contains the settings and versions, OUTPUT/reports what the run did. Run the command again to resume.
+OUTPUT/config.yaml contains settings and versions; OUTPUT/reports has the report. Run the command again to resume.
 After Ctrl-C, SIGTERM or SIGHUP the run finishes the frames that it has begun. The exit status is 0 if every frame is
-complete, 1 if one is missing, 2 if the call was wrong, and 128 + n after signal number n. The report has the time of
-each stage, and verbose=true prints it.
+complete, 1 if one is missing, 2 if the call was wrong, and 128 + n after signal number n. The report has the times of
+all stages; verbose=true prints them.
 
-result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep, where the viewers of
-OpenSceneFlow read it. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a log are complete: one
-row per moving object and sweep, with id, box and velocity. tracks=mot and tracks=kitti add OUTPUT/<log id>/mot.txt or
-kitti.txt, the tracks in these formats.
+result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep but the last. The
+viewers of OpenSceneFlow read it there. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a log
+are complete: one row per moving object and sweep, with id, box and velocity. tracks=mot and tracks=kitti add
+OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats.
 
 examples:
   cflow flow data=av2 data.root=/data/av2/val output=outputs/val
@@ -80,7 +80,7 @@ def compute(
     Args:
         contents: columns of a flow file.
         check: called before anything is computed; raises an error if the logs cannot be used.
-        use: gets the report of a run that no signal has stopped, and returns what failed.
+        use: called with the report, unless a signal has stopped the run; returns what failed.
     """
     shard, output = find_shard(cfg.shard.index, cfg.shard.count, os.environ), run.output_folder(cfg)
     settings: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
@@ -169,7 +169,7 @@ def _write_more(cfg: DictConfig, flow: FlowRun, report: dict[str, Any]) -> Failu
 
 
 def _write_tracks(kind: Any, flow: FlowRun, output: Path) -> Failures:
-    """Write the tracks of each log of this shard whose frames, also those of other shards, are all complete."""
+    """Write the tracks of each log of this shard. Skip logs with incomplete frames, in this or another shard."""
     failures: Failures = []
     stored = run.stored_flow(output, ())
     for unit in tqdm(flow.shard.units(flow.sources.logs), desc="tracks", unit="log", disable=None):

@@ -1,6 +1,6 @@
 """Prints the versions of cflow_torch and of the packages that it uses, the system, the processor and the GPUs.
 
---full adds what torch knows about the system, and the optional packages that are not installed.
+--full adds torch's report about the system, and names the optional packages that are not installed.
 
 examples:
   cflow info            paste the output into a bug report
@@ -51,7 +51,7 @@ def processor() -> str:
 
 
 def _requirements() -> set[str]:
-    """Names of the packages that the core and the extras need; none for a checkout that is not installed."""
+    """Return the names of the packages that the core and the extras need; none if this package is not installed."""
     with suppress(metadata.PackageNotFoundError):
         return {re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in metadata.requires("cflow_torch") or []}
     return set()

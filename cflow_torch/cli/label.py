@@ -1,11 +1,11 @@
 """Writes pseudo-labels into OpenSceneFlow's HDF5 scenes, for the training of SeFlow, SeFlow++ and TeFlow.
 
-Each sweep gets the keys dufo (dynamic), dufocluster, cluster and nnd, and ground_mask if it has none, with the types
-and meanings of OpenSceneFlow's own scripts. First, the command estimates the flow like `cflow flow`, with the preset
-offline, which uses earlier and later sweeps. Then each scene is copied, labelled and replaced, so a killed run leaves
-the old scene or the new one. Run the command again to resume; labelled scenes are skipped. The report is next to the
-scenes, cflow_label-0-of-1.json. You can delete OUTPUT when all scenes are labelled. With shards, the process that
-completes the flow of a scene labels it. The exit statuses are those of `cflow flow`.
+Each sweep gets the keys dufo (dynamic), dufocluster, cluster and nnd. It gets ground_mask if it has none. Types and
+meanings are those of OpenSceneFlow's own scripts. First, the command estimates the flow like `cflow flow`, with the
+preset offline, which uses earlier and later sweeps. Then each scene is copied, labelled and replaced, so a killed run
+leaves the old scene or the new one. Run the command again to resume; labelled scenes are skipped. The report,
+cflow_label-0-of-1.json, is next to the scenes. You can delete OUTPUT when all scenes are labelled. With shards,
+the process that completes the flow of a scene labels it. The exit statuses are those of `cflow flow`.
 
 examples:
   cflow label /data/scenes/train

@@ -34,7 +34,7 @@ _WITHOUT_SETTINGS = ("settings", "info")
 _NAMES = ("output", "log", "flow", "archive", "frames", "masks", "result_name", "data.root", "data.cache")
 # Hydra reads these values as numbers or booleans: 1e5, 2024_11_22, true.
 _NOT_TEXT = re.compile(r"[+-]?[._]*\d[\d._]*(e[+-]?[\d_]+)?|true|false", re.IGNORECASE)
-_READABLE = re.compile(r"[\w./\\:+%@?|*$ -]*", re.ASCII)  # without quotes
+_READABLE = re.compile(r"[\w./\\:+%@?|*$ -]*", re.ASCII)  # values that need no quotes
 _WITH_VALUE = ("-c", "--cfg", "-p", "--package", "-i", "--info", "-cd", "--config-dir", "-cn", "--config-name", "-cp")
 _GRAMMAR = re.compile(r"['\"\[{]|(choice|glob|range|shuffle|sort|str|tag)\(|.*\$\{")  # Hydra's own syntax
 
@@ -99,7 +99,7 @@ def _run(arguments: list[str]) -> None:
 
 
 def _help(command: str, has_settings: bool) -> str:
-    """The help of a command: the docstring of its module, which is not imported, and its settings."""
+    """Return the help of a command: its settings and the docstring of its module, which is not imported."""
     from cflow_torch.cli.choices import settings_help
 
     spec: Any = find_spec(f"cflow_torch.cli.{command}")
@@ -119,7 +119,7 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     main_of = hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=command)
     try:
-        # The folder of a job is named after the swept settings and those that distinguish sweeps into the same output.
+        # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
         parsed = OverridesParser.create().parse_overrides(overrides)
         fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
         unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}
@@ -137,7 +137,7 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
 def split(arguments: list[str]) -> tuple[list[str], list[str]]:
     """Split the arguments of a command into settings, with quoted names, and options with their values.
 
-    Hydra accepts no option, such as `-m`, between two settings. A path by itself means data.root. Without quotes, Hydra
+    Hydra accepts no option, such as `-m`, between two settings. A word without "=" is data.root. Without quotes, Hydra
     would read the Waymo segment log=10203656353524179475_7625_000_7645_000 as a whole number, and it would reject
     output=Ausgänge.
     """

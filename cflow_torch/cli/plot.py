@@ -1,6 +1,6 @@
 """Draws one pair of sweeps, or an animation of a log: OUTPUT/<picture>.png (animation: .gif or .mp4).
 
-log=ID pair=N choose the pair. Without log=, the first log is drawn.
+log=ID and pair=N choose the pair. Without log=, the first log is drawn.
 
 picture=flow         the flow from above; truth=true|false|auto adds the ground truth and the error
 picture=clusters     the points by cluster

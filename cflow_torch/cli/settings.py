@@ -35,7 +35,7 @@ _PAGE = """# Settings
 Settings have the same names in Python, `make_config("paper", max_speed=30.0)`, on the command line, `model=paper
 model.max_speed=30`, and in a sweep, `-m model.num_history=0,2,4`. null is None in Python. Words such as Alg. clustering
 are labels of the paper. If a name or a value is wrong, the error message lists what is allowed."""
-# The values are literals, because the harness's eval.yaml and save.yaml define nothing to refer to.
+# The values are literals, because the harness's eval.yaml and save.yaml define no settings that they could refer to.
 _HARNESS = """\
 # CorrelationFlow, preset {preset}: hydra.searchpath=[pkg://cflow_torch.configs.opensceneflow] model={name}
 # For OpenSceneFlow. Written by `cflow settings --opensceneflow FOLDER`; `cflow settings` says what each setting does.
@@ -51,7 +51,7 @@ target:
   voxel_size: [0.1, 0.1, 2000.0]  # the harness asks for it; without effect, pixel_sizes counts
 """
 _COMMANDS = sorted(file.stem for file in CONFIGS.glob("*.yaml") if file.stem != "hydra")
-_Z = 1000.0  # metres, in place of infinite bounds of z, because the harness computes with the region
+_Z = 1000.0  # metres, replaces infinite bounds of z, because the harness computes with the bounds
 
 
 def task(arguments: list[str]) -> None:

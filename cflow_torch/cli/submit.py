@@ -70,7 +70,7 @@ def task(cfg: DictConfig) -> None:
 
 
 def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, masks: _Masks) -> tuple[Plan, Failures]:
-    """List the frames that are needed, with their rows; collect those whose sweep cannot be read."""
+    """List the needed frames with their numbers of rows, and the frames whose sweep cannot be read."""
     frames.require_logs(logs, listed)
     wanted = [frame for log in logs for frame in frames.plan_log(log, listed)]
     if not wanted:

@@ -111,7 +111,7 @@ def _results(
     for index in Progress(pairs, log.log_id):
         result = None
         with run.collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
-            window(log, index)  # reads both sweeps, which the file needs
+            window(log, index)  # fails now if a sweep cannot be read, not while the file is written
             log.labels(index)
             result = flow(log, index)
         if result is not None:
