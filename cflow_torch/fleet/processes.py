@@ -53,7 +53,7 @@ class ChildProcess:
         list(self._answers())
 
     def call(self, *arguments: Any) -> Iterator[Any]:
-        """Yield what a call yields, as it happens; start a process if there is none. Errors as in `start`."""
+        """Yield the answers to a call as they arrive; start a process if there is none. Errors as in `start`."""
         if self._process is None:
             self.start()
         with suppress(OSError):  # the process has died: `_answers` finds out how

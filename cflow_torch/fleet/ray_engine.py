@@ -122,7 +122,7 @@ class _Process(ChildProcess):
 
     def close(self) -> None:
         if self._actor is not None:
-            with suppress(Exception):  # the actor has ended with its cluster
+            with suppress(Exception):  # the actor may have ended with its cluster
                 self._ray.kill(self._actor)
 
     def _get(self, answer: Any) -> Any:

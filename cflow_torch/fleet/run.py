@@ -163,7 +163,7 @@ class Counters:
             "frames": numbers of frames: "total", "complete_before", "computed", "failed" and "waiting" (not done, of
             opened logs); numbers of logs or parts of logs: "failed_logs" and "unopened_units".
             "frames_per_s": computed frames. "stages": seconds per computed frame, summed over all workers.
-            "failures" and "waiting": lists of frames. "notes": log, message and how often.
+            "failures": frame or log, and message. "waiting": frames. "notes": log, message and how often.
         """
         computed = self.total - self.num_before - self.num_failed - len(self.waiting)
         return {

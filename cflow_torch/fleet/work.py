@@ -101,7 +101,7 @@ class Worker:
                 yield Done(unit.number, frame.timestamp, frame.seconds)
 
     def close(self) -> None:
-        """Close the log. Reads and writes that hang are not waited for."""
+        """Close the log. We do not wait for reads and writes that hang."""
         self._reader.shutdown(wait=False)
         self._writer.shutdown(wait=False)
         if self._log is not None:
