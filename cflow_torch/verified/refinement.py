@@ -64,10 +64,10 @@ def register_deskewed(
         start: (G, 2) float64, x and y, metres per sweep interval, from which registration starts.
 
     Returns:
-        The motion, and the apparent motion, which registration finds. Without times, both are equal. With times, the
-        motion is the apparent motion divided by `VoxelPairs.stretch`. In windows with history, we then de-skew the
-        points and register them again, from the start divided by the same factor. We do not de-skew pairs, because
-        their smooth surfaces would slide along the pattern of the beams, and only a third sweep can prevent that.
+        The motion, and the apparent motion, which registration finds. Without times, both are equal. With times, we
+        divide the translation by `VoxelPairs.stretch`. In windows with history, we then de-skew the points by the new
+        motion, and register them again from `start / stretch`. Windows of two sweeps are not de-skewed, because
+        without a third sweep, smooth surfaces would slide along the pattern of the beams.
 
     Convention: times of 0 give the same bits as no times.
 
