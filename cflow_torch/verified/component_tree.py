@@ -243,7 +243,7 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
 
 
 def number_objects(name: Tensor, num_names: int) -> Objects:
-    """Number the objects. `name` is the component that each pixel belongs to, (P,) int64; `num_names` is none."""
+    """Number the objects. `name`, (P,) int64, is the component of each pixel, or `num_names` if it has none."""
     is_used = torch.zeros(num_names + 1, dtype=torch.bool, device=name.device).index_fill_(0, name, True)
     component = flat_nonzero(is_used[:-1])
     position = torch.arange(len(name), device=name.device)

@@ -38,7 +38,7 @@ _FADE = 0.72  # how far the pixels behind the matches fade to white, 0 ... 1
 
 
 def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int | None = None) -> Figure:
-    """Draw coarse to fine, one column per pixel size.
+    """Draw coarse to fine: one column per pixel size, and one more.
 
     Args:
         window: sweeps.
@@ -48,8 +48,8 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
 
     Returns:
         Figure, 1600 pixels wide. The upper row is a close-up of one cluster: t+1, and t moved by the flow of coarser
-        scales. The last column moves t by the whole flow. The lower row has the flow after each scale, in the colours
-        of the wheel. Its last column has the flow of a run with the finest pixels alone.
+        scales. Its extra column moves t by the whole flow. The lower row has the flow after each scale, in the colours
+        of the wheel. Its extra column has the flow of a run with the finest pixels alone.
 
     Convention: metres, frame of t+1.
 
