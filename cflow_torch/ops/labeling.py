@@ -83,8 +83,8 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
         connectivity: 4 or 8.
 
     Returns:
-        The components of each set. A component is named by one of its blocks, not by its first pixel. `num_components`
-        is the same for all sets, and the components of a set follow those of the set before.
+        The components of each set. The number of a component is that of one of its blocks that have set pixels. Sets
+        share the numbering: the numbers of a set follow those of the set before, and `num_components` is the same.
 
     Cost: one pass over the images, a few rounds of union-find over their blocks, and some host synchronisations. The
     number of kernel launches hardly grows with the number of sets.
