@@ -63,7 +63,7 @@ class SizeClass(NamedTuple):
 
 @dataclass(frozen=True)
 class Packing:
-    """J templates and N targets in the shapes of their classes, class after class, templates before targets."""
+    """J templates and N targets, padded to their size class. Class follows class, with its templates first."""
 
     samples: Tensor  # (A,) bool, all images
     classes: list[SizeClass]  # size classes, in order

@@ -37,7 +37,7 @@ class CorrelationFlowKeypoints(CoarseToFine):
 
     @property
     def bytes_per_point(self) -> int:  # type: ignore[override]
-        """Working memory per point, including two copies of a descriptor for at most half of the points."""
+        """Working memory per point. At most half of the points have a descriptor, stored twice."""
         return int(super().bytes_per_point) + int(self.config.patch_size) ** 2
 
     def motion_at_scale(self, sweeps: ProjectedSweeps) -> Motion:
