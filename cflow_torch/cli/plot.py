@@ -6,7 +6,7 @@ picture=flow         the flow from above; truth=true|false|auto adds the ground 
 picture=clusters     the points by cluster
 picture=keypoints    the key points of both sweeps and their matches (model=keypoints)
 picture=correlation  one cluster and the correlation of all its shifts (model=paper); cluster=ID chooses it
-picture=scales       one cluster and the flow, coarse to fine, a column per pixel size and one more (model=paper, 3 sizes)
+picture=scales       one cluster and the flow, coarse to fine: a column per pixel size, one more (model=paper, 3 sizes)
 picture=animation    the flow of many pairs: first= step= count= format=gif|mp4 frames_per_second= width=
 
 examples:
