@@ -135,11 +135,11 @@ def _run_with_settings(command: str, rest: list[str]) -> None:
 
 
 def split(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Split the arguments of a command into settings, with quoted names, and options with their values.
+    """Split the arguments of a command into settings, and options with their values.
 
-    Hydra accepts no option, such as `-m`, between two settings. A word without "=" is data.root. Without quotes, Hydra
-    would read the Waymo segment log=10203656353524179475_7625_000_7645_000 as a whole number, and it would reject
-    output=Ausgänge.
+    Hydra accepts no option, such as `-m`, between two settings. A word without "=" is data.root. We quote names of
+    files, folders and logs. Without quotes, Hydra would read the Waymo segment
+    log=10203656353524179475_7625_000_7645_000 as a whole number, and it would reject output=Ausgänge.
     """
     overrides, options = [], []
     for before, word in zip(["", *arguments], arguments):

@@ -37,7 +37,7 @@ _ROUNDS, _JUMPS = 3, 3
 
 @dataclass(frozen=True)
 class Blocks:
-    """Components of the blocks of a set of padded images."""
+    """The connected component of each square block of pixels in a set of padded images."""
 
     side: int  # pixels per side of a block
     cols: int  # blocks per row

@@ -41,8 +41,8 @@ def require_memory(num_bytes: int, device: torch.device, what: str, remedy: str)
 
 
 def available_memory(environ: Mapping[str, str]) -> int | None:
-    """Return the bytes that this process may still allocate: free memory within the limits of its control groups. The
-    processes of a torchrun job on this machine (`environ`) share them. None if the system does not report it."""
+    """Return the bytes that this process may still allocate: free memory within the limits of its control groups. In a
+    torchrun job, this is divided by LOCAL_WORLD_SIZE of `environ`. None if the system does not report it."""
     free = []
     with suppress(OSError, StopIteration, ValueError):
         lines = Path("/proc/meminfo").read_text().splitlines()
