@@ -38,7 +38,8 @@ class TemplatePairs:
 def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max_speed: float | None) -> TemplatePairs:
     """Make a pair for every cluster and every earlier sweep in which it has pixels.
 
-    `pixel_size` is in metres, one for all M clusters or (M,) float64. `max_speed` is in m/s; None = half the box.
+    `pixel_size` is in metres, one for all M clusters or (M,) float64. `max_speed` is in m/s; with None, we
+    search shifts of up to half the box.
     """
     num_sources, pixels = batch.num_steps - 1, clusters.pixels
     num_slots = clusters.window.numel() * num_sources
