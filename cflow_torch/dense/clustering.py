@@ -115,7 +115,7 @@ def label_components(image: Tensor, pixels: Tensor, pixel_size: float, config: C
     """Label the components of dilated images; erode those that are too long and label them again (Alg. clustering).
 
     `image` is (B, H, W) bool. `pixels` are the flat indices of its set pixels, (P,) int64, ascending. The result, (P,)
-    int64, names each pixel's component by the position in `pixels` of its first pixel in raster order.
+    int64, gives for each pixel the position in `pixels` of the first pixel of its component.
     """
     _, height, width = image.shape
     padded = pad([image])
