@@ -51,7 +51,7 @@ class Config:
     )
     max_memory: Optional[float] = setting(
         None,
-        "bytes of working memory that the method may plan with. None = no limit",
+        "bytes of working memory that the method may plan with. None = no limit on a GPU, 512 MiB on a CPU",
         kind=float,
         optional=True,
         above=0,

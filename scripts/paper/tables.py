@@ -36,8 +36,8 @@ INTRODUCTION = """# The paper's tables next to ours
 
 The score is the dynamic bucket-normalised EPE, averaged over classes; lower is better. Rows "paper" are of Argoverse 2
 val, or of the set that they name. Rows "benchmark (av2)" are ours, on simulated drives: compare whether a change helps,
-not the numbers. The line "benchmark (av2): ..." below a table describes our run. A table without it has the run of the
-table above. The CSV files next to the pictures have the score of each class. docs/settings.md has the commands.
+not the numbers. The line "benchmark (av2): ..." below a table describes our run. A table without it is of the same run
+as the table above. The CSV files next to the pictures have the score of each class. docs/settings.md has the commands.
 """
 Cells = List[List[str]]
 
