@@ -50,7 +50,7 @@ class Route:
         return self.speed == 0 and self.acceleration == 0
 
     def at(self, distance: np.ndarray) -> np.ndarray:
-        """(T, 3) float64 world x, y, yaw after `distance` (T,) metres from the beginning of the arc."""
+        """(T, 3) float64 world x, y, yaw at `distance` (T,) metres from the beginning of the arc."""
         side = math.copysign(1.0, self.angle)
         angle = np.clip(distance / self.radius, 0, abs(self.angle))
         beyond = np.maximum(distance - self.radius * abs(self.angle), 0)

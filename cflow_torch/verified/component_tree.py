@@ -97,14 +97,14 @@ class Objects:
 
 
 def find_components(sweeps: HeightSlicedSweeps, change: ChangedPixels, blocks: Sequence[int]) -> Components:
-    """Label the components of all scales by one union-find, and apply the static test.
+    """Label the components of all scales by one union-find, and find which of them may move.
 
     Args:
         blocks: side of a pixel at each scale in finest pixels, coarse to fine, the last one 1. Each scale is dilated as
             in Alg. clustering, but not eroded, so the scales are nested. The last level has the plain components: those
             of the finest pixels without dilation.
 
-    Convention: the static test excludes motions only in windows with history.
+    Convention: with history, a component cannot move if at most 5 % of its pixels have a missing slice.
 
     Cost: one pass over the images of each scale, a few rounds of union-find, some passes over the pixels.
     """
