@@ -58,7 +58,7 @@ class LidarChain(NamedTuple):
 
 
 class Annotations(NamedTuple):
-    """The A boxes of one scene, at its samples."""
+    """A number A of boxes: those of a scene at all its samples (key frames), or those at one time (`Tracks.at`)."""
 
     time: np.ndarray  # (A,) int64, microseconds
     track: Sequence[str]  # A instance tokens
