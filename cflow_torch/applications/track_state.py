@@ -102,7 +102,7 @@ class Tracks(NamedTuple):
         self.write(index, start=self.box[index], start_length=self.size[index, 0], travel=0.0, evidence=0.0)
 
     def have_shown_motion(self) -> Tensor:
-        """(K,) bool: the track moves, and its box has moved about as its flow predicts.
+        """(K,) bool: the track moves, and its box has moved roughly as its flow predicts.
 
         If `evidence` is high, both ends of the box must have moved at least a little: a piece of a wall may have flow,
         but its box then grows, shrinks or jumps. Otherwise, the box must have moved far, and very nearly as predicted.

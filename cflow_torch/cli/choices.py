@@ -45,7 +45,7 @@ def defaults(command: str, chosen: Mapping[str, Any] | None = None) -> Iterator[
 
 
 def own_settings(file: Path) -> dict[str, Any]:
-    """Return the dotted settings of a YAML file and of the files that it extends, with their defaults."""
+    """Return {dotted name: default} of the settings in a YAML file and in the files that it extends."""
     content, found = _load(file), {}
     for base in content.get("defaults", ()):
         if isinstance(base, str) and base not in ("_self_", "hydra"):
