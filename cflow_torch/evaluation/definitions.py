@@ -39,7 +39,7 @@ class Definition:
         average: average of the three-way end-point errors and IoU. "points": over all points of all frames, NaN where
             there are none. "frames": over frames, where a frame without points of a set counts as 0.
         nan_rows: "drop": a point with NaN in position, truth or prediction is not scored, which flatters a method that
-            returns NaN (`num_nan` counts them). "error": such a point is an error.
+            returns NaN (`num_nan` counts them). "error": NaN raises a `CFlowError`.
         norm_dtype: precision in which lengths of residuals are computed.
         dynamic_threshold: metres per frame; true or predicted residual from which a point is dynamic (three-way).
         speed_edges: metres per frame, ascending edges of the buckets; the first is "static". Lower edges are included.

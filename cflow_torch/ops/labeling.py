@@ -145,7 +145,7 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
         reach: 1 (plain) or 3 (as after a 3 x 3 dilation).
 
     Returns:
-        (P,) int64: the position in `pixels` of the first pixel, in raster order, of the component of each pixel.
+        (P,) int64: for each pixel, the position in `pixels` of the first pixel of its component, in raster order.
 
     Convention:
         Components never join across images. The result does not depend on thread count or device.

@@ -102,14 +102,14 @@ class MovingSolids:
 
 @dataclass(frozen=True)
 class Shots:
-    """The C columns of B shots that a unit fires in one sweep.
+    """The shots of one LiDAR in one sweep: C columns of B shots.
 
     Args:
         azimuth: (C,) float64 radians, sensor frame, in the order of time, evenly spaced.
         seconds: (C,) float64, evenly spaced.
         T_world_sensor: (C, 4, 4) float64, relative to the `origin` of the solids.
         elevation: (B,) float64 radians, ascending.
-        speed: (2,) upper bounds of the unit's motion, m/s and rad/s.
+        speed: (2,) upper bounds of the LiDAR's motion, m/s and rad/s.
     """
 
     azimuth: Tensor

@@ -226,7 +226,7 @@ class HeightSlicedSweeps:
 
     @cached_property
     def row_of_point(self) -> Tensor:
-        """(N + K,) int64, row in the batch of each point, then of each copy."""
+        """(N + K,) int64, batch row of each point, then of each copied point."""
         return torch.cat((torch.arange(self.batch.image.numel(), device=self.copied.device), self.copied))
 
 

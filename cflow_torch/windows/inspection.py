@@ -36,9 +36,9 @@ _LEAST_MOTION, _REACH = 0.3, 30.0  # metres; we judge ego motions that move a po
 class Inspection:
     """Warns of likely mistakes in the windows of a model.
 
-    In every window, it checks that pc1 does not repeat pc0. It makes the other checks once, in the first window of a
-    call. The first time that this window has points, it checks that z points up and ground is masked. The first time
-    that the sensor moves in it, it checks poses and order of sweeps. Cost: about 20 ms, once; 5 us for each window.
+    In every window, it checks that pc1 does not repeat pc0. It makes the other checks once each, only in the first
+    window of a call. Once such a window has points, it checks that z points up and ground is masked. Once the sensor
+    moves in such a window, it checks poses and order of sweeps. Cost: about 20 ms, once; 5 us for each window.
     """
 
     def __init__(self) -> None:
