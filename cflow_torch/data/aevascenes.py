@@ -173,7 +173,7 @@ class Cloud:
     def column(self, key: str, dtype: Any) -> np.ndarray:
         """Return one value per point, (N,) of `dtype`; np.str_ gives an object array of strings."""
         with file_errors(f"{self.file}: {key}", _HINT):
-            values = self._texts(key) if dtype is np.str_ else self._arrays[key].astype(dtype)
+            values = self._texts(key) if dtype is np.str_ else self._arrays[key].astype(dtype, casting="same_kind")
             return values.reshape(len(self.points))
 
     def _texts(self, key: str) -> np.ndarray:

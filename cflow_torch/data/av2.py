@@ -73,6 +73,8 @@ def read_ground_raster(map_folder: Path) -> GroundRaster | None:
     with file_errors(alignments[0], "copy the map folder again"):
         alignment = read_json(alignments[0])
         rotation, translation, scale = (np.array(alignment[key], dtype=np.float64) for key in "Rts")
+        if not all(np.isfinite(values).all() for values in (rotation, translation, scale)):
+            raise CFlowError("its numbers must be finite; copy the map folder again")
         return GroundRaster(heights.astype(np.float64), rotation.reshape(2, 2), translation.reshape(2), float(scale))
 
 

@@ -118,6 +118,12 @@ def test_class_names_of_every_pickle_protocol_are_read(tmp_path: Path, protocol:
     assert Cloud(tmp_path / "b.npz").column("semantic_labels", np.str_).tolist() == ["car", "road"]
 
 
+def test_times_with_fractions_are_an_error(tmp_path: Path) -> None:
+    save(tmp_path / "a.npz", xyz=np.zeros((3, 3)), time_offset_ns=np.full(3, 0.5))
+    with pytest.raises(CFlowError, match="a.npz: time_offset_ns.*Cannot cast"):
+        Cloud(tmp_path / "a.npz").column("time_offset_ns", np.int64)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [

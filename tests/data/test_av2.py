@@ -199,6 +199,9 @@ def test_a_map_gives_ground_masks(folder: Path) -> None:
     sweep = AV2Log(folder).sweep(0)
     np.testing.assert_array_equal(sweep.is_ground, [False, False, True])  # z = 3, 0.5, 0
     np.testing.assert_array_equal(AV2Log(folder, ground="bsfe").sweep(0).is_ground, [False, False, True])
+    sim2.write_text(json.dumps({"R": [1, 0, 0, 1], "t": [float("nan"), 10], "s": 1.0}))
+    with pytest.raises(CFlowError, match="img_Sim2_city.json: its numbers must be finite"):
+        AV2Log(folder)
     sim2.write_text("{}")
     with pytest.raises(CFlowError, match="cannot read .*img_Sim2_city.json.*copy the map folder again"):
         AV2Log(folder)

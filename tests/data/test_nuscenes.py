@@ -159,6 +159,12 @@ def test_inconsistent_tables_are_refused(tiny, table, change, complaint):
         open_log(tiny)
 
 
+def test_two_scenes_of_one_name_are_an_error(tiny):
+    edit(tiny, "scene", lambda rows: rows + rows[:1])
+    with pytest.raises(CFlowError, match="scenes but 1 names"):
+        find_nuscenes_scenes(tiny)
+
+
 def test_a_missing_sweep_is_named(tiny):
     min((tiny / "samples" / "LIDAR_TOP").iterdir()).unlink()
     with pytest.raises(CFlowError, match=r"\.bin is missing; copy"):
@@ -168,7 +174,8 @@ def test_a_missing_sweep_is_named(tiny):
 def test_a_bad_sweep_costs_no_other(tiny):
     file = min((tiny / "samples" / "LIDAR_TOP").iterdir())
     whole, log = file.read_bytes(), open_log(tiny)
-    for content, complaint in [(whole[:-1], "not a multiple of 20"), (b"", "is empty")]:
+    kitti = np.random.default_rng(0).uniform(-50, 50, (100, 4)).astype("<f4").tobytes()  # four columns: 1600 bytes
+    for content, complaint in [(whole[:-1], "multiple of"), (b"", "is empty"), (kitti, "not a ring index")]:
         file.write_bytes(content)
         with pytest.raises(CFlowError, match=f"{file.name}.*{complaint}"):
             log.sweep(0)

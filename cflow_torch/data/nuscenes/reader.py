@@ -7,12 +7,11 @@ from typing import ClassVar, Literal, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, points_in_box
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
-from cflow_torch.data.paths import PathLike, as_path, path_inside
+from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
 from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
@@ -192,10 +191,13 @@ class NuScenesLog(Log):
 
     def _points_of(self, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
         """Return (N, 3) points in the frame of the LiDAR, and the (N,) int64 microseconds of shots; None = unknown."""
-        points = read_cloud(file, _COLUMNS)
-        if len(points) == 0:
+        with file_errors(file):
+            rows = np.frombuffer(read_bytes(file), "<f4").reshape(-1, _COLUMNS)
+        if len(rows) == 0:
             raise CFlowError(f"{file} is empty; copy it again")
-        return points, None
+        if not np.isin(rows[:, 4], np.arange(256)).all():
+            raise CFlowError(f"{file}: column 5 is not a ring index (0 ... 255); is it a .pcd.bin of nuScenes?")
+        return rows[:, :3].astype(np.float32), None
 
     def _is_own(self, points: np.ndarray, index: int) -> np.ndarray:
         """Return (N,) bool: in the footprint of the recording vehicle or the box of its trailer. Points: ego frame."""

@@ -121,8 +121,11 @@ class Tables:
     @cached_property
     def scenes(self) -> dict[str, str]:
         """Name of each scene -> its token."""
-        what = f"{self.folder / 'scene.json'}: the scene"
-        return {safe_name(row["name"], what): row["token"] for row in read_table(self.folder, "scene")}
+        rows, file = read_table(self.folder, "scene"), self.folder / "scene.json"
+        scenes = {safe_name(row["name"], f"{file}: the scene"): row["token"] for row in rows}
+        if len(scenes) < len(rows):
+            raise CFlowError(f"{file} has {len(rows)} scenes but {len(scenes)} names; {_COPY}")
+        return scenes
 
     def scene(self, name: str) -> tuple[np.ndarray, dict[str, LidarChain], Annotations]:
         """Return the rows of a scene, linked and checked: sample times, LiDARs by channel as in sensor.json, and boxes.
