@@ -226,14 +226,15 @@ def select_objects(nodes: Nodes, components: Components, evidence: Tensor, num_p
     for _ in range(num_levels - 1):  # winners spread to their descendants, a level at a time
         winner = torch.minimum(winner, winner.index_select(0, parent))  # nodes are numbered coarse to fine
 
-    # The last node of a pixel is its node of changed pixels or under an overhang; without one, it is its finest node.
+    # A pixel is in many nodes: those of the tree, those of changed pixels (its own or one that it joined, see
+    # `add_unchanged`), or one under an overhang. At most one of those outside the tree has evidence.
     is_other = nodes.level >= num_levels
-    both = torch.stack((nodes.node, nodes.node.masked_fill(is_other.index_select(0, nodes.node), -1)))
+    finest_or_none = nodes.node.masked_fill(is_other.index_select(0, nodes.node), -1)
+    other_or_none = nodes.node.masked_fill(~(is_other & (evidence > 0)).index_select(0, nodes.node), -1)
+    both = torch.stack((finest_or_none, other_or_none))
     largest = both.new_full((2, num_pixels), -1).scatter_reduce_(1, nodes.pixel.expand_as(both), both, "amax")
-    last, finest = largest.remainder_(count + 1)  # -1 becomes "none"
-    moving = winner.index_select(0, finest)
-    other = torch.where(lookup(is_other & (evidence > 0), last), last, count)
-    moving = torch.minimum(moving, other)
+    finest, other = largest.remainder_(count + 1)  # -1 becomes "none"
+    moving = torch.minimum(winner.index_select(0, finest), other)
     none, num_own = components.count + count, components.roots.shape[1]
     static = torch.where(components.is_linked.index_select(0, components.roots[-1]), components.roots[-1], none)
     static = F.pad(static, (0, num_pixels - num_own), value=none)

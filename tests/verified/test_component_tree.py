@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import FrozenSet, NamedTuple, Tuple
 
@@ -145,6 +146,22 @@ def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_
     assert nodes.level.tolist() == [0, 1, 1] and nodes.parent.tolist() == [3, 0, 0]
     objects, node = select_objects(nodes, components, torch.tensor([whole, 100, 100]), sweeps.num_pixels)
     assert node.tolist() == ([0] if wins else [1, 2])
+
+
+def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_of_it_has_no_evidence():
+    images = np.zeros((1, 3, 9, 20), dtype=np.uint8)
+    images[0, :2, 4, 2:5] = images[0, :2, 4, 9:12] = 1  # two components of changed pixels
+    sweeps = from_images(images, SIZE)
+    every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
+    components = find_components(sweeps, ChangedPixels(every, every), (1,))
+    nodes = movable_nodes(sweeps, components, None)
+    first, second = (nodes.level == components.num_levels).nonzero()[:, 0].tolist()
+    joined = nodes.pixel[nodes.node == second][:1]
+    nodes = replace(nodes, pixel=torch.cat((nodes.pixel, joined)), node=torch.cat((nodes.node, joined * 0 + first)))
+    evidence = torch.zeros(nodes.count, dtype=torch.int64)
+    evidence[first] = 100
+    objects, node = select_objects(nodes, components, evidence, sweeps.num_pixels)
+    assert node[objects.of_pixel[joined]].tolist() == [first]
 
 
 @pytest.mark.parametrize("num_missing, may_move", [(0, False), (1, False), (2, True)])
