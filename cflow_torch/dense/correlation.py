@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterator, NamedTuple
+from typing import Iterator
 
 import torch
 import torch.nn.functional as F
@@ -12,20 +12,20 @@ from torch import Tensor
 from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
-from cflow_torch.dense.packing import Packing, Search, pack, shift_at
+from cflow_torch.dense.packing import ImageClass, Search, pack
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
-from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.cross_correlation import cross_correlate
-from cflow_torch.ops.indices import flat_nonzero, largest_of_rows, take_columns
-from cflow_torch.ops.segments import segment_amin
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import flat_nonzero, largest_of_rows, split_index, take_columns
 from cflow_torch.ops.window_counts import WindowCounts
+from cflow_torch.windows.bev_grid import LONGEST_SIDE
 
 # Working memory of a pair per sample of its class: spectra, counts and tables.
 _BYTES_PER_SAMPLE = 48
-# Samples of templates in one call of the correlation, and samples of counts in one run. On a CPU both must fit the
-# cache (we tried 2^14 ... 2^26). A GPU needs few launches.
-_PER_CALL_CPU, _PER_RUN_CPU = 1 << 18, 1 << 21
-_PER_CALL_GPU, _PER_RUN_GPU = 1 << 26, 1 << 26
+# Samples of templates in one call of the correlation. On a CPU they must fit the cache (we tried 2^14 ... 2^26). A GPU
+# needs few launches.
+_PER_CALL_CPU = 1 << 18
+_PER_CALL_GPU = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -92,125 +92,123 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
     limited size.
     Source: Eq. norm_correlation, displacement_in_bev, Alg. scene_flow_1view.
     """
-    num_pairs, device = pairs.cluster.numel(), pairs.size.device
+    num_pairs = len(pairs.cluster)
     if num_pairs == 0:
-        return pairs.cluster.new_zeros((0, 2)), torch.zeros(0, dtype=torch.float32, device=device)
+        return pairs.cluster.new_zeros((0, 2)), torch.zeros(0, dtype=torch.float32, device=pairs.size.device)
     packing = pack(pairs)
-    radius = None if pairs.radius is None else pairs.radius.index_select(0, packing.pairs)
-    target_energy = packing.energy.index_select(0, packing.clusters + num_pairs)
-    runs = _correlation_runs(packing, engine, max_memory)
-    packed, dy, dx, count = torch.cat([_candidates(run, packing.search, target_energy, radius) for run in runs], 1)
+    square = None if pairs.radius is None else (pairs.radius * pairs.radius).floor()  # (J,), of the longest shift
+    target_energy = packing.energy.index_select(0, num_pairs + pairs.cluster)  # (J,)
+    found = []
+    for images in packing.classes:
+        for some, counts in _correlate(images, engine, max_memory):
+            pair = images.pair[some]
+            longest = None if square is None else square[pair]
+            needed = _least_count(packing.search[pair], counts, target_energy[pair], longest)
+            row, sample = split_index(flat_nonzero(counts > needed[:, None]), counts.shape[1])
+            found.append(torch.stack((pair[row], sample, counts[row, sample].long())))
+    pair, sample, count = torch.cat(found, 1)  # [K]
+    search = packing.search[pair]
+    shift = search.shift_at(sample)
+    is_searched = (shift <= search.high).all(0)
+    if square is not None:
+        is_searched &= (shift * shift).sum(0) <= square.index_select(0, pair)
+    dy, dx = shift
+    candidates = _Candidates(pair, pairs.cluster.index_select(0, pair), dy, dx, count).at(flat_nonzero(is_searched))
     target = pairs.target
-    dy, dx, count, energy = _best_of_each_pair(
-        WindowCounts(target.image, target.row, target.col, packing.size),
-        packing.pairs.index_select(0, packed),
-        packing.clusters.index_select(0, packed),
-        torch.stack((dy, dx)),
-        count,
-        num_pairs,
-    )
-    energies = (packing.energy[:num_pairs] * energy).clamp_(min=1)  # 0 where nothing overlaps
-    return torch.stack((dy, dx), 1), (count.double() / torch.sqrt(energies.double())).float()
+    windows = WindowCounts(target.image, target.row, target.col, packing.size)
+    best = _best_of_each_pair(candidates, windows, num_pairs)
+    energies = (packing.energy[:num_pairs] * best.energy).clamp(min=1)  # 0 where nothing overlaps
+    score = best.count.double() / torch.sqrt(energies.double())
+    return torch.stack((best.dy, best.dx), 1), score.float()
 
 
-class _Run(NamedTuple):
-    """Correlation counts of consecutive packed pairs."""
+@dataclass(frozen=True)
+class _Candidates:
+    """Shifts that may be the best of their pair, (K,) int64 each."""
 
-    pairs: slice  # the packed pairs
-    counts: Tensor  # (A,) float, counts of all pairs, one pair after the other; the next run overwrites them
-    pieces: list[Tensor]  # views of the counts, (pairs, searched samples), one for each call of the correlation
+    pair: Tensor
+    cluster: Tensor
+    dy: Tensor
+    dx: Tensor
+    count: Tensor  # coinciding pixels
+
+    def at(self, index: Tensor) -> _Candidates:
+        """Select some candidates."""
+        columns = torch.stack((self.pair, self.cluster, self.dy, self.dx, self.count))
+        return _Candidates(*take_columns(columns, index))
 
 
-def _correlation_runs(packing: Packing, engine: str, max_memory: float | None) -> Iterator[_Run]:
-    """Correlate all packed pairs, in runs that fit the cache or the memory."""
-    device, classes = packing.samples.device, packing.classes
-    per_call, per_run = (_PER_CALL_CPU, _PER_RUN_CPU) if device.type == "cpu" else (_PER_CALL_GPU, _PER_RUN_GPU)
+@dataclass(frozen=True)
+class _Best:
+    """The best shift of each pair, (J,) int64 each."""
+
+    dy: Tensor
+    dx: Tensor
+    count: Tensor  # coinciding pixels
+    energy: Tensor  # target pixels under the window
+
+
+def _correlate(images: ImageClass, engine: str, max_memory: float | None) -> Iterator[tuple[slice, Tensor]]:
+    """Yield some templates of a class, and their counts of coinciding pixels, (n, searched samples), whole numbers."""
+    per_call = _PER_CALL_CPU if images.images.device.type == "cpu" else _PER_CALL_GPU
     if max_memory is not None:
-        per_call, per_run = (min(size, int(max_memory) // _BYTES_PER_SAMPLE) for size in (per_call, per_run))
-    steps = [min(shape.templates, max(1, per_call // shape.area)) for shape in classes]
-    size = max(per_run, *(step * shape.searched for step, shape in zip(steps, classes)))
-    size = min(size, sum(shape.templates * shape.searched for shape in classes))
-    dtype = torch.float32 if max(shape.max_energy for shape in classes) < 1 << 24 else torch.float64
-    buffer = torch.empty(size, dtype=dtype, device=device)
-    pieces: list[Tensor] = []
-    first = pair = used = 0  # first pair of the run, next pair, samples used by the run
-    blocks = packing.samples.split([(shape.templates + shape.targets) * shape.area for shape in classes])
-    for block, shape, step in zip(blocks, classes, steps):
-        images = block.view(-1, shape.height, shape.width)
-        for begin in range(0, shape.templates, step):
-            num_pairs = min(step, shape.templates - begin)
-            stop = used + num_pairs * shape.searched
-            if stop > len(buffer):
-                yield _Run(slice(first, pair), buffer[:used], pieces)
-                pieces, first, used, stop = [], pair, 0, stop - used
-            called, target = images, packing.target[pair : pair + num_pairs]
-            if num_pairs < shape.templates:  # pairs are in order of targets, so they need a range of targets
-                low, high = packing.target_on_host[[pair, pair + num_pairs - 1]].tolist()
-                targets = images[shape.templates + low : shape.templates + high + 1]
-                called, target = torch.cat((images[begin : begin + num_pairs], targets)), target - low
-            counts = cross_correlate(called.view(torch.uint8).float(), num_pairs, target, engine, shape.max_energy)
-            piece = buffer[used:stop].view(num_pairs, -1)
-            pieces.append(piece.copy_(counts.flatten(1)[:, : shape.searched]).round_())
-            pair, used = pair + num_pairs, stop
-    yield _Run(slice(first, pair), buffer[:used], pieces)
+        per_call = min(per_call, int(max_memory) // _BYTES_PER_SAMPLE)
+    num_templates = len(images.pair)
+    at_once = max(1, per_call // images.area)
+    for first in range(0, num_templates, at_once):
+        some = slice(first, min(first + at_once, num_templates))
+        # Templates are in order of their targets, so they need a range of targets.
+        low, high = images.target_on_host[[some.start, some.stop - 1]].tolist()
+        targets = images.images[num_templates + low : num_templates + high + 1]
+        called = torch.cat((images.images[some], targets)).float()
+        target = images.target[some] - low
+        counts = cross_correlate(called, some.stop - some.start, target, engine, images.max_energy)
+        yield some, counts.flatten(1)[:, : images.num_searched].round_()
 
 
-def _candidates(run: _Run, search: Search, target_energy: Tensor, radius: Tensor | None) -> Tensor:
-    """Find the shifts that may be the best of their pair: (4, K) int64, packed pair, dy, dx, count.
+def _least_count(search: Search, counts: Tensor, target_energy: Tensor, square: Tensor | None) -> Tensor:
+    """Return a bound that the count of the best shift of each pair exceeds, (n,) float.
 
     The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
-    count^2 / target energy and count. A shift whose count is below such a lower bound of another shift cannot win.
-    `target_energy`, (J,) int64, and `radius`, (J,) float64, are in pixels; no radius = no limit.
+    count^2 / target energy and count. A shift whose count is below such a lower bound of another shift cannot win. We
+    take the bounds of two shifts: shift 0, and the shift of the largest count, clamped to the search range.
+
+    Args:
+        counts: (n, searched samples).
+        target_energy: (n,) int64, pixels.
+        square: (n,) float64, of the longest shift, pixels; None = no limit.
     """
-    low, high, stride = search.low[:, run.pairs], search.high[:, run.pairs], search.stride[run.pairs]
-    searched = search.searched[run.pairs]
-    end = searched.cumsum(0)
-    # Two shifts give a lower bound: shift 0, and the shift of the largest count, clamped to the search range.
-    middle, largest = low[0] * stride + low[1], torch.cat([largest_of_rows(piece) for piece in run.pieces])
-    dy, dx = torch.minimum(shift_at(largest, stride, low), high)
-    probe = middle + dy * stride + dx
-    if radius is not None:
-        square = (radius[run.pairs] * radius[run.pairs]).floor()
-        probe = torch.where(dy * dy + dx * dx <= square, probe, middle)
-    start = end - searched
-    bound = torch.maximum(run.counts.index_select(0, start + middle), run.counts.index_select(0, start + probe))
+    zero = torch.zeros_like(search.low)
+    probe = torch.minimum(search.shift_at(largest_of_rows(counts)), search.high)
+    if square is not None:
+        probe = torch.where((probe * probe).sum(0) <= square, probe, zero)
+    samples = torch.stack((search.sample_at(zero), search.sample_at(probe)), 1)  # [n, 2]
+    largest = counts.gather(1, samples).amax(1)
     # We subtract 1, because the quotient is rounded. A count of 0 never beats shift 0.
-    needed = (bound * bound / target_energy[run.pairs] - 1).clamp_(min=0.5)[:, None]
-    needed_of_piece = needed.split([len(piece) for piece in run.pieces])
-    sample = flat_nonzero(torch.cat([(piece > least).view(-1) for piece, least in zip(run.pieces, needed_of_piece)]))
-    pair = torch.searchsorted(end, sample, right=True)
-    table = take_columns(torch.cat((low, high, stride[None], start[None])), pair)
-    shift = shift_at(sample - table[5], table[4], table[:2])
-    is_searched = (shift <= table[2:4]).all(0)
-    if radius is not None:
-        is_searched &= (shift * shift).sum(0) <= square.index_select(0, pair)
-    found = torch.stack((pair + run.pairs.start, *shift, run.counts.index_select(0, sample).long()))
-    return take_columns(found, flat_nonzero(is_searched))
+    return (largest * largest / target_energy - 1).clamp(min=0.5)
 
 
-def _best_of_each_pair(
-    windows: WindowCounts, pair: Tensor, target: Tensor, shift: Tensor, count: Tensor, num_pairs: int
-) -> Tensor:
-    """Choose the best candidate of each pair: (4, J) int64, dy, dx, count, energy, all 0 for a pair without candidates.
+def _best_of_each_pair(candidates: _Candidates, windows: WindowCounts, num_pairs: int) -> _Best:
+    """Choose the best candidate of each pair, all 0 for a pair without candidates.
 
     The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels under the H x W window at
-    that shift. `pair`, `target` and `count`, (K,) int64, and `shift`, (2, K) int64, describe K candidates, in order of
-    pair, dy and dx. Ties: as in `best_shifts`.
+    that shift. Ties: as in `best_shifts`.
     """
     # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
-    parts = [windows.bounds(target[some], shift[:, some]) for some in chunks(0, len(pair), pair.device, 16)]
-    least, most = (torch.cat(bounds) for bounds in zip(*parts)) if parts else (count, count)
-    square = (count * count).double()
-    bound = square.new_zeros(num_pairs).scatter_reduce_(0, pair, square / most, "amax")
-    kept = flat_nonzero(square / torch.maximum(least, count) >= bound.index_select(0, pair))
-    pair, target, dy, dx, count = take_columns(torch.stack((pair, target, *shift, count)), kept)
-    energy = windows.count(target, torch.stack((dy, dx)))
-    value = square.index_select(0, kept) / energy
-    best_value = value.new_zeros(num_pairs).scatter_reduce_(0, pair, value, "amax")
-    # One number orders shifts by length, then by position in the list, that is by dy, then dx. It fits an int64, as
-    # images have at most 2^15 pixels a side.
-    mask, none = (1 << 31) - 1, (1 << 62) + len(kept)
-    order = torch.add(torch.arange(len(kept), device=pair.device), dy * dy + dx * dx, alpha=1 << 31)
-    order.masked_fill_(value < best_value.index_select(0, pair), none)
-    best = segment_amin(order, pair, num_pairs, none) & mask
-    return take_columns(F.pad(torch.stack((dy, dx, count, energy)), (0, 1)), best)
+    least, most = windows.bounds(candidates.cluster, torch.stack((candidates.dy, candidates.dx)))
+    square = (candidates.count * candidates.count).double()
+    of_pair = Groups(candidates.pair, num_pairs)
+    lower = of_pair.spread(of_pair.max(square / most, empty=0.0))
+    candidates = candidates.at(flat_nonzero(square / torch.maximum(least, candidates.count) >= lower))
+
+    energy = windows.count(candidates.cluster, torch.stack((candidates.dy, candidates.dx)))
+    value = (candidates.count * candidates.count).double() / energy
+    of_pair = Groups(candidates.pair, num_pairs)
+    is_best = value == of_pair.spread(of_pair.max(value, empty=0.0))
+    # Among the best, the shortest shift wins, then the smallest dy, then the smallest dx.
+    length = candidates.dy * candidates.dy + candidates.dx * candidates.dx
+    of_pair = of_pair.where(is_best)
+    of_pair = of_pair.where(length == of_pair.spread(of_pair.min(length, empty=0)))
+    raster = candidates.dy * 2 * LONGEST_SIDE + candidates.dx
+    of_pair = of_pair.where(raster == of_pair.spread(of_pair.min(raster, empty=0)))
+    return _Best(*of_pair.sum(torch.stack((candidates.dy, candidates.dx, candidates.count, energy))))
