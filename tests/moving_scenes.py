@@ -11,6 +11,7 @@ from oracle.registration import LAYER_HEIGHT, NUM_LAYERS
 from scenes import pose
 
 from cflow_torch.config import VerifiedConfig
+from cflow_torch.ops.groups import Groups
 from cflow_torch.verified.component_tree import Objects, number_objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.refinement import MOST_TIME
@@ -45,7 +46,7 @@ class Scene(NamedTuple):
         for window in range(self.sweeps.batch.num_windows):
             sweeps = for_oracle(self.sweeps, window)
             numbers = (pixels.window[self.objects.first] == window).nonzero()[:, 0].tolist()
-            of_pixel = self.objects.of_pixel[pixels.window == window].tolist()
+            of_pixel = self.objects.pixels.of_item[pixels.window == window].tolist()
             object_of = np.array([numbers.index(own) if own in numbers else -1 for own in of_pixel], dtype=int)
             result.append((sweeps, object_of, [(x, y) for x, y in self.flow[numbers].tolist()]))
         return result
@@ -56,7 +57,7 @@ def for_oracle(sweeps: HeightSlicedSweeps, window: int) -> SlicedSweeps:
     batch, grid = sweeps.batch, sweeps.grid
     elapsed, seconds = sweeps.elapsed[window].tolist(), batch.seconds[window].tolist()
     steps = [step for step, k in enumerate(elapsed) if step == 0 or k != 0]
-    is_drawn = sweeps.pixel_of_point[: batch.image.numel()] < sweeps.num_pixels
+    is_drawn = sweeps.points.is_member[: batch.image.numel()]
     rows = [is_drawn & (batch.image == window * sweeps.num_steps + step) for step in steps]
     clouds = [batch.positions.T[mine].numpy() for mine in rows]
     config = VerifiedConfig(pixel_sizes=(grid.pixel_size,), point_cloud_range=(*grid.lower, *grid.upper))
@@ -143,10 +144,11 @@ def _draw(
     assert batch.num_steps == num_steps
     sweeps = HeightSlicedSweeps.of(batch, grid)
     # The first point of a pixel says whose it is. Objects are numbered by their first pixel, so by window.
-    _, first_point = np.unique(sweeps.pixel_of_point.numpy(), return_index=True)
+    _, first_point = np.unique(sweeps.points.of_item.numpy(), return_index=True)
     of_pixel = number_of_point[inside.numpy()][first_point]
-    objects = number_objects(torch.from_numpy(np.where(of_pixel < 0, len(flows), of_pixel)), len(flows))
-    flow = np.array(flows, dtype=np.float64).reshape(-1, 2)[objects.component.numpy()]
+    name = Groups(torch.from_numpy(np.where(of_pixel < 0, len(flows), of_pixel)), len(flows))
+    objects = number_objects(name, len(flows))
+    flow = np.array(flows, dtype=np.float64).reshape(-1, 2)[objects.nodes.of_item.numpy()]
     return Scene(sweeps, objects, torch.from_numpy(flow))
 
 

@@ -45,8 +45,7 @@ def in_pieces(config: Config, windows: list[Window]) -> Results:
     pieces = {
         "ops.chunks.CHUNK_ON_CPU": 997,
         "dense.correlation._PER_CALL_CPU": 600,
-        "dense.correlation._PER_RUN_CPU": 900,
-        "verified.paired_test._AT_ONCE_CPU": 500,
+        "verified.in_place._AT_ONCE_CPU": 500,
         "keypoints.match_candidates._PAIRS_AT_ONCE_CPU": 5000,
         "keypoints.match_candidates._TILE_ROWS": 3,
         "keypoints.match_candidates._TILE_COLS": 5,

@@ -15,13 +15,18 @@ vehicle. However, no vehicle is as low as a guard rail, or as long as a noise ba
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, members_of, scatter_count, take_columns
-from cflow_torch.ops.segments import segment_amin
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import constant, flat_nonzero
 from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
+from cflow_torch.verified.in_place import count_in_place
+
+if TYPE_CHECKING:
+    from cflow_torch.verified.component_tree import Tree
 
 # A line: its largest standard deviation across and its smallest one along it, metres.
 _THIN, _LONG = 0.3, 1.0
@@ -35,15 +40,15 @@ _TALL, _RAIL = 2, 2.0
 
 
 def slides_along_itself(
-    sweeps: HeightSlicedSweeps, members: Pixels, component: Tensor, candidates: Tensor, is_covered: Tensor
+    sweeps: HeightSlicedSweeps, pixels: Pixels, groups: Groups, candidates: Tensor, travels: Tensor
 ) -> Tensor:
     """Find the motions that a static line would seem to have.
 
     Args:
-        members: K pixels of components.
-        component: (K,) int64, component of each pixel.
+        pixels: K pixels.
+        groups: A groups of these pixels.
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
-        is_covered: (A,) bool, most of the component is found in place in other sweeps, see `Wins.is_covered`.
+        travels: (A,) bool, both ends of the component move, so that it slides only if it is a rail.
 
     Returns:
         (A, C) bool. True if the pixels of the component at t+1 form a line, this line is covered or a rail, the motion
@@ -56,18 +61,21 @@ def slides_along_itself(
 
     Cost: some passes over the pixels.
     """
-    count, pixel_size = len(candidates), sweeps.grid.pixel_size
-    newest = flat_nonzero(members.step == 0)
-    members, component = members.take(newest), component.index_select(0, newest)
-    is_line, variance, (var_y, cov, var_x) = principal_axes(component, members.row_col, count, pixel_size)
+    pixel_size = sweeps.grid.pixel_size
+    newest = flat_nonzero(pixels.step == 0)
+    newest_pixels = pixels[newest]
+    at_newest = groups[newest]
+    is_line, variance, (var_y, cov, var_x) = principal_axes(at_newest, newest_pixels.row_col, pixel_size)
+    of_line = flat_nonzero(groups.spread(is_line & ~travels))  # few pixels
+    is_covered = count_in_place(sweeps, pixels[of_line], groups[of_line]).is_covered
     # Of the two forms of the eigenvector, we take the one that does not vanish.
     is_wide = var_y < var_x
     axis_y, axis_x = torch.where(is_wide, cov, variance - var_x), torch.where(is_wide, variance - var_y, cov)
-    num_more = scatter_count(component, count, count_slices(members.slices) - _TALL)
+    num_more = at_newest.sum(count_slices(newest_pixels.slices) - _TALL)
     is_rail = (num_more < 0) & (variance >= (_RAIL / pixel_size) ** 2)
 
     # The window of each component; components without pixels at t+1 are not lines.
-    window = torch.zeros_like(num_more).scatter_(0, component, members.window)
+    window = at_newest.max(newest_pixels.window, empty=0)
     intervals = (sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)).index_select(0, window)[:, None]
     y, x = candidates.unbind(2)
     across = axis_y[:, None] * x - axis_x[:, None] * y
@@ -78,15 +86,15 @@ def slides_along_itself(
 
 
 def principal_axes(
-    component: Tensor, row_col: Tensor, num_components: int, pixel_size: float
+    groups: Groups, row_col: Tensor, pixel_size: float
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Return which of A components are lines, (A,) bool, and the variances of their pixels at t+1.
 
     These are the largest variance of all directions, then the variance in y, the covariance, the variance in x. Each is
-    (A,) float64, square pixels. `component`, (Q,) int64, is the component of each pixel; `row_col` is (2, Q) int64.
+    (A,) float64, square pixels. `row_col` is (2, Q) int64.
     """
     one_y_x = torch.cat((torch.ones_like(row_col[:1]), row_col))  # `F.pad` of torch 2.0 fails without pixels
-    moments = scatter_count(component, num_components, (one_y_x[:, None] * one_y_x).view(9, -1)).view(3, 3, -1)
+    moments = groups.sum((one_y_x[:, None] * one_y_x).view(9, -1)).reshape(3, 3, -1)
     n, sums = moments[0, 0], moments[0, 1:]
     # Differences of large products are exact in integers.
     (var_y, cov), (_, var_x) = (n * moments[1:, 1:] - sums[:, None] * sums) / (n * n).clamp(min=1).double()
@@ -98,11 +106,11 @@ def principal_axes(
     return is_line, large, (var_y, cov, var_x)
 
 
-def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -> Tensor:
+def both_ends_move(sweeps: HeightSlicedSweeps, tree: Tree, is_long: Tensor) -> Tensor:
     """Find the long components whose two ends both move.
 
     Args:
-        roots: (L, P) int64, component of each pixel at each level.
+        tree: the components.
         is_long: (V,) bool, the components to test; each has pixels at t+1.
 
     Returns:
@@ -120,19 +128,19 @@ def both_ends_move(sweeps: HeightSlicedSweeps, roots: Tensor, is_long: Tensor) -
     name = flat_nonzero(is_long)
     if name.numel() == 0:
         return torch.zeros_like(is_long)
-    count, step = name.numel(), sweeps.pixels.step
-    farthest = sweeps.elapsed.abs().argmax(1).index_select(0, sweeps.pixels.window)
-    compared = flat_nonzero((step == 0) | (step == farthest))
-    some, component = members_of(name, take_columns(roots, compared).flatten(), is_long.numel())
-    pixels = sweeps.pixels.take(compared.index_select(0, some % len(compared)))
+    farthest = sweeps.elapsed.abs().argmax(1).index_select(0, sweeps.pixels.window)  # [P]
+    is_compared = (sweeps.pixels.step == 0) | (sweeps.pixels.step == farthest)
+    member = flat_nonzero(tree.members.spread(is_long) & is_compared.index_select(0, tree.pixel))
+    components = tree.members[member].select(name)
+    pixels = sweeps.pixels[tree.pixel[member]]
     # The components at t+1, then those in the farthest sweep.
-    group = torch.add(component, pixels.step != 0, alpha=count)
-    is_tall = scatter_count(group, 2 * count, count_slices(pixels.slices) - _TALL)[:count] >= 0
+    both = Groups(components.of_item + len(name) * (pixels.step != 0), 2 * len(name))
+    is_tall = both.sum(count_slices(pixels.slices) - _TALL)[: len(name)] >= 0
 
     # The first pixel in each direction, y, x and the diagonals, and in each opposite direction.
     directions = ((1, 0), (0, 1), (1, 1), (1, -1), (-1, 0), (0, -1), (-1, -1), (-1, 1))
     along = constant(directions, torch.float64, name.device) @ pixels.row_col.double()
-    ends = segment_amin(along, group, 2 * count, math.inf).view(2, 4, 2, count)
+    ends = both.min(along, math.inf).reshape(2, 4, 2, len(name))
     metres = tuple(scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))
     unit = constant(metres, torch.float64, name.device)[:, None]
     length, direction = (ends[:, :, 0].sum(0) * -unit).max(0)

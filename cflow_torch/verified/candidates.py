@@ -6,10 +6,10 @@ around it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import VerifiedConfig
@@ -17,19 +17,11 @@ from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.clustering import Pixels as ClusterPixels
 from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
-from cflow_torch.ops.indices import (
-    constant,
-    flat_nonzero,
-    gather,
-    lazy_empty,
-    lazy_zeros,
-    lookup,
-    scatter_count,
-    take_columns,
-)
-from cflow_torch.ops.segments import masked_median, segment_minmax
-from cflow_torch.verified.component_tree import Components, Nodes
-from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, count_slices
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import constant, flat_nonzero, lazy_empty, lazy_zeros, take_columns
+from cflow_torch.ops.segments import masked_median
+from cflow_torch.verified.component_tree import Tree
+from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, Pixels, count_slices
 
 # A node whose box has more pixels is correlated at a coarser scale. Its children are correlated at the finer scales.
 _LARGEST_BOX = 1 << 12
@@ -42,7 +34,7 @@ class Candidates(NamedTuple):
     score: Tensor  # (N,) float32, NCC with the nearest sweep in which the node has pixels
 
 
-def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, config: VerifiedConfig) -> Candidates:
+def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, config: VerifiedConfig) -> Candidates:
     """Return the candidates of all nodes, each correlated at its own pixel size.
 
     Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
@@ -51,7 +43,7 @@ def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, co
 
     Source: adapted from Sec. leverage_past_pcs, which takes the medians of magnitude and of orientation.
     """
-    images = _NodeImages.of(nodes, components.blocks, sweeps)
+    images = _NodeImages.of(nodes, blocks, sweeps)
     clusters = Clusters(nodes.window, images.first, images.size, images.pixels)
     pairs = make_pairs(clusters, sweeps.batch, images.block.double() * sweeps.grid.pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
@@ -63,62 +55,83 @@ def propose(nodes: Nodes, components: Components, sweeps: HeightSlicedSweeps, co
     if sweeps.num_steps > 2:
         own = torch.cat((masked_median(own, estimates.available)[:, None], own), 1)
     own = own + 0.0  # turns -0.0 into 0.0
-    parent = F.pad(nodes.parent, (0, 1), value=nodes.count)
-    around = [nodes.parent]
-    for _ in range(components.num_levels - 2):
-        around.append(parent.index_select(0, around[-1]))
-    others = lookup(own[:, 0], torch.cat(around)).view(len(around), nodes.count, 2).transpose(0, 1)
-    return Candidates(torch.cat((own, others), 1), estimates.newest_score())
+    candidates = [own]
+    around = own[:, 0]
+    for _ in range(nodes.num_levels - 1):  # the parent's candidate, then that of the parent's parent, ...
+        around = nodes.children.spread(around)
+        candidates.append(around[:, None])
+    return Candidates(torch.cat(candidates, 1), estimates.newest_score())
 
 
-class _NodeImages(NamedTuple):
-    """A small image of each of N nodes for each of S sweeps, at the scale at which the node is correlated."""
+@dataclass(frozen=True)
+class _NodeImages:
+    """A small image of each of N nodes for each of S sweeps, at the scale at which the node is correlated.
+
+    All images lie one after the other in `slices`: node by node, sweep by sweep, row by row.
+    """
 
     block: Tensor  # (N,) int64, side of a pixel in finest pixels
     first: Tensor  # (N, 2) int64, top-left (row, col) of the box over all sweeps, in pixels of the scale
     size: Tensor  # (N, 2) int64, height and width of the box
-    start: Tensor  # (N,) int64, where the images of each node begin in `image`
-    image: Tensor  # (I,) uint8, slices of the pixels of all images, one image after the other
+    start: Tensor  # (N,) int64, where the images of each node begin
+    slices: Tensor  # (I,) uint8
     pixels: ClusterPixels  # the Q occupied pixels of the images
-    occupied: Tensor  # (Q,) int64, index of each occupied pixel into `image`
+    slices_of_pixel: Tensor  # (Q,) uint8
 
     @classmethod
-    def of(cls, nodes: Nodes, blocks: Sequence[int], sweeps: HeightSlicedSweeps) -> _NodeImages:
-        """Draw the nodes.
+    def of(cls, nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps) -> _NodeImages:
+        """Draw the nodes. At coarser scales, all slices of a pixel are set."""
+        node = nodes.members.of_item  # [A]
+        members = sweeps.pixels[nodes.pixel]  # [A]
+        block, first, size = _boxes(nodes, members, blocks)
+        height, width = size.t()
+        end = (height * width * sweeps.num_steps).cumsum(0)
+        start = end - height * width * sweeps.num_steps
 
-        Convention: a node has the scale of its level, unless its box has more than `_LARGEST_BOX` pixels there. Then it
-            has the finest scale at which the box fits, or the coarsest if it fits nowhere.
-        """
-        members, node, device = sweeps.pixels.take(nodes.pixel), nodes.node, nodes.node.device
-        block = constant(tuple(blocks), torch.int64, device)
-        ends = torch.cat(segment_minmax(members.row_col, node, nodes.count)).t()[:, None]
-        ends = torch.div(ends, block[:, None], rounding_mode="floor")  # (N, scales, 4)
-        sizes = ends[:, :, 2:] - ends[:, :, :2] + 1
-        num_small = (sizes.prod(2) <= _LARGEST_BOX).sum(1)  # these come first, because scales are coarse to fine
-        scale = torch.minimum(nodes.level.clamp(max=len(blocks) - 1), (num_small - 1).clamp(min=0))
-        at = (torch.arange(nodes.count, device=device), scale)
-        block, first, size = block[scale], ends[at][:, :2], sizes[at]
-        area = size.prod(1) * sweeps.num_steps
-        end = area.cumsum(0)
-
+        block_of, height_of, width_of, start_of, top, left = take_columns(
+            torch.stack((block, height, width, start, *first.t())), node
+        )
+        row, col = torch.div(members.row_col, block_of, rounding_mode="floor")
+        index = start_of + (members.step * height_of + row - top) * width_of + col - left  # [A]
+        num_samples = int(end[-1]) if nodes.count else 0
+        slices = lazy_zeros(num_samples, torch.uint8, node.device)
+        slices.scatter_(0, index, members.slices.masked_fill(block_of > 1, OWN))
         # Several finest pixels may fall into one pixel of the scale. They are equal there, so any of them may remain.
-        begin = end - area
-        table = torch.stack((begin, block, *size.unbind(1), *first.unbind(1)))
-        of_member = take_columns(table, node)
-        start, side, height, width = of_member[:4]
-        pixel = torch.div(members.row_col, side, rounding_mode="floor")
-        row, col = pixel - of_member[4:]
-        index = (members.step * height + row).mul_(width).add_(start).add_(col)
-        total = int(end[-1]) if nodes.count else 0
-        # At coarser scales, all slices of a pixel are set.
-        slices = members.slices.masked_fill(side > 1, OWN)
-        image = lazy_zeros(total, torch.uint8, device).index_copy_(0, index, slices)
-        member = torch.arange(len(node), dtype=torch.int32, device=device)
-        member = lazy_empty(total, torch.int32, device).scatter_(0, index, member)
-        drawn = flat_nonzero(image)
-        member = member.index_select(0, drawn).long()
-        pixels = ClusterPixels(*gather(member, node, members.step, *pixel))
-        return cls(block, first, size, begin, image, pixels, drawn)
+        member_at = lazy_empty(num_samples, torch.int32, node.device)
+        member_at.scatter_(0, index, torch.arange(len(node), dtype=torch.int32, device=node.device))
+        drawn = flat_nonzero(slices)  # [Q]
+        member = member_at.index_select(0, drawn).long()
+        pixels = ClusterPixels(
+            cluster=node.index_select(0, member),
+            step=members.step.index_select(0, member),
+            row=row.index_select(0, member),
+            col=col.index_select(0, member),
+        )
+        return cls(block, first, size, start, slices, pixels, slices.index_select(0, drawn))
+
+    def look_up_newest(self, node: Tensor, row: Tensor, col: Tensor) -> Tensor:
+        """Return the slices of pixels of nodes at t+1; 0 outside of the box. Node is (K,), row and col (..., K)."""
+        height, width = take_columns(self.size.t(), node)
+        is_inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
+        index = (row * width + col + self.start.index_select(0, node)) * is_inside
+        return self.slices.index_select(0, index.view(-1)).view_as(index) * is_inside
+
+
+def _boxes(nodes: Tree, members: Pixels, blocks: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose the scale of each node. Return the side of its pixels, (N,), and its box: first pixel and size, (N, 2).
+
+    Convention: a node has the scale of its level, unless its box has more than `_LARGEST_BOX` pixels there. Then it has
+        the finest scale at which the box fits, or the coarsest if it fits nowhere.
+    """
+    block = constant(tuple(blocks), torch.int64, members.step.device)[:, None]  # [scales, 1], coarse to fine
+    first = nodes.members.min(members.row_col, empty=0)  # [2, N], finest pixels
+    last = nodes.members.max(members.row_col, empty=0)
+    first = torch.div(first[:, None], block, rounding_mode="floor")  # [2, scales, N]
+    size = torch.div(last[:, None], block, rounding_mode="floor") - first + 1
+    num_fitting = (size.prod(0) <= _LARGEST_BOX).sum(0)  # these scales come first
+    scale = torch.minimum(nodes.kind.clamp(max=len(blocks) - 1), (num_fitting - 1).clamp(min=0))
+    node = torch.arange(nodes.count, device=scale.device)
+    return block[scale, 0], first[:, scale, node].t(), size[:, scale, node].t()
 
 
 def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tensor:
@@ -131,21 +144,17 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     is_moved = shift.any(1)
     template = pairs.template
     assert pairs.pixel is not None
-    some = flat_nonzero(is_moved.index_select(0, template.image))
-    pair, row, col, pixel = gather(some, template.image, template.row, template.col, pairs.pixel)
+    some = flat_nonzero(is_moved.index_select(0, template.image))  # template pixels
+    pair = template.image.index_select(0, some)
+    row = template.row.index_select(0, some) + shift[:, 0].index_select(0, pair)
+    col = template.col.index_select(0, some) + shift[:, 1].index_select(0, pair)
+    # At the peak, before it (above, left) and after it (below, right).
+    beside = constant(((0, -1, 0, 1, 0), (0, 0, -1, 0, 1)), torch.int64, shift.device)[..., None]  # [2, 5, 1]
     node = pairs.cluster.index_select(0, pair)
-    start, size = images.start.index_select(0, node), images.size.index_select(0, node).t()
-    beside = constant(((0, -1, 1, 0, 0), (0, 0, 0, -1, 1)), torch.int64, shift.device)
-    peak = torch.stack((row, col)) + shift.index_select(0, pair).t()
-    at = peak[:, None] + beside[..., None]  # (2, 5, pixels)
-    is_row, is_col = (at >= 0) & (at < size[:, None])
-    inside = is_row & is_col
-    index = (at[0] * size[1]).add_(at[1]).add_(start).mul_(inside)
-    own = images.image.index_select(0, images.occupied.index_select(0, pixel))
-    target = images.image.index_select(0, index.view(-1)).view_as(index)
-    sums = scatter_count(pair, len(shift), count_slices(own & target) * inside)
-    # Counts at the peak, before it (above, left) and after it (below, right).
-    middle, low, high = sums[:1], sums[1::2], sums[2::2]
-    curve = (2 * middle - low - high).double()
-    vertex = ((high - low) / (2 * curve)).masked_fill_(curve <= 0, 0.0).clamp_(-0.5, 0.5)
+    target = images.look_up_newest(node, row + beside[0], col + beside[1])  # [5, K]
+    own = images.slices_of_pixel.index_select(0, pairs.pixel.index_select(0, some))
+    counts = Groups(pair, len(shift)).sum(count_slices(own & target))  # [5, J]
+    peak, before, after = counts[:1], counts[1:3], counts[3:]
+    curve = (2 * peak - before - after).double()
+    vertex = ((after - before) / (2 * curve)).masked_fill(curve <= 0, 0.0).clamp(-0.5, 0.5)  # [2, J]
     return (vertex * is_moved).t()

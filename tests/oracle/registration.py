@@ -14,7 +14,6 @@ import numpy as np
 
 from oracle.height_slices import SlicedSweeps, Vector, slice_of
 
-UNITS = 1024  # of a metre: centroids are whole numbers of them
 LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of voxels, metres; their number, then they repeat
 FARTHEST = 0.2  # metres, between the voxels of a pair
 FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces, at which its weight is a quarter
@@ -56,12 +55,12 @@ class Voxels:
         self.sweeps, pixel = sweeps, sweeps.pixel_of_point
         is_near = np.abs(sweeps.elapsed[sweeps.pixels[:, 0]]) <= MOST_TIME
         rows = np.flatnonzero(np.array([*wanted, False])[object_of[pixel]] & is_near[pixel])
-        points = (sweeps.points[rows] - (*sweeps.lower, 0)) * UNITS
+        points = sweeps.points[rows] - (*sweeps.lower, 0)
         key = pixel[rows] * NUM_LAYERS + slice_of(sweeps.points[rows, 2], LAYER_HEIGHT, NUM_LAYERS)
         keys, voxel, count = np.unique(key, return_inverse=True, return_counts=True)
         self.position = np.zeros((len(keys), 3))
-        np.add.at(self.position, voxel, np.clip(np.round(points), -(2**24), 2**24))
-        self.position = np.floor(self.position / count[:, None])
+        np.add.at(self.position, voxel, np.clip(points, -1e6, 1e6))
+        self.position = self.position / count[:, None]
         pixel, self.layer = keys // NUM_LAYERS, keys % NUM_LAYERS
         self.step, self.object_id = sweeps.pixels[pixel, 0], object_of[pixel]
         self.number = {key: number for number, key in enumerate(keys.tolist())}
@@ -70,7 +69,7 @@ class Voxels:
         """Voxels of t+1 in the 3 x 3 pixels around a position, in its layer and those next to it, the last of which is
         below the first: pixel by pixel in raster order. Beyond the border, the outermost pixels are taken."""
         image = self.sweeps.number[0]
-        col, row = np.floor(position[:2] / (self.sweeps.size * UNITS)).astype(int)
+        col, row = np.floor(position[:2] / self.sweeps.size).astype(int)
         row, col = np.clip((row, col), 1, np.array(image.shape) - 2)
         square = image[row - 1 : row + 2, col - 1 : col + 2].ravel().tolist()
         keys = [pixel * NUM_LAYERS + (layer + up) % NUM_LAYERS for pixel, up in product(square, (-1, 0, 1))]
@@ -84,14 +83,14 @@ def register(sweeps: SlicedSweeps, object_of: np.ndarray, flow: Sequence[Vector]
     for object_id, start in enumerate(flow):
         at_t = voxels.position[(voxels.object_id == object_id) & (voxels.step == 1), :2]
         if len(at_t) == 0:
-            result.append(RigidMotion(start, 0.0, tuple(sweeps.lower)))
+            result.append(RigidMotion(start, 0.0, (0.0, 0.0)))
             continue
-        centre, given = at_t.sum(0) // len(at_t), np.array([*start, 0.0])
+        centre, given = at_t.sum(0) / len(at_t), np.array([*start, 0.0])
         motion = given
         for _ in range(NUM_STEPS):
             motion = motion + STEP_LENGTH * gauss_newton(voxels, spread, object_id, centre, given, motion)
         x, y, rotation = motion.tolist()
-        result.append(RigidMotion((x, y), rotation, tuple(centre / UNITS + sweeps.lower)))
+        result.append(RigidMotion((x, y), rotation, tuple(centre + sweeps.lower)))
     return result
 
 
@@ -106,24 +105,24 @@ def gauss_newton(
     """
     halves = np.array([1, 1, 2])  # the angle is twice the tangent
     matrix, force = np.diag(HELD), HELD * (given - motion) * halves
-    velocity, elapsed = motion[:2] * UNITS, voxels.sweeps.elapsed
+    velocity, elapsed = motion[:2], voxels.sweeps.elapsed
     for v in np.flatnonzero((voxels.object_id == object_id) & (voxels.step > 0)).tolist():
         # The centre is that of t; it moves on, and the voxel rotates about it.
         position, layer, k = voxels.position[v], voxels.layer[v], elapsed[voxels.step[v]]
         arm = rotate(motion[2] * k, position[:2] - centre - velocity * (elapsed[1] - k))
-        target = np.array([*np.round(centre + velocity * elapsed[1] + arm), position[2]])
+        target = np.array([*(centre + velocity * elapsed[1] + arm), position[2]])
         near = voxels.around(layer, target)
         if not near:
             continue
         error = voxels.position[near] - target
         best = (error**2).sum(1).argmin()
-        if voxels.object_id[near[best]] != object_id or (error[best] ** 2).sum() > round((FARTHEST * UNITS) ** 2):
+        if voxels.object_id[near[best]] != object_id or (error[best] ** 2).sum() > FARTHEST**2:
             continue
-        error = error[best] / UNITS
+        error = error[best]
         inverse = np.linalg.inv(spread[v] + spread[near[best]] + NOISE**2 * np.eye(3))
-        weight = np.round(256 * (FAR / (FAR + error @ inverse @ error)) ** 2 * NOISE**2 * inverse[:2]) / 256
-        r_x, r_y = np.round(arm / 16) / 64
-        change = np.round(k * 16) / 16 * np.array([[1.0, 0.0, -r_y], [0.0, 1.0, r_x]])
+        weight = (FAR / (FAR + error @ inverse @ error)) ** 2 * NOISE**2 * inverse[:2]
+        r_x, r_y = arm
+        change = k * np.array([[1.0, 0.0, -r_y], [0.0, 1.0, r_x]])
         matrix = matrix + change.T @ weight[:, :2] @ change
         force = force + change.T @ weight @ error
     return np.linalg.solve(matrix, force) / halves
@@ -135,11 +134,10 @@ def spread_of(voxels: Voxels) -> np.ndarray:
 
     Blocks are 2 voxels wide. Centroids are whole 256ths of a metre.
     """
-    spread, size = np.zeros((len(voxels.step), 3, 3)), np.array([voxels.sweeps.size] * 2 + [LAYER_HEIGHT]) * UNITS
+    spread, size = np.zeros((len(voxels.step), 3, 3)), np.array([voxels.sweeps.size] * 2 + [LAYER_HEIGHT])
     for v, (position, step, object_id) in enumerate(zip(voxels.position, voxels.step, voxels.object_id)):
         own = voxels.position[(voxels.step == step) & (voxels.object_id == object_id)]
         apart = np.floor(own / (2 * size)) - np.floor(position / (2 * size))
-        near = own[(np.abs(apart) <= 1).all(1)] // 4
-        n, sums = len(near), near.sum(0)
-        spread[v] = (n * near.T @ near - np.outer(sums, sums)) / (256 * n) ** 2
+        near = own[(np.abs(apart) <= 1).all(1)]
+        spread[v] = np.cov(near.T, bias=True)
     return spread

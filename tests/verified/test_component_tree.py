@@ -16,8 +16,16 @@ from oracle import component_tree as oracle
 from oracle.height_slices import SlicedSweeps
 
 from cflow_torch.config import VerifiedConfig
+from cflow_torch.ops.groups import Groups
 from cflow_torch.verified.changed_pixels import ChangedPixels
-from cflow_torch.verified.component_tree import Components, Nodes, find_components, movable_nodes, select_objects
+from cflow_torch.verified.component_tree import (
+    Components,
+    NodeKind,
+    Tree,
+    find_components,
+    movable_nodes,
+    select_objects,
+)
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 SIZE = 0.25
@@ -29,7 +37,7 @@ class Grown(NamedTuple):
 
     sweeps: HeightSlicedSweeps
     components: Components
-    nodes: Nodes
+    nodes: Tree
     windows: list[SlicedSweeps]
     trees: list[oracle.Tree]
 
@@ -42,9 +50,14 @@ class Grown(NamedTuple):
         window = self.sweeps.pixels.window
         number = torch.arange(len(window)) - torch.searchsorted(window, window)  # within its window
         pixels: list[list[int]] = [[] for _ in range(self.nodes.count)]
-        for node, pixel in zip(self.nodes.node.tolist(), number[self.nodes.pixel].tolist()):
+        for node, pixel in zip(self.nodes.members.of_item.tolist(), number[self.nodes.pixel].tolist()):
             pixels[node].append(pixel)
-        return [(frozenset(own), level) for own, level in zip(pixels, self.nodes.level.tolist())]
+        return [(frozenset(own), level) for own, level in zip(pixels, levels_of(self.nodes))]
+
+
+def levels_of(tree: Tree) -> list[int]:
+    """Levels of the nodes; L = changed pixels."""
+    return torch.where(tree.kind == NodeKind.CHANGED, tree.num_levels, tree.kind).tolist()
 
 
 @lru_cache(maxsize=None)
@@ -78,12 +91,12 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
     for seed in range(6):
         found = grown(seed, longest, blocks)
         names, none = found.fast_names(), found.nodes.count
-        parents = [None if parent == none else names[parent] for parent in found.nodes.parent.tolist()]
+        parents = [None if parent == none else names[parent] for parent in found.nodes.children.of_item.tolist()]
         given = list(zip(names, parents, found.nodes.travels.tolist()))
         for window, tree in enumerate(found.trees):
             mine = found.sweeps.pixels.window == window
-            for level, roots in enumerate(found.components.roots):
-                assert same_groups(roots[mine].numpy(), tree.levels[level])
+            for level, roots in enumerate(found.components.levels):
+                assert same_groups(roots.of_item[mine].numpy(), tree.levels[level])
             own = found.names(window)
             expected = {
                 (name, None if node.parent < 0 else own[node.parent], node.travels)
@@ -102,9 +115,9 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
 
 def test_scales_are_nested():
     found = grown(0, density=0.04)
-    for coarse, fine in zip(found.components.roots, found.components.roots[1:]):
-        assert torch.equal(found.components.parent[fine], coarse)
-    assert found.components.size.sum() == 4 * found.sweeps.num_pixels + len(found.components.changed)
+    for coarse, fine in zip(found.components.levels, found.components.levels[1:]):
+        assert torch.equal(found.components.tree.children.of_item[fine.of_item], coarse.of_item)
+    assert found.components.size.sum() == len(found.components.tree.pixel)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -116,15 +129,16 @@ def test_the_cut_equals_the_oracle(seed, of_evidence):
     names = found.fast_names()
     for window, name, value in zip(found.nodes.window.tolist(), names, evidence.tolist()):
         evidence_of[window, name] = value
-    objects, node = select_objects(found.nodes, found.components, evidence, found.sweeps.num_pixels)
-    assert torch.equal(objects.of_pixel[objects.first], torch.arange(objects.count))
+    objects = select_objects(found.sweeps, found.components, found.nodes, evidence)
+    node = objects.nodes.of_item
+    assert torch.equal(objects.pixels.of_item[objects.first], torch.arange(objects.count))
     assert torch.equal(objects.first, objects.first.sort().values)
     start = 0
     for window, tree in enumerate(found.trees):
         own = found.names(window)
         values = [evidence_of[window, name] for name in own]
         expected, chosen = oracle.select_objects(found.windows[window], tree, values)
-        mine = objects.of_pixel[found.sweeps.pixels.window == window]
+        mine = objects.pixels.of_item[found.sweeps.pixels.window == window]
         numbers = torch.where(mine < objects.count, mine - start, -1).tolist()
         assert numbers == expected.tolist()
         of_window = node[start : start + len(chosen)].tolist()
@@ -143,9 +157,9 @@ def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_
     change = ChangedPixels(*torch.zeros((2, sweeps.num_pixels), dtype=torch.bool))
     components = find_components(sweeps, change, (2, 1))
     nodes = movable_nodes(sweeps, components, None)
-    assert nodes.level.tolist() == [0, 1, 1] and nodes.parent.tolist() == [3, 0, 0]
-    objects, node = select_objects(nodes, components, torch.tensor([whole, 100, 100]), sweeps.num_pixels)
-    assert node.tolist() == ([0] if wins else [1, 2])
+    assert nodes.kind.tolist() == [0, 1, 1] and nodes.children.of_item.tolist() == [3, 0, 0]
+    objects = select_objects(sweeps, components, nodes, torch.tensor([whole, 100, 100]))
+    assert objects.nodes.of_item.tolist() == ([0] if wins else [1, 2])
 
 
 def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_of_it_has_no_evidence():
@@ -155,13 +169,14 @@ def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_o
     every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
     components = find_components(sweeps, ChangedPixels(every, every), (1,))
     nodes = movable_nodes(sweeps, components, None)
-    first, second = (nodes.level == components.num_levels).nonzero()[:, 0].tolist()
-    joined = nodes.pixel[nodes.node == second][:1]
-    nodes = replace(nodes, pixel=torch.cat((nodes.pixel, joined)), node=torch.cat((nodes.node, joined * 0 + first)))
+    first, second = (nodes.kind == NodeKind.CHANGED).nonzero()[:, 0].tolist()
+    joined = nodes.pixel[nodes.members.of_item == second][:1]
+    members = Groups(torch.cat((nodes.members.of_item, joined * 0 + first)), nodes.count)
+    nodes = replace(nodes, pixel=torch.cat((nodes.pixel, joined)), members=members)
     evidence = torch.zeros(nodes.count, dtype=torch.int64)
     evidence[first] = 100
-    objects, node = select_objects(nodes, components, evidence, sweeps.num_pixels)
-    assert node[objects.of_pixel[joined]].tolist() == [first]
+    objects = select_objects(sweeps, components, nodes, evidence)
+    assert objects.nodes.of_item[objects.pixels.of_item[joined]].tolist() == [first]
 
 
 @pytest.mark.parametrize("num_missing, may_move", [(0, False), (1, False), (2, True)])
@@ -181,5 +196,5 @@ def test_a_component_of_changed_pixels_is_a_node_only_up_to_3_m(num_pixels, is_n
     sweeps = from_images(images, SIZE)
     every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
     components = find_components(sweeps, ChangedPixels(every, every), (1,))
-    levels = movable_nodes(sweeps, components, None).level
-    assert bool((levels == components.num_levels).any()) == is_node and 0 in levels
+    levels = movable_nodes(sweeps, components, None).kind
+    assert bool((levels == NodeKind.CHANGED).any()) == is_node and 0 in levels

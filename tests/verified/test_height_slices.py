@@ -27,29 +27,41 @@ SETTINGS = config("verified", min_height=0.4, num_history=1)
 LOW, HIGH = np.array(RANGE[:3]), np.array(RANGE[3:])
 
 
+def image_of(sweeps: fast.HeightSlicedSweeps, shape: tuple[int, ...], first: int = 0) -> torch.Tensor:
+    """The images without their borders, from image number `first` on."""
+    (height, width), reach = shape[2:], fast.REACH
+    images = sweeps.images.slices.view(-1, height + 2 * reach, width + 2 * reach)[first : first + shape[0] * shape[1]]
+    return images[:, reach:-reach, reach:-reach].reshape(shape)
+
+
 def test_upper_bits_hold_the_slices_around_and_rows_do_not_touch():
     images = np.zeros((2, 2, 9, 11), dtype=np.uint8)
     images[0, 0, 0, 10], images[0, 0, 1, 0], images[1, 1, 4, 5], images[1, 1, 5, 6] = 1, 2, 4, 8
     sweeps = from_images(images)
-    drawn = sweeps.image[: images.size].view(images.shape).numpy()
+    drawn = image_of(sweeps, images.shape).numpy()
     assert np.array_equal(drawn & fast.OWN, images)
     for window, step, row, col in np.ndindex(*images.shape):
         around = images[window, step, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2]
         assert drawn[window, step, row, col] >> NUM_SLICES == np.bitwise_or.reduce(around, axis=None)
-    assert not sweeps.image[images.size :].any()
+    assert (
+        not sweeps.images.slices.view(-1, 13, 15)[:, [0, 1, -1, -2]].any()
+        and not image_of(sweeps, images.shape, 4).any()
+    )
 
 
 def test_copies_are_images_of_their_own():
     sweeps = sweeps_of([scene(0), scene(1)], PLAIN)
-    before, rows = sweeps.image[: sweeps.image.numel() // 2].clone(), torch.arange(0, 400, 7)
-    rows = rows[sweeps.pixel_of_point[rows] < sweeps.num_pixels]
+    half = len(sweeps.images.slices) // 2
+    before, rows = sweeps.images.slices[:half].clone(), torch.arange(0, 400, 7)
+    rows = rows[sweeps.points[rows].is_member]
+    own = sweeps.pixels[sweeps.points[rows].of_item]
+    num_points = len(sweeps.points.of_item)
     copies = sweeps.with_copies(rows)
-    assert same_bits(copies.image[: len(before)], before)
-    of_copy = copies.pixels.take(copies.pixel_of_point[len(sweeps.pixel_of_point) :])
-    own = copies.pixels.take(sweeps.pixel_of_point[rows])
+    assert same_bits(copies.images.slices[:half], before)
+    of_copy = copies.pixels[copies.points.of_item[num_points:]]
     assert torch.equal(of_copy.window, own.window + 2)
     assert all(torch.equal(getattr(of_copy, name), getattr(own, name)) for name in ("step", "row_col"))
-    slices = copies.image[of_copy.index] & fast.OWN
+    slices = copies.images.look_up(of_copy, of_copy.step) & fast.OWN
     assert torch.equal(slices, of_copy.slices) and bool((slices & ~own.slices == 0).all())
     points = fast.slice_of(sweeps.batch.positions[2, rows], fast.SLICE_HEIGHT).long()
     assert bool(((slices.long() >> points) & 1).all()) and (slices != own.slices).any()
@@ -88,7 +100,7 @@ def random_window(seed: int) -> Window:
 def test_ground_residue_equals_the_oracle_in_a_batch(seed):
     windows, dropped = [random_window(4 * seed + i) for i in range(4)], 0
     sweeps = sweeps_of(windows, SETTINGS)
-    batch, is_drawn = sweeps.batch, sweeps.pixel_of_point < sweeps.num_pixels
+    batch, is_drawn = sweeps.batch, sweeps.points.is_member
     for number, window in enumerate(windows):
         clouds, cloud1 = compensate(window, SETTINGS)
         ground = ground_points(window.pc0, clouds[0])

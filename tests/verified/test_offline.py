@@ -14,6 +14,7 @@ from scenes import assert_same_bits, config, pose, reordered, rows_of, scene
 from turning_car import MODEL, upright_box
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, estimate_flow, make_config, make_model
+from cflow_torch.ops.groups import Groups
 from cflow_torch.verified.component_tree import number_objects
 from cflow_torch.verified.offline import best_nearby
 
@@ -75,7 +76,7 @@ def corrected(places: Sequence[Sequence[int]], given: Sequence[float], z: float 
     for row, col in places:
         images[:, 0, row, col] = 1
     sweeps = from_images(images, 0.25, np.array([[0.0, 1, -1], [0, 1, 2]]))
-    objects = number_objects(sweeps.pixels.window, 2)
+    objects = number_objects(Groups(sweeps.pixels.window, 2))
     motion = torch.tensor([given] * 2, dtype=torch.float64)
     return best_nearby(sweeps, objects, motion, z).tolist()
 

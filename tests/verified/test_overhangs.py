@@ -15,7 +15,7 @@ from cflow_torch import Sweep, VerifiedFlow, Window
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.verified import method
 from cflow_torch.verified.changed_pixels import ChangedPixels
-from cflow_torch.verified.component_tree import find_components, movable_nodes
+from cflow_torch.verified.component_tree import NodeKind, find_components, movable_nodes
 from cflow_torch.verified.overhangs import add_overhung
 
 REGION = (-9.0, -7.0, -2.0, 9.0, 7.0, 40.0)
@@ -50,7 +50,7 @@ def overhung(boxes: Sequence[Box]) -> tuple[int, torch.Tensor]:
     drawn, nodes = add_overhung(sweeps, components, tree_nodes)
     added = slice(tree_nodes.count, None)
     assert torch.equal(nodes.pixel[: len(tree_nodes.pixel)], tree_nodes.pixel)
-    assert (nodes.level[added] == components.num_levels + 1).all() and (nodes.parent[added] == nodes.count).all()
+    assert (nodes.kind[added] == NodeKind.OVERHUNG).all() and (nodes.children.of_item[added] == nodes.count).all()
     assert (nodes.window[added] == 1).all() and (drawn.pixels.window[nodes.pixel[len(tree_nodes.pixel) :]] == 1).all()
     return nodes.count - tree_nodes.count, sweeps.batch.positions[2, drawn.copied]
 

@@ -12,10 +12,12 @@ from oracle import aperture
 from oracle import paired_test as oracle
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
+from cflow_torch.ops.groups import Groups
+from cflow_torch.verified import in_place as in_place_module
 from cflow_torch.verified import paired_test as fast
 from cflow_torch.verified.aperture import both_ends_move, slides_along_itself
-from cflow_torch.verified.component_tree import Nodes
-from cflow_torch.verified.paired_test import count_wins
+from cflow_torch.verified.component_tree import NodeKind, Tree
+from cflow_torch.verified.in_place import count_in_place
 
 
 def random_images(rng: np.random.Generator, shape: tuple) -> np.ndarray:
@@ -26,7 +28,7 @@ def random_images(rng: np.random.Generator, shape: tuple) -> np.ndarray:
 
 @pytest.mark.parametrize("at_once", [1 << 18, 700])
 def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
-    monkeypatch.setattr(fast, "_AT_ONCE_CPU", at_once)
+    monkeypatch.setattr(in_place_module, "_AT_ONCE_CPU", at_once)
     far = num_covered = 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -37,26 +39,27 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
         component = torch.from_numpy(rng.integers(0, 3, sweeps.num_pixels)) + 3 * sweeps.pixels.window
         kept = (torch.arange(sweeps.num_pixels) % 7 > 0).nonzero()[:, 0]
         candidates = torch.from_numpy(np.where(rng.random((6, 5, 1)) < 0.7, rng.normal(0, 1.5, (6, 5, 2)), 0.0))
-        wins = fast.count_wins(sweeps, sweeps.pixels.take(kept), component[kept], candidates)
+        wins = fast.count_wins(sweeps, sweeps.pixels[kept], Groups(component[kept], 6), candidates)
+        in_place = count_in_place(sweeps, sweeps.pixels[kept], Groups(component[kept], 6))
         component[::7] = 6
         for number in range(6):
             window = for_oracle(sweeps, number // 3)
             members = np.flatnonzero(component[sweeps.pixels.window == number // 3] == number)
             motions = candidates[number].numpy()
-            for is_near, won, lost in zip((False, True), wins.won[:, number], wins.lost[:, number]):
+            for is_near, counts in ((False, wins.exact), (True, wins.near)):
                 expected = [oracle.count_wins(window, members, each, is_near).sum(1) for each in motions]
-                assert np.array_equal(torch.stack((won, lost), 1), expected)
-            assert wins.in_place[number] == oracle.found_in_place(window, members, window.image)[:, 0].sum()
-            assert wins.is_covered[number] == aperture.is_covered(window, members)
-            num_covered += int(wins.is_covered[number])
+                assert np.array_equal(torch.stack((counts.won[number], counts.lost[number]), 1), expected)
+            assert in_place.number[number] == oracle.found_in_place(window, members, window.image)[:, 0].sum()
+            assert in_place.is_covered[number] == aperture.is_covered(window, members)
+            num_covered += int(in_place.is_covered[number])
             far += int((candidates[number].abs().amax(1) > 1.5).sum())
     assert far > 20 and 0 < num_covered < 24
 
 
 def won_by_older(sweeps, motion: torch.Tensor) -> list[list[int]]:
     """Slices of the older sweep that a motion wins."""
-    older = sweeps.pixels.take((sweeps.pixels.step == 1).nonzero()[:, 0])
-    return fast.count_wins(sweeps, older, torch.zeros_like(older.step), motion).won[0].tolist()
+    older = sweeps.pixels[(sweeps.pixels.step == 1).nonzero()[:, 0]]
+    return fast.count_wins(sweeps, older, Groups(torch.zeros_like(older.step), 1), motion).exact.won.tolist()
 
 
 def test_a_far_motion_must_leave_the_neighbourhood_as_well():
@@ -74,30 +77,39 @@ def test_evidence_equals_the_oracle(z):
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(range(40), range(40))).reshape(2, -1)
     counts = np.concatenate([grid, rng.integers(0, 2**31, (2, 500))], 1)
-    found = fast.evidence_of(*torch.from_numpy(counts), z)
+    found = fast.Counts(*torch.from_numpy(counts)).evidence(z)
     assert found.dtype == torch.int64
     assert found.tolist() == [oracle.evidence_of(won, lost, z) for won, lost in counts.T.tolist()]
 
 
 def test_the_first_candidate_with_most_evidence_is_chosen():
     evidence = torch.tensor([[2**36 - 2, 2**36 - 1, 2**36 - 1], [1, 0, 2**36 - 1], [0, 0, 0]])
-    motion, most = fast.best_candidate(evidence, torch.arange(18, dtype=torch.float64).view(3, 3, 2))
+    motion, most = fast.best_motion(evidence, torch.arange(18, dtype=torch.float64).view(3, 3, 2))
     assert motion.tolist() == [[2.0, 3.0], [10.0, 11.0], [0.0, 0.0]] and most.tolist() == [2**36 - 1] * 2 + [0]
 
 
-@pytest.mark.parametrize("level, num_pixels, moves", [(0, 1, False), (0, 2, True), (2, 8, False), (2, 9, True)])
+@pytest.mark.parametrize(
+    "level, num_pixels, moves", [(0, 1, False), (0, 2, True), (NodeKind.CHANGED, 8, False), (NodeKind.CHANGED, 9, True)]
+)
 def test_nodes_of_changed_pixels_need_4_standard_deviations(level, num_pixels, moves):
     """Lone pixels that move win two slices each: 4 > 1.5 * 2 and 18 > 4 * 4.2, but 16 = 4 * 4."""
     images = np.zeros((1, 2, 40, 12), dtype=np.uint8)
     images[0, 1, 2 : 4 * num_pixels : 4, 2] = images[0, 0, 2 : 4 * num_pixels : 4, 7] = 1
     sweeps, zero = from_images(images), torch.zeros(1, dtype=torch.int64)
     every = torch.arange(sweeps.num_pixels)
-    nodes = Nodes(zero, zero + level, zero + 1, zero, zero > 0, every, torch.zeros_like(every))
-    motion, _ = fast.verify(sweeps, nodes, torch.tensor([[[0.0, 5.0]]], dtype=torch.float64), 2, 1.5)
+    one = Groups(torch.zeros_like(every), 1)
+    tree = Tree(every, one, Groups(zero + 1, 1), zero + level, zero, zero > 0, 2)
+    motion, _ = fast.verify(sweeps, tree, torch.tensor([[[0.0, 5.0]]], dtype=torch.float64), 1.5)
     assert motion.tolist() == [[0.0, 5.0 * moves]]
 
 
 Pixels = Set[Tuple[int, int]]
+
+
+def values_at(image: np.ndarray, sweeps) -> torch.Tensor:
+    """Values of images (B, S, H, W) at the occupied pixels."""
+    pixels = sweeps.pixels
+    return torch.from_numpy(image)[(pixels.window, pixels.step, *pixels.row_col)]
 
 
 def rail(start: int, stop: int, row: int = 30) -> Pixels:
@@ -112,10 +124,11 @@ def slides(component: dict[int, Pixels], motion, others=None, slices: int = 1) -
             for r, c in pixels:
                 image[0, m, r, c] = value
     sweeps = from_images(np.minimum(image, 1) * slices, 0.1)
-    own = torch.from_numpy(image.ravel())[sweeps.pixels.index] == 2
-    members = sweeps.pixels.take(own.nonzero()[:, 0])
-    given = sweeps, members, torch.zeros_like(members.index), torch.tensor([[motion]], dtype=torch.float64)
-    return bool(slides_along_itself(*given, count_wins(*given).is_covered))
+    own = values_at(image, sweeps) == 2
+    members = sweeps.pixels[own.nonzero()[:, 0]]
+    one = Groups(torch.zeros_like(members.step), 1)
+    motions = torch.tensor([[motion]], dtype=torch.float64)
+    return bool(slides_along_itself(sweeps, members, one, motions, torch.tensor([False])))
 
 
 def test_a_rail_covered_in_place_slides_and_one_that_leaves_does_not():
@@ -187,9 +200,12 @@ def test_ends_equal_the_oracle():
     for seed in range(12):
         image, number_of = long_things(seed)
         sweeps, is_long = from_images(image), np.random.default_rng(seed).random(9) < 0.9
-        roots = torch.from_numpy(number_of.ravel())[sweeps.pixels.index]
+        roots = values_at(number_of, sweeps)
         # Two levels: things by themselves, and all in one.
-        found = both_ends_move(sweeps, torch.stack((torch.full_like(roots, 9), roots)), torch.tensor([*is_long, False]))
+        every, none = torch.arange(len(roots)), torch.zeros(10, dtype=torch.int64)
+        members = Groups(torch.cat((torch.full_like(roots, 9), roots)), 10)
+        tree = Tree(every.repeat(2), members, Groups(none + 10, 10), none, none, none > 0, 2)
+        found = both_ends_move(sweeps, tree, torch.tensor([*is_long, False]))
         assert not found[9]
         for number, answer in enumerate(found[:9].tolist()):
             window = int(sweeps.pixels.window[roots == number][0])
