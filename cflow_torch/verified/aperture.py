@@ -22,7 +22,8 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, Pixels, count_slices
+from cflow_torch.verified.columns import Pixels, count_slices
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.in_place import count_in_place
 
 if TYPE_CHECKING:

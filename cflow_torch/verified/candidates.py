@@ -20,8 +20,9 @@ from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, lazy_empty, lazy_zeros, take_columns
 from cflow_torch.ops.segments import masked_median
+from cflow_torch.verified.columns import OWN, Pixels, count_slices
 from cflow_torch.verified.component_tree import Tree
-from cflow_torch.verified.height_slices import OWN, HeightSlicedSweeps, Pixels, count_slices
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 # A node whose box has more pixels is correlated at a coarser scale. Its children are correlated at the finer scales.
 _LARGEST_BOX = 1 << 12

@@ -19,8 +19,9 @@ from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, take_columns
 from cflow_torch.ops.linear import inverse, matmul, matvec
+from cflow_torch.verified.columns import REACH, Columns, Pixels
 from cflow_torch.verified.component_tree import Objects
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, SweepImages
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
 from cflow_torch.verified.subpixel_motion import NUM_STEPS, STEP_LENGTH, subpixel_motion
 from cflow_torch.verified.voxel_centroids import ObjectPoints, Voxels, covariance_of, points_of_objects
@@ -240,16 +241,29 @@ def deskew(
 
     inside = flat_nonzero(sweeps.grid.contains(position[:2]))
     position = take_columns(position, inside)
-    images = SweepImages(sweeps.batch.num_windows, sweeps.num_steps, sweeps.grid, position.device)
-    image = (window * sweeps.num_steps + step).index_select(0, inside)
-    index, number = torch.unique(images.index(image, *sweeps.grid.row_col(position)), return_inverse=True)
-    pixels = images.pixels_at(index)
-    images.draw(pixels, first=0)
-    moved = replace(points.at(inside), position=position, pixel=number)
-    of_pixel = Groups(number, len(index))
+    columns, pixels, of_pixel = _draw_points(sweeps, position, window[inside], step[inside])
+    moved = replace(points.at(inside), position=position, pixel=of_pixel.of_item)
     first_object = of_pixel.min(moved.object_id, empty=0)
     kept = flat_nonzero(moved.object_id == of_pixel.spread(first_object))
-    return moved.at(kept), replace(sweeps, images=images, pixels=pixels)
+    return moved.at(kept), replace(sweeps, columns=columns, pixels=pixels)
+
+
+def _draw_points(
+    sweeps: HeightSlicedSweeps, position: Tensor, window: Tensor, step: Tensor
+) -> tuple[Columns, Pixels, Groups]:
+    """Draw points inside the region, without their height slices. Return columns, pixels, and the points by pixel."""
+    grid = sweeps.grid
+    num_windows = sweeps.batch.num_windows
+    stride = grid.width + 2 * REACH
+    row, col = grid.row_col(position)
+    at = (window * (grid.height + 2 * REACH) + (row + REACH)) * stride + (col + REACH)
+    is_occupied = torch.zeros(num_windows * (grid.height + 2 * REACH) * stride, dtype=torch.bool, device=at.device)
+    columns = Columns.at(is_occupied.index_fill_(0, at, True), grid, sweeps.num_steps)
+    column = columns.image.index_select(0, at).long()
+    slices = torch.zeros_like(columns.slices[:, : columns.first_of_copies])
+    slices[column, step] = 1
+    pixels = columns.draw(slices.contiguous(), 0, 0, num_windows)
+    return columns, pixels, columns.pixel_at(column * columns.num_slots + step, len(pixels))
 
 
 def _at_instant(points: ObjectPoints, elapsed: Tensor, window: Tensor, step: Tensor, rigid: RigidMotion) -> Tensor:

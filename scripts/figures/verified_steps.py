@@ -19,8 +19,9 @@ from cflow_torch.data.log import window
 from cflow_torch.ops.indices import lookup
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.changed_pixels import find_changed
+from cflow_torch.verified.columns import count_slices
 from cflow_torch.verified.component_tree import find_components, movable_nodes, select_objects
-from cflow_torch.verified.height_slices import HeightSlicedSweeps, count_slices
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.overhangs import add_overhung
 from cflow_torch.verified.paired_test import add_unchanged, verify
 from cflow_torch.viz import save_picture, style

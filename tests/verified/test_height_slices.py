@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 from moving_scenes import from_images
-from oracle.height_slices import NUM_SLICES, ground_slope, is_residue, slice_of
+from oracle.height_slices import NUM_SLICES, ground_slope, is_residue
+from oracle.height_slices import slice_of as oracle_slice_of
 from oracle.pixels import in_range
 from oracle.sweeps import compensate, ground_points
 from preset_windows import changed
@@ -17,7 +18,8 @@ from scenes import RANGE, config, same_bits, scene, sweeps_of
 from turning_car import MODEL, REGION, turning_car
 
 from cflow_torch import Sweep, VerifiedFlow, Window
-from cflow_torch.verified import height_slices as fast
+from cflow_torch.verified.columns import OWN, REACH, count_slices
+from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, pack_bits, slice_of
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ground_heights import GroundHeights
 
@@ -27,54 +29,74 @@ SETTINGS = config("verified", min_height=0.4, num_history=1)
 LOW, HIGH = np.array(RANGE[:3]), np.array(RANGE[3:])
 
 
-def image_of(sweeps: fast.HeightSlicedSweeps, shape: tuple[int, ...], first: int = 0) -> torch.Tensor:
-    """The images without their borders, from image number `first` on."""
-    (height, width), reach = shape[2:], fast.REACH
-    images = sweeps.images.slices.view(-1, height + 2 * reach, width + 2 * reach)[first : first + shape[0] * shape[1]]
-    return images[:, reach:-reach, reach:-reach].reshape(shape)
+def drawn(sweeps: HeightSlicedSweeps, first_slot: int = 0) -> np.ndarray:
+    """Bytes of all positions of B windows and S sweeps, (B, S, H, W): of the points, or of their copies."""
+    columns, num_steps = sweeps.columns, sweeps.num_steps
+    images = columns.image.view(-1, columns.height + 2 * REACH, columns.stride)
+    column = images[:, REACH:-REACH, REACH:-REACH].long()
+    slots = columns.slices[:, first_slot : first_slot + num_steps]
+    return slots[column].permute(0, 3, 1, 2).numpy()
 
 
 def test_upper_bits_hold_the_slices_around_and_rows_do_not_touch():
     images = np.zeros((2, 2, 9, 11), dtype=np.uint8)
     images[0, 0, 0, 10], images[0, 0, 1, 0], images[1, 1, 4, 5], images[1, 1, 5, 6] = 1, 2, 4, 8
     sweeps = from_images(images)
-    drawn = image_of(sweeps, images.shape).numpy()
-    assert np.array_equal(drawn & fast.OWN, images)
+    found = drawn(sweeps)
+    assert np.array_equal(found & OWN, images)
     for window, step, row, col in np.ndindex(*images.shape):
         around = images[window, step, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2]
-        assert drawn[window, step, row, col] >> NUM_SLICES == np.bitwise_or.reduce(around, axis=None)
-    assert (
-        not sweeps.images.slices.view(-1, 13, 15)[:, [0, 1, -1, -2]].any()
-        and not image_of(sweeps, images.shape, 4).any()
-    )
+        assert found[window, step, row, col] >> NUM_SLICES == np.bitwise_or.reduce(around, axis=None)
+    border = sweeps.columns.image.view(-1, 13, 15)
+    assert not border[:, [0, 1, -1, -2]].any() and not border[:, :, [0, 1, -1, -2]].any()
+    assert not drawn(sweeps, sweeps.columns.first_of_copies).any()
 
 
-def test_copies_are_images_of_their_own():
+def test_a_look_up_reads_the_shifted_pixel_of_another_sweep_and_nothing_outside():
+    rng, num_steps = np.random.default_rng(3), 10  # more sweeps than a word has bytes
+    images = (rng.random((2, num_steps, 9, 11)) < 0.1) * rng.integers(1, 16, (2, num_steps, 9, 11))
+    sweeps = from_images(images.astype(np.uint8))
+    pixels = sweeps.pixels
+    step = torch.from_numpy(rng.integers(0, num_steps, len(pixels)))
+    shift = torch.from_numpy(rng.integers(-14, 15, (2, 3, len(pixels))))
+    found = sweeps.columns.look_up(pixels, step, shift).numpy() & OWN
+    wide = np.pad(images, ((0, 0), (0, 0), (30, 30), (30, 30)))
+    row, col = (pixels.row_col[:, None] + shift).numpy() + 30
+    assert np.array_equal(found, wide[pixels.window.numpy(), step.numpy(), row, col]) and found.any()
+    words = sweeps.columns.words(pixels).view(torch.uint8)[:, :num_steps] & OWN
+    row, col = pixels.row_col.numpy()
+    assert np.array_equal(words.numpy(), images[pixels.window.numpy(), :, row, col])
+
+
+def test_copies_are_columns_of_their_own():
     sweeps = sweeps_of([scene(0), scene(1)], PLAIN)
-    half = len(sweeps.images.slices) // 2
-    before, rows = sweeps.images.slices[:half].clone(), torch.arange(0, 400, 7)
+    before, rows = drawn(sweeps), torch.arange(0, 400, 7)
     rows = rows[sweeps.points[rows].is_member]
     own = sweeps.pixels[sweeps.points[rows].of_item]
     num_points = len(sweeps.points.of_item)
     copies = sweeps.with_copies(rows)
-    assert same_bits(copies.images.slices[:half], before)
+    assert np.array_equal(drawn(copies), before)
     of_copy = copies.pixels[copies.points.of_item[num_points:]]
     assert torch.equal(of_copy.window, own.window + 2)
     assert all(torch.equal(getattr(of_copy, name), getattr(own, name)) for name in ("step", "row_col"))
-    slices = copies.images.look_up(of_copy, of_copy.step) & fast.OWN
+    slices = copies.columns.look_up(of_copy, of_copy.step) & OWN
     assert torch.equal(slices, of_copy.slices) and bool((slices & ~own.slices == 0).all())
-    points = fast.slice_of(sweeps.batch.positions[2, rows], fast.SLICE_HEIGHT).long()
+    points = slice_of(sweeps.batch.positions[2, rows], SLICE_HEIGHT).long()
     assert bool(((slices.long() >> points) & 1).all()) and (slices != own.slices).any()
+    around = copies.around(torch.arange(copies.num_pixels), 0)
+    assert torch.equal(around.of_item, torch.arange(copies.num_pixels))
 
 
 def test_slices_by_hand():
     z = torch.tensor([0.0, 0.49, 0.5, 1.0, 1.99, 2.0, -0.01, -0.5, -0.51, -2.0, 1e300, -1e300], dtype=torch.float64)
-    assert fast.slice_of(z, 0.5).tolist() == [0, 0, 1, 2, 3, 0, 3, 3, 2, 0, 0, 0]
-    assert fast.slice_of(z[:10], 0.1, 16).tolist() == slice_of(z[:10].numpy(), 0.1, 16).tolist()
+    assert slice_of(z, 0.5).tolist() == [0, 0, 1, 2, 3, 0, 3, 3, 2, 0, 0, 0]
+    assert slice_of(z[:10], 0.1, 16).tolist() == oracle_slice_of(z[:10].numpy(), 0.1, 16).tolist()
     infinite = torch.tensor([math.inf, -math.inf, math.nan], dtype=torch.float64)
-    assert fast.slice_of(infinite, 0.5).tolist() == [0, 0, 0]
+    assert slice_of(infinite, 0.5).tolist() == [0, 0, 0]
     every = torch.arange(16, dtype=torch.uint8)
-    assert fast.count_slices(every).tolist() == [bin(value).count("1") for value in range(16)]
+    assert count_slices(every).tolist() == [bin(value).count("1") for value in range(16)]
+    flags = (every[:, None] >> torch.arange(4)) & 1
+    assert pack_bits(flags.bool()).tolist() == every.tolist()
 
 
 def random_window(seed: int) -> Window:

@@ -1,0 +1,262 @@
+"""Columns: the height slices of all sweeps of a window, at each position that any of them occupies or is next to.
+
+Most of a bird's-eye view is empty, so a dense image of every sweep is slow to make and to read. One dense image per
+window tells which column is at a position, and small tables have a row for each column.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import constant, flat_nonzero, lazy_zeros, split_index, take_columns
+from cflow_torch.windows.bev_grid import Grid
+
+NUM_SLICES = 4
+OWN = (1 << NUM_SLICES) - 1  # the bits of the pixel itself
+REACH = 2  # rows and columns; several steps search this far around a pixel
+_WORD = 8  # sweeps whose slices make up one int64
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """K occupied pixels of sweeps. Step 0 is sweep t+1, 1 is t, 2 is t-1, ..."""
+
+    place: Tensor  # (6, K) int64: column, its first slot, window, step, row and col
+    slices: Tensor  # (K,) uint8, one bit for each height slice
+
+    @property
+    def column(self) -> Tensor:
+        """(K,) int64, row of the tables of `Columns`."""
+        return self.place[0]
+
+    @property
+    def first_slot(self) -> Tensor:
+        """(K,) int64, slot of sweep t+1; that of sweep `step` is `step` slots on."""
+        return self.place[1]
+
+    @property
+    def window(self) -> Tensor:
+        """(K,) int64."""
+        return self.place[2]
+
+    @property
+    def step(self) -> Tensor:
+        """(K,) int64."""
+        return self.place[3]
+
+    @property
+    def row_col(self) -> Tensor:
+        """(2, K) int64."""
+        return self.place[4:]
+
+    def __getitem__(self, index: Tensor) -> Pixels:
+        """Select pixels by their positions in the list, (L,) int64."""
+        return Pixels(take_columns(self.place, index), self.slices.index_select(0, index))
+
+    def __len__(self) -> int:
+        return len(self.slices)
+
+    def followed_by(self, other: Pixels) -> Pixels:
+        """Concatenate two lists of pixels."""
+        return Pixels(torch.cat((self.place, other.place), 1), torch.cat((self.slices, other.slices)))
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of B windows. All index arithmetic of images is here.
+
+    The image of a window has an empty border of `REACH` positions (b), so that only distant positions need a test:
+
+        b b b b b b b b
+        b b b b b b b b
+        b b 0 1 2 3 b b      0 = no sweep occupies this position or one of the 8 around it
+        b b 0 4 5 6 b b      n = column n
+        b b b b b b b b
+        b b b b b b b b
+
+    The tables have a row for each column, and a slot for each sweep. S slots are rounded up to whole words. As many
+    slots follow for the copies of points that lie under an overhang (`HeightSlicedSweeps.with_copies`):
+
+        slot         0    1    2    3   .   .   .   .  |  8    9   ...
+        sweep of    t+1   t   t-1  t-2                 | t+1   t   ...      of the copies
+
+    A byte of `slices` holds two sets of height slices:
+
+        bit          7 6 5 4 | 3 2 1 0
+        slices of    the 3 x 3 pixels around | the pixel itself
+    """
+
+    height: int  # H, rows of an image without its border
+    width: int  # W
+    image: Tensor  # (B * area,) int32, column at each position; 0 = none
+    position: Tensor  # (C + 1,) int64, flat index into `image` of each column; column 0 is the empty one
+    slices: Tensor  # (C + 1, T) uint8
+    # (C + 1, T) int32, 1 + position of each occupied pixel in the list of pixels; 0 = the pixel is empty
+    rank: Tensor
+
+    @classmethod
+    def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int) -> Columns:
+        """Make empty columns at and around the occupied positions, (B * area,) bool. The border must be False."""
+        stride = grid.width + 2 * REACH
+        device = is_occupied.device
+        is_column = _dilate(is_occupied, stride)
+        images = is_column.view(-1, grid.height + 2 * REACH, stride)
+        images[:, :REACH] = images[:, -REACH:] = False
+        images[:, :, :REACH] = images[:, :, -REACH:] = False
+        position = flat_nonzero(is_column)  # [C]
+        image = lazy_zeros(len(is_column), torch.int32, device)
+        image.index_copy_(0, position, torch.arange(1, len(position) + 1, dtype=torch.int32, device=device))
+        # Column 0 is said to be at a position of the border that has only border around it.
+        position = torch.cat((constant((stride + 1,), torch.int64, device), position))
+        shape = (len(position), 2 * _WORD * -(-num_steps // _WORD))
+        slices = torch.zeros(shape, dtype=torch.uint8, device=device)
+        rank = torch.zeros(shape, dtype=torch.int32, device=device)
+        return cls(grid.height, grid.width, image, position, slices, rank)
+
+    @property
+    def stride(self) -> int:
+        """Positions from a row of an image to the next one."""
+        return self.width + 2 * REACH
+
+    @property
+    def num_slots(self) -> int:
+        """T."""
+        return self.slices.shape[1]
+
+    @property
+    def first_of_copies(self) -> int:
+        """First slot of the copies."""
+        return self.num_slots // 2
+
+    def look_up(self, pixels: Pixels, step: Tensor | int, shift: Tensor | None = None) -> Tensor:
+        """Return the bytes of the pixels that are `shift` away in another sweep of the same window.
+
+        Args:
+            pixels: K pixels.
+            step: the other sweep, (K,) int64, or one for all.
+            shift: (2, ..., K) integers, rows down and columns to the right; None = the same position.
+
+        Returns:
+            (..., K) uint8; 0 outside of the images.
+        """
+        column = pixels.column if shift is None else self._column_at(pixels, shift)
+        index = column * self.num_slots + (pixels.first_slot + step)  # [..., K]
+        return self.slices.view(-1).index_select(0, index.view(-1)).view_as(index)
+
+    def _column_at(self, pixels: Pixels, shift: Tensor) -> Tensor:
+        """Return the column at the positions that are `shift` away, (..., K) int32."""
+        # These lines take 3 % of a window, so they are in place, and in 32 bits unless there are too many positions.
+        dtype = torch.int32 if len(self.image) <= torch.iinfo(torch.int32).max else torch.int64
+        row, col = pixels.row_col.to(dtype)
+        start = self.position.index_select(0, pixels.column).to(dtype) - row * self.stride - col  # of row 0, col 0
+        index = (row + shift[0].to(dtype)).clamp_(-1, self.height).mul_(self.stride)  # [..., K]
+        index += (col + shift[1].to(dtype)).clamp_(-1, self.width)
+        index += start
+        return self.image.index_select(0, index.view(-1)).view_as(index)
+
+    def words(self, pixels: Pixels) -> Tensor:
+        """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""
+        words = self.slices.view(torch.int64)[:, : self.first_of_copies // _WORD]  # not of copies
+        return words.index_select(0, pixels.column)
+
+    def around(self, pixels: Pixels, reach: int, count: int) -> Groups:
+        """Return which of the `count` pixels of the list are around K pixels, up to `reach` pixels each way.
+
+        The result has an item for each pixel of the square in raster order, and for each of the K pixels:
+        (2 reach + 1)^2 K items, grouped by the pixel of the list.
+        """
+        position = self.position.index_select(0, pixels.column)
+        return self.pixel_at(self._slots_around(position, pixels.first_slot + pixels.step, reach).view(-1), count)
+
+    def ranks_near(self, sweep: Tensor, num_steps: int, row_col: Tensor, reach: int) -> Tensor:
+        """Return the pixels around K places in the images: ((2 reach + 1)^2, K) int32, as in `rank`, in raster order.
+
+        `sweep` is window * num_steps + step, (K,) int64. `row_col`, (2, K) int64, are at least `reach` from the border.
+        """
+        window, step = split_index(sweep, num_steps)
+        num_windows = len(self.image) // ((self.height + 2 * REACH) * self.stride)
+        is_copy = window >= num_windows
+        row, col = row_col + REACH
+        line = (window - is_copy * num_windows) * (self.height + 2 * REACH) + row
+        slots = self._slots_around(line * self.stride + col, step + is_copy * self.first_of_copies, reach)
+        return self.rank.view(-1).index_select(0, slots.view(-1)).view_as(slots)
+
+    def _slots_around(self, position: Tensor, slot: Tensor, reach: int) -> Tensor:
+        """Return a slot of the columns around K positions, counted through all columns, ((2 reach + 1)^2, K) int64."""
+        line = range(-reach, reach + 1)
+        offsets = tuple((down * self.stride + right,) for down in line for right in line)
+        index = position + constant(offsets, torch.int64, self.image.device)  # [(2 reach + 1)^2, K]
+        column = self.image.index_select(0, index.view(-1)).view_as(index)
+        return column * self.num_slots + slot
+
+    def pixel_at(self, slot: Tensor, count: int) -> Groups:
+        """Group K slots, counted through all columns, (K,), by their pixel, one of `count` in the list."""
+        rank = self.rank.view(-1).index_select(0, slot).long() - 1
+        return Groups(torch.where(rank < 0, count, rank), count)
+
+    def or_around(self, words: Tensor) -> Tensor:
+        """Return the bitwise OR over the 3 x 3 columns around each column, (C + 1, ...) int64."""
+        left, right, above, below = self._neighbours
+        words = words | words.index_select(0, left) | words.index_select(0, right)
+        return words | words.index_select(0, above) | words.index_select(0, below)
+
+    @cached_property
+    def _neighbours(self) -> Tensor:
+        """(4, C + 1) int32, column to the left and to the right of each column, above and below it; 0 = none."""
+        steps = constant(((-1,), (1,), (-self.stride,), (self.stride,)), torch.int64, self.image.device)
+        beside = self.position + steps
+        return self.image.index_select(0, beside.view(-1)).view_as(beside)
+
+    def draw(self, slices: Tensor, first: int, pixels_before: int, num_windows: int) -> Pixels:
+        """Draw the height slices of sweeps, and list their pixels, in order of window, step and position.
+
+        Args:
+            slices: (C + 1, T / 2) uint8, slices of the pixels themselves; row 0 is 0.
+            first: the first slot to draw, 0 or `first_of_copies`.
+            pixels_before: number of pixels that are in the list already.
+            num_windows: B. Pixels of copies are in window B + w.
+        """
+        words = slices.view(torch.int64)
+        half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
+        self.slices.view(torch.int64)[:, half] = words | self.or_around(words) << NUM_SLICES
+        step, column = split_index(flat_nonzero(slices.t().contiguous()), len(self.position))
+        position = self.position.index_select(0, column)
+        line, col = split_index(position, self.stride)
+        window, row = split_index(line, self.height + 2 * REACH)
+        if num_windows > 1:
+            order = window.sort(stable=True).indices
+            window, step, column, row, col = torch.stack((window, step, column, row, col)).index_select(1, order)
+        index = column * self.num_slots + (step + first)
+        rank = torch.arange(pixels_before + 1, pixels_before + 1 + len(index), dtype=torch.int32, device=index.device)
+        self.rank.view(-1).index_copy_(0, index, rank)
+        if first > 0:
+            window = window + num_windows
+        place = torch.stack((column, torch.full_like(column, first), window, step, row - REACH, col - REACH))
+        return Pixels(place, self.slices.view(-1).index_select(0, index) & OWN)
+
+
+def _dilate(image: Tensor, stride: int) -> Tensor:
+    """Dilate images by 3 x 3, (N,) bool, row after row of `stride` values; their borders are empty."""
+    across = image.clone()
+    across[1:] |= image[:-1]
+    across[:-1] |= image[1:]
+    result = across.clone()
+    result[stride:] |= across[:-stride]
+    result[:-stride] |= across[stride:]
+    return result
+
+
+def count_slices(slices: Tensor, dtype: torch.dtype = torch.int64) -> Tensor:
+    """Count the slices in each value, (...) uint8 with bits 0 ... 3 only: (...) numbers.
+
+    bits                        d c b a
+    minus bits 1 and 3          d+c b+a      two bits each
+    the sum of both halves      d+c+b+a
+    """
+    pairs = slices - ((slices >> 1) & 0b0101)
+    return ((pairs & 0b0011) + (pairs >> 2)).to(dtype)
