@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
@@ -199,6 +200,10 @@ class Columns:
         rank = self.rank.view(-1).index_select(0, slot).long() - 1
         return Groups(torch.where(rank < 0, count, rank), count)
 
+    def as_words(self, values: Tensor) -> Tensor:
+        """Return (C + 1, S) bytes as words, with a byte for each slot: (C + 1, T / 16) int64."""
+        return F.pad(values, (0, self.first_of_copies - values.shape[1])).view(torch.int64)
+
     def or_around(self, words: Tensor) -> Tensor:
         """Return the bitwise OR over the 3 x 3 columns around each column, (C + 1, ...) int64."""
         left, right, above, below = self._neighbours
@@ -216,15 +221,15 @@ class Columns:
         """Draw the height slices of sweeps, and list their pixels, in order of window, step and position.
 
         Args:
-            slices: (C + 1, T / 2) uint8, slices of the pixels themselves; row 0 is 0.
+            slices: (C + 1, S) uint8, slices of the pixels themselves; row 0 is 0.
             first: the first slot to draw, 0 or `first_of_copies`.
             pixels_before: number of pixels that are in the list already.
             num_windows: B. Pixels of copies are in window B + w.
         """
-        words = slices.view(torch.int64)
+        words = self.as_words(slices)
         half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
         self.slices.view(torch.int64)[:, half] = words | self.or_around(words) << NUM_SLICES
-        step, column = split_index(flat_nonzero(slices.t().contiguous()), len(self.position))
+        step, column = split_index(flat_nonzero((slices != 0).t().contiguous()), len(self.position))
         position = self.position.index_select(0, column)
         line, col = split_index(position, self.stride)
         window, row = split_index(line, self.height + 2 * REACH)

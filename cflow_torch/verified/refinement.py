@@ -260,9 +260,9 @@ def _draw_points(
     is_occupied = torch.zeros(num_windows * (grid.height + 2 * REACH) * stride, dtype=torch.bool, device=at.device)
     columns = Columns.at(is_occupied.index_fill_(0, at, True), grid, sweeps.num_steps)
     column = columns.image.index_select(0, at).long()
-    slices = torch.zeros_like(columns.slices[:, : columns.first_of_copies])
+    slices = columns.slices.new_zeros((len(columns.position), sweeps.num_steps))
     slices[column, step] = 1
-    pixels = columns.draw(slices.contiguous(), 0, 0, num_windows)
+    pixels = columns.draw(slices, 0, 0, num_windows)
     return columns, pixels, columns.pixel_at(column * columns.num_slots + step, len(pixels))
 
 
