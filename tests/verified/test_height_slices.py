@@ -58,11 +58,12 @@ def test_a_look_up_reads_the_shifted_pixel_of_another_sweep_and_nothing_outside(
     sweeps = from_images(images.astype(np.uint8))
     pixels = sweeps.pixels
     step = torch.from_numpy(rng.integers(0, num_steps, len(pixels)))
-    shift = torch.from_numpy(rng.integers(-14, 15, (2, 3, len(pixels))))
+    shift = torch.from_numpy(rng.integers(-14, 15, (len(pixels), 3, 2)))
     found = sweeps.columns.look_up(pixels, step, shift).numpy() & OWN
     wide = np.pad(images, ((0, 0), (0, 0), (30, 30), (30, 30)))
-    row, col = (pixels.row_col[:, None] + shift).numpy() + 30
-    assert np.array_equal(found, wide[pixels.window.numpy(), step.numpy(), row, col]) and found.any()
+    row, col = (pixels.row_col.T[:, None] + shift).permute(2, 0, 1).numpy() + 30
+    window = pixels.window[:, None].numpy()
+    assert np.array_equal(found, wide[window, step[:, None].numpy(), row, col]) and found.any()
     words = sweeps.columns.words(pixels).view(torch.uint8)[:, :num_steps] & OWN
     row, col = pixels.row_col.numpy()
     assert np.array_equal(words.numpy(), images[pixels.window.numpy(), :, row, col])
