@@ -16,11 +16,10 @@ from matplotlib.patches import Rectangle
 
 from cflow_torch import VerifiedFlow
 from cflow_torch.data.log import window
-from cflow_torch.ops.indices import lookup
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.changed_pixels import find_changed
 from cflow_torch.verified.columns import count_slices
-from cflow_torch.verified.component_tree import find_components, movable_nodes, select_objects
+from cflow_torch.verified.component_tree import NodeKind, find_components, movable_nodes, select_objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.overhangs import add_overhung
 from cflow_torch.verified.paired_test import add_unchanged, verify
@@ -58,19 +57,21 @@ def take_steps(drive: Any) -> tuple[Any, ...]:
     batch = make_batch(given, config, grid, torch.device("cpu"), 3, model.needs_ground, model.needs_times)
     sweeps = HeightSlicedSweeps.of(batch, grid, config.min_height)
     change = find_changed(sweeps)
-    components = find_components(sweeps, change, [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes])
-    sweeps, nodes = add_overhung(sweeps, components, movable_nodes(sweeps, components, config.max_object_length))
-    candidates = propose(nodes, components, sweeps, config)
-    motion, evidence = verify(sweeps, nodes, candidates.motion, components.num_levels, config.significance)
-    nodes = add_unchanged(sweeps, nodes, motion, components.num_levels)
-    objects, node = select_objects(nodes, components, evidence, sweeps.num_pixels)
-    return sweeps, change, components, nodes, objects, lookup(motion, node).any(1), model(given)[0]
+    blocks = [round(size / config.pixel_sizes[-1]) for size in config.pixel_sizes]
+    components = find_components(sweeps, change, blocks)
+    sweeps, tree = add_overhung(sweeps, components, movable_nodes(sweeps, components, config.max_object_length))
+    candidates = propose(tree, blocks, sweeps, config)
+    motion, evidence = verify(sweeps, tree, candidates.motion, config.significance)
+    tree = add_unchanged(sweeps, tree, motion)
+    objects = select_objects(sweeps, components, tree, evidence)
+    return sweeps, change, components, tree, objects, objects.nodes.spread(motion).any(1), model(given)[0]
 
 
 def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: float) -> None:
     """Draw one drive, a step in each panel. The view is `width` metres wide and begins at the corner `low`."""
     sweeps, change, components, nodes, objects, moves, result = take_steps(drive)
-    pixels, size, own, levels = sweeps.pixels, sweeps.grid.pixel_size, components.roots.shape[1], components.num_levels
+    pixels, size, levels = sweeps.pixels, sweeps.grid.pixel_size, nodes.num_levels
+    own, node_of_member = len(components.levels[0].of_item), nodes.members.of_item
     high = np.array(low) + (width, width * HIGH / WIDE)
     corners = pixels.row_col.flip(0).T.numpy() * size + sweeps.grid.lower[:2]  # lower left ones
 
@@ -90,21 +91,23 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
     paint(panels[0], (now, SHADES[count_slices(pixels.slices[now])]))
     paint(panels[1], (every, PALE), (torch.where(change.has_changed)[0], PALETTE[0]))
     scales = torch.tensor((levels - 2, levels - 1))  # the finest, dilated and plain
-    fine = torch.where(torch.isin(nodes.level[nodes.node], scales))[0].flip(0)  # dilated ones are drawn over plain ones
-    paint(panels[2], (every, PALE), colours(nodes.pixel[fine], nodes.node[fine]))
-    for number, level in enumerate(nodes.level.tolist()):
+    fine = torch.where(torch.isin(nodes.kind[node_of_member], scales))[0].flip(
+        0
+    )  # dilated ones are drawn over plain ones
+    paint(panels[2], (every, PALE), colours(nodes.pixel[fine], node_of_member[fine]))
+    for number, level in enumerate(nodes.kind.tolist()):
         if level not in (levels - 2, levels - 1):
-            inside = corners[nodes.pixel[nodes.node == number]]
+            inside = corners[nodes.pixel[node_of_member == number]]
             corner, far = inside.min(0) - 0.5 * size, inside.max(0) + 1.5 * size
-            line = {levels: (":", 1.3), levels + 1: ("--", 1.6)}.get(level, ("-", 1.0))
+            line = {NodeKind.CHANGED: (":", 1.3), NodeKind.OVERHUNG: ("--", 1.6)}.get(level, ("-", 1.0))
             panels[2].add_patch(Rectangle(corner, *(far - corner), fill=False, linestyle=line[0], linewidth=line[1]))
-    chosen = torch.where(lookup(moves, objects.of_pixel))[0]
-    chosen, rgb = colours(chosen, objects.of_pixel[chosen])
+    chosen = torch.where(objects.pixels.spread(moves))[0]
+    chosen, rgb = colours(chosen, objects.pixels.of_item[chosen])
     rgb[(chosen >= own) & (pixels.row_col[:, chosen].sum(0) % 6 < 2)] = 255
     paint(panels[3], (every, PALE), (chosen, rgb))
 
     flow, rows = result.residual_flow.numpy(), sweeps.batch.rows[0]
-    pixel, points = sweeps.pixel_of_point[rows], sweeps.batch.positions[:2, rows].T.numpy()
+    pixel, points = sweeps.points.of_item[rows], sweeps.batch.positions[:2, rows].T.numpy()
     fast = np.linalg.norm(flow, axis=1) > MOVING
     fast &= ((points >= low) & (points <= high)).all(1)
     longest = np.ceil(20 * np.linalg.norm(flow[fast], axis=1).max()) / 20
