@@ -20,6 +20,7 @@ from cflow_torch.windows.bev_grid import Grid
 NUM_SLICES = 4
 OWN = (1 << NUM_SLICES) - 1  # the bits of the pixel itself
 REACH = 2  # rows and columns; several steps search this far around a pixel
+_COUNTS = tuple(bin(slices).count("1") for slices in range(OWN + 1))
 _WORD = 8  # sweeps whose slices make up one int64
 
 
@@ -55,7 +56,7 @@ class Pixels:
     @cached_property
     def row_col(self) -> Tensor:
         """(2, K) int64."""
-        return self.place[:, 4:].t().long().contiguous()
+        return self.place[:, 4:].t().to(torch.int64, memory_format=torch.contiguous_format)
 
     def __getitem__(self, index: Tensor) -> Pixels:
         """Select pixels by their positions in the list, (L,) int64."""
@@ -263,12 +264,7 @@ def _dilate(image: Tensor, stride: int) -> Tensor:
     return result
 
 
-def count_slices(slices: Tensor, dtype: torch.dtype = torch.int64) -> Tensor:
-    """Count the slices in each value, (...) uint8 with bits 0 ... 3 only: (...) numbers.
-
-    bits                        d c b a
-    minus bits 1 and 3          d+c b+a      two bits each
-    the sum of both halves      d+c+b+a
-    """
-    pairs = slices - ((slices >> 1) & 0b0101)
-    return ((pairs & 0b0011) + (pairs >> 2)).to(dtype)
+def count_slices(slices: Tensor) -> Tensor:
+    """Count the slices in each value, (...) uint8 with bits 0 ... 3 only: (...) int64."""
+    counts = constant(_COUNTS, torch.int64, slices.device)
+    return counts.index_select(0, slices.reshape(-1).int()).view(slices.shape)
