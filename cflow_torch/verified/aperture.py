@@ -15,7 +15,7 @@ vehicle. However, no vehicle is as low as a guard rail, or as long as a noise ba
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -66,45 +66,55 @@ def slides_along_itself(
     newest = flat_nonzero(pixels.step == 0)
     newest_pixels = pixels[newest]
     at_newest = groups[newest]
-    is_line, variance, (var_y, cov, var_x) = principal_axes(at_newest, newest_pixels.row_col, pixel_size)
-    of_line = flat_nonzero(groups.spread(is_line & ~travels))  # few pixels
+    lines = principal_axes(at_newest, newest_pixels.row_col, pixel_size)
+    of_line = flat_nonzero(groups.spread(lines.is_line & ~travels))  # few pixels
     is_covered = count_in_place(sweeps, pixels[of_line], groups[of_line]).is_covered
-    # Of the two forms of the eigenvector, we take the one that does not vanish.
-    is_wide = var_y < var_x
-    axis_y, axis_x = torch.where(is_wide, cov, variance - var_x), torch.where(is_wide, variance - var_y, cov)
     num_more = at_newest.sum(count_slices(newest_pixels.slices) - _TALL)
-    is_rail = (num_more < 0) & (variance >= (_RAIL / pixel_size) ** 2)
+    is_rail = (num_more < 0) & (lines.variance >= (_RAIL / pixel_size) ** 2)
+    slides = lines.is_line & (is_covered | is_rail)
 
     # The window of each component; components without pixels at t+1 are not lines.
     window = at_newest.max(newest_pixels.window, empty=0)
-    intervals = (sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)).index_select(0, window)[:, None]
-    y, x = candidates.unbind(2)
-    across = axis_y[:, None] * x - axis_x[:, None] * y
-    square = y * y + x * x
-    length = (axis_y * axis_y + axis_x * axis_x)[:, None]
-    slides = (is_line & (is_covered | is_rail))[:, None] & (across * across <= _ALONG * square * length)
-    return slides & (square * (intervals * intervals) >= (_LEAST_TRAVEL / pixel_size) ** 2)
+    intervals = sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)  # [B]
+    travel = candidates.square().sum(2) * intervals.square().index_select(0, window)[:, None]  # [A, C], square pixels
+    return slides[:, None] & lines.are_along(candidates) & (travel >= (_LEAST_TRAVEL / pixel_size) ** 2)
 
 
-def principal_axes(
-    groups: Groups, row_col: Tensor, pixel_size: float
-) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """Return which of A components are lines, (A,) bool, and the variances of their pixels at t+1.
+class Lines(NamedTuple):
+    """The principal axes of A components, and which of them are lines."""
 
-    These are the largest variance of all directions, then the variance in y, the covariance, the variance in x. Each is
-    (A,) float64, square pixels. `row_col` is (2, Q) int64.
-    """
+    is_line: Tensor  # (A,) bool
+    variance: Tensor  # (A,) float64, square pixels, the largest of all directions
+    axis: Tensor  # (A, 2) float64, (y, x), a vector in that direction, of any length
+
+    def are_along(self, motions: Tensor) -> Tensor:
+        """Tell which motions of each component, (A, C, 2) float64, (y, x), point along its axis: (A, C) bool."""
+        y, x = self.axis[:, None].unbind(2)
+        across = y * motions[..., 1] - x * motions[..., 0]
+        return across.square() <= _ALONG * motions.square().sum(2) * self.axis.square().sum(1)[:, None]
+
+
+def principal_axes(groups: Groups, row_col: Tensor, pixel_size: float) -> Lines:
+    """Return the principal axes of A components from their pixels at t+1; `row_col` is (2, Q) int64."""
     one_y_x = torch.cat((torch.ones_like(row_col[:1]), row_col))  # `F.pad` of torch 2.0 fails without pixels
     moments = groups.sum((one_y_x[:, None] * one_y_x).view(9, -1)).reshape(3, 3, -1)
-    n, sums = moments[0, 0], moments[0, 1:]
+    count = moments[0, 0]
+    sums = moments[0, 1:]
     # Differences of large products are exact in integers.
-    (var_y, cov), (_, var_x) = (n * moments[1:, 1:] - sums[:, None] * sums) / (n * n).clamp(min=1).double()
+    covariance = (count * moments[1:, 1:] - sums[:, None] * sums) / (count * count).clamp(min=1).double()
+    var_y = covariance[0, 0]
+    var_x = covariance[1, 1]
+    cov = covariance[0, 1]
     # Eigenvalues of the 2 x 2 matrix.
-    mean, half = (var_y + var_x) / 2, (var_y - var_x) / 2
+    mean = (var_y + var_x) / 2
+    half = (var_y - var_x) / 2
     root = torch.sqrt(half * half + cov * cov)
-    small, large = mean - root, mean + root
-    is_line = (small <= (_THIN / pixel_size) ** 2) & (large >= (_LONG / pixel_size) ** 2)
-    return is_line, large, (var_y, cov, var_x)
+    largest = mean + root
+    is_line = (mean - root <= (_THIN / pixel_size) ** 2) & (largest >= (_LONG / pixel_size) ** 2)
+    # Of the two forms of the eigenvector, we take the one that does not vanish.
+    wide = torch.stack((cov, largest - var_y), 1)
+    high = torch.stack((largest - var_x, cov), 1)
+    return Lines(is_line, largest, torch.where((var_y < var_x)[:, None], wide, high))
 
 
 def both_ends_move(sweeps: HeightSlicedSweeps, tree: Tree, is_long: Tensor) -> Tensor:

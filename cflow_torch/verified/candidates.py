@@ -18,7 +18,7 @@ from cflow_torch.dense.clustering import Pixels as ClusterPixels
 from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import constant, flat_nonzero, lazy_empty, lazy_zeros, take_columns
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_empty, lazy_zeros
 from cflow_torch.ops.segments import masked_median
 from cflow_torch.verified.columns import OWN, Pixels, count_slices
 from cflow_torch.verified.component_tree import Tree
@@ -45,11 +45,12 @@ def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, conf
     Source: adapted from Sec. leverage_past_pcs, which takes the medians of magnitude and of orientation.
     """
     images = _NodeImages.of(nodes, blocks, sweeps)
-    clusters = Clusters(nodes.window, images.first, images.size, images.pixels)
-    pairs = make_pairs(clusters, sweeps.batch, images.block.double() * sweeps.grid.pixel_size, config.max_speed)
+    boxes = images.boxes
+    clusters = Clusters(nodes.window, boxes.top_left, boxes.size, images.pixels)
+    pairs = make_pairs(clusters, sweeps.batch, boxes.block.double() * sweeps.grid.pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
     peak = shift + _parabola(images, pairs, shift)
-    peak *= images.block.index_select(0, pairs.cluster)[:, None]
+    peak *= boxes.block.index_select(0, pairs.cluster)[:, None]
     estimates = Estimates.of(pairs, peak, score, sweeps.elapsed.index_select(0, nodes.window)[:, 1:])
 
     own = estimates.per_interval().masked_fill_(~estimates.available[:, :, None], 0.0)
@@ -65,16 +66,38 @@ def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, conf
 
 
 @dataclass(frozen=True)
+class _Boxes:
+    """The box of each of N nodes over all sweeps, at the scale at which the node is correlated."""
+
+    # (N, 6) int64: side of a pixel in finest pixels, where the images of the node begin, top and left of its box, and
+    # height and width of the box, in pixels of the scale.
+    table: Tensor
+    num_samples: int  # I, of all images
+
+    @property
+    def block(self) -> Tensor:
+        """(N,) int64, side of a pixel in finest pixels."""
+        return self.table[:, 0]
+
+    @property
+    def top_left(self) -> Tensor:
+        """(N, 2) int64."""
+        return self.table[:, 2:4]
+
+    @property
+    def size(self) -> Tensor:
+        """(N, 2) int64, height and width."""
+        return self.table[:, 4:]
+
+
+@dataclass(frozen=True)
 class _NodeImages:
     """A small image of each of N nodes for each of S sweeps, at the scale at which the node is correlated.
 
     All images lie one after the other in `slices`: node by node, sweep by sweep, row by row.
     """
 
-    block: Tensor  # (N,) int64, side of a pixel in finest pixels
-    first: Tensor  # (N, 2) int64, top-left (row, col) of the box over all sweeps, in pixels of the scale
-    size: Tensor  # (N, 2) int64, height and width of the box
-    start: Tensor  # (N,) int64, where the images of each node begin
+    boxes: _Boxes
     slices: Tensor  # (I,) uint8
     pixels: ClusterPixels  # the Q occupied pixels of the images
     slices_of_pixel: Tensor  # (Q,) uint8
@@ -84,42 +107,31 @@ class _NodeImages:
         """Draw the nodes. At coarser scales, all slices of a pixel are set."""
         node = nodes.members.of_item  # [A]
         members = sweeps.pixels[nodes.pixel]  # [A]
-        block, first, size = _boxes(nodes, members, blocks)
-        height, width = size.t()
-        end = (height * width * sweeps.num_steps).cumsum(0)
-        start = end - height * width * sweeps.num_steps
-
-        block_of, height_of, width_of, start_of, top, left = take_columns(
-            torch.stack((block, height, width, start, *first.t())), node
-        )
-        row, col = torch.div(members.row_col, block_of, rounding_mode="floor")
-        index = start_of + (members.step * height_of + row - top) * width_of + col - left  # [A]
-        num_samples = int(end[-1]) if nodes.count else 0
-        slices = lazy_zeros(num_samples, torch.uint8, node.device)
-        slices.scatter_(0, index, members.slices.masked_fill(block_of > 1, OWN))
+        boxes = _boxes(nodes, members, blocks, sweeps.num_steps)
+        of_member = boxes.table.index_select(0, node)
+        block, start, top, left, height, width = of_member.t()  # [A] each
+        row, col = torch.div(members.row_col, block, rounding_mode="floor")
+        index = start + (members.step * height + row - top) * width + col - left  # [A]
+        slices = lazy_zeros(boxes.num_samples, torch.uint8, node.device)
+        slices.scatter_(0, index, members.slices.masked_fill(block > 1, OWN))
         # Several finest pixels may fall into one pixel of the scale. They are equal there, so any of them may remain.
-        member_at = lazy_empty(num_samples, torch.int32, node.device)
+        member_at = lazy_empty(boxes.num_samples, torch.int32, node.device)
         member_at.scatter_(0, index, torch.arange(len(node), dtype=torch.int32, device=node.device))
-        drawn = flat_nonzero(slices)  # [Q]
+        drawn = flat_nonzero(slices.bool())  # [Q]
         member = member_at.index_select(0, drawn).long()
-        pixels = ClusterPixels(
-            cluster=node.index_select(0, member),
-            step=members.step.index_select(0, member),
-            row=row.index_select(0, member),
-            col=col.index_select(0, member),
-        )
-        return cls(block, first, size, start, slices, pixels, slices.index_select(0, drawn))
+        pixels = ClusterPixels(*gather(member, node, members.step, row, col))
+        return cls(boxes, slices, pixels, slices.index_select(0, drawn))
 
     def look_up_newest(self, node: Tensor, row: Tensor, col: Tensor) -> Tensor:
         """Return the slices of pixels of nodes at t+1; 0 outside of the box. Node is (K,), row and col (..., K)."""
-        height, width = take_columns(self.size.t(), node)
+        _, start, _, _, height, width = self.boxes.table.index_select(0, node).t()
         is_inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
-        index = (row * width + col + self.start.index_select(0, node)) * is_inside
+        index = (start + row * width + col) * is_inside
         return self.slices.index_select(0, index.view(-1)).view_as(index) * is_inside
 
 
-def _boxes(nodes: Tree, members: Pixels, blocks: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose the scale of each node. Return the side of its pixels, (N,), and its box: first pixel and size, (N, 2).
+def _boxes(nodes: Tree, members: Pixels, blocks: Sequence[int], num_steps: int) -> _Boxes:
+    """Choose the scale and the box of each node.
 
     Convention: a node has the scale of its level, unless its box has more than `_LARGEST_BOX` pixels there. Then it has
         the finest scale at which the box fits, or the coarsest if it fits nowhere.
@@ -132,7 +144,12 @@ def _boxes(nodes: Tree, members: Pixels, blocks: Sequence[int]) -> tuple[Tensor,
     num_fitting = (size.prod(0) <= _LARGEST_BOX).sum(0)  # these scales come first
     scale = torch.minimum(nodes.kind.clamp(max=len(blocks) - 1), (num_fitting - 1).clamp(min=0))
     node = torch.arange(nodes.count, device=scale.device)
-    return block[scale, 0], first[:, scale, node].t(), size[:, scale, node].t()
+    top_left = first[:, scale, node]  # [2, N]
+    size = size[:, scale, node]
+    num_samples = size.prod(0) * num_steps
+    end = num_samples.cumsum(0)
+    table = torch.stack((block[scale, 0], end - num_samples, *top_left, *size), 1)
+    return _Boxes(table, int(end[-1]) if nodes.count else 0)
 
 
 def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tensor:

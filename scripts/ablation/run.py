@@ -99,8 +99,10 @@ def print_row(of_set: str, setting: str, figures: Figures) -> None:
     print(f"| {of_set} | {setting} | {shown} | {moving:.0f} |", flush=True)
 
 
-def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any]) -> Figures:
+def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any], steps: Mapping[str, Any] = {}) -> Figures:
     """Score a preset with the history and the region of a set, for a fair comparison, and with the given changes.
+
+    `steps` are steps of `VerifiedFlow` that replace those of the model.
 
     Small drives are scored one by one and averaged, as in docs/limits.md.
     """
@@ -110,6 +112,8 @@ def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any]) -> Fig
         of_set["point_cloud_range"] = (-half, -half, -math.inf, half, half, math.inf)
     config = make_config(preset, **{**of_set, **changes})
     model, frames = make_model(config), []
+    for step, replacement in steps.items():
+        setattr(model, step, replacement)
     for window, frame in scored.items:
         (result,) = model([replace(window, pcf=window.pcf[: config.num_future])])
         frames.append(replace(frame, residual_flow=result.residual_flow))

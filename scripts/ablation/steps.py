@@ -9,54 +9,59 @@ The columns are those of run.py.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
-from typing import Any, ContextManager
-from unittest.mock import patch
+from typing import Any
 
 import torch
 from run import Figures, make_parser, print_table, score_preset
 from sets import ScoredSet, make_sets
+from torch import Tensor
 
-from cflow_torch.verified import changed_pixels, component_tree, confidence, method, paired_test, refinement
+from cflow_torch.verified import changed_pixels, component_tree, confidence, paired_test, refinement
 
 
-def _without_changed(sweeps: Any) -> Any:
+def _without_changed(sweeps: Any) -> changed_pixels.ChangedPixels:
     change = changed_pixels.find_changed(sweeps)
-    return changed_pixels.ChangedPixels(change.is_missing, torch.zeros_like(change.has_changed))
+    return change._replace(has_changed=torch.zeros_like(change.has_changed))
 
 
-def _without_margin(*given: Any) -> Any:
+def _linked_may_move(*given: Any) -> component_tree.Components:
+    components = component_tree.find_components(*given)
+    return replace(components, may_move=components.is_linked)
+
+
+def _without_margin(*given: Any) -> confidence.MotionMargin:
     margin = confidence.motion_margin(*given)
-    return confidence.MotionMargin(margin.z, torch.ones_like(margin.is_dynamic))
+    return margin._replace(is_dynamic=torch.ones_like(margin.is_dynamic))
 
 
-def _nothing_slides(sweeps: Any, members: Any, component: Any, candidates: Any, is_covered: Any) -> Any:
-    return torch.zeros(candidates.shape[:2], dtype=torch.bool, device=candidates.device)
+def _nothing_slides(sweeps: Any, pixels: Any, groups: Any, motions: Tensor, *_: Any) -> Tensor:
+    return torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
 
 
-def _nothing_is_slow(sweeps: Any, objects: Any, motion: Any, may_be_slow: Any) -> Any:
+def _nothing_is_slow(sweeps: Any, objects: Any, motion: Tensor, may_be_slow: Tensor) -> Tensor:
     return motion.flip(1) * sweeps.grid.pixel_size
 
 
-def _no_ends_move(sweeps: Any, roots: Any, is_long: Any) -> Any:
+def _no_ends_move(sweeps: Any, tree: Any, is_long: Tensor) -> Tensor:
     return torch.zeros_like(is_long)
 
 
-# For each step, what replaces it.
-STEPS: dict[str, ContextManager[Any]] = {
-    "all steps": nullcontext(),
-    "no changed pixels": patch.object(method, "find_changed", _without_changed),
-    "no unchanged pixels": patch.object(method, "add_unchanged", lambda sweeps, nodes, *_: nodes),
-    "no static test": patch.object(component_tree, "_MISSING", 1 << 40),
-    "no objects under overhangs": patch.object(method, "add_overhung", lambda sweeps, _, nodes: (sweeps, nodes)),
-    "no aperture test": patch.object(paired_test, "slides_along_itself", _nothing_slides),
-    "no least gain": patch.object(paired_test, "_LEAST_GAIN", 0),
-    "no price of an object": patch.object(component_tree, "_PRICE", 0),
-    "no margin": patch.object(method, "motion_margin", _without_margin),
-    "no registration": patch.object(refinement, "NUM_STEPS", 0),
-    "no slow objects of pairs": patch.object(refinement, "subpixel_motion", _nothing_is_slow),
-    "long vehicles are static": patch.object(component_tree, "both_ends_move", _no_ends_move),
+# For each row of the table, the steps of `VerifiedFlow` that it replaces.
+STEPS: dict[str, dict[str, Any]] = {
+    "all steps": {},
+    "no changed pixels": {"find_changed": _without_changed},
+    "no unchanged pixels": {"add_unchanged": lambda sweeps, tree, motion: tree},
+    "no static test": {"find_components": _linked_may_move},
+    "no objects under overhangs": {"add_overhung": lambda sweeps, components, tree: (sweeps, tree)},
+    "no aperture test": {"verify": partial(paired_test.verify, slides=_nothing_slides)},
+    "no least gain": {"verify": partial(paired_test.verify, least_gain=0)},
+    "no price of an object": {"select_objects": partial(component_tree.select_objects, price=0)},
+    "no margin": {"motion_margin": _without_margin},
+    "no registration": {"refine": partial(refinement.refine, num_steps=0)},
+    "no slow objects of pairs": {"refine": partial(refinement.refine, find_slow=_nothing_is_slow)},
+    "long vehicles are static": {"movable_nodes": partial(component_tree.movable_nodes, ends_move=_no_ends_move)},
 }
 SETTINGS: dict[str, dict[str, Any]] = {
     "no scale of 0.4 m": {"pixel_sizes": (0.2, 0.1)},
@@ -65,8 +70,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 def score_without(scored: ScoredSet, name: str) -> Figures:
-    with STEPS.get(name, nullcontext()):
-        return score_preset(scored, "default", SETTINGS.get(name, {}))
+    return score_preset(scored, "default", SETTINGS.get(name, {}), STEPS.get(name, {}))
 
 
 def main() -> None:

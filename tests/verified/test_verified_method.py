@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -75,9 +76,12 @@ def test_a_wall_that_seems_to_slide_is_static(monkeypatch):
     wall = np.stack((rng.uniform(-4, 4, 250), np.full(250, 3.05), rng.uniform(-1, 1, 250)), 1)
     window = Window(Sweep(wall - (1.4, 0.0, 0.0)), Sweep(wall))
     assert not flow_as_oracle(window, MODEL).residual_flow.any()
-    monkeypatch.setattr(
-        paired_test, "slides_along_itself", lambda *given: torch.zeros(given[3].shape[:2], dtype=torch.bool)
-    )
+
+    def nothing_slides(*given):
+        return torch.zeros(given[3].shape[:2], dtype=torch.bool)
+
+    without = partial(paired_test.verify, slides=nothing_slides)
+    monkeypatch.setattr(VerifiedFlow, "verify", staticmethod(without))
     monkeypatch.setattr(confidence, "_Z", 0.0)
     assert (VerifiedFlow(MODEL)([window])[0].residual_flow[:, 0] > 1.0).any()
 
