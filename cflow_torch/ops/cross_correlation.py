@@ -45,7 +45,9 @@ def cross_correlate(
     images = images.to(_fft_dtype(images, most))
     height, width = images.shape[-2:]
     spectrum = torch.fft.rfft(images[..., 0, :]) if height == 1 else torch.fft.rfft2(images)
-    product = spectrum[num_templates:].index_select(0, target).mul_(spectrum[:num_templates].conj())
+    # In place, because a lazy `conj` would be copied by the product.
+    templates = spectrum[:num_templates].conj_physical_()
+    product = spectrum[num_templates:].index_select(0, target).mul_(templates)
     if height == 1:
         return torch.fft.irfft(product, n=width)[:, None]
     return torch.fft.irfft2(product, s=(height, width))
