@@ -17,7 +17,7 @@ from cflow_torch.dense.packing import ImageClass, Packing, pack
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import flat_nonzero, largest_of_rows, take_columns
+from cflow_torch.ops.indices import exceeds, flat_nonzero, largest_of_rows, take_columns
 from cflow_torch.ops.window_counts import WindowCounts
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
 
@@ -136,7 +136,9 @@ class _Counts:
     def above(self, bounds: Tensor) -> Tensor:
         """Return the samples whose counts exceed the bound of their template, (n,) float: (K,) int64, ascending."""
         bounds_of_parts = bounds[:, None].split([len(part) for part in self.parts])
-        return flat_nonzero(torch.cat([(part > bound).view(-1) for part, bound in zip(self.parts, bounds_of_parts)]))
+        return flat_nonzero(
+            torch.cat([exceeds(part, bound).view(-1) for part, bound in zip(self.parts, bounds_of_parts)])
+        )
 
 
 def _correlate(packing: Packing, engine: str, max_memory: float | None) -> Iterator[_Counts]:
@@ -193,7 +195,7 @@ def _correlate_class(images: ImageClass, some: slice, engine: str) -> Tensor:
         targets = called[len(target) + low : len(target) + high + 1]
         called = torch.cat((called[some], targets))
         target = target[some] - low
-    counts = cross_correlate(called.float(), num_templates, target, engine, images.max_energy)
+    counts = cross_correlate(called, num_templates, target, engine, images.max_energy)
     return counts.flatten(1)[:, : images.num_searched]
 
 
@@ -216,10 +218,11 @@ def _candidates(counts: _Counts, packing: Packing, cluster: Tensor) -> _Candidat
     sample = counts.above((largest * largest / target_energy - 1).clamp(min=0.5))  # [K]
 
     template = torch.searchsorted(end, sample, right=True)
-    shift = search[template].shift_at(sample - start[template])
+    search = search[template]
+    shift = search.shift_at(sample - start[template])
     pair = pair[template]
     columns = torch.stack((pair, cluster[pair], *shift, counts.samples[sample].long()))
-    return _Candidates(take_columns(columns, flat_nonzero(search[template].contains(shift))))
+    return _Candidates(take_columns(columns, flat_nonzero(search.contains(shift))))
 
 
 @dataclass(frozen=True)

@@ -138,6 +138,13 @@ def take_columns(table: Tensor, index: Tensor) -> Tensor:
     return table.gather(1, index.expand(len(table), -1))
 
 
+def exceeds(values: Tensor, bound: Tensor) -> Tensor:
+    """`values > bound`, bool, of numbers that broadcast; on the CPU NumPy is four times as fast as torch."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(np.greater(values.numpy(), bound.numpy()))
+    return values > bound
+
+
 def largest_of_rows(values: Tensor) -> Tensor:
     """`values.argmax(1)`, (R,) int64, of (R, C) numbers; on the CPU NumPy is four times as fast as torch."""
     if values.device.type == "cpu":
