@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Iterator
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -12,11 +13,11 @@ from torch import Tensor
 from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
-from cflow_torch.dense.packing import ImageClass, Search, pack
+from cflow_torch.dense.packing import ImageClass, Packing, pack
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import flat_nonzero, largest_of_rows, split_index, take_columns
+from cflow_torch.ops.indices import exceeds, flat_nonzero, largest_of_rows, take_columns
 from cflow_torch.ops.window_counts import WindowCounts
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
 
@@ -26,6 +27,10 @@ _BYTES_PER_SAMPLE = 48
 # needs few launches.
 _PER_CALL_CPU = 1 << 18
 _PER_CALL_GPU = 1 << 26
+# Searched samples of templates whose counts we compare in one go.
+_PER_RUN_CPU = 1 << 21
+_PER_RUN_GPU = 1 << 26
+_EXACT_IN_FLOAT32 = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -96,24 +101,8 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
     if num_pairs == 0:
         return pairs.cluster.new_zeros((0, 2)), torch.zeros(0, dtype=torch.float32, device=pairs.size.device)
     packing = pack(pairs)
-    square = None if pairs.radius is None else (pairs.radius * pairs.radius).floor()  # (J,), of the longest shift
-    target_energy = packing.energy.index_select(0, num_pairs + pairs.cluster)  # (J,)
-    found = []
-    for images in packing.classes:
-        for some, counts in _correlate(images, engine, max_memory):
-            pair = images.pair[some]
-            longest = None if square is None else square[pair]
-            needed = _least_count(packing.search[pair], counts, target_energy[pair], longest)
-            row, sample = split_index(flat_nonzero(counts > needed[:, None]), counts.shape[1])
-            found.append(torch.stack((pair[row], sample, counts[row, sample].long())))
-    pair, sample, count = torch.cat(found, 1)  # [K]
-    search = packing.search[pair]
-    shift = search.shift_at(sample)
-    is_searched = (shift <= search.high).all(0)
-    if square is not None:
-        is_searched &= (shift * shift).sum(0) <= square.index_select(0, pair)
-    dy, dx = shift
-    candidates = _Candidates(pair, pairs.cluster.index_select(0, pair), dy, dx, count).at(flat_nonzero(is_searched))
+    found = [_candidates(counts, packing, pairs.cluster) for counts in _correlate(packing, engine, max_memory)]
+    candidates = _Candidates(torch.cat([part.columns for part in found], 1))
     target = pairs.target
     windows = WindowCounts(target.image, target.row, target.col, packing.size)
     best = _best_of_each_pair(candidates, windows, num_pairs)
@@ -123,19 +112,144 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
 
 
 @dataclass(frozen=True)
-class _Candidates:
-    """Shifts that may be the best of their pair, (K,) int64 each."""
+class _Counts:
+    """Numbers of coinciding pixels of some packed templates, which follow each other.
 
-    pair: Tensor
-    cluster: Tensor
-    dy: Tensor
-    dx: Tensor
-    count: Tensor  # coinciding pixels
+    samples   0 0 0 0 | 1 1 1 1 | 2 2 2 2 2 2      two templates of a class and one of the next
+    parts     [2, 4]              [1, 6]
+    """
+
+    templates: slice  # the n packed templates
+    samples: Tensor  # (A,) float, whole numbers: the searched samples of one template after the other
+    parts: list[Tensor]  # views of the samples, (templates, searched samples), one for each call of the correlation
+
+    def ends(self) -> Tensor:
+        """(n,) int64, number of samples up to the last one of each template."""
+        lengths = [part.shape[1] for part in self.parts]
+        repeats = [len(part) for part in self.parts]
+        return torch.from_numpy(np.repeat(lengths, repeats).cumsum()).to(self.samples.device)
+
+    def largest(self) -> Tensor:
+        """(n,) int64, the sample of the largest count of each template, from its first sample on."""
+        return torch.cat([largest_of_rows(part) for part in self.parts])
+
+    def above(self, bounds: Tensor) -> Tensor:
+        """Return the samples whose counts exceed the bound of their template, (n,) float: (K,) int64, ascending."""
+        bounds_of_parts = bounds[:, None].split([len(part) for part in self.parts])
+        return flat_nonzero(
+            torch.cat([exceeds(part, bound).view(-1) for part, bound in zip(self.parts, bounds_of_parts)])
+        )
+
+
+def _correlate(packing: Packing, engine: str, max_memory: float | None) -> Iterator[_Counts]:
+    """Correlate all packed templates, as many at once as suit the device and the memory, in Bytes, that we may use."""
+    per_call = _PER_CALL_CPU if packing.pair.device.type == "cpu" else _PER_CALL_GPU
+    per_run = _PER_RUN_CPU if packing.pair.device.type == "cpu" else _PER_RUN_GPU
+    if max_memory is not None:
+        per_call = min(per_call, int(max_memory) // _BYTES_PER_SAMPLE)
+        per_run = min(per_run, int(max_memory) // _BYTES_PER_SAMPLE)
+    first = 0
+    for run in _runs(packing.classes, per_call, per_run):
+        is_exact = max(images.max_energy for images, _ in run) <= _EXACT_IN_FLOAT32
+        num_samples = [images.num_searched * (some.stop - some.start) for images, some in run]
+        dtype = torch.float32 if is_exact else torch.float64
+        samples = torch.empty(sum(num_samples), dtype=dtype, device=packing.pair.device)
+        parts = [part.view(-1, images.num_searched) for part, (images, _) in zip(samples.split(num_samples), run)]
+        for part, (images, some) in zip(parts, run):
+            torch.round(_correlate_class(images, some, engine).to(dtype), out=part)
+        stop = first + sum(map(len, parts))
+        yield _Counts(slice(first, stop), samples, parts)
+        first = stop
+
+
+def _runs(classes: list[ImageClass], per_call: int, per_run: int) -> Iterator[list[tuple[ImageClass, slice]]]:
+    """Yield lists of calls of the correlation: a class, and some of its templates.
+
+    A call has at most `per_call` samples of templates, and a list at most `per_run` searched samples, or one call.
+    """
+    run: list[tuple[ImageClass, slice]] = []
+    num_samples = 0
+    for images in classes:
+        num_templates = len(images.target)
+        at_once = max(1, per_call // images.area)
+        for first in range(0, num_templates, at_once):
+            some = slice(first, min(first + at_once, num_templates))
+            added = (some.stop - some.start) * images.num_searched
+            if run and num_samples + added > per_run:
+                yield run
+                run = []
+                num_samples = 0
+            run.append((images, some))
+            num_samples += added
+    yield run
+
+
+def _correlate_class(images: ImageClass, some: slice, engine: str) -> Tensor:
+    """Correlate some templates of a class with their targets: (n, searched samples) float, nearly whole numbers."""
+    num_templates = some.stop - some.start
+    called = images.images
+    target = images.target
+    if num_templates < len(target):
+        # Templates are in order of their targets, so they need a range of targets.
+        low, high = images.target_on_host[[some.start, some.stop - 1]].tolist()
+        targets = called[len(target) + low : len(target) + high + 1]
+        called = torch.cat((called[some], targets))
+        target = target[some] - low
+    counts = cross_correlate(called, num_templates, target, engine, images.max_energy)
+    return counts.flatten(1)[:, : images.num_searched]
+
+
+def _candidates(counts: _Counts, packing: Packing, cluster: Tensor) -> _Candidates:
+    """Find the shifts that may be the best of their pair; `cluster` is the target of each pair, (J,) int64.
+
+    The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
+    count^2 / target energy and count. A shift whose count is below such a lower bound of another shift cannot win. We
+    take the bounds of two shifts: shift 0, and the shift of the largest count, clamped to the search range.
+    """
+    pair = packing.pair[counts.templates]
+    search = packing.search[counts.templates]
+    end = counts.ends()
+    start = F.pad(end[:-1], (1, 0))
+    probe = search.clamp(search.shift_at(counts.largest()))
+    samples = torch.stack((search.sample_at(torch.zeros_like(probe)), search.sample_at(probe))) + start  # [2, n]
+    largest = counts.samples[samples].amax(0)
+    target_energy = packing.energy[len(cluster) + cluster[pair]]
+    # We subtract 1, because the quotient is rounded. A count of 0 never beats shift 0.
+    sample = counts.above((largest * largest / target_energy - 1).clamp(min=0.5))  # [K]
+
+    template = torch.searchsorted(end, sample, right=True)
+    search = search[template]
+    shift = search.shift_at(sample - start[template])
+    pair = pair[template]
+    columns = torch.stack((pair, cluster[pair], *shift, counts.samples[sample].long()))
+    return _Candidates(take_columns(columns, flat_nonzero(search.contains(shift))))
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """K shifts that may be the best of their pair."""
+
+    columns: Tensor  # (5, K) int64: pair, cluster, dy, dx, number of coinciding pixels
+
+    @property
+    def pair(self) -> Tensor:
+        return self.columns[0]
+
+    @property
+    def cluster(self) -> Tensor:
+        return self.columns[1]
+
+    @property
+    def shift(self) -> Tensor:
+        return self.columns[2:4]
+
+    @property
+    def count(self) -> Tensor:
+        return self.columns[4]
 
     def at(self, index: Tensor) -> _Candidates:
         """Select some candidates."""
-        columns = torch.stack((self.pair, self.cluster, self.dy, self.dx, self.count))
-        return _Candidates(*take_columns(columns, index))
+        return _Candidates(take_columns(self.columns, index))
 
 
 @dataclass(frozen=True)
@@ -148,46 +262,6 @@ class _Best:
     energy: Tensor  # target pixels under the window
 
 
-def _correlate(images: ImageClass, engine: str, max_memory: float | None) -> Iterator[tuple[slice, Tensor]]:
-    """Yield some templates of a class, and their counts of coinciding pixels, (n, searched samples), whole numbers."""
-    per_call = _PER_CALL_CPU if images.images.device.type == "cpu" else _PER_CALL_GPU
-    if max_memory is not None:
-        per_call = min(per_call, int(max_memory) // _BYTES_PER_SAMPLE)
-    num_templates = len(images.pair)
-    at_once = max(1, per_call // images.area)
-    for first in range(0, num_templates, at_once):
-        some = slice(first, min(first + at_once, num_templates))
-        # Templates are in order of their targets, so they need a range of targets.
-        low, high = images.target_on_host[[some.start, some.stop - 1]].tolist()
-        targets = images.images[num_templates + low : num_templates + high + 1]
-        called = torch.cat((images.images[some], targets)).float()
-        target = images.target[some] - low
-        counts = cross_correlate(called, some.stop - some.start, target, engine, images.max_energy)
-        yield some, counts.flatten(1)[:, : images.num_searched].round_()
-
-
-def _least_count(search: Search, counts: Tensor, target_energy: Tensor, square: Tensor | None) -> Tensor:
-    """Return a bound that the count of the best shift of each pair exceeds, (n,) float.
-
-    The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
-    count^2 / target energy and count. A shift whose count is below such a lower bound of another shift cannot win. We
-    take the bounds of two shifts: shift 0, and the shift of the largest count, clamped to the search range.
-
-    Args:
-        counts: (n, searched samples).
-        target_energy: (n,) int64, pixels.
-        square: (n,) float64, of the longest shift, pixels; None = no limit.
-    """
-    zero = torch.zeros_like(search.low)
-    probe = torch.minimum(search.shift_at(largest_of_rows(counts)), search.high)
-    if square is not None:
-        probe = torch.where((probe * probe).sum(0) <= square, probe, zero)
-    samples = torch.stack((search.sample_at(zero), search.sample_at(probe)), 1)  # [n, 2]
-    largest = counts.gather(1, samples).amax(1)
-    # We subtract 1, because the quotient is rounded. A count of 0 never beats shift 0.
-    return (largest * largest / target_energy - 1).clamp(min=0.5)
-
-
 def _best_of_each_pair(candidates: _Candidates, windows: WindowCounts, num_pairs: int) -> _Best:
     """Choose the best candidate of each pair, all 0 for a pair without candidates.
 
@@ -195,20 +269,21 @@ def _best_of_each_pair(candidates: _Candidates, windows: WindowCounts, num_pairs
     that shift. Ties: as in `best_shifts`.
     """
     # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
-    least, most = windows.bounds(candidates.cluster, torch.stack((candidates.dy, candidates.dx)))
+    least, most = windows.bounds(candidates.cluster, candidates.shift)
     square = (candidates.count * candidates.count).double()
     of_pair = Groups(candidates.pair, num_pairs)
     lower = of_pair.spread(of_pair.max(square / most, empty=0.0))
     candidates = candidates.at(flat_nonzero(square / torch.maximum(least, candidates.count) >= lower))
 
-    energy = windows.count(candidates.cluster, torch.stack((candidates.dy, candidates.dx)))
+    energy = windows.count(candidates.cluster, candidates.shift)
     value = (candidates.count * candidates.count).double() / energy
     of_pair = Groups(candidates.pair, num_pairs)
     is_best = value == of_pair.spread(of_pair.max(value, empty=0.0))
+    dy, dx = candidates.shift
     # Among the best, the shortest shift wins, then the smallest dy, then the smallest dx.
-    length = candidates.dy * candidates.dy + candidates.dx * candidates.dx
+    length = dy * dy + dx * dx
     of_pair = of_pair.where(is_best)
     of_pair = of_pair.where(length == of_pair.spread(of_pair.min(length, empty=0)))
-    raster = candidates.dy * 2 * LONGEST_SIDE + candidates.dx
+    raster = dy * 2 * LONGEST_SIDE + dx
     of_pair = of_pair.where(raster == of_pair.spread(of_pair.min(raster, empty=0)))
-    return _Best(*of_pair.sum(torch.stack((candidates.dy, candidates.dx, candidates.count, energy))))
+    return _Best(*of_pair.sum(torch.stack((dy, dx, candidates.count, energy))))

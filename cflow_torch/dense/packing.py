@@ -23,7 +23,7 @@ from torch import Tensor
 
 from cflow_torch.dense.templates import TemplatePairs
 from cflow_torch.ops.cross_correlation import FAST_LENGTHS
-from cflow_torch.ops.indices import scatter_count, take_columns
+from cflow_torch.ops.indices import draw, scatter_count, take_columns
 from cflow_torch.types import CFlowError, as_numpy
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
 from cflow_torch.windows.memory import require_memory
@@ -40,16 +40,21 @@ _BASE = 1 << 24  # a class is named by height * _BASE + width of its images
 
 @dataclass(frozen=True)
 class Search:
-    """Search range of K images: dy in [-low_y, high_y], dx in [-low_x, high_x]."""
+    """Search range of K images: dy in [-low_y, high_y], dx in [-low_x, high_x], up to the longest shift."""
 
     low: Tensor  # (2, K) int64, (y, x)
     high: Tensor  # (2, K) int64, (y, x)
     stride: Tensor  # (K,) int64, samples from one row of the image to the next, and so from one dy to the next
+    longest_squared: Tensor | None  # (K,) float64, square of the length of the longest shift; None = no limit
 
-    def __getitem__(self, some: Tensor) -> Search:
-        """Select images, (L,) int64."""
-        low = take_columns(self.low, some)
-        return Search(low, take_columns(self.high, some), self.stride.index_select(0, some))
+    def __getitem__(self, images: Tensor | slice) -> Search:
+        """Select images, (L,) int64 or a slice."""
+        if isinstance(images, slice):
+            ranges = (self.low[:, images], self.high[:, images])
+        else:
+            ranges = (take_columns(self.low, images), take_columns(self.high, images))
+        longest = None if self.longest_squared is None else self.longest_squared[images]
+        return Search(*ranges, self.stride[images], longest)
 
     def sample_at(self, shift: Tensor) -> Tensor:
         """(K,) int64, the sample of each image that belongs to a shift, (2, K) int64."""
@@ -57,9 +62,22 @@ class Search:
         return dy * self.stride + dx
 
     def shift_at(self, sample: Tensor) -> Tensor:
-        """(2, K) int64, the shift that belongs to a sample of each image, (K,) int64; invalid above `high`."""
+        """(2, K) int64, the shift that belongs to a sample of each image, (K,) int64; may be beyond the range."""
         row = sample // self.stride
         return torch.stack((row, sample - row * self.stride)) - self.low
+
+    def contains(self, shift: Tensor) -> Tensor:
+        """(K,) bool, whether shifts that belong to samples, (2, K) int64, are in the range."""
+        is_inside = (shift <= self.high).all(0)
+        return is_inside if self.longest_squared is None else is_inside & self._is_short(shift)
+
+    def clamp(self, shift: Tensor) -> Tensor:
+        """(2, K) int64, shifts in the range: those that belong to samples, (2, K) int64, cut to it, or 0."""
+        shift = torch.minimum(shift, self.high)
+        return shift if self.longest_squared is None else shift * self._is_short(shift)
+
+    def _is_short(self, shift: Tensor) -> Tensor:
+        return (shift * shift).sum(0) <= self.longest_squared
 
 
 @dataclass(frozen=True)
@@ -67,8 +85,7 @@ class ImageClass:
     """T templates and their M targets, all of one shape."""
 
     images: Tensor  # (T + M, Y, X) bool, first the templates
-    pair: Tensor  # (T,) int64, index of each template among all pairs, ascending
-    target: Tensor  # (T,) int64, index of its target among the M targets, ascending
+    target: Tensor  # (T,) int64, index of the target of each template among the M targets, ascending
     target_on_host: np.ndarray  # the same as an array
     num_searched: int  # number of leading samples that hold the search range
     max_energy: int  # largest number of set pixels of an image
@@ -81,38 +98,13 @@ class ImageClass:
 
 @dataclass(frozen=True)
 class Packing:
-    """J templates and N targets."""
+    """J templates and N targets. The packed order of the templates is by class, then by pair."""
 
     classes: list[ImageClass]
-    search: Search  # of the J templates
-    energy: Tensor  # (J + N,) int64, set pixels of all templates, then of all targets
-    size: np.ndarray  # (N, 2) int64, height and width of all targets
-
-
-class _Shapes(NamedTuple):
-    """Shapes of the N targets and of their templates; arrays on the host."""
-
-    low: np.ndarray  # (N, 2)
-    high: np.ndarray  # (N, 2)
-    height: np.ndarray  # (N,) Y
-    length: np.ndarray  # (N,) X
-    stride: np.ndarray  # (N,)
-
-    @classmethod
-    def of(cls, size: np.ndarray, farthest: np.ndarray, lines: Sequence[int]) -> _Shapes:
-        """Choose the shapes of clusters of a size, (N, 2), that are searched up to `farthest` pixels, (N,)."""
-        low = np.minimum(size // 2, farthest[:, None])
-        high = np.minimum(size - 1 - size // 2, farthest[:, None])
-        rows, width = (size + low).T
-        is_line = rows * width <= lines[-1]
-        height = np.where(is_line, 1, _at_least(FAST_LENGTHS, rows))
-        length = np.where(is_line, _at_least(lines, rows * width), _at_least(FAST_LENGTHS, width))
-        return cls(low, high, height, length, np.where(is_line, width, length))
-
-    def num_searched(self) -> np.ndarray:
-        """(N,) number of leading samples that hold the search range."""
-        rows, cols = (self.low + self.high).T
-        return rows * self.stride + cols + 1
+    pair: Tensor  # (J,) int64, pair of each packed template
+    search: Search  # of the packed templates
+    energy: Tensor  # (J + N,) int64, set pixels of the template of each pair, then of each target
+    size: np.ndarray  # (N, 2) int64, height and width of each target
 
 
 def pack(pairs: TemplatePairs) -> Packing:
@@ -123,82 +115,188 @@ def pack(pairs: TemplatePairs) -> Packing:
     """
     device = pairs.size.device
     num_pairs = len(pairs.cluster)
-    num_targets = len(pairs.size)
     image_of_pixel = torch.cat((pairs.template.image, pairs.target.image + num_pairs))
-    energy = scatter_count(image_of_pixel, num_pairs + num_targets)
-    size, cluster, energies, farthest = _to_host(pairs, energy)
-    if size.max() > LONGEST_SIDE:
+    energy = scatter_count(image_of_pixel, num_pairs + len(pairs.size))
+    numbers = _Numbers.of(pairs, energy)
+    shapes = _Shapes.of(numbers, _LINES_CPU if device.type == "cpu" else _LINES_GPU)
+    _check_size(numbers, shapes, device)
+    layout = _Layout.of(numbers.cluster, shapes)
+
+    images = torch.from_numpy(layout.images(shapes)).to(device)  # [2, J + N]
+    buffer = _draw(pairs, take_columns(images, image_of_pixel), int(layout.num_samples.sum()))
+    templates = layout.templates(numbers.cluster, shapes)  # [7, J]
+    table = torch.from_numpy(templates).to(device)
+    pair = table[0]
+    longest_squared = None
+    if pairs.radius is not None:
+        longest_squared = (pairs.radius * pairs.radius).floor()[pair]
+    return Packing(
+        classes=_classes(layout, buffer, table[1], templates[1], shapes, numbers),
+        pair=pair,
+        search=Search(low=table[3:5], high=table[5:], stride=table[2], longest_squared=longest_squared),
+        energy=energy,
+        size=numbers.size,
+    )
+
+
+def _check_size(numbers: _Numbers, shapes: _Shapes, device: torch.device) -> None:
+    """Raise an error if a cluster is too long, or if the images need too much memory."""
+    longest = numbers.size.max()
+    if longest > LONGEST_SIDE:
         raise CFlowError(
-            f"a cluster is {size.max()} pixels long in one view (at most {LONGEST_SIDE}): is there a point far above "
+            f"a cluster is {longest} pixels long in one view (at most {LONGEST_SIDE}): is there a point far above "
             "or below? Give finite z bounds in point_cloud_range, or larger pixel_sizes"
         )
-    shapes = _Shapes.of(size, farthest, _LINES_CPU if device.type == "cpu" else _LINES_GPU)
-    area = shapes.height * shapes.length
+    area = shapes.area()
     require_memory(
-        int(area[cluster].sum() + area.sum() + _BYTES_PER_SAMPLE * area.max()),
+        int(area[numbers.cluster].sum() + area.sum() + _BYTES_PER_SAMPLE * area.max()),
         device,
-        f"a cluster that is {size.max()} pixels long",
+        f"a cluster that is {longest} pixels long",
         "give a max_speed, so that it is searched less far, a smaller point_cloud_range or larger pixel_sizes",
     )
 
-    # In the buffer, class follows class; templates come before targets. Templates have the class of their target.
-    names, class_of_target = np.unique(shapes.height * _BASE + shapes.length, return_inverse=True)
-    of_image = np.concatenate((cluster, np.arange(num_targets)))  # target of each image
-    is_target = np.arange(len(of_image)) >= num_pairs
-    order = np.argsort(2 * class_of_target[of_image] + is_target, kind="stable")
-    end = area[of_image[order]].cumsum()
-    start = np.empty_like(end)
-    start[order] = end - area[of_image[order]]
-    start[num_pairs:] += shapes.low[:, 0] * shapes.stride + shapes.low[:, 1]
-    low = shapes.low[of_image].T
-    high = shapes.high[of_image].T
-    on_device = torch.from_numpy(np.stack((start, shapes.stride[of_image], *low, *high))).to(device)
-    buffer = _draw(pairs, take_columns(on_device[:2], image_of_pixel), int(end[-1]))
-    search = Search(low=on_device[2:4, :num_pairs], high=on_device[4:6, :num_pairs], stride=on_device[1, :num_pairs])
 
-    classes = []
-    first = 0
-    for number, name in enumerate(names.tolist()):
-        targets = np.flatnonzero(class_of_target == number)
-        templates = np.flatnonzero(class_of_target[cluster] == number)
-        height, length = divmod(name, _BASE)
-        stop = first + (len(templates) + len(targets)) * height * length
-        target = np.searchsorted(targets, cluster[templates])
-        classes.append(
-            ImageClass(
-                images=buffer[first:stop].view(-1, height, length),
-                pair=torch.from_numpy(templates).to(device),
-                target=torch.from_numpy(target).to(device),
-                target_on_host=target,
-                num_searched=int(shapes.num_searched()[targets].max()),
-                max_energy=int(max(energies[templates].max(initial=0), energies[num_pairs + targets].max())),
-            )
-        )
-        first = stop
-    return Packing(classes, search, energy, size)
-
-
-def _to_host(pairs: TemplatePairs, energy: Tensor) -> tuple[np.ndarray, ...]:
-    """Copy to the host at once: size (N, 2), cluster (J,), energy (J + N,), and the longest search of a target (N,)."""
-    num_pairs = len(pairs.cluster)
-    longest = torch.full_like(pairs.cluster, LONGEST_SIDE)
-    if pairs.radius is not None:
-        longest = pairs.radius.clamp(max=LONGEST_SIDE).floor().long()
-    numbers = as_numpy(torch.cat((pairs.cluster, longest, energy, pairs.size.flatten())))
-    cluster, radius, energies, size = np.split(numbers, np.cumsum((num_pairs, num_pairs, len(energy))))
-    size = size.reshape(-1, 2)
-    farthest = np.zeros(len(size), np.int64)
-    np.maximum.at(farthest, cluster, radius)
-    return size, cluster, energies, farthest
-
-
-def _draw(pairs: TemplatePairs, layout: Tensor, num_samples: int) -> Tensor:
-    """Draw all images into one buffer, (A,) bool; `layout`, (2, P), has start and stride of the image of each pixel."""
+def _draw(pairs: TemplatePairs, places: Tensor, num_samples: int) -> Tensor:
+    """Draw all images into one buffer, (A,) bool; `places`, (2, P), has start and stride of the image of each pixel."""
     row = torch.cat((pairs.template.row, pairs.target.row))
     col = torch.cat((pairs.template.col, pairs.target.col))
-    start, stride = layout
-    buffer = torch.zeros(num_samples, dtype=torch.bool, device=row.device)
-    return buffer.index_fill_(0, start + row * stride + col, True)
+    start, stride = places
+    return draw(start + row * stride + col, num_samples)
+
+
+class _Numbers(NamedTuple):
+    """Numbers of the J pairs and N targets that decide on the layout; int64 arrays on the host."""
+
+    cluster: np.ndarray  # (J,) target of each pair
+    radius: np.ndarray  # (J,) longest shift that is searched, pixels
+    energy: np.ndarray  # (J + N,) set pixels of all templates, then of all targets
+    size: np.ndarray  # (N, 2) height and width
+
+    @classmethod
+    def of(cls, pairs: TemplatePairs, energy: Tensor) -> _Numbers:
+        """Copy the numbers to the host at once."""
+        radius = torch.full_like(pairs.cluster, LONGEST_SIDE)
+        if pairs.radius is not None:
+            radius = pairs.radius.clamp(max=LONGEST_SIDE).floor().long()
+        parts = (pairs.cluster, radius, energy, pairs.size.flatten())
+        ends = np.cumsum([len(part) for part in parts[:-1]])
+        *columns, size = np.split(as_numpy(torch.cat(parts)), ends)
+        return cls(*columns, size.reshape(-1, 2))
+
+
+class _Shapes(NamedTuple):
+    """Shapes of the images of N targets and of their templates; int64 arrays on the host."""
+
+    low: np.ndarray  # (N, 2)
+    high: np.ndarray  # (N, 2)
+    height: np.ndarray  # (N,) Y
+    length: np.ndarray  # (N,) X
+    stride: np.ndarray  # (N,)
+
+    @classmethod
+    def of(cls, numbers: _Numbers, lines: Sequence[int]) -> _Shapes:
+        """Choose the shape for the size of each target and the farthest shift of its pairs."""
+        farthest = np.zeros((len(numbers.size), 1), np.int64)
+        np.maximum.at(farthest[:, 0], numbers.cluster, numbers.radius)
+        low = np.minimum(numbers.size // 2, farthest)
+        high = np.minimum(numbers.size - 1 - numbers.size // 2, farthest)
+        rows, width = (numbers.size + low).T
+        is_line = rows * width <= lines[-1]
+        height = np.where(is_line, 1, _at_least(FAST_LENGTHS, rows))
+        length = np.where(is_line, _at_least(lines, rows * width), _at_least(FAST_LENGTHS, width))
+        return cls(low, high, height, length, np.where(is_line, width, length))
+
+    def area(self) -> np.ndarray:
+        """(N,) number of samples of an image."""
+        return self.height * self.length
+
+    def num_searched(self) -> np.ndarray:
+        """(N,) number of leading samples that hold the search range."""
+        rows, cols = (self.low + self.high).T
+        return rows * self.stride + cols + 1
+
+
+class _Layout(NamedTuple):
+    """Order of the J templates and N targets in one buffer; int64 arrays on the host.
+
+    Class follows class. In a class, the templates come before the targets:
+
+        class 0           class 1               t3 = template of pair 3
+        t0 t3 T0 T2       t1 t2 t4 T1 T3        T2 = target 2
+    """
+
+    target: np.ndarray  # (J + N,) target of each image; the templates first, by pair
+    image_class: np.ndarray  # (J + N,) class of each image, 0 ... C - 1
+    order: np.ndarray  # (J + N,) images in the order of the buffer: 0 3 J+0 J+2 1 2 4 J+1 J+3
+    num_templates: np.ndarray  # (C,)
+    num_targets: np.ndarray  # (C,)
+    height: np.ndarray  # (C,) Y
+    length: np.ndarray  # (C,) X
+
+    @classmethod
+    def of(cls, cluster: np.ndarray, shapes: _Shapes) -> _Layout:
+        """Order the images by their shapes; `cluster`, (J,), is the target of each template."""
+        names, class_of_target = np.unique(shapes.height * _BASE + shapes.length, return_inverse=True)
+        target = np.concatenate((cluster, np.arange(len(class_of_target))))
+        image_class = class_of_target[target]
+        is_target = np.arange(len(target)) >= len(cluster)
+        return cls(
+            target=target,
+            image_class=image_class,
+            order=np.argsort(2 * image_class + is_target, kind="stable"),
+            num_templates=np.bincount(class_of_target[cluster], minlength=len(names)),
+            num_targets=np.bincount(class_of_target),
+            height=names // _BASE,
+            length=names % _BASE,
+        )
+
+    @property
+    def num_samples(self) -> np.ndarray:
+        """(C,) number of samples of all images of each class."""
+        return (self.num_templates + self.num_targets) * self.height * self.length
+
+    def images(self, shapes: _Shapes) -> np.ndarray:
+        """(2, J + N): sample of the first pixel, and stride, of the templates by pair, then of the targets."""
+        end = shapes.area()[self.target[self.order]].cumsum()
+        start = np.empty_like(end)
+        start[self.order] = end - shapes.area()[self.target[self.order]]
+        # The search range begins with shift (-low_y, -low_x), so targets are drawn that far from the corner.
+        corner = shapes.low[:, 0] * shapes.stride + shapes.low[:, 1]
+        start[-len(corner) :] += corner
+        return np.stack((start, shapes.stride[self.target]))
+
+    def templates(self, cluster: np.ndarray, shapes: _Shapes) -> np.ndarray:
+        """(7, J), in packed order: pair, target in the class, stride, low y and x, high y and x of each template."""
+        is_template = self.order < len(cluster)
+        pair = self.order[is_template]
+        target = self.order[~is_template] - len(cluster)
+        index_in_class = np.empty_like(target)
+        first = self.num_targets.cumsum() - self.num_targets
+        index_in_class[target] = np.arange(len(target)) - np.repeat(first, self.num_targets)
+        own = cluster[pair]
+        ranges = (*shapes.low[own].T, *shapes.high[own].T)
+        return np.stack((pair, index_in_class[own], shapes.stride[own], *ranges))
+
+
+def _classes(
+    layout: _Layout, buffer: Tensor, target: Tensor, target_on_host: np.ndarray, shapes: _Shapes, numbers: _Numbers
+) -> list[ImageClass]:
+    """Split the buffer, (A,) bool, and the targets of the packed templates, (J,) int64, by class."""
+    num_classes = len(layout.height)
+    num_searched = np.zeros(num_classes, np.int64)
+    np.maximum.at(num_searched, layout.image_class[len(numbers.cluster) :], shapes.num_searched())
+    max_energy = np.zeros(num_classes, np.int64)
+    np.maximum.at(max_energy, layout.image_class, numbers.energy)
+    columns = zip(
+        buffer.split(layout.num_samples.tolist()),
+        layout.height.tolist(),
+        layout.length.tolist(),
+        target.split(layout.num_templates.tolist()),
+        np.split(target_on_host, layout.num_templates.cumsum()),
+        num_searched.tolist(),
+        max_energy.tolist(),
+    )
+    return [ImageClass(images.view(-1, height, length), *others) for images, height, length, *others in columns]
 
 
 def _at_least(lengths: Sequence[int], values: np.ndarray) -> np.ndarray:

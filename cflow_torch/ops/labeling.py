@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate, product
-from typing import Sequence
+from typing import NamedTuple, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -47,25 +47,24 @@ class Blocks:
 
     def of_pixel(self, row: Tensor, col: Tensor) -> Tensor:
         """Component of the pixels at (row, col), (P,) int64. Rows continue from one padded image to the next."""
-        row, col = floor_divide(row, self.side), floor_divide(col, self.side)
-        return self.component.index_select(0, torch.add(col, row, alpha=self.cols))
+        block = floor_divide(row, self.side) * self.cols + floor_divide(col, self.side)
+        return self.component.index_select(0, block)
 
 
 def pad(images: Sequence[Tensor]) -> Tensor:
     """Combine sets of (B, H, W) bool images with OR, and add the margin to the right and below that `label_together`
     needs: (B, H', W') bool."""
-    first = images[0]
-    num_images, height, width = first.shape
-    padded = first.new_empty((num_images, padded_size(height), padded_size(width)))
+    num_images, height, width = images[0].shape
+    padded = images[0].new_empty((num_images, padded_size(height), padded_size(width)))
     padded[:, height:] = 0
     padded[:, :height, width:] = 0
     inside = padded[:, :height, :width]
     if len(images) == 1:
-        inside.copy_(first)
+        inside.copy_(images[0])
     else:
-        torch.bitwise_or(first, images[1], out=inside)
-    for more in images[2:]:
-        inside |= more
+        torch.bitwise_or(images[0], images[1], out=inside)
+    for image in images[2:]:
+        inside |= image
     return padded.bool()
 
 
@@ -91,38 +90,79 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
 
     Source: Sec. clustering; contraction of blocks as in block-based labelling (bolelli2022connected).
     """
-    device, num_sets = images[0][0].device, len(images)
-    sides = [reach + 1 if connectivity == 8 else reach for _, reach in images]
-    cols = [padded.shape[2] // side for (padded, _), side in zip(images, sides)]
-    parts = [_block_masks(padded, side) for (padded, _), side in zip(images, sides)]
-    masks = parts[0] if num_sets == 1 else torch.cat(parts)
-    nodes = flat_nonzero(masks.bool())  # on the CPU ten times faster than `masks != 0`
-    node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=device)
-    node_of_block.scatter_(0, nodes, torch.arange(nodes.numel(), device=device))
-
-    # One lookup for each half of a block tells which pixels of its four neighbours it reaches.
-    own = masks.index_select(0, nodes).int()
-    own |= own >> 4  # two columns of at most four bits in a byte
-    offsets, tables = _neighbourhoods(tuple(sides), tuple(cols), connectivity, tuple(r for _, r in images), device)
-    left, right = own & 0xFF, ((own >> 16) & 0xFF).add_(1 << 8)
-    if num_sets > 1:
-        ends = constant(tuple(accumulate(len(part) for part in parts[:-1])), torch.int64, device)
-        of_set = torch.bucketize(nodes, ends, right=True)
-        left, right = (torch.add(columns, of_set, alpha=1 << 9) for columns in (left, right))
-        offsets = offsets.index_select(0, of_set)
-    reached = tables.index_select(0, left)
-    if max(sides) > 2:
-        reached |= tables.index_select(0, right)
-    neighbours = nodes[:, None] + offsets
-    edges = flat_nonzero((reached & masks.take(neighbours)).bool())
-    targets = node_of_block.index_select(0, neighbours.view(-1).index_select(0, edges))
-    root = union_find(nodes.numel(), edges >> 2, targets)  # four neighbours
-    component = node_of_block.scatter_(0, nodes, root).split([len(part) for part in parts])
-    first = [0, *torch.searchsorted(nodes, ends).tolist()] if num_sets > 1 else [0]
+    kinds = tuple(_Kind(reach, connectivity, padded.shape[2]) for padded, reach in images)
+    parts = [_block_masks(padded, kind.side) for (padded, _), kind in zip(images, kinds)]
+    lengths = [len(part) for part in parts]
+    masks = torch.cat(parts) if len(parts) > 1 else parts[0]
+    nodes = flat_nonzero(masks.bool())  # [V]; on the CPU ten times faster than `masks != 0`
+    node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=masks.device)
+    node_of_block.scatter_(0, nodes, torch.arange(len(nodes), device=masks.device))
+    first_blocks = constant(tuple(accumulate(lengths[:-1])), torch.int64, masks.device)  # of all sets but the first
+    source, block = _links(masks, nodes, kinds, first_blocks)
+    root = union_find(len(nodes), source, node_of_block.index_select(0, block))
+    components = node_of_block.scatter_(0, nodes, root).split(lengths)
+    first = [0]
+    if len(kinds) > 1:
+        first += torch.searchsorted(nodes, first_blocks).tolist()
     return [
-        Blocks(side, width, start, nodes.numel(), part)
-        for side, width, start, part in zip(sides, cols, first, component)
+        Blocks(kind.side, kind.cols, number, len(nodes), component)
+        for kind, number, component in zip(kinds, first, components)
     ]
+
+
+class _Kind(NamedTuple):
+    """What a set of images says about the links of its blocks."""
+
+    reach: int
+    connectivity: int
+    width: int  # W', pixels of a row
+
+    @property
+    def side(self) -> int:
+        """Pixels per side of a block, in which all pixels are linked."""
+        return self.reach + 1 if self.connectivity == 8 else self.reach
+
+    @property
+    def cols(self) -> int:
+        """Blocks per row."""
+        return self.width // self.side
+
+
+def _links(masks: Tensor, nodes: Tensor, kinds: tuple[_Kind, ...], first_blocks: Tensor) -> tuple[Tensor, Tensor]:
+    """Find the linked neighbours of all nodes.
+
+    A byte of a mask is a column of a block, its bits are the rows. As no column has more than four rows, half a block
+    fits a byte, and this byte is a row of the table of `_reachable`:
+
+        mask        ....dddd ....cccc ....bbbb ....aaaa     columns a b c d
+        halves                        ddddcccc bbbbaaaa     right and left half
+
+    Args:
+        masks: (blocks,) int8, int16 or int32, of all sets.
+        nodes: (V,) int64, blocks that have pixels.
+        kinds: of each set.
+        first_blocks: (sets - 1,) int64, first block of each set but the first.
+
+    Returns:
+        The node and the linked block, (E,) int64 each, of each link.
+    """
+    offsets, tables = _neighbourhoods(kinds, masks.device)
+    mask = masks.index_select(0, nodes).int()
+    columns = mask | mask >> 4
+    left = columns & 0xFF
+    right = (columns >> 16 & 0xFF) + 256
+    if len(kinds) > 1:
+        set_of_node = torch.bucketize(nodes, first_blocks, right=True)
+        left = left + 512 * set_of_node
+        right = right + 512 * set_of_node
+        offsets = offsets.index_select(0, set_of_node)
+    reached = tables.index_select(0, left)  # [V, 4], masks of the pixels that each neighbour would need
+    if max(kind.side for kind in kinds) > 2:
+        reached |= tables.index_select(0, right)
+    neighbours = nodes[:, None] + offsets  # [V, 4]
+    is_linked = (reached & masks.index_select(0, neighbours.view(-1)).view_as(reached)).bool()
+    links = flat_nonzero(is_linked)
+    return floor_divide(links, len(_NEIGHBOURS)), neighbours.view(-1).index_select(0, links)
 
 
 def _block_masks(padded: Tensor, side: int) -> Tensor:
@@ -171,43 +211,49 @@ def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:
     the same parent, that parent is the root.
     """
     parent = torch.arange(num_nodes, device=sources.device)
-    ends, low, high, num_rounds = torch.cat((sources, targets)), sources, targets, _ROUNDS
+    ends = torch.cat((sources, targets))
+    parents = torch.stack((sources, targets))  # [2, E], of both ends of each edge
+    num_rounds = _ROUNDS
     while True:
         for _ in range(num_rounds):
-            # Hook the larger parent of an edge to the smaller one; the other direction has no effect.
-            parent.scatter_reduce_(0, high, low, "amin").scatter_reduce_(0, low, high, "amin")
+            parent = _hook(parent, *parents)
             for _ in range(_JUMPS):
                 parent = parent.index_select(0, parent)
-            low, high = parent.index_select(0, ends).view(2, -1)
-        if torch.equal(low, high):
+            parents = parent.index_select(0, ends).view(2, -1)
+        if torch.equal(parents[0], parents[1]):
             return parent
         num_rounds = 1
 
 
+def _hook(parent: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Hook the larger parent of each edge to the smaller one. The other direction has no effect."""
+    return parent.scatter_reduce_(0, other, one, "amin").scatter_reduce_(0, one, other, "amin")
+
+
 @lru_cache(maxsize=256)
-def _neighbourhoods(
-    sides: tuple[int, ...], cols: tuple[int, ...], connectivity: int, reaches: tuple[int, ...], device: torch.device
-) -> tuple[Tensor, Tensor]:
+def _neighbourhoods(kinds: tuple[_Kind, ...], device: torch.device) -> tuple[Tensor, Tensor]:
     """(sets, 4) int64 offsets of the neighbours of a block, and (512 sets, 4) int32 tables of `_reachable`."""
-    offsets = torch.tensor([[down * width + right for down, right in _NEIGHBOURS] for width in cols], device=device)
-    tables = [_reachable(side, connectivity, reach, device) for side, reach in zip(sides, reaches)]
-    return offsets, torch.cat(tables)
+    offsets = [[down * kind.cols + right for down, right in _NEIGHBOURS] for kind in kinds]
+    tables = [_reachable(kind.side, kind.connectivity, kind.reach) for kind in kinds]
+    return torch.tensor(offsets, device=device), torch.cat(tables).to(device)
 
 
 @lru_cache(maxsize=32)
-def _reachable(side: int, connectivity: int, reach: int, device: torch.device) -> Tensor:
+def _reachable(side: int, connectivity: int, reach: int) -> Tensor:
     """(512, 4) int32: mask of the pixels of each neighbour that are linked to a block.
 
-    Rows 0 ... 255 are for the first two columns of the block, four bits each, rows 256 ... 511 for the last two.
+    Rows 0 ... 255 are for the left half of the block, rows 256 ... 511 for the right half, see `_links`.
     """
-    half, bits = torch.arange(2)[:, None], torch.arange(1 << 8, dtype=torch.int32)
+    half = torch.arange(2)[:, None]
+    bits = torch.arange(256, dtype=torch.int32)
     tables = []
     for down, right in _NEIGHBOURS:
-        table = torch.zeros((2, 1 << 8), dtype=torch.int32)
+        table = torch.zeros((2, 256), dtype=torch.int32)
         for row, col, other_row, other_col in product(range(side), repeat=4):
-            dy, dx = abs(down * side + other_row - row), abs(right * side + other_col - col)
+            dy = abs(down * side + other_row - row)
+            dx = abs(right * side + other_col - col)
             if max(dy, dx) <= reach and not (connectivity == 4 and dy == dx == reach):
                 is_set = (bits >> (4 * (col % 2) + row)) & 1
                 table |= torch.where(half == col // 2, is_set, 0) << (8 * other_col + other_row)
         tables.append(table.flatten())
-    return torch.stack(tables, 1).to(device)
+    return torch.stack(tables, 1)

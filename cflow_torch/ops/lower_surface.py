@@ -10,6 +10,8 @@ UNKNOWN = 1 << 29  # height of an empty cell; sums with it still fit an int32
 _SUPPORT = 300  # height difference of similar neighbours, mm; low points without such neighbours are multipath
 _STEEP, _GENTLE = 164, 51  # mm per cell: 16 % for hills, 5 % about the smoothed hills (cells of a metre)
 _ROUGH = 70  # mm; cells up to this height above the surface belong to it
+# The cells around a cell, counted down and to the right from the one above and to the left of it.
+_NEIGHBOURS = tuple((down, right) for down in range(3) for right in range(3) if (down, right) != (1, 1))
 _SMOOTH = 10  # cells on each side over which we smooth the hills
 
 
@@ -39,14 +41,14 @@ def _is_supported(low: Tensor) -> Tensor:
     """(B, H, W) bool: three of the eight neighbours, or half of the occupied ones, have a similar height."""
     height, width = low.shape[1:]
     padded = F.pad(low, (1, 1, 1, 1), value=UNKNOWN)
-    similar, occupied = torch.zeros_like(low, dtype=torch.uint8), torch.zeros_like(low, dtype=torch.uint8)
-    for down in range(3):
-        for right in range(3):
-            if (down, right) != (1, 1):
-                neighbour = padded[:, down : down + height, right : right + width]
-                similar += (neighbour - low).abs_() <= _SUPPORT
-                occupied += neighbour < UNKNOWN
-    return (similar * 2 >= occupied.clamp(max=6)) & (occupied > 0) & (low < UNKNOWN)
+    num_similar = torch.zeros_like(low, dtype=torch.uint8)
+    num_occupied = torch.zeros_like(low, dtype=torch.uint8)
+    for down, right in _NEIGHBOURS:
+        neighbour = padded[:, down : down + height, right : right + width]
+        num_similar += (neighbour - low).abs_() <= _SUPPORT
+        num_occupied += neighbour < UNKNOWN
+    is_similar = num_similar * 2 >= num_occupied.clamp(max=6)
+    return is_similar & (num_occupied > 0) & (low < UNKNOWN)
 
 
 def _gentlest(heights: Tensor, slope: int) -> Tensor:
@@ -74,11 +76,15 @@ def _box_mean(heights: Tensor) -> Tensor:
     """(B, H, W) int32 mean over the part of the square around each cell that is inside."""
     _, height, width = heights.shape
     table = F.pad(heights.cumsum(1, dtype=torch.int64).cumsum(2), (1, 0, 1, 0))
-    cell = torch.arange(max(height, width), device=heights.device)
-    first, end = (cell - _SMOOTH).clamp_(min=0), cell + _SMOOTH + 1
-    top, bottom = first[:height], end[:height].clamp(max=height)
-    left, right = first[:width], end[:width].clamp(max=width)
+    top, bottom = _neighbourhood(height, heights.device)
+    left, right = _neighbourhood(width, heights.device)
     rows = table.index_select(1, bottom) - table.index_select(1, top)
     total = rows.index_select(2, right) - rows.index_select(2, left)
     area = (bottom - top)[:, None] * (right - left)
     return torch.div(total, area, rounding_mode="floor").int()
+
+
+def _neighbourhood(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """First cell, and end, of the cells about each of a row of cells, (size,) int64 each."""
+    cell = torch.arange(size, device=device)
+    return (cell - _SMOOTH).clamp(min=0), (cell + _SMOOTH + 1).clamp(max=size)

@@ -20,28 +20,39 @@ class WindowCounts:
     """
 
     def __init__(self, image: Tensor, row: Tensor, col: Tensor, size: np.ndarray) -> None:
-        edges = np.ascontiguousarray(size.T) + 1
-        first_edge = (edges.cumsum() - edges.ravel()).reshape(edges.shape)
-        area = size[:, 0] * edges[1]
-        numbers = np.concatenate((size.T, first_edge, area.cumsum()[None] - area, edges[1:]))
-        self._numbers = torch.from_numpy(numbers).to(image.device)
-        numbers_of_pixel = take_columns(self._numbers[2:], image)
-        edge, (start, stride) = numbers_of_pixel[:2], numbers_of_pixel[2:]
-        # Number of pixels above every row, and to the left of every column. In differences, earlier images cancel.
-        line = torch.stack((row, col)).add_(edge).add_(1)
-        self._before = scatter_count(line.flatten(), int(edges.sum())).cumsum(0)
-        # Running sum over all rows. Each row has W + 1 samples, of which the first is empty.
-        table = torch.zeros(int(area.sum()), dtype=torch.int32, device=image.device)
-        self._table = table.index_fill_(0, stride.mul_(row).add_(start).add_(col).add_(1), 1).cumsum(0)
+        lines = size.T + 1  # [2, N]: H + 1 and W + 1
+        ends = lines.cumsum().reshape(lines.shape)
+        area = size[:, 0] * lines[1]
+        first = area.cumsum() - area
+        table = torch.from_numpy(np.concatenate((size.T, ends - lines, np.stack((first, lines[1]))))).to(image.device)
+        self._size = table[:2]  # (2, N)
+        self._first_line = table[2:4]  # (2, N), of the rows and of the columns of each image, see `_num_before`
+        self._start_stride = table[4:]  # (2, N), of each image in `_num_so_far`
+
+        # Number of pixels above every row, then to the left of every column, of all images. Each image has one line
+        # more than rows or columns. We count through all images, because differences are all that we need.
+        line = torch.stack((row, col)) + take_columns(self._first_line, image) + 1
+        self._num_before = scatter_count(line.flatten(), int(lines.sum())).cumsum(0)
+        # Number of pixels so far, in raster order. A row of W pixels has W + 1 entries:
+        #
+        #     row      . x x      entries   0 0 1 2
+        #              x . x                2 3 3 4
+        start, stride = take_columns(self._start_stride, image)
+        drawn = torch.zeros(int(area.sum()), dtype=torch.int32, device=image.device)
+        self._num_so_far = drawn.index_fill_(0, start + row * stride + col + 1, 1).cumsum(0)
 
     def bounds(self, image: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Lower and upper bounds of `count`, (K,) int64 each. Args as for `count`."""
-        size, first = take_columns(self._numbers[:4], image).view(2, 2, -1)
-        begin, end = shift.clamp(min=0), torch.minimum(size, size + shift)
-        edges = torch.stack((begin, end, torch.zeros_like(size), size)).add_(first)
-        begin, end, first, last = self._before.index_select(0, edges.view(-1)).view(edges.shape)
-        rows, cols = end - begin
-        return rows + cols - (last - first)[0], torch.minimum(rows, cols)
+        size = take_columns(self._size, image)
+        top_left = shift.clamp(min=0)
+        bottom_right = torch.minimum(size, size + shift)
+        lines = torch.stack((top_left, bottom_right, torch.zeros_like(size), size)) + take_columns(
+            self._first_line, image
+        )
+        counts = self._num_before.index_select(0, lines.view(-1)).view(lines.shape)  # [4, 2, K]
+        rows, cols = counts[1] - counts[0]  # pixels in the rows, and in the columns, of the window
+        total = counts[3, 0] - counts[2, 0]
+        return rows + cols - total, torch.minimum(rows, cols)
 
     def count(self, image: Tensor, shift: Tensor) -> Tensor:
         """(K,) int64, number of set pixels in rows dy ... H - 1 + dy and columns dx ... W - 1 + dx.
@@ -52,12 +63,12 @@ class WindowCounts:
 
         Cost: linear in the height of the windows.
         """
-        height, width, _, _, start, stride = take_columns(self._numbers, image)
-        (top, left), (down, right) = shift.clamp(min=0), shift.abs()
-        num_rows = height - down
-        row = concat_ranges(top, num_rows)
-        window = torch.repeat_interleave(num_rows, output_size=row.numel())
-        start, stride, width = take_columns(torch.stack((start + left, stride, width - right)), window)
-        start += row.mul_(stride)
-        in_row = self._table.index_select(0, start + width) - self._table.index_select(0, start)
+        start, stride = take_columns(self._start_stride, image)
+        num_rows, num_cols = take_columns(self._size, image) - shift.abs()
+        top, left = shift.clamp(min=0)
+        row = concat_ranges(top, num_rows)  # [R], the rows of all windows
+        window = torch.repeat_interleave(num_rows, output_size=len(row))
+        start, stride, num_cols = take_columns(torch.stack((start + left, stride, num_cols)), window)
+        first = start + row * stride
+        in_row = self._num_so_far.index_select(0, first + num_cols) - self._num_so_far.index_select(0, first)
         return torch.zeros_like(image).index_add_(0, window, in_row)

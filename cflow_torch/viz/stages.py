@@ -203,7 +203,7 @@ def _image(images: Images, number: int, size: Tensor) -> Tensor:
 def _ncc_map(template: Tensor, target: Tensor) -> Tensor:
     """(H, W) float64, as `ClusterCorrelation.ncc`. The energy of the target is its correlation with ones."""
     height, width = template.shape
-    images = torch.zeros(3, 2 * height, 2 * width)
+    images = torch.zeros(3, 2 * height, 2 * width, dtype=torch.bool)
     images[:, :height, :width] = torch.stack((template, torch.ones_like(template), target))
     counts = cross_correlate(images, 2, torch.zeros(2, dtype=torch.int64)).round().double()
     # The correlation wraps around, and half of each image is empty, so negative shifts are at the far end.

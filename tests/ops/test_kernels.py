@@ -138,8 +138,8 @@ def test_counts_are_those_of_bincount():
 def test_fft_counts_stay_exact_on_full_images(shape):
     # The largest counts there are: the overlap of two full images is (H - |dy|) (W - |dx|).
     height, width = shape
-    template = F.pad(torch.ones((1, *shape)), (0, width // 2, 0, height // 2))
-    target = F.pad(torch.ones((1, *shape)), (width // 2, 0, height // 2, 0))  # moved by half the size
+    template = F.pad(torch.ones((1, *shape), dtype=torch.bool), (0, width // 2, 0, height // 2))
+    target = F.pad(torch.ones((1, *shape), dtype=torch.bool), (width // 2, 0, height // 2, 0))  # moved by half the size
     found = cross_correlate(torch.cat((template, target)), 1, torch.zeros(1, dtype=torch.int64), "fft")
     rows, cols = (side - abs(np.arange(-(side // 2), side // 2 + 1)) for side in shape)
     found = found[0, : len(rows), : len(cols)]
