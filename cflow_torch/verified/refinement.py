@@ -179,7 +179,7 @@ class Registration:
     """
 
     def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> None:
-        self._voxels = Voxels(points, sweeps, NUM_LAYERS)
+        self._voxels = Voxels.of(points, sweeps, NUM_LAYERS)
         self._target = VoxelSearch(self._voxels, flat_nonzero(self._voxels.step == 0), reach=1)
         self._covariance = covariance_of(self._voxels, sweeps.grid.pixel_size, LAYER_HEIGHT)  # [6, V]
         object_id = self._voxels.object_id
@@ -309,12 +309,11 @@ def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion)
     inside = flat_nonzero(sweeps.grid.contains(position[:2]))
     points = points.at(inside)
     position = take_columns(position, inside)
-    row, col = sweeps.grid.row_col(position)
-    place = torch.stack((points.window, points.step, row.long(), col.long()))
-    moved = replace(points, position=position, place=place)
+    row_col = torch.stack(sweeps.grid.row_col(position)).long()
+    moved = replace(points, position=position, place=torch.cat((points.place[:2], row_col)))
 
-    image = points.window * sweeps.num_steps + points.step
-    pixel, number = torch.unique(pixel_key(sweeps.grid, image, *place[2:]), return_inverse=True)
+    pixel = pixel_key(sweeps.grid, points.window * sweeps.num_steps + points.step, row_col)
+    pixel, number = torch.unique(pixel, return_inverse=True)
     pixels = Groups(number, len(pixel))
     first_object = pixels.min(points.object_id, empty=0)
     return moved.at(flat_nonzero(points.object_id == pixels.spread(first_object)))
