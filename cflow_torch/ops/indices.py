@@ -95,6 +95,13 @@ def unique_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor,
     return own, key - own * width - 1, index, count
 
 
+def searchsorted(values: Tensor, wanted: Tensor) -> Tensor:
+    """`torch.searchsorted`; on the CPU NumPy is twice as fast if most of the wanted values are in order."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(np.searchsorted(values.numpy(), wanted.numpy()))
+    return torch.searchsorted(values, wanted)
+
+
 def index_in_group(group: Tensor) -> Tensor:
     """(N,) int64, index of each element among the elements of its group, from groups (N,) in ascending order."""
     return torch.arange(group.numel(), device=group.device) - torch.searchsorted(group, group)

@@ -182,19 +182,6 @@ class Columns:
         position = self.position.index_select(0, pixels.column)
         return self.pixel_at(self._slots_around(position, pixels.first_slot + pixels.step, reach).view(-1), count)
 
-    def ranks_near(self, sweep: Tensor, num_steps: int, row_col: Tensor, reach: int) -> Tensor:
-        """Return the pixels around K places in the images: ((2 reach + 1)^2, K) int32, as in `rank`, in raster order.
-
-        `sweep` is window * num_steps + step, (K,) int64. `row_col`, (2, K) int64, are at least `reach` from the border.
-        """
-        window, step = split_index(sweep, num_steps)
-        num_windows = len(self.image) // ((self.height + 2 * REACH) * self.stride)
-        is_copy = window >= num_windows
-        row, col = row_col + REACH
-        line = (window - is_copy * num_windows) * (self.height + 2 * REACH) + row
-        slots = self._slots_around(line * self.stride + col, step + is_copy * self.first_of_copies, reach)
-        return self.rank.view(-1).index_select(0, slots.view(-1)).view_as(slots)
-
     def _slots_around(self, position: Tensor, slot: Tensor, reach: int) -> Tensor:
         """Return a slot of the columns around K positions, counted through all columns, ((2 reach + 1)^2, K) int64."""
         line = range(-reach, reach + 1)

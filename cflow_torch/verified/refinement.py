@@ -5,12 +5,24 @@ those of the other sweeps are the source. Beams hit a surface at positions that 
 Correspondences of nearest points would align these positions, and so give the surface a wrong motion along itself.
 Therefore a correspondence counts mainly across the surface: its information matrix is the inverse of the covariance of
 the voxels around both ends.
+
+    refine
+        subpixel_motion         slow objects of pairs start to move, too
+        points_of_objects       the points of the moving objects
+        register_deskewed
+            Registration        voxels with centroids and covariances; the target and the source
+                align           four times: correspond (move the source, find the nearest target), linearise, solve
+            if points have times:
+                stretch         corrects the motion for the time between two measurements of an object
+                deskew          moves the points to the instant of their sweep
+                Registration    of the moved points
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Callable
 
 import torch
 from torch import Tensor
@@ -18,13 +30,19 @@ from torch import Tensor
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, take_columns
-from cflow_torch.ops.linear import inverse, matmul, matvec
-from cflow_torch.verified.columns import REACH, Columns, Pixels
+from cflow_torch.ops.linear import full, inverse, matvec
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
 from cflow_torch.verified.subpixel_motion import NUM_STEPS, STEP_LENGTH, subpixel_motion
-from cflow_torch.verified.voxel_centroids import ObjectPoints, Voxels, covariance_of, points_of_objects
+from cflow_torch.verified.voxel_centroids import (
+    ObjectPoints,
+    Voxels,
+    VoxelSearch,
+    covariance_of,
+    pixel_key,
+    points_of_objects,
+)
 
 # We chose these values on real pairs and windows with history (docs/benchmarks.md).
 LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels: height in metres, number of layers before they repeat
@@ -41,21 +59,29 @@ _LEAST_STRETCH = 0.75
 
 
 def refine(
-    sweeps: HeightSlicedSweeps, objects: Objects, motion: Tensor, longest: float | None
+    sweeps: HeightSlicedSweeps,
+    objects: Objects,
+    motion: Tensor,
+    longest: float | None,
+    find_slow: Callable[..., Tensor] = subpixel_motion,
+    num_steps: int = NUM_STEPS,
 ) -> tuple[RigidMotion, RigidMotion]:
     """Return the final motion of objects, and their apparent motion, which differs from it if points have times.
 
-    `motion` is (G, 2) float64, (y, x), finest pixels per sweep interval. Static objects longer than `longest` metres at
-    t+1 stay static. None = no bound.
+    Args:
+        motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
+        longest: metres; static objects that are longer at t+1 stay static. None = no bound.
+        find_slow: finds the motion of slow objects of pairs.
+        num_steps: number of Gauss-Newton steps.
     """
     length = objects.length_at_newest(sweeps)
-    start = subpixel_motion(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
+    start = find_slow(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
     points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
-    return register_deskewed(points, sweeps, start)
+    return register_deskewed(points, sweeps, start, num_steps)
 
 
 def register_deskewed(
-    points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor
+    points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor, num_steps: int = NUM_STEPS
 ) -> tuple[RigidMotion, RigidMotion]:
     """Register objects, and correct their motion per sweep interval for the times of points.
 
@@ -69,29 +95,88 @@ def register_deskewed(
         new motion, and register them again from `start / stretch`. Windows of two sweeps are not de-skewed, because
         without a third sweep, smooth surfaces would slide along the pattern of the beams.
 
-    Cost: two registrations with times, else one; a sort of the points.
+    Cost: two registrations with times, else one; a few sorts of the points.
     """
     registration = Registration(points, sweeps, len(start))
-    apparent = registration.align(start)
+    apparent = registration.align(start, num_steps)
     if points.time is None:
         return apparent, apparent
     stretch = registration.stretch(apparent)[:, None]
     divided = replace(apparent, flow=apparent.flow / stretch)
-    has_history = sweeps.has_history.index_select(0, sweeps.pixels.window.index_select(0, points.pixel))
-    points = points.at(flat_nonzero(has_history))
-    again = Registration(*deskew(points, sweeps, divided), len(start)).align(start / stretch)
+    points = points.at(flat_nonzero(sweeps.has_history.index_select(0, points.window)))
+    deskewed = Registration(deskew(points, sweeps, divided), sweeps, len(start))
+    again = deskewed.align(start / stretch, num_steps)
     is_again = Groups(points.object_id, len(start)).size() > 0
     return again.where(is_again, divided), apparent
 
 
 @dataclass(frozen=True)
-class Correspondences:
-    """Some voxels of the source, each with the nearest voxel of the target, under a motion."""
+class Source:
+    """K voxels of t and of older sweeps, which we move to t+1."""
 
-    target: Tensor  # (K,) int64, voxel of the target; 0 = none
-    residual: Tensor  # (3, K) float64, metres, from the moved voxel to the target
-    information: Tensor  # (3, 3, K) float64, 0 without a target; 1 = a pair at distance 0 without surfaces
+    voxel: Tensor  # (K,) int64
+    objects: Groups  # the object of each voxel; each one is in a group
+    centre: Tensor  # (2, K) float64, metres, x and y of the centre of its object at t
+    position: Tensor  # (3, K) float64, metres
+    target_sweep: Tensor  # (K,) int64, t+1 of its window
+    target_layers: Tensor  # (3, K) int64, in which we search for the target
+    elapsed: Tensor  # (K,) float64, sweep intervals from the voxel to t+1
+    elapsed_of_t: Tensor  # (K,) float64, sweep intervals from t to t+1
+
+    @classmethod
+    def of(cls, voxels: Voxels, objects: Groups, centre: Tensor, elapsed: Tensor) -> Source:
+        """Select the voxels of objects with points at t, in all sweeps but t+1.
+
+        Args:
+            objects: the objects of the voxels.
+            centre: (2, G) float64, NaN for objects without points at t.
+            elapsed: (B, S) float64, sweep intervals from each sweep to t+1.
+        """
+        has_centre = objects.spread(~centre[0].isnan())
+        voxel = flat_nonzero(has_centre & (voxels.step > 0))
+        objects = objects[voxel]
+        window = voxels.window.index_select(0, voxel)
+        num_steps = elapsed.shape[1]
+        up = constant(((-1,), (0,), (1,)), torch.int64, voxel.device)
+        return cls(
+            voxel=voxel,
+            objects=objects,
+            centre=take_columns(centre, objects.of_item),
+            position=take_columns(voxels.position, voxel),
+            target_sweep=window * num_steps,
+            target_layers=(voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS,
+            elapsed=elapsed.view(-1).index_select(0, window * num_steps + voxels.step.index_select(0, voxel)),
+            elapsed_of_t=elapsed[:, 1].index_select(0, window),
+        )
+
+    def __len__(self) -> int:
+        return len(self.voxel)
+
+    def __getitem__(self, some: slice) -> Source:
+        """Select voxels by their positions in the list."""
+        return Source(
+            voxel=self.voxel[some],
+            objects=self.objects[some],
+            centre=self.centre[:, some],
+            position=self.position[:, some],
+            target_sweep=self.target_sweep[some],
+            target_layers=self.target_layers[:, some],
+            elapsed=self.elapsed[some],
+            elapsed_of_t=self.elapsed_of_t[some],
+        )
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """K voxels of the source, each with the nearest voxel of the target, under a motion."""
+
+    source: Tensor  # (K,) int64, voxel of the source
+    target: Tensor  # (K,) int64, voxel of the target
+    objects: Groups  # the object of both
+    elapsed: Tensor  # (K,) float64, sweep intervals from the source to t+1
     arm: Tensor  # (2, K) float64, metres, from the centre of the object at t+1 to the moved voxel
+    residual: Tensor  # (3, K) float64, metres, from the moved voxel to the target
+    information: Tensor  # (3, 3, K) float64; the identity = a pair at distance 0 without surfaces
 
 
 class Registration:
@@ -104,29 +189,17 @@ class Registration:
     """
 
     def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> None:
-        self._voxels = voxels = Voxels(points, sweeps, NUM_LAYERS)
-        at_t = flat_nonzero(voxels.step == 1)
-        objects = Groups(voxels.object_id[at_t], num_objects)
-        size = objects.size()
-        self.centre = objects.sum(take_columns(voxels.position[:2], at_t)) / size.clamp(min=1)  # [2, G], at t
-        self._covariance = covariance_of(voxels, sweeps.grid.pixel_size, LAYER_HEIGHT).view(9, -1)  # [9, V]
+        self._voxels = Voxels.of(points, sweeps, NUM_LAYERS)
+        self._target = VoxelSearch(self._voxels, flat_nonzero(self._voxels.step == 0), reach=1)
+        self._covariance = covariance_of(self._voxels, sweeps.grid.pixel_size, LAYER_HEIGHT)  # [6, V]
+        object_id = self._voxels.object_id
+        objects = Groups(object_id.masked_fill(object_id < 0, num_objects), num_objects)
+        at_t = objects.where(self._voxels.step == 1)
+        self._centre = at_t.sum(self._voxels.position[:2]) / at_t.size()  # [2, G], at t; NaN without points
+        source = Source.of(self._voxels, objects, self._centre, sweeps.elapsed)
+        self._sources = [source[some] for some in chunks(0, len(source), object_id.device, 9)]
 
-        # The source: voxels of objects with points at t, in all sweeps but t+1. [K] each.
-        has_points = torch.cat((size > 0, size.new_zeros(1, dtype=torch.bool)))
-        self._source = flat_nonzero((voxels.step > 0) & has_points[voxels.object_id])
-        self._objects = Groups(voxels.object_id[self._source], num_objects)
-        self._position = take_columns(voxels.position, self._source)  # [3, K]
-        noise = torch.eye(3, dtype=torch.float64, device=size.device).view(9, 1) * _NOISE**2
-        self._source_covariance = take_columns(self._covariance, self._source) + noise  # [9, K]
-        window = voxels.window[self._source]
-        step = voxels.step[self._source]
-        self._target_sweep = window * sweeps.num_steps
-        up = constant(((-1,), (0,), (1,)), torch.int64, step.device)
-        self._layers = (voxels.layer[self._source] + up) % NUM_LAYERS  # [3, K], to search in
-        self._elapsed = sweeps.elapsed[window, step]  # sweep intervals from the voxel to t+1
-        self._elapsed_of_t = sweeps.elapsed[window, 1]
-
-    def align(self, start: Tensor) -> RigidMotion:
+    def align(self, start: Tensor, num_steps: int = NUM_STEPS) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
 
         Each Gauss-Newton step minimises the weighted residuals of the correspondences over translation and angle, with
@@ -140,59 +213,54 @@ class Registration:
 
         Cost: 27 lookups a step for each voxel of the source.
         """
-        prior = constant(_PRIOR, torch.float64, start.device)
+        prior = constant(_PRIOR, torch.float64, start.device)[:, None]  # [3, 1]
         start = torch.cat((start, torch.zeros_like(start[:, :1])), 1).t()  # [3, G]
         motion = start  # x, y and the tangent of half the angle, per sweep interval
-        for _ in range(NUM_STEPS):
-            hessian = torch.diag(prior)[..., None].repeat(1, 1, start.shape[1])  # [3, 3, G]
-            gradient = prior[:, None] * (start - motion)  # [3, G]
-            for some in chunks(0, len(self._source), start.device, 27):
-                pairs = self._correspond(motion, some)
-                self._linearise(pairs, some, hessian, gradient)
-            motion = motion + STEP_LENGTH * matvec(inverse(hessian), gradient)
-        return RigidMotion(motion[:2].t(), motion[2], self.centre.t())
+        for _ in range(num_steps):
+            hessian = torch.cat((prior, torch.zeros_like(prior)))  # [6, 1], as in ops/linear.py
+            gradient = prior * (start - motion)  # [3, G]
+            for source in self._sources:
+                pairs = self._correspond(source, motion)
+                equations = pairs.objects.sum(_normal_equations(pairs))  # [9, G]
+                hessian = hessian + equations[:6]
+                gradient = gradient + equations[6:]
+            motion = motion + STEP_LENGTH * matvec(full(inverse(hessian)), gradient)
+        return RigidMotion(motion[:2].t(), motion[2], self._centre.nan_to_num(0.0).t())
 
-    def _correspond(self, motion: Tensor, some: slice) -> Correspondences:
-        """Move some voxels of the source to t+1, and find the nearest voxels of the target."""
-        objects = self._objects[some]
-        of_object = objects.spread(torch.cat((motion, self.centre)).t()).t()  # [5, K]
-        velocity = of_object[:2]
-        rotation = of_object[2]
-        centre = of_object[3:]  # at t
-        elapsed = self._elapsed[some]
-        elapsed_of_t = self._elapsed_of_t[some]
+    def _correspond(self, source: Source, motion: Tensor) -> Correspondences:
+        """Move the source to t+1, and find the nearest voxels of the target; `motion` is (3, G), as in `align`."""
+        motion_of_voxel = take_columns(motion, source.objects.of_item)  # [3, K]
+        velocity = motion_of_voxel[:2]
+        rotation = motion_of_voxel[2]
         # The object rotates about its centre, which moves on.
-        arm = self._position[:2, some] - (centre - velocity * (elapsed - elapsed_of_t))
-        arm = rotate(rotation * elapsed, arm)
-        moved = torch.cat((centre + velocity * elapsed_of_t + arm, self._position[2:, some]))  # [3, K]
+        arm = source.position[:2] - source.centre + velocity * (source.elapsed - source.elapsed_of_t)
+        arm = rotate(rotation * source.elapsed, arm)
+        moved = source.centre + velocity * source.elapsed_of_t + arm
+        moved = torch.cat((moved, source.position[2:]))  # [3, K]
 
-        target = self._voxels.nearest(self._target_sweep[some], self._layers[:, some], moved)
+        target = self._target.nearest(source.target_sweep, source.target_layers, moved)
         residual = take_columns(self._voxels.position, target) - moved
         is_near = residual.square().sum(0) <= _FARTHEST**2
-        is_pair = is_near & (self._voxels.object_id.index_select(0, target) == objects.of_item)
+        is_same = self._voxels.object_id.index_select(0, target) == source.objects.of_item
+        pair = flat_nonzero(is_near & is_same)
+        voxel = source.voxel.index_select(0, pair)
+        target = target.index_select(0, pair)
+        residual = take_columns(residual, pair)
 
-        covariance = self._source_covariance[:, some] + take_columns(self._covariance, target)
-        information = inverse(covariance.view(3, 3, -1))
+        noise = constant((_NOISE**2, _NOISE**2, _NOISE**2, 0.0, 0.0, 0.0), torch.float64, pair.device)[:, None]
+        covariance = take_columns(self._covariance, voxel) + take_columns(self._covariance, target) + noise
+        information = full(inverse(covariance))
         square = (residual * matvec(information, residual)).sum(0)  # Mahalanobis distance
         weight = (_KERNEL / (_KERNEL + square)).square() * _NOISE**2
-        return Correspondences(target, residual, information * (weight * is_pair), arm)
-
-    def _linearise(self, pairs: Correspondences, some: slice, hessian: Tensor, gradient: Tensor) -> None:
-        """Add the normal equations of some correspondences to those of their objects, (3, 3, G) and (3, G)."""
-        elapsed = self._elapsed[some]
-        x, y = pairs.arm
-        zero = torch.zeros_like(x)
-        jacobian = torch.stack(  # of the moved voxel, by x, y and the tangent of half the angle
-            (
-                torch.stack((elapsed, zero, -2 * elapsed * y)),
-                torch.stack((zero, elapsed, 2 * elapsed * x)),
-                torch.stack((zero, zero, zero)),
-            )
-        )  # [3, 3, K]
-        weighted = matmul(jacobian.transpose(0, 1), pairs.information)  # [3, 3, K]
-        objects = self._objects[some]
-        hessian += objects.sum(matmul(weighted, jacobian))
-        gradient += objects.sum(matvec(weighted, pairs.residual))
+        return Correspondences(
+            source=voxel,
+            target=target,
+            objects=source.objects[pair],
+            elapsed=source.elapsed.index_select(0, pair),
+            arm=take_columns(arm, pair),
+            residual=residual,
+            information=information * weight,
+        )
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
         """Return the time between two measurements of an object, divided by the time between their sweeps.
@@ -209,70 +277,65 @@ class Registration:
         time = self._voxels.time
         assert time is not None
         motion = torch.cat((rigid.flow.t(), rigid.rotation[None]))
-        square, late = torch.zeros_like(motion[:2])  # [G] each
-        for some in chunks(0, len(self._source), motion.device, 27):
-            pairs = self._correspond(motion, some)
-            elapsed = self._elapsed[some]
-            delay = time.index_select(0, pairs.target) - time.index_select(0, self._source[some])
-            weight = (pairs.information[0, 0] + pairs.information[1, 1]) * elapsed
-            square += self._objects[some].sum(weight * elapsed)
-            late += self._objects[some].sum(weight * delay)
+        sums = torch.zeros_like(motion[:2])
+        for source in self._sources:
+            pairs = self._correspond(source, motion)
+            delay = time.index_select(0, pairs.target) - time.index_select(0, pairs.source)
+            weight = (pairs.information[0, 0] + pairs.information[1, 1]) * pairs.elapsed
+            sums = sums + pairs.objects.sum(weight * torch.stack((pairs.elapsed, delay)))
+        square, late = sums
         stretch = torch.where(square > 0, 1 + late / square, 1.0)
         return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
 
 
-def deskew(
-    points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion
-) -> tuple[ObjectPoints, HeightSlicedSweeps]:
-    """Move the points of objects to their positions at the instant of their sweep. The points have times.
+def _normal_equations(pairs: Correspondences) -> Tensor:
+    """Linearise the residuals of K correspondences. Return the hessian and the gradient of each, (6 + 3, K) float64.
 
-    Returns:
-        The moved points, and sweeps with the pixels of these points. Their images have no slices.
+    The parameters are x, y and the tangent of half the angle. A change of x or y moves the voxel by the elapsed time, a
+    change of the tangent by the elapsed time times `lever`. No parameter changes z.
+    """
+    x, y = pairs.arm
+    lever = torch.stack((-2 * y, 2 * x))  # [2, K]
+    weight = pairs.information[:2, :2]  # [2, 2, K]
+    weighted_lever = matvec(weight, lever)  # [2, K]
+    of_angle = (lever * weighted_lever).sum(0)
+    hessian = torch.stack(
+        (weight[0, 0], weight[1, 1], of_angle, weighted_lever[1], weighted_lever[0], weight[0, 1])
+    )  # as in ops/linear.py
+    gradient = matvec(pairs.information[:2], pairs.residual)
+    torque = (lever * gradient).sum(0, keepdim=True)
+    return torch.cat((hessian * pairs.elapsed.square(), torch.cat((gradient, torque)) * pairs.elapsed))
+
+
+def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> ObjectPoints:
+    """Move the points of objects to their positions at the instant of their sweep. The points have times.
 
     Convention: translation and rotation are proportional to time. Points that leave the region are dropped. If several
     objects share a pixel, only the points of the first one are kept. Points whose time is 0 do not move.
 
     Cost: a sort of the points.
     """
-    assert points.time is not None
-    window = sweeps.pixels.window.index_select(0, points.pixel)
-    step = sweeps.pixels.step.index_select(0, points.pixel)
-    position = torch.cat((_at_instant(points, sweeps.elapsed, window, step, rigid), points.position[2:]))
-
+    position = torch.cat((_at_instant(points, sweeps.elapsed, rigid), points.position[2:]))
     inside = flat_nonzero(sweeps.grid.contains(position[:2]))
+    points = points.at(inside)
     position = take_columns(position, inside)
-    columns, pixels, of_pixel = _draw_points(sweeps, position, window[inside], step[inside])
-    moved = replace(points.at(inside), position=position, pixel=of_pixel.of_item)
-    first_object = of_pixel.min(moved.object_id, empty=0)
-    kept = flat_nonzero(moved.object_id == of_pixel.spread(first_object))
-    return moved.at(kept), replace(sweeps, columns=columns, pixels=pixels)
+    row_col = torch.stack(sweeps.grid.row_col(position)).long()
+    moved = replace(points, position=position, place=torch.cat((points.place[:2], row_col)))
+
+    pixel = pixel_key(sweeps.grid, points.window * sweeps.num_steps + points.step, row_col)
+    pixel, number = torch.unique(pixel, return_inverse=True)
+    pixels = Groups(number, len(pixel))
+    first_object = pixels.min(points.object_id, empty=0)
+    return moved.at(flat_nonzero(points.object_id == pixels.spread(first_object)))
 
 
-def _draw_points(
-    sweeps: HeightSlicedSweeps, position: Tensor, window: Tensor, step: Tensor
-) -> tuple[Columns, Pixels, Groups]:
-    """Draw points inside the region, without their height slices. Return columns, pixels, and the points by pixel."""
-    grid = sweeps.grid
-    num_windows = sweeps.batch.num_windows
-    stride = grid.width + 2 * REACH
-    row, col = grid.row_col(position)
-    at = (window * (grid.height + 2 * REACH) + (row + REACH)) * stride + (col + REACH)
-    is_occupied = torch.zeros(num_windows * (grid.height + 2 * REACH) * stride, dtype=torch.bool, device=at.device)
-    columns = Columns.at(is_occupied.index_fill_(0, at, True), grid, sweeps.num_steps)
-    column = columns.image.index_select(0, at).long()
-    slices = columns.slices.new_zeros((len(columns.position), sweeps.num_steps))
-    slices[column, step] = 1
-    pixels = columns.draw(slices, 0, 0, num_windows)
-    return columns, pixels, columns.pixel_at(column * columns.num_slots + step, len(pixels))
-
-
-def _at_instant(points: ObjectPoints, elapsed: Tensor, window: Tensor, step: Tensor, rigid: RigidMotion) -> Tensor:
+def _at_instant(points: ObjectPoints, elapsed: Tensor, rigid: RigidMotion) -> Tensor:
     """Return x and y of each point at the instant of its sweep, (2, N) float64."""
     assert points.time is not None
     time = points.time.double()
     velocity = rigid.flow.index_select(0, points.object_id).t()  # [2, N]
     rotation = rigid.rotation.index_select(0, points.object_id)
-    since_t = elapsed[window, 1] - elapsed[window, step]
+    since_t = elapsed[points.window, 1] - elapsed[points.window, points.step]
     centre = rigid.centre.index_select(0, points.object_id).t() + velocity * since_t  # at the instant of the sweep
     arm = points.position[:2] - velocity * time - centre
     return centre + rotate(-time * rotation, arm)

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant
-from cflow_torch.ops.linear import adjugate
+from cflow_torch.ops.linear import adjugate, full, matvec, voigt
 from cflow_torch.windows.bev_grid import Grid
 
 # Side of the blocks, metres. A block and the eight around it cover 6 m x 6 m.
@@ -90,8 +90,8 @@ class GroundHeights:
             if fit > 0:
                 is_used = is_known & ((height - (plane[:, :, None] * design.t()[:, None]).sum(0)).abs() <= _FARTHEST)
             sums = ((terms * is_used[:, None]) @ design).permute(1, 2, 0)
-            inverse, det = adjugate(sums[:3])
-            plane = (inverse * sums[3]).sum(1) / det  # undefined where `is_flat` is False
+            cofactors, det = adjugate(voigt(sums[:3]))
+            plane = matvec(full(cofactors), sums[3]) / det  # undefined where `is_flat` is False
             fits.append((sums[0, 0], det))
         n, det = (torch.stack(of_fits) for of_fits in zip(*fits))
         is_flat = ((n >= _FEWEST_BLOCKS) & (4 * det >= n**3)).all(0)

@@ -67,10 +67,10 @@ class Voxels:
 
     def around(self, layer: int, position: np.ndarray) -> list[int]:
         """Voxels of t+1 in the 3 x 3 pixels around a position, in its layer and those next to it, the last of which is
-        below the first: pixel by pixel in raster order. Beyond the border, the outermost pixels are taken."""
-        image = self.sweeps.number[0]
+        below the first: pixel by pixel in raster order. Beyond the border, there are none."""
+        image = np.pad(self.sweeps.number[0], 2, constant_values=-1)
         col, row = np.floor(position[:2] / self.sweeps.size).astype(int)
-        row, col = np.clip((row, col), 1, np.array(image.shape) - 2)
+        row, col = np.clip((row, col), -1, np.array(self.sweeps.number[0].shape)) + 2
         square = image[row - 1 : row + 2, col - 1 : col + 2].ravel().tolist()
         keys = [pixel * NUM_LAYERS + (layer + up) % NUM_LAYERS for pixel, up in product(square, (-1, 0, 1))]
         return [self.number[key] for key in keys if key in self.number]

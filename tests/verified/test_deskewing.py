@@ -87,10 +87,10 @@ def test_points_are_moved_to_where_they_were_at_the_instant_of_their_sweep(angle
     scene = with_times(one_object(clouds, velocity, elapsed), torch.from_numpy(of_points))
     centre = -torch.tensor([velocity], dtype=torch.float64)  # at t
     rigid = RigidMotion(scene.flow, torch.tensor([np.tan(angle / 2)]), centre)
-    sharp, drawn = deskew(scene.points(), scene.sweeps, rigid)
+    sharp = deskew(scene.points(), scene.sweeps, rigid)
     np.testing.assert_allclose(sharp.position.T, np.concatenate(at_instant), atol=1e-4)
     expected = torch.stack(scene.sweeps.grid.row_col(sharp.position))
-    assert torch.equal(drawn.pixels.row_col[:, sharp.pixel], expected.long())
+    assert torch.equal(sharp.place[2:], expected.long())
 
 
 def test_points_that_leave_the_region_are_dropped_and_a_pixel_belongs_to_the_first_object():
@@ -99,10 +99,10 @@ def test_points_that_leave_the_region_are_dropped_and_a_pixel_belongs_to_the_fir
     points = scene.points()
     points = replace(points, object_id=torch.tensor([0, 1, 0, 1, 0]))
     rigid = RigidMotion(torch.tensor([[1.0, 0.0]] * 2).double(), torch.zeros(2).double(), torch.zeros(2, 2).double())
-    sharp, drawn = deskew(points, scene.sweeps, rigid)
+    sharp = deskew(points, scene.sweeps, rigid)
     assert sharp.object_id.tolist() == [0, 1, 0]
     np.testing.assert_allclose(sharp.position[0], [0.05, 1.05, 0.05], atol=1e-12)
-    assert drawn.num_pixels == 3 and drawn.pixels.step.tolist() == [0, 0, 1]
+    assert sharp.step.tolist() == [0, 0, 1]
 
 
 @pytest.mark.parametrize("num_history", [0, 2])

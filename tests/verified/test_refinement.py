@@ -169,7 +169,7 @@ def shift_of(count: int, moved: float) -> list[float]:
     scene = one_object([cloud + (moved, 0.0, 0.0), cloud], (0.0, 0.0))
     every = torch.ones(1, dtype=torch.bool)
     points = points_of_objects(scene.sweeps, scene.objects, every, 0.1, fast._NUM_LAYERS)
-    shift = fast._significant_shift(Voxels(points, scene.sweeps, fast._NUM_LAYERS), 1)
+    shift = fast._significant_shift(Voxels.of(points, scene.sweeps, fast._NUM_LAYERS), 1)
     return shift[0].tolist()
 
 
