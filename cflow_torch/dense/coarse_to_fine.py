@@ -38,12 +38,14 @@ def project(batch: Batch, flow: Tensor | None, grid: Grid) -> ProjectedSweeps:
 
     `flow` is as in `ProjectedSweeps`. At this scale, we ignore points that are warped out of the images.
     """
-    num_images, num_points = batch.num_windows * batch.num_steps, len(batch.image)
+    num_images = batch.num_windows * batch.num_steps
+    num_points = len(batch.image)
     pixel = torch.empty(num_points, dtype=torch.int64, device=batch.image.device)
     for points in chunks(0, batch.num_newest, pixel.device):
         pixel[points] = grid.pixel_of_image(batch.positions[:, points], batch.image[points], num_images)
     for points in chunks(batch.num_newest, num_points, pixel.device):
-        positions, is_active = batch.positions[:, points], batch.is_active[points]
+        positions = batch.positions[:, points]
+        is_active = batch.is_active[points]
         if flow is not None:
             positions = _warp(batch, flow, points)
             is_active = grid.contains(positions).logical_and_(is_active)
@@ -63,7 +65,8 @@ class CoarseToFine(SceneFlowModel):
 
     def motion(self, batch: Batch) -> Motion:
         """Add up the motion of all `pixel_sizes`, coarse to fine."""
-        flow, motion = None, None
+        flow = None
+        motion = None
         for pixel_size in self.config.pixel_sizes:
             if motion is not None:
                 with stage("spread"):
@@ -83,9 +86,10 @@ def _flow_so_far(batch: Batch, flow: Tensor | None, motion: Motion) -> Tensor:
     """Add the flow of a scale to the flow of the coarser ones: `ProjectedSweeps.flow`. `flow` is overwritten."""
     total = torch.empty_like(batch.positions) if flow is None else flow
     for points in chunks(batch.num_newest, len(batch.image), batch.image.device):
-        of_chunk, cluster = total[:, points], motion.cluster(points)
+        flow_of_chunk = total[:, points]
+        cluster = motion.cluster(points)
         if flow is None:
-            motion.flow_of(cluster, out=of_chunk)
+            motion.flow_of(cluster, out=flow_of_chunk)
         else:
-            of_chunk += motion.flow_of(cluster, out=torch.empty_like(of_chunk))
+            flow_of_chunk += motion.flow_of(cluster, out=torch.empty_like(flow_of_chunk))
     return total

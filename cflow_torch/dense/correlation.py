@@ -17,7 +17,7 @@ from cflow_torch.dense.packing import ImageClass, Packing, pack
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import exceeds, flat_nonzero, largest_of_rows, take_columns
+from cflow_torch.ops.indices import draw, exceeds, flat_nonzero, largest_of_rows, take_columns
 from cflow_torch.ops.window_counts import WindowCounts
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
 
@@ -46,17 +46,13 @@ class Estimates:
     @classmethod
     def of(cls, pairs: TemplatePairs, displacement: Tensor, score: Tensor, intervals: Tensor) -> Estimates:
         """Collect the estimates of J pairs: `displacement` is (J, A), `score` is (J,), `intervals` is (M, K)."""
-        (count, num_sources), num_axes = intervals.shape, displacement.shape[1]
-        slot = torch.add(pairs.source, pairs.cluster, alpha=num_sources)
-        displacements = displacement.new_zeros((count * num_sources, num_axes))
-        scores = score.new_zeros(count * num_sources)
-        available = torch.zeros_like(scores, dtype=torch.bool).index_fill_(0, slot, True)
-        return cls(
-            displacements.index_copy_(0, slot, displacement).view(count, num_sources, num_axes),
-            scores.index_copy_(0, slot, score).view_as(intervals),
-            available.view_as(intervals),
-            intervals,
-        )
+        displacements = displacement.new_zeros((*intervals.shape, displacement.shape[1]))
+        scores = score.new_zeros(intervals.shape)
+        slot = pairs.cluster * intervals.shape[1] + pairs.source
+        displacements.flatten(0, 1).index_copy_(0, slot, displacement)
+        scores.flatten().index_copy_(0, slot, score)
+        available = draw(slot, intervals.numel()).view_as(intervals)
+        return cls(displacements, scores, available, intervals)
 
     def per_interval(self) -> Tensor:
         """Displacement per sweep interval, (M, K, A) float64; undefined where not `available`."""
@@ -70,11 +66,11 @@ class Estimates:
 
 def correlate(clusters: Clusters, sweeps: ProjectedSweeps, config: DenseConfig) -> Estimates:
     """Estimate the displacement (z = 0) of every cluster from each earlier sweep to t+1 (Alg. scene_flow_1view)."""
-    batch, pixel_size = sweeps.batch, sweeps.grid.pixel_size
-    pairs = make_pairs(clusters, batch, pixel_size, config.max_speed)
+    pixel_size = sweeps.grid.pixel_size
+    pairs = make_pairs(clusters, sweeps.batch, pixel_size, config.max_speed)
     shift, score = best_shifts(pairs, config.correlation, config.max_memory)
     displacement = F.pad(shift.flip(1).double() * pixel_size, (0, 1))  # (dy, dx) -> (x, y, 0)
-    return Estimates.of(pairs, displacement, score, batch.elapsed[clusters.window, 1:])
+    return Estimates.of(pairs, displacement, score, sweeps.batch.elapsed[clusters.window, 1:])
 
 
 def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | None = None) -> tuple[Tensor, Tensor]:
@@ -143,60 +139,72 @@ class _Counts:
 
 def _correlate(packing: Packing, engine: str, max_memory: float | None) -> Iterator[_Counts]:
     """Correlate all packed templates, as many at once as suit the device and the memory, in Bytes, that we may use."""
-    per_call = _PER_CALL_CPU if packing.pair.device.type == "cpu" else _PER_CALL_GPU
-    per_run = _PER_RUN_CPU if packing.pair.device.type == "cpu" else _PER_RUN_GPU
+    device = packing.pair.device
+    per_call = _PER_CALL_CPU if device.type == "cpu" else _PER_CALL_GPU
+    per_run = _PER_RUN_CPU if device.type == "cpu" else _PER_RUN_GPU
     if max_memory is not None:
-        per_call = min(per_call, int(max_memory) // _BYTES_PER_SAMPLE)
-        per_run = min(per_run, int(max_memory) // _BYTES_PER_SAMPLE)
+        most = int(max_memory) // _BYTES_PER_SAMPLE
+        per_call = min(per_call, most)
+        per_run = min(per_run, most)
+    max_energy = max(images.max_energy for images in packing.classes)
+    dtype = torch.float32 if max_energy <= _EXACT_IN_FLOAT32 else torch.float64
     first = 0
     for run in _runs(packing.classes, per_call, per_run):
-        is_exact = max(images.max_energy for images, _ in run) <= _EXACT_IN_FLOAT32
-        num_samples = [images.num_searched * (some.stop - some.start) for images, some in run]
-        dtype = torch.float32 if is_exact else torch.float64
-        samples = torch.empty(sum(num_samples), dtype=dtype, device=packing.pair.device)
-        parts = [part.view(-1, images.num_searched) for part, (images, _) in zip(samples.split(num_samples), run)]
-        for part, (images, some) in zip(parts, run):
-            torch.round(_correlate_class(images, some, engine).to(dtype), out=part)
+        num_samples = [call.num_samples for call in run]
+        samples = torch.empty(sum(num_samples), dtype=dtype, device=device)
+        parts = [call.view(part) for call, part in zip(run, samples.split(num_samples))]
+        for call, part in zip(run, parts):
+            torch.round(call.correlate(engine).to(dtype), out=part)
         stop = first + sum(map(len, parts))
         yield _Counts(slice(first, stop), samples, parts)
         first = stop
 
 
-def _runs(classes: list[ImageClass], per_call: int, per_run: int) -> Iterator[list[tuple[ImageClass, slice]]]:
-    """Yield lists of calls of the correlation: a class, and some of its templates.
+def _runs(classes: list[ImageClass], per_call: int, per_run: int) -> Iterator[list[_Call]]:
+    """Yield lists of calls. A call has at most `per_call` samples of templates, or one template.
 
-    A call has at most `per_call` samples of templates, and a list at most `per_run` searched samples, or one call.
+    A list has at most `per_run` searched samples, or one call.
     """
-    run: list[tuple[ImageClass, slice]] = []
-    num_samples = 0
+    run: list[_Call] = []
     for images in classes:
-        num_templates = len(images.target)
         at_once = max(1, per_call // images.area)
-        for first in range(0, num_templates, at_once):
-            some = slice(first, min(first + at_once, num_templates))
-            added = (some.stop - some.start) * images.num_searched
-            if run and num_samples + added > per_run:
+        for first in range(0, len(images.target), at_once):
+            call = _Call(images, slice(first, min(first + at_once, len(images.target))))
+            if run and sum(other.num_samples for other in run) + call.num_samples > per_run:
                 yield run
                 run = []
-                num_samples = 0
-            run.append((images, some))
-            num_samples += added
+            run.append(call)
     yield run
 
 
-def _correlate_class(images: ImageClass, some: slice, engine: str) -> Tensor:
-    """Correlate some templates of a class with their targets: (n, searched samples) float, nearly whole numbers."""
-    num_templates = some.stop - some.start
-    called = images.images
-    target = images.target
-    if num_templates < len(target):
-        # Templates are in order of their targets, so they need a range of targets.
-        low, high = images.target_on_host[[some.start, some.stop - 1]].tolist()
-        targets = called[len(target) + low : len(target) + high + 1]
-        called = torch.cat((called[some], targets))
-        target = target[some] - low
-    counts = cross_correlate(called, num_templates, target, engine, images.max_energy)
-    return counts.flatten(1)[:, : images.num_searched]
+@dataclass(frozen=True)
+class _Call:
+    """A call of the correlation."""
+
+    images: ImageClass
+    templates: slice  # n templates of the class
+
+    @property
+    def num_samples(self) -> int:
+        """Number of searched samples."""
+        return self.images.num_searched * (self.templates.stop - self.templates.start)
+
+    def view(self, samples: Tensor) -> Tensor:
+        """View the samples of all templates, one after the other, as (n, searched samples)."""
+        return samples.view(-1, self.images.num_searched)
+
+    def correlate(self, engine: str) -> Tensor:
+        """Count the coinciding pixels of templates and targets, (n, searched samples) float, nearly whole numbers."""
+        num_templates = self.templates.stop - self.templates.start
+        images = self.images.images
+        target = self.images.target
+        if num_templates < len(target):
+            # Templates are in order of their targets, so they need a range of targets.
+            ends = self.images.target_on_host[[self.templates.start, self.templates.stop - 1]] + len(target)
+            images = torch.cat((images[self.templates], images[ends[0] : ends[1] + 1]))
+            target = target[self.templates] - int(ends[0] - len(target))
+        counts = cross_correlate(images, num_templates, target, engine, self.images.max_energy)
+        return counts.flatten(1)[:, : self.images.num_searched]
 
 
 def _candidates(counts: _Counts, packing: Packing, cluster: Tensor) -> _Candidates:

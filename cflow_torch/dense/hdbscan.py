@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -10,7 +12,7 @@ from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters, Pixels
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.errors import import_optional
-from cflow_torch.ops.indices import renumber
+from cflow_torch.ops.indices import draw, flat_nonzero, renumber, split_index
 from cflow_torch.ops.segments import bounding_boxes, segment_amin
 
 
@@ -25,36 +27,58 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
 
     Cost: N log N in points, on the CPU, window by window; seconds for a full pair of sweeps.
     """
-    batch, grid, pixel, positions = sweeps.batch, sweeps.grid, sweeps.pixel, sweeps.positions()
-    area, num_cells = grid.height * grid.width, sweeps.occupancy.numel()
-    window = batch.image // batch.num_steps
-    label = torch.full_like(pixel, -1)
-    num_labels = 0
-    for index in range(batch.num_windows):
-        points = ((pixel < num_cells) & (window == index)).nonzero()[:, 0]
-        found = torch.from_numpy(_labels(positions[:, points].t().cpu().numpy(), config.min_cluster_size))
-        label[points] = torch.where(found >= 0, found + num_labels, found).to(label.device)
-        num_labels += int(found.max()) + 1 if found.numel() else 0
-
-    # Occupied pixels, each once per label and sweep.
-    member = (label >= 0).nonzero()[:, 0]
-    key = torch.unique(label[member] * num_cells + pixel[member])
-    label_of_pixel, image, raster = key // num_cells, key % num_cells // area, key % area
-    step = image % batch.num_steps
-    steps_seen = torch.zeros((num_labels, batch.num_steps), dtype=torch.bool, device=key.device)
-    steps_seen[label_of_pixel, step] = True
-    kept = (steps_seen[:, 0] & steps_seen[:, 1:].any(1)).nonzero()[:, 0]
+    num_steps = sweeps.batch.num_steps
+    label, num_labels = _label_points(sweeps, config.min_cluster_size)
+    pixels = _occupied_pixels(sweeps, label)
     # Labels ascend with the window.
-    first = segment_amin(raster + image // batch.num_steps * area, label_of_pixel, num_labels, num_cells)
+    area = sweeps.grid.height * sweeps.grid.width
+    window_and_pixel = pixels.image // num_steps * area + pixels.raster
+    first = segment_amin(window_and_pixel, pixels.label, num_labels, sweeps.occupancy.numel())
+    step = pixels.image % num_steps
+    kept = flat_nonzero(draw(pixels.label[step == 0], num_labels) & draw(pixels.label[step > 0], num_labels))
     kept = kept[first[kept].argsort(stable=True)]
     cluster_of_label = renumber(kept, num_labels)
 
-    is_kept = cluster_of_label[label_of_pixel] < len(kept)
-    label_of_pixel, step, raster = cluster_of_label[label_of_pixel[is_kept]], step[is_kept], raster[is_kept]
-    pixels = Pixels(label_of_pixel, step, raster // grid.width, raster % grid.width)
-    boxes = bounding_boxes(pixels.row, pixels.col, label_of_pixel, len(kept))
-    clusters = Clusters(first[kept] // area, *boxes, pixels)
+    cluster = cluster_of_label[pixels.label]
+    is_kept = cluster < len(kept)
+    row, col = split_index(pixels.raster[is_kept], sweeps.grid.width)
+    members = Pixels(cluster=cluster[is_kept], step=step[is_kept], row=row, col=col)
+    top_left, size = bounding_boxes(row, col, members.cluster, len(kept))
+    clusters = Clusters(window=first[kept] // area, first=top_left, size=size, pixels=members)
     return clusters, cluster_of_label[label], torch.arange(len(label), device=label.device)
+
+
+def _label_points(sweeps: ProjectedSweeps, min_cluster_size: int) -> tuple[Tensor, int]:
+    """Cluster the points window by window: label of each point, (P,) int64, -1 = noise, and the number of labels."""
+    batch = sweeps.batch
+    positions = sweeps.positions()
+    window = batch.image // batch.num_steps
+    is_inside = sweeps.pixel < sweeps.occupancy.numel()
+    label = torch.full_like(sweeps.pixel, -1)
+    num_labels = 0
+    for index in range(batch.num_windows):
+        points = flat_nonzero(is_inside & (window == index))
+        found = torch.from_numpy(_labels(positions[:, points].t().cpu().numpy(), min_cluster_size))
+        label[points] = torch.where(found >= 0, found + num_labels, found).to(label.device)
+        num_labels += int(found.max()) + 1 if len(found) else 0
+    return label, num_labels
+
+
+class _LabelledPixels(NamedTuple):
+    """Occupied pixels, each once per label and sweep, in order of label, image and raster; (Q,) int64 each."""
+
+    label: Tensor
+    image: Tensor  # window * num_steps + step
+    raster: Tensor  # row * W + column
+
+
+def _occupied_pixels(sweeps: ProjectedSweeps, label: Tensor) -> _LabelledPixels:
+    """Return the pixels of the labelled points; `label` is (P,) int64, -1 = none."""
+    member = flat_nonzero(label >= 0)
+    num_cells = sweeps.occupancy.numel()
+    label_and_cell = torch.unique(label[member] * num_cells + sweeps.pixel[member])
+    label_of_pixel, cell = split_index(label_and_cell, num_cells)
+    return _LabelledPixels(label_of_pixel, *split_index(cell, sweeps.grid.height * sweeps.grid.width))
 
 
 def _labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:

@@ -69,15 +69,20 @@ class Search:
     def contains(self, shift: Tensor) -> Tensor:
         """(K,) bool, whether shifts that belong to samples, (2, K) int64, are in the range."""
         is_inside = (shift <= self.high).all(0)
-        return is_inside if self.longest_squared is None else is_inside & self._is_short(shift)
+        if self.longest_squared is None:
+            return is_inside
+        return is_inside & _is_short(shift, self.longest_squared)
 
     def clamp(self, shift: Tensor) -> Tensor:
         """(2, K) int64, shifts in the range: those that belong to samples, (2, K) int64, cut to it, or 0."""
         shift = torch.minimum(shift, self.high)
-        return shift if self.longest_squared is None else shift * self._is_short(shift)
+        if self.longest_squared is None:
+            return shift
+        return shift * _is_short(shift, self.longest_squared)
 
-    def _is_short(self, shift: Tensor) -> Tensor:
-        return (shift * shift).sum(0) <= self.longest_squared
+
+def _is_short(shift: Tensor, longest_squared: Tensor) -> Tensor:
+    return (shift * shift).sum(0) <= longest_squared
 
 
 @dataclass(frozen=True)
@@ -180,8 +185,8 @@ class _Numbers(NamedTuple):
             radius = pairs.radius.clamp(max=LONGEST_SIDE).floor().long()
         parts = (pairs.cluster, radius, energy, pairs.size.flatten())
         ends = np.cumsum([len(part) for part in parts[:-1]])
-        *columns, size = np.split(as_numpy(torch.cat(parts)), ends)
-        return cls(*columns, size.reshape(-1, 2))
+        cluster, longest, set_pixels, size = np.split(as_numpy(torch.cat(parts)), ends)
+        return cls(cluster, longest, set_pixels, size.reshape(-1, 2))
 
 
 class _Shapes(NamedTuple):

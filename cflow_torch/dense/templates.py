@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.dense.clustering import Clusters
-from cflow_torch.ops.indices import flat_nonzero, gather, renumber, split_index
+from cflow_torch.ops.indices import draw, flat_nonzero, gather, renumber, split_index
 from cflow_torch.windows.collation import Batch
 
 
@@ -41,25 +41,33 @@ def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max
     `pixel_size` is in metres, one for all M clusters or (M,) float64. `max_speed` is in m/s; with None, we
     search shifts of up to half the box.
     """
-    num_sources, pixels = batch.num_steps - 1, clusters.pixels
-    num_slots = clusters.window.numel() * num_sources
-    top, left = clusters.first.unbind(1)
-    row, col = pixels.row - top.index_select(0, pixels.cluster), pixels.col - left.index_select(0, pixels.cluster)
-    older, newest = flat_nonzero(pixels.step > 0), flat_nonzero(pixels.step == 0)
+    pixels = clusters.pixels
+    num_sources = batch.num_steps - 1
+    num_slots = len(clusters.window) * num_sources  # a slot for every cluster and earlier sweep
+    first = clusters.first.index_select(0, pixels.cluster)
+    row = pixels.row - first[:, 0]
+    col = pixels.col - first[:, 1]
+    older = flat_nonzero(pixels.step > 0)
+    newest = flat_nonzero(pixels.step == 0)
     slot = (pixels.cluster * num_sources + pixels.step - 1).index_select(0, older)
-    pairs = flat_nonzero(torch.zeros(num_slots, dtype=torch.bool, device=row.device).index_fill_(0, slot, True))
+    pairs = flat_nonzero(draw(slot, num_slots))
     cluster, source = split_index(pairs, num_sources)
-    radius = None
-    if max_speed is not None:
-        seconds = batch.seconds[clusters.window[cluster], source + 1]
-        size = pixel_size[cluster] if isinstance(pixel_size, Tensor) else torch.full_like(seconds, pixel_size)
-        radius = max_speed * seconds.abs() / size + 1
     return TemplatePairs(
-        Images(renumber(pairs, num_slots).index_select(0, slot), *gather(older, row, col)),
-        Images(*gather(newest, pixels.cluster, row, col)),
-        cluster,
-        source,
-        clusters.size,
-        radius,
-        older,
+        template=Images(renumber(pairs, num_slots).index_select(0, slot), *gather(older, row, col)),
+        target=Images(*gather(newest, pixels.cluster, row, col)),
+        cluster=cluster,
+        source=source,
+        size=clusters.size,
+        radius=_radius(batch.seconds[clusters.window[cluster], source + 1], cluster, pixel_size, max_speed),
+        pixel=older,
     )
+
+
+def _radius(seconds: Tensor, cluster: Tensor, pixel_size: float | Tensor, max_speed: float | None) -> Tensor | None:
+    """Return how many pixels an object may move in the seconds of each pair, and one for rounding, (J,) float64."""
+    if max_speed is None:
+        return None
+    if isinstance(pixel_size, Tensor):
+        return max_speed * seconds.abs() / pixel_size[cluster] + 1
+    # A GPU multiplies by the reciprocal of a plain number, which rounds differently.
+    return max_speed * seconds.abs() / torch.full_like(seconds, pixel_size) + 1
