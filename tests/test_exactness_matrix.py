@@ -46,13 +46,10 @@ def in_pieces(config: Config, windows: list[Window]) -> Results:
         "ops.chunks.CHUNK_ON_CPU": 997,
         "dense.correlation._PER_CALL_CPU": 600,
         "verified.in_place._AT_ONCE_CPU": 500,
-        "keypoints.match_candidates._PAIRS_AT_ONCE_CPU": 5000,
-        "keypoints.match_candidates._TILE_ROWS": 3,
-        "keypoints.match_candidates._TILE_COLS": 5,
-        "keypoints.match_candidates._BAND": 5,
-        "keypoints.match_candidates._GROUP": 2,
-        "keypoints.matching._STRIP_NUMBERS": 11,
-        "keypoints.matching._CONTENDERS_AT_ONCE": 40,
+        "keypoints.match_candidates._BAND_ROWS": 5,
+        "keypoints.matching._PAIRS_AT_ONCE_CPU": 5000,
+        "keypoints.matching._ENERGY_STEP": 2,
+        "keypoints.matching._MOST_ROWS": 11,
     }
     with pytest.MonkeyPatch.context() as patch:
         for name, value in pieces.items():

@@ -49,12 +49,12 @@ def densify(
     """
     pixel = flat_nonzero(images)
     image_size = images.shape[1] * images.shape[2]
-    shift, score = matches.shift.double(), matches.score
+    shift = matches.shift.double()
     if config.densify == "nearest":
         seeds = torch.zeros_like(images).view(-1).index_fill_(0, matched, True).view_as(images)
         nearest = nearest_set_pixel(seeds, pixel)
         group = torch.where(nearest < 0, matched.numel(), torch.searchsorted(matched, nearest))
-        return DenseShift(pixel, group, shift, index_in_group(matched // image_size), score)
+        return DenseShift(pixel, group, shift, index_in_group(matched // image_size), matches.score)
     if config.densify == "clusters":
         component = label_components(images, pixel, pixel_size, config)
     else:
@@ -64,6 +64,9 @@ def densify(
     group = (is_first.cumsum(0) - 1).index_select(0, component)
     first = flat_nonzero(is_first)
     group_of_match = group.index_select(0, torch.searchsorted(pixel, matched))
-    dy, dx, ncc = (segment_median(values, group_of_match, first.numel()) for values in (*shift.unbind(1), score))
+    num_groups = first.numel()
+    dy = segment_median(shift[:, 0], group_of_match, num_groups)
+    dx = segment_median(shift[:, 1], group_of_match, num_groups)
+    score = segment_median(matches.score, group_of_match, num_groups)
     window = pixel.index_select(0, first) // image_size
-    return DenseShift(pixel, group, torch.stack((dy, dx), 1), index_in_group(window), ncc)
+    return DenseShift(pixel, group, torch.stack((dy, dx), 1), index_in_group(window), score)

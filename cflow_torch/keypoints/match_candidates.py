@@ -1,36 +1,27 @@
-"""Key points, their descriptors, and match candidates: the key points of t+1 within a radius of a key point of t.
+"""Key points, their descriptors, and the blocks of key points of t+1 within a radius of a key point of t.
 
-We group the key points of t by small tiles of the image. The key points of t+1 are sorted by band of rows, then by
-column, so those within the radius of a group are a few ranges of this list. No tensor ever holds all pairs of key
+A block is 64 neighbours: consecutive key points, by column, of a band of 12 rows. In the order of window, band and
+column, the blocks within the radius of a key point are a few ranges, one a band. No tensor ever holds all pairs of key
 points of t and t+1.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterator
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
-from cflow_torch.ops.indices import concat_ranges, flat_nonzero, gather, index_in_group, split_index
+from cflow_torch.ops.indices import concat_ranges, flat_nonzero, index_in_group, split_index
 from cflow_torch.ops.morphology import erode_cross
 from cflow_torch.windows.collation import Batch
 
-# Rows and columns of a tile, rows of a band, key points in a group. We tried several tiles and bands for groups of 16.
-# These give the fewest pairs (key point, candidate): on the AV2 pair, 1.55 times the number within the radius. Groups
-# of 8 have fewer pairs, but fetch twice as many descriptors per pair.
-_TILE_ROWS, _TILE_COLS = 12, 64
-_BAND = 4
-_GROUP = 16
-# Pairs that we compare together. They should fit the cache of a CPU; a GPU needs many.
-_PAIRS_AT_ONCE_CPU = 1 << 17
-_PAIRS_AT_ONCE_GPU = 1 << 26
-_BYTES_PER_PAIR = 64
-# Lists of candidates that we compare together are padded to the longest one, rounded up to a multiple of this.
-_LENGTH_STEP = 8
+BLOCK_SIZE = 64
+_BAND_ROWS = 12
+_BAND_BITS = 16
+_COL_BITS = 17
 # `gate_radius` is the longest distance of a match between sweeps that are this many seconds apart.
 _GATE_SECONDS = 0.1
 
@@ -45,6 +36,9 @@ class KeyPoints:
     col: Tensor  # (K,) int64, column in the image of the window
     patch: Tensor  # (K, L * L) uint8, zeros and ones
     energy: Tensor  # (K,) int64, number of ones, at least 1
+
+    def __len__(self) -> int:
+        return self.row.numel()
 
 
 def detect(occupancy: Tensor) -> Tensor:
@@ -84,73 +78,64 @@ def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Te
 
 
 @dataclass(frozen=True)
-class Pairing:
-    """Groups of key points and their match candidates. The groups with the most candidates come first."""
+class Blocks:
+    """Key points in blocks, in order of window, band of rows and column. A block lies in one band of one window."""
 
-    member: Tensor  # (G, S) int64, key points of each group, padded with the number of key points
-    candidate: Tensor  # (C,) int64, candidates of all groups, one group after the other
-    first: Tensor  # (G,) int64, start of the range of `candidate` that belongs to each group
-    count: Tensor  # (G,) int64, length of that range
-    limit: Tensor  # (G,) int32, largest squared distance of a match, pixels
+    block: Tensor  # (K,) int64, block of each key point
+    slot: Tensor  # (K,) int64, index of each key point in its block, 0 ... 63
+    first: Tensor  # (N,) int64, sorting key of the first key point of each block, ascending
+    last: Tensor  # (N,) int64, sorting key of the last key point of each block, ascending
+    num_bands: int  # bands of rows in an image, down to the last one with a key point
+
+    def __len__(self) -> int:
+        return self.first.numel()
+
+    def arrange(self, values: Tensor, missing: float) -> Tensor:
+        """Arrange values of the key points, (K,), by blocks, (N, 64); `missing` where a block has fewer."""
+        table = values.new_full((len(self), BLOCK_SIZE), missing)
+        table[self.block, self.slot] = values
+        return table
 
 
-def pair(source: KeyPoints, target: KeyPoints, reach: Tensor) -> Pairing:
-    """Group the key points of `source`, and find the candidates of each group: all key points of `target` within
-    `reach`, (B,) float64 pixels, of a key point of the group, and some farther ones."""
-    key, order = _band_key(target.window, target.row // _BAND, target.col).sort()
-    groups = _group(source)
-    window = source.window.take(groups[:, :1])
-    member = torch.where(groups == source.row.numel(), groups[:, :1], groups)
-    (top, bottom), (left, right) = (
-        values.take(member).aminmax(dim=1, keepdim=True) for values in (source.row, source.col)
-    )
-    reach = reach.take(window)
-    num_bands = min((2 * int(reach.max()) + _TILE_ROWS) // _BAND + 2, 1 << 13)
-    band = (top - reach.long()).clamp_(min=0) // _BAND + torch.arange(num_bands, device=key.device)
-    gap = torch.maximum(top - (band * _BAND + _BAND - 1), band * _BAND - bottom).clamp_(min=0)
-    square = reach * reach - gap * gap
+def make_blocks(points: KeyPoints) -> Blocks:
+    """Cut the key points of each band of rows into blocks, by column."""
+    band = points.row // _BAND_ROWS
+    key, order = _sorting_key(points.window, band, points.col).sort()
+    slot = index_in_group(key >> _COL_BITS) % BLOCK_SIZE
+    begin = flat_nonzero(slot == 0)
+    end = F.pad(begin[1:], (0, 1), value=len(points))
+    block = torch.repeat_interleave(torch.arange(begin.numel(), device=key.device), end - begin)
+    rank = order.argsort()
+    return Blocks(block[rank], slot[rank], key[begin], key[end - 1], int(band.max()) + 1)
+
+
+def near_blocks(points: KeyPoints, order: Tensor, blocks: Blocks, reach: Tensor) -> tuple[Tensor, Tensor]:
+    """Find the blocks that may have a key point within reach of each point; `reach` is (B,) float64, pixels.
+
+    Returns:
+        The blocks near the first point in this order, those near the second one, and so on, int64. The number of
+        blocks near each point in this order, (K,) int64.
+    """
+    window = points.window[order, None]
+    row = points.row[order, None]
+    col = points.col[order, None]
+    radius = reach[window]
+    num_bands = min(int(2 * reach.max()) // _BAND_ROWS + 2, blocks.num_bands)
+    band = (row - radius.long()).clamp_(min=0) // _BAND_ROWS + torch.arange(num_bands, device=row.device)
+    top = band * _BAND_ROWS
+    gap = torch.maximum(top - row, row - (top + _BAND_ROWS - 1)).clamp_(min=0)  # rows between point and band
+    square = radius * radius - gap * gap
     half_width = square.clamp(min=0).sqrt().ceil().clamp(max=1 << 15).long()
-    start = torch.searchsorted(key, _band_key(window, band, (left - half_width).clamp(min=0)))
-    end = torch.searchsorted(key, _band_key(window, band, right + half_width + 1))
-    length = (end - start).mul_(square >= 0)
-    candidate = order.index_select(0, concat_ranges(start.flatten(), length.flatten()))
-    limit = (reach * reach).floor().clamp(max=torch.iinfo(torch.int32).max - 1).int()[:, 0]
-    count = length.sum(1)
-    first = count.cumsum(0) - count
-    count, order = count.sort(descending=True)
-    groups, first, limit = gather(order, groups, first, limit)
-    return Pairing(groups, candidate, first, count, limit)
+    begin = torch.searchsorted(blocks.last, _sorting_key(window, band, (col - half_width).clamp(min=0)))
+    end = torch.searchsorted(blocks.first, _sorting_key(window, band, col + half_width + 1))
+    count = (end - begin) * (square >= 0)  # [K, bands]
+    return concat_ranges(begin.flatten(), count.flatten()), count.sum(1)
 
 
-def pairs_at_once(device: torch.device, max_memory: float | None) -> int:
-    """Number of pairs (key point, candidate) that we compare together."""
-    number = _PAIRS_AT_ONCE_CPU if device.type == "cpu" else _PAIRS_AT_ONCE_GPU
-    return number if max_memory is None else min(number, int(max_memory) // _BYTES_PER_PAIR)
+def _sorting_key(window: Tensor, band: Tensor, col: Tensor) -> Tensor:
+    """Return a key that sorts by window, band, column.
 
-
-def chunks(pairing: Pairing, num_pairs: int) -> Iterator[tuple[slice, int]]:
-    """Yield ranges of groups that we compare together, and the length to which we pad their lists of candidates."""
-    counts = pairing.count.tolist()
-    begin = 0
-    while begin < len(counts) and counts[begin] > 0:  # the remaining groups have no candidate
-        length = -(-counts[begin] // _LENGTH_STEP) * _LENGTH_STEP
-        end = begin + max(1, num_pairs // (length * _GROUP))
-        yield slice(begin, end), length
-        begin = end
-
-
-def _group(points: KeyPoints) -> Tensor:
-    """(G, _GROUP) int64, groups of key points of one tile each, in order of columns; padded with K."""
-    tile = (points.window << 24) + (points.row // _TILE_ROWS << 12) + points.col // _TILE_COLS
-    tile, order = ((tile << 16) + points.col).sort(stable=True)
-    tile >>= 16
-    slot = index_in_group(tile) % _GROUP
-    group = (slot == 0).cumsum(0) - 1
-    member = torch.full((int(group[-1]) + 1, _GROUP), tile.numel(), dtype=torch.int64, device=tile.device)
-    member.view(-1).scatter_(0, group * _GROUP + slot, order)
-    return member
-
-
-def _band_key(window: Tensor, band: Tensor, col: Tensor) -> Tensor:
-    """A key that sorts by window, band, column. Bands may lie up to 2^13 below the image."""
-    return (((window << 16) + band) << 17) + col
+    bits  33 ...  17 ... 32  0 ... 16
+          window  band       column
+    """
+    return (((window << _BAND_BITS) + band) << _COL_BITS) + col

@@ -1,36 +1,48 @@
 """Match key points by normalised correlation, all windows at once (Sec. Matching keypoints).
 
-One small matrix product counts the pixels that each key point of a group shares with each match candidate of the
-group. Few candidates score close to the best one of a key point; we compare only those exactly.
+Most pixels of a descriptor are empty. So we do not multiply descriptors. For each set pixel of a key point of t, we add
+a row of a table, which says which key points of a block of t+1 have this pixel, too. The sum counts the pixels that the
+key point shares with each of the 64 key points of the block. Few of them score close to the best one; we compare only
+those exactly.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import reduce
-from typing import Iterable, Iterator, Sequence
+from typing import Iterator
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
-from cflow_torch.keypoints.match_candidates import KeyPoints, chunks, pair, pairs_at_once
-from cflow_torch.ops.indices import flat_nonzero, gather
+from cflow_torch.keypoints.match_candidates import BLOCK_SIZE, Blocks, KeyPoints, make_blocks, near_blocks
+from cflow_torch.ops.chunks import chunks
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import flat_nonzero
 
 # The ratio rho is used to four decimals, so that the ratio test compares integers.
 _RATIO_UNIT = 10_000
-# We pack two pixels of a descriptor into one number, a + 128 b, and two of the other descriptor into 128 a' + b'. The
-# product is a b' + 128 (a a' + b b') + 128^2 b a', so the count is the middle digit. It has 7 bits, enough for 126
-# pixels. Packing halves the number of multiplications. Nothing is rounded: 1, 128 and 129 fit bfloat16 and TF32, which
-# matrix products may fall back to, and the sum fits float32. We cut longer descriptors into strips.
-_DIGIT_BITS = 7
-_STRIP_NUMBERS = 63
-_COUNT_BITS = 127 << _DIGIT_BITS
+# One float32 of the table stands for four key points of a block: float32 holds 24 bits exactly.
+#
+#     bits         0 ... 5   6 ... 11   12 ... 17   18 ... 23
+#     key points   0 ... 15  16 ... 31  32 ... 47   48 ... 63   (one of them in each of the 16 columns)
+#
+# So we add at most 63 rows as float32. Then we split the digits into two int32 of two digits each, which have 12 bits
+# for a digit. A descriptor has at most 51^2 = 2601 pixels, so we can add those.
+_DIGIT_BITS = 6
+_MOST_ROWS = (1 << _DIGIT_BITS) - 1
+_EVEN_DIGITS = 63 + (63 << 12)
+_COLUMNS = BLOCK_SIZE // 4
 # Bound of the relative rounding error of count^2 / energy in float32, by which we find contenders.
 _ROUNDING = 2.0**-20
-# Contenders that we compare exactly at once; on a CPU `pairs_at_once` is less.
-_CONTENDERS_AT_ONCE = 1 << 22
+# Pairs that we compare together. With 2^17 a CPU takes a tenth longer, because there are more calls.
+_PAIRS_AT_ONCE_CPU = 1 << 19
+_PAIRS_AT_ONCE_GPU = 1 << 22
+_BYTES_PER_PAIR = 128
+# Key points of t whose energies differ by less are compared together, those of other energies apart.
+_ENERGY_STEP = 32
 
 
 @dataclass(frozen=True)
@@ -42,6 +54,39 @@ class Matches:
     score: Tensor  # (M,) float64, NCC of the two descriptors (Eq. descriptor_ncc)
 
 
+@dataclass(frozen=True)
+class Targets:
+    """Key points of t+1 in N blocks of 64. We fill up a block with the first key point."""
+
+    blocks: Blocks
+    number: Tensor  # (N, 64) int64, key point; 0 where a block is filled up
+    row: Tensor  # (N, 64) int32
+    col: Tensor  # (N, 64) int32
+    energy: Tensor  # (N, 64) float32; infinite, for a score of 0, where a block is filled up
+    has_pixel: Tensor  # (N * (L^2 + 1), 16) float32, row b (L^2 + 1) + p: which key points of block b have pixel p
+
+
+@dataclass(frozen=True)
+class Bags:
+    """Some key points of t, each with the blocks of t+1 near it. A bag is a key point and a block."""
+
+    source: Tensor  # (S,) int64, key points of t
+    of_source: Groups  # N bags in S groups
+    block: Tensor  # (N,) int64, block of each bag
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of a key point of t and one of t+1."""
+
+    source: Tensor  # (P,) int64, key point of t
+    target: Tensor  # (P,) int64, key point of t+1
+    count: Tensor  # (P,) int64, pixels that are set in both descriptors
+
+    def __getitem__(self, index: Tensor) -> Pairs:
+        return Pairs(self.source[index], self.target[index], self.count[index])
+
+
 def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> Matches:
     """Find the best match of every key point of t and apply the ratio test (Eq. descriptor_ncc, best_match).
 
@@ -49,126 +94,135 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig
     count^2 / energy of the candidate. We accept the best match, of score R, if R > rho R' for the second-best score R',
     in integers, or if there is no second candidate. Ties: rejected.
 
-    Cost: time (pairs of a key point and a candidate) x L^2; memory a fixed number of pairs, plus L^2 bytes per point.
+    Cost: time (pairs of a key point and a candidate) x (energy of the key point); memory 2 L^2 bytes per key point.
     """
-    num_source = pc0.row.numel()
-    accepted = [torch.zeros((3, 0), dtype=torch.int64, device=reach.device)]
-    rho = round(config.ratio_threshold * _RATIO_UNIT)
-    num_pairs = pairs_at_once(reach.device, config.max_memory)
-    parts = _contenders(pc0, pc1, reach, (_RATIO_UNIT / rho) ** 2, num_pairs)
-    for source, target, count in _join(parts, min(num_pairs, _CONTENDERS_AT_ONCE)):
-        energy, square = pc1.energy.index_select(0, target), count * count
-        value = square.double() / energy  # exact enough to tell any two different fractions apart
-        top = value.new_zeros(num_source).scatter_reduce_(0, source, value, "amax")
-        tied = flat_nonzero(value == top.index_select(0, source))
-        p = source.index_select(0, tied)
-        best_of_point = torch.zeros_like(pc0.row).scatter_(0, p, tied)  # any of a tie, which the ratio test rejects
-        best = tied.index_select(0, flat_nonzero(tied == best_of_point.index_select(0, p)))
-        p = source.index_select(0, best)
-        # The ratio test against every other contender: c1^2 E2 > rho^2 c2^2 E1.
-        rivalled = best_of_point.index_select(0, source)
-        best_square, best_energy = gather(rivalled, square, energy)
-        is_rival = best_square * energy * _RATIO_UNIT**2 <= square * best_energy * rho**2
-        rivals = flat_nonzero(is_rival.index_fill_(0, best, False))
-        is_clear = torch.ones_like(pc0.row, dtype=torch.bool).index_fill_(0, source.index_select(0, rivals), False)
-        best = best.index_select(0, flat_nonzero(is_clear.index_select(0, p)))
-        accepted.append(torch.stack(gather(best, source, target, count)))
-    source, target, count = torch.cat(accepted, 1)
-    source, by_source = source.sort()
-    target, count = gather(by_source, target, count)
-    energies = pc0.energy.index_select(0, source) * pc1.energy.index_select(0, target)
-    (row0, col0), (row1, col1) = gather(source, pc0.row, pc0.col), gather(target, pc1.row, pc1.col)
-    return Matches(source, torch.stack((row1 - row0, col1 - col0), 1), count.double() / torch.sqrt(energies.double()))
+    ratio = round(config.ratio_threshold * _RATIO_UNIT)
+    none = torch.zeros(0, dtype=torch.int64, device=reach.device)
+    accepted = [Pairs(none, none, none)]
+    if len(pc0) and len(pc1):
+        targets = arrange_targets(pc1, config.patch_size**2)
+        for bags in make_bags(pc0, targets.blocks, reach, config):
+            count = shared_pixels(pc0, bags, targets)  # [N, 64]
+            count *= is_within_reach(pc0, bags, targets, reach)
+            contenders = find_contenders(bags, targets, count, ratio)
+            accepted.append(contenders[passes_ratio_test(contenders, pc1.energy, ratio)])
+    source = torch.cat([pairs.source for pairs in accepted])
+    source, order = source.sort()
+    target = torch.cat([pairs.target for pairs in accepted])[order]
+    count = torch.cat([pairs.count for pairs in accepted])[order]
+    shift = torch.stack((pc1.row[target] - pc0.row[source], pc1.col[target] - pc0.col[source]), 1)
+    energies = pc0.energy[source] * pc1.energy[target]
+    return Matches(source, shift, count.double() / energies.double().sqrt())
 
 
-def _contenders(
-    source: KeyPoints, target: KeyPoints, reach: Tensor, share: float, num_pairs: int
-) -> Iterator[tuple[Tensor, ...]]:
-    """Yield pairs of key points of `source` and `target`, and their counts, (N,) int64 each.
-
-    We keep a pair if its count^2 / energy is at least `share` times the largest one of the same key point of `source`.
-    All pairs of a key point of `source` come in the same tensors.
-    """
-    if source.row.numel() == 0 or target.row.numel() == 0:
-        return
-    pairing = pair(source, target, reach)
-    num_target = target.row.numel()
-    members = pairing.member
-    # An additional last key point pads the groups and the lists of candidates.
-    row0, col0 = gather(members.flatten(), *(F.pad(values.int(), (0, 1)) for values in (source.row, source.col)))
-    row0, col0 = row0.view(*members.shape, 1), col0.view(*members.shape, 1)
-    row1, col1, energy1 = (F.pad(values, (0, 1), value=1) for values in (target.row, target.col, target.energy))
-    row1, col1, energy1 = row1.int(), col1.int(), energy1.float()
-    patch0, patch1 = _pack(source.patch, False), _pack(target.patch, True)
-    offset = row0 * row0 + col0 * col0 - pairing.limit[:, None, None] - 1
-    for groups, length in chunks(pairing, num_pairs):
-        member = members[groups]
-        shape = (member.shape[0], 1, length)
-        slot = torch.arange(length, device=member.device)
-        index = (pairing.first[groups, None] + slot).clamp_(max=pairing.candidate.numel() - 1)
-        candidate = pairing.candidate.index_select(0, index.flatten())
-        candidate.masked_fill_((slot >= pairing.count[groups, None]).flatten(), num_target)
-        overlap = _overlap(patch0, member, patch1, candidate)
-
-        # Clear the overlap of pairs out of reach. dy^2 + dx^2 - limit - 1 is negative within reach; its terms may
-        # exceed 31 bits, their sum does not. Masks of bits are ten times faster than bool masks.
-        row, col = row1.index_select(0, candidate).view(shape), col1.index_select(0, candidate).view(shape)
-        inside = (row * row).addcmul_(col, col) + offset[groups]
-        inside.addcmul_(row, row0[groups], value=-2).addcmul_(col, col0[groups], value=-2).bitwise_right_shift_(31)
-        overlap.bitwise_and_(inside)
-        value = overlap.float()
-        value.mul_(value).div_(energy1.index_select(0, candidate).view(shape))
-        threshold = value.amax(2, keepdim=True).mul_(share * (1 - _ROUNDING)).clamp_(min=2.0**-15)  # > 0
-        index = flat_nonzero(value.ge_(threshold).bool())  # three times faster than value >= threshold
-
-        of_member = index // length
-        of_candidate = index - (of_member - of_member // member.shape[1]) * length
-        count = overlap.flatten().index_select(0, index).long() >> _DIGIT_BITS
-        yield member.flatten().index_select(0, of_member), candidate.index_select(0, of_candidate), count
+def arrange_targets(points: KeyPoints, num_pixels: int) -> Targets:
+    """Arrange the key points of t+1 and their descriptors, of L^2 = `num_pixels`, by blocks."""
+    blocks = make_blocks(points)
+    number = blocks.arrange(torch.arange(len(points), device=points.row.device), 0)
+    # The last row of each block is zero: it fills up the lists of set pixels of the key points of t.
+    has_pixel = points.patch.new_empty((len(blocks), num_pixels + 1, _COLUMNS), dtype=torch.float32)
+    has_pixel[:, -1] = 0
+    for part in chunks(0, len(blocks), number.device, BLOCK_SIZE * num_pixels // 16):
+        digits = points.patch.index_select(0, number[part].flatten()).view(-1, 4, _COLUMNS, num_pixels)
+        packed = digits[:, 0].float()
+        for digit in range(1, 4):
+            packed.add_(digits[:, digit], alpha=1 << (digit * _DIGIT_BITS))
+        has_pixel[part, :-1] = packed.transpose(1, 2)
+    return Targets(
+        blocks=blocks,
+        number=number,
+        row=blocks.arrange(points.row.int(), 0),
+        col=blocks.arrange(points.col.int(), 0),
+        energy=blocks.arrange(points.energy.float(), math.inf),
+        has_pixel=has_pixel.flatten(0, 1),
+    )
 
 
-def _join(parts: Iterable[tuple[Tensor, ...]], enough: int) -> Iterator[tuple[Tensor, ...]]:
-    """Concatenate consecutive parts until each result has `enough` elements."""
-    waiting: list[tuple[Tensor, ...]] = []
-    for one in parts:
-        waiting.append(one)
-        if sum(len(values) for values, *_ in waiting) >= enough:
-            yield tuple(map(torch.cat, zip(*waiting)))
-            waiting = []
-    if waiting:
-        yield tuple(map(torch.cat, zip(*waiting)))
+def make_bags(points: KeyPoints, blocks: Blocks, reach: Tensor, config: KeypointsConfig) -> Iterator[Bags]:
+    """Yield the bags of all key points of t: as many at a time as we compare together."""
+    num_pairs = _PAIRS_AT_ONCE_CPU if reach.device.type == "cpu" else _PAIRS_AT_ONCE_GPU
+    if config.max_memory is not None:
+        num_pairs = min(num_pairs, int(config.max_memory) // _BYTES_PER_PAIR)
+    order = (points.energy // _ENERGY_STEP).argsort(stable=True)
+    block, num_blocks = near_blocks(points, order, blocks, reach)
+    part = (num_blocks.cumsum(0) - num_blocks) // max(1, num_pairs // BLOCK_SIZE)
+    groups = Groups(part, int(part[-1]) + 1)
+    num_sources = groups.size().tolist()
+    num_bags = groups.sum(num_blocks).tolist()
+    for source, number, near in zip(order.split(num_sources), num_blocks.split(num_sources), block.split(num_bags)):
+        if near.numel() == 0:
+            continue
+        position = torch.arange(source.numel(), device=source.device)
+        yield Bags(source, Groups(torch.repeat_interleave(position, number), source.numel()), near)
 
 
-def _pack(patch: Tensor, swapped: bool) -> tuple[Tensor, ...]:
-    """Pack (K, L^2) zeros and ones into strips, (K + 1, N) uint8 each, two pixels in a number; the last row is zero.
+def shared_pixels(points: KeyPoints, bags: Bags, targets: Targets) -> Tensor:
+    """Count the pixels that the key point of each bag shares with those of its block: (N, 64) int32."""
+    num_pixels = points.patch.shape[1]
+    energy = points.energy[bags.source]
+    num_sums = -(-int(energy.max()) // _MOST_ROWS)
+    length = -(-int(energy.max()) // num_sums)
+    pixels = list_set_pixels(points.patch.index_select(0, bags.source), energy, length * num_sums)
+    rows = pixels.index_select(0, bags.of_source.of_item)  # [N, length * num_sums]
+    rows += bags.block[:, None].int() * (num_pixels + 1)
+    sums = F.embedding_bag(rows.view(-1, length), targets.has_pixel, mode="sum").int().view(-1, num_sums, _COLUMNS)
+    even = (sums & _EVEN_DIGITS).sum(1, dtype=torch.int32)  # [N, 16]
+    odd = (sums >> _DIGIT_BITS & _EVEN_DIGITS).sum(1, dtype=torch.int32)
+    return torch.cat((even & 0xFFF, odd & 0xFFF, even >> 12, odd >> 12), 1)
 
-    If `swapped`, the first half of the pixels is the higher digit.
-    """
+
+def list_set_pixels(patch: Tensor, energy: Tensor, length: int) -> Tensor:
+    """List the ones of each row of (S, L^2) uint8: (S, length) int32, filled up with L^2. `energy` counts them."""
     num_points, num_pixels = patch.shape
-    half = -(-num_pixels // 2)
-    num_strips = -(-half // _STRIP_NUMBERS)
-    width = -(-half // num_strips)
-    packed = patch.new_zeros((num_points + 1, num_strips * width))
-    first, second = (1 << _DIGIT_BITS, 1) if swapped else (1, 1 << _DIGIT_BITS)
-    torch.mul(patch[:, :half], first, out=packed[:-1, :half])
-    packed[:-1, : num_pixels - half].add_(patch[:, half:], alpha=second)
-    return tuple(strip.contiguous() for strip in packed.split(width, dim=1))
+    is_used = torch.arange(length, device=patch.device) < energy[:, None]
+    start = torch.arange(0, patch.numel(), num_pixels, device=patch.device)[:, None]
+    pixels = torch.zeros((num_points, length), dtype=torch.int64, device=patch.device)
+    pixels.masked_scatter_(is_used, flat_nonzero(patch.bool())).sub_(start)
+    return pixels.masked_fill_(~is_used, num_pixels).int()
 
 
-def _overlap(patch0: Sequence[Tensor], member: Tensor, patch1: Sequence[Tensor], candidate: Tensor) -> Tensor:
-    """Count the pixels that are set in both descriptors, times 128: (G, S, C) int32.
+def is_within_reach(points: KeyPoints, bags: Bags, targets: Targets, reach: Tensor) -> Tensor:
+    """Tell which key points of the block of each bag are within reach of its key point: (N, 64) bool."""
+    radius = reach[points.window[bags.source]]
+    limit = (radius * radius).floor().clamp(max=torch.iinfo(torch.int32).max).int()[:, None]
+    row = points.row[bags.source].int()[:, None]
+    col = points.col[bags.source].int()[:, None]
+    of_source = bags.of_source.of_item
+    dy = targets.row.index_select(0, bags.block).sub_(row[of_source])
+    dx = targets.col.index_select(0, bags.block).sub_(col[of_source])
+    return dy.mul_(dy).addcmul_(dx, dx) <= limit[of_source]
 
-    The descriptors are strips of `_pack`; `member` (G, S) and `candidate` (G * C,) are their rows.
+
+def find_contenders(bags: Bags, targets: Targets, count: Tensor, ratio: int) -> Pairs:
+    """Select the pairs whose count^2 / energy, in float32, is not clearly too small for the ratio test."""
+    value = count.float()
+    value.mul_(value).div_(targets.energy.index_select(0, bags.block))  # [N, 64]
+    best = bags.of_source.max(value.amax(1), empty=0)
+    share = (_RATIO_UNIT / ratio) ** 2 * (1 - _ROUNDING)
+    threshold = bags.of_source.spread(best * share).clamp_(min=2.0**-15)  # > 0
+    index = flat_nonzero(value >= threshold[:, None])
+    bag = index // BLOCK_SIZE
+    source = bags.source[bags.of_source.of_item[bag]]
+    target = targets.number[bags.block[bag], index % BLOCK_SIZE]
+    return Pairs(source, target, count.flatten()[index].long())
+
+
+def passes_ratio_test(pairs: Pairs, energies: Tensor, ratio: int) -> Tensor:
+    """Find the pairs that are better than `ratio` / 10^4 times all other pairs of their key point of t, (M,) int64.
+
+    `energies`, (K,) int64, are those of the key points of t+1.
     """
-    num_groups, size = member.shape
-    width = patch1[0].shape[1]
-    right = torch.empty((candidate.numel(), width), dtype=torch.float32, device=member.device)  # allocated once
-    product = right.new_empty((num_groups, size, candidate.numel() // num_groups))
-
-    def of_strip(strip0: Tensor, strip1: Tensor) -> Tensor:
-        left = strip0.index_select(0, member.flatten()).float().view(num_groups, size, -1)
-        right.copy_(strip1.index_select(0, candidate))
-        torch.bmm(left, right.view(num_groups, -1, width).transpose(1, 2), out=product)
-        return product.int().bitwise_and_(_COUNT_BITS)
-
-    return reduce(Tensor.add_, map(of_strip, patch0, patch1))
+    square = pairs.count * pairs.count
+    energy = energies[pairs.target]
+    value = square.double() / energy  # exact enough to tell any two different fractions apart
+    number, of_source = torch.unique(pairs.source, return_inverse=True)
+    of_source = Groups(of_source, number.numel())
+    is_best = value == of_source.spread(of_source.max(value, empty=0))
+    best = flat_nonzero(is_best)
+    # If several are best, we take any of them: another one rejects it.
+    best_of_source = torch.zeros_like(number).scatter_(0, of_source.of_item[best], best)
+    best = best_of_source[of_source.of_item]
+    # c1^2 / E1 > rho^2 c2^2 / E2
+    is_beaten = square[best] * energy * _RATIO_UNIT**2 > square * energy[best] * ratio**2
+    is_rival = ~is_beaten & (best != torch.arange(best.numel(), device=best.device))
+    return best_of_source[flat_nonzero(~of_source.any(is_rival))]

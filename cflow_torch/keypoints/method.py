@@ -37,14 +37,17 @@ class CorrelationFlowKeypoints(CoarseToFine):
 
     @property
     def bytes_per_point(self) -> int:  # type: ignore[override]
-        """Working memory per point. At most half of the points have a descriptor, stored twice."""
+        """Working memory per point. At most half of the points have a descriptor, of L^2 bytes, or 2 L^2 at t+1."""
         return int(super().bytes_per_point) + int(self.config.patch_size) ** 2
 
     def motion_at_scale(self, sweeps: ProjectedSweeps) -> Motion:
         """Match the key points of t and t+1 at one pixel size and spread the matches to all points of t."""
-        config, occupancy, pixel_size = self.config, sweeps.occupancy, sweeps.grid.pixel_size
+        config = self.config
+        occupancy = sweeps.occupancy
+        pixel_size = sweeps.grid.pixel_size
         with stage("describe"):
-            pc1, pc0 = (describe(occupancy[:, step], config.patch_size) for step in (0, 1))
+            pc1 = describe(occupancy[:, 0], config.patch_size)
+            pc0 = describe(occupancy[:, 1], config.patch_size)
         with stage("match"):
             matches = match(pc0, pc1, match_radius(sweeps.batch, pixel_size, config), config)
         with stage("densify"):

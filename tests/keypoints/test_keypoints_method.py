@@ -150,22 +150,32 @@ def test_a_match_at_the_radius_is_allowed():
 
 @pytest.mark.parametrize("precision", ["highest", "medium"])
 @pytest.mark.parametrize("patch_size", [1, 11, 51])
-def test_the_products_count_exactly(patch_size, precision):
-    generator, descriptors = torch.Generator().manual_seed(patch_size), []
-    for number, density in ((7, 0.1), (9, 0.7)):
+def test_shared_pixels_are_counted_exactly(patch_size, precision):
+    generator, points = torch.Generator().manual_seed(patch_size), []
+    for number, density in ((7, 0.1), (150, 0.7)):
         patch = torch.rand((number, patch_size**2), generator=generator) < density
-        patch[0], patch[1] = True, False
-        descriptors.append(patch.byte())
-    expected = (descriptors[0][:, None] & descriptors[1]).sum(2)
-    strips0, strips1 = matching._pack(descriptors[0], False), matching._pack(descriptors[1], True)
+        patch[0], patch[:, 0] = True, True  # every descriptor has a set pixel
+        index = torch.arange(number)
+        zero = torch.zeros_like(index)
+        points.append(KeyPoints(index, zero, zero, index, patch.byte(), patch.sum(1)))
+    pc0, pc1 = points
+    expected = (pc0.patch[:, None] & pc1.patch).sum(2)
+    targets = matching.arrange_targets(pc1, patch_size**2)
+    reach = torch.tensor([1000.0], dtype=torch.float64)
     before = torch.get_float32_matmul_precision()
+    counted = torch.zeros(7, dtype=torch.int64)
     try:
         torch.set_float32_matmul_precision(precision)
-        found = matching._overlap(strips0, torch.arange(8).view(2, 4), strips1, torch.arange(10).repeat(2))
+        for bags in matching.make_bags(pc0, targets.blocks, reach, config("keypoints", max_memory=60_000)):
+            source = bags.source[bags.of_source.of_item][:, None].expand(-1, 64)
+            number = targets.number[bags.block]
+            is_target = targets.energy[bags.block].isfinite()
+            count = matching.shared_pixels(pc0, bags, targets)
+            assert torch.equal(count[is_target].long(), expected[source[is_target], number[is_target]])
+            counted.index_add_(0, source[is_target], torch.ones_like(source[is_target]))
     finally:
         torch.set_float32_matmul_precision(before)
-    found = found.reshape(8, 10) >> 7
-    assert torch.equal(found[:7, :9], expected.int()) and not found[7].any() and not found[:, 9].any()  # padding
+    assert counted.tolist() == [150] * 7  # every pair once
 
 
 def test_values_that_float32_cannot_separate_are_both_contenders():
