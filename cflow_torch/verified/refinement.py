@@ -242,24 +242,19 @@ class Registration:
         residual = take_columns(self._voxels.position, target) - moved
         is_near = residual.square().sum(0) <= _FARTHEST**2
         is_same = self._voxels.object_id.index_select(0, target) == source.objects.of_item
-        pair = flat_nonzero(is_near & is_same)
-        voxel = source.voxel.index_select(0, pair)
-        target = target.index_select(0, pair)
-        residual = take_columns(residual, pair)
-
-        noise = constant((_NOISE**2, _NOISE**2, _NOISE**2, 0.0, 0.0, 0.0), torch.float64, pair.device)[:, None]
-        covariance = take_columns(self._covariance, voxel) + take_columns(self._covariance, target) + noise
+        noise = constant((_NOISE**2, _NOISE**2, _NOISE**2, 0.0, 0.0, 0.0), torch.float64, target.device)[:, None]
+        covariance = take_columns(self._covariance, source.voxel) + take_columns(self._covariance, target) + noise
         information = full(inverse(covariance))
         square = (residual * matvec(information, residual)).sum(0)  # Mahalanobis distance
         weight = (_KERNEL / (_KERNEL + square)).square() * _NOISE**2
         return Correspondences(
-            source=voxel,
+            source=source.voxel,
             target=target,
-            objects=source.objects[pair],
-            elapsed=source.elapsed.index_select(0, pair),
-            arm=take_columns(arm, pair),
+            objects=source.objects,
+            elapsed=source.elapsed,
+            arm=arm,
             residual=residual,
-            information=information * weight,
+            information=information * (weight * (is_near & is_same)),
         )
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
