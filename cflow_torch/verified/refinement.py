@@ -30,7 +30,7 @@ from torch import Tensor
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, take_columns
-from cflow_torch.ops.linear import full, inverse, matvec
+from cflow_torch.ops.linear import full, inverse, matvec, upper
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
@@ -118,16 +118,18 @@ class Source:
     objects: Groups  # the object of each voxel; each one is in a group
     centre: Tensor  # (2, K) float64, metres, x and y of the centre of its object at t
     position: Tensor  # (3, K) float64, metres
-    target_sweep: Tensor  # (K,) int64, t+1 of its window
-    target_layers: Tensor  # (3, K) int64, in which we search for the target
+    covariance: Tensor  # (6, K) float64, square metres, of the surface and of the noise, as in ops/linear.py
+    target_start: Tensor  # (K,) int64, number of the first pixel of t+1 of its window, see `pixel_key`
+    target_layers: Tensor  # (3, K) int32, in which we search for the target
     elapsed: Tensor  # (K,) float64, sweep intervals from the voxel to t+1
     elapsed_of_t: Tensor  # (K,) float64, sweep intervals from t to t+1
 
     @classmethod
-    def of(cls, voxels: Voxels, objects: Groups, centre: Tensor, elapsed: Tensor) -> Source:
+    def of(cls, voxels: Voxels, covariance: Tensor, objects: Groups, centre: Tensor, elapsed: Tensor) -> Source:
         """Select the voxels of objects with points at t, in all sweeps but t+1.
 
         Args:
+            covariance: (6, V) float64, square metres, of the surface around each voxel.
             objects: the objects of the voxels.
             centre: (2, G) float64, NaN for objects without points at t.
             elapsed: (B, S) float64, sweep intervals from each sweep to t+1.
@@ -138,13 +140,15 @@ class Source:
         window = voxels.window.index_select(0, voxel)
         num_steps = elapsed.shape[1]
         up = constant(((-1,), (0,), (1,)), torch.int64, voxel.device)
+        noise = constant((_NOISE**2, 0.0, 0.0, _NOISE**2, 0.0, _NOISE**2), torch.float64, voxel.device)[:, None]
         return cls(
             voxel=voxel,
             objects=objects,
             centre=take_columns(centre, objects.of_item),
             position=take_columns(voxels.position, voxel),
-            target_sweep=window * num_steps,
-            target_layers=(voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS,
+            covariance=take_columns(covariance, voxel) + noise,
+            target_start=pixel_key(voxels.grid, window * num_steps, constant(((0,), (0,)), torch.int64, voxel.device)),
+            target_layers=((voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS).int(),
             elapsed=elapsed.view(-1).index_select(0, window * num_steps + voxels.step.index_select(0, voxel)),
             elapsed_of_t=elapsed[:, 1].index_select(0, window),
         )
@@ -159,7 +163,8 @@ class Source:
             objects=self.objects[some],
             centre=self.centre[:, some],
             position=self.position[:, some],
-            target_sweep=self.target_sweep[some],
+            covariance=self.covariance[:, some],
+            target_start=self.target_start[some],
             target_layers=self.target_layers[:, some],
             elapsed=self.elapsed[some],
             elapsed_of_t=self.elapsed_of_t[some],
@@ -196,7 +201,7 @@ class Registration:
         objects = Groups(object_id.masked_fill(object_id < 0, num_objects), num_objects)
         at_t = objects.where(self._voxels.step == 1)
         self._centre = at_t.sum(self._voxels.position[:2]) / at_t.size()  # [2, G], at t; NaN without points
-        source = Source.of(self._voxels, objects, self._centre, sweeps.elapsed)
+        source = Source.of(self._voxels, self._covariance, objects, self._centre, sweeps.elapsed)
         self._sources = [source[some] for some in chunks(0, len(source), object_id.device, 9)]
 
     def align(self, start: Tensor, num_steps: int = NUM_STEPS) -> RigidMotion:
@@ -214,10 +219,11 @@ class Registration:
         Cost: 27 lookups a step for each voxel of the source.
         """
         prior = constant(_PRIOR, torch.float64, start.device)[:, None]  # [3, 1]
+        held = upper(torch.diag_embed(prior[:, 0])[..., None])  # [6, 1]
         start = torch.cat((start, torch.zeros_like(start[:, :1])), 1).t()  # [3, G]
         motion = start  # x, y and the tangent of half the angle, per sweep interval
         for _ in range(num_steps):
-            hessian = torch.cat((prior, torch.zeros_like(prior)))  # [6, 1], as in ops/linear.py
+            hessian = held
             gradient = prior * (start - motion)  # [3, G]
             for source in self._sources:
                 pairs = self._correspond(source, motion)
@@ -238,12 +244,11 @@ class Registration:
         moved = source.centre + velocity * source.elapsed_of_t + arm
         moved = torch.cat((moved, source.position[2:]))  # [3, K]
 
-        target = self._target.nearest(source.target_sweep, source.target_layers, moved)
+        target = self._target.nearest(source.target_start, source.target_layers, moved)
         residual = take_columns(self._voxels.position, target) - moved
         is_near = residual.square().sum(0) <= _FARTHEST**2
         is_same = self._voxels.object_id.index_select(0, target) == source.objects.of_item
-        noise = constant((_NOISE**2, _NOISE**2, _NOISE**2, 0.0, 0.0, 0.0), torch.float64, target.device)[:, None]
-        covariance = take_columns(self._covariance, source.voxel) + take_columns(self._covariance, target) + noise
+        covariance = source.covariance + take_columns(self._covariance, target)
         information = full(inverse(covariance))
         square = (residual * matvec(information, residual)).sum(0)  # Mahalanobis distance
         weight = (_KERNEL / (_KERNEL + square)).square() * _NOISE**2
@@ -295,7 +300,7 @@ def _normal_equations(pairs: Correspondences) -> Tensor:
     weighted_lever = matvec(weight, lever)  # [2, K]
     of_angle = (lever * weighted_lever).sum(0)
     hessian = torch.stack(
-        (weight[0, 0], weight[1, 1], of_angle, weighted_lever[1], weighted_lever[0], weight[0, 1])
+        (weight[0, 0], weight[0, 1], weighted_lever[0], weight[1, 1], weighted_lever[1], of_angle)
     )  # as in ops/linear.py
     gradient = matvec(pairs.information[:2], pairs.residual)
     torque = (lever * gradient).sum(0, keepdim=True)

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant
-from cflow_torch.ops.linear import adjugate, full, matvec, voigt
+from cflow_torch.ops.linear import adjugate, full, matvec, upper
 from cflow_torch.windows.bev_grid import Grid
 
 # Side of the blocks, metres. A block and the eight around it cover 6 m x 6 m.
@@ -90,7 +90,7 @@ class GroundHeights:
             if fit > 0:
                 is_used = is_known & ((height - (plane[:, :, None] * design.t()[:, None]).sum(0)).abs() <= _FARTHEST)
             sums = ((terms * is_used[:, None]) @ design).permute(1, 2, 0)
-            cofactors, det = adjugate(voigt(sums[:3]))
+            cofactors, det = adjugate(upper(sums[:3]))
             plane = matvec(full(cofactors), sums[3]) / det  # undefined where `is_flat` is False
             fits.append((sums[0, 0], det))
         n, det = (torch.stack(of_fits) for of_fits in zip(*fits))

@@ -13,7 +13,7 @@ from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import floor_divide, scatter_count, split_index, unique_pairs
 from cflow_torch.ops.kornia_engine import close_3x3_kornia
 from cflow_torch.ops.labeling import pad
-from cflow_torch.ops.linear import adjugate, full, voigt
+from cflow_torch.ops.linear import adjugate, full, upper
 from cflow_torch.ops.lower_surface import _cone
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.ops.segments import masked_median, segment_median
@@ -45,17 +45,17 @@ def test_medians_are_numpys():
 def test_adjugate_is_the_inverse_times_the_determinant():
     factors = np.random.default_rng(0).normal(size=(50, 3, 3))
     matrices = factors @ factors.transpose(0, 2, 1)
-    found, determinant = adjugate(voigt(torch.from_numpy(matrices.transpose(1, 2, 0).copy())))
+    found, determinant = adjugate(upper(torch.from_numpy(matrices.transpose(1, 2, 0).copy())))
     inverse = full(found / determinant).permute(2, 0, 1)
     np.testing.assert_allclose(inverse, np.linalg.inv(matrices), rtol=1e-8)
     np.testing.assert_allclose(determinant, np.linalg.det(matrices), rtol=1e-8)
-    alone = [adjugate(voigt(torch.from_numpy(matrix[:, :, None].copy())))[0] for matrix in matrices]
+    alone = [adjugate(upper(torch.from_numpy(matrix[:, :, None].copy())))[0] for matrix in matrices]
     assert torch.equal(torch.cat(alone, 1), found)
 
 
 def test_singular_whole_numbers_give_exactly_zero():
     matrix = torch.tensor([[1.0, 2, 3], [2, 4, 6], [3, 6, 9]], dtype=torch.float64)[:, :, None]
-    found, determinant = adjugate(voigt(matrix))
+    found, determinant = adjugate(upper(matrix))
     assert not found.any() and determinant.tolist() == [0.0]
 
 
