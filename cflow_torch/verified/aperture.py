@@ -24,7 +24,7 @@ from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero
 from cflow_torch.verified.columns import Pixels, count_slices
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.in_place import count_in_place
+from cflow_torch.verified.in_place import are_covered
 
 if TYPE_CHECKING:
     from cflow_torch.verified.component_tree import Tree
@@ -68,7 +68,7 @@ def slides_along_itself(
     at_newest = groups[newest]
     lines = principal_axes(at_newest, newest_pixels.row_col, pixel_size)
     of_line = flat_nonzero(groups.spread(lines.is_line & ~travels))  # few pixels
-    is_covered = count_in_place(sweeps, pixels[of_line], groups[of_line]).is_covered
+    is_covered = are_covered(sweeps, pixels[of_line], groups[of_line])
     num_more = at_newest.sum(count_slices(newest_pixels.slices) - _TALL)
     is_rail = (num_more < 0) & (lines.variance >= (_RAIL / pixel_size) ** 2)
     slides = lines.is_line & (is_covered | is_rail)

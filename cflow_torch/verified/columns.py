@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import constant, flat_nonzero, lazy_zeros, split_index
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, lazy_zeros, split_index
 from cflow_torch.windows.bev_grid import Grid
 
 NUM_SLICES = 4
@@ -28,20 +28,16 @@ _WORD = 8  # sweeps whose slices make up one int64
 class Pixels:
     """K occupied pixels of sweeps. Step 0 is sweep t+1, 1 is t, 2 is t-1, ..."""
 
-    # (K, 6) int32: column, its first slot, window, step, row, col. A row per pixel, because pixels are often selected
-    # at random: rows take a quarter of the time of columns.
+    # (K, 6) int32 (int64 if that is too small): slot of t+1 in the same column, counted through all columns; position
+    # of row 0 and column 0 in the image; window, step, row, col. A row per pixel, because pixels are often selected at
+    # random: rows take a quarter of the time of columns.
     place: Tensor
     slices: Tensor  # (K,) uint8, one bit for each height slice
 
     @cached_property
-    def column(self) -> Tensor:
-        """(K,) int64, row of the tables of `Columns`."""
-        return self.place[:, 0].long()
-
-    @cached_property
     def first_slot(self) -> Tensor:
-        """(K,) int64, slot of sweep t+1; that of sweep `step` is `step` slots on."""
-        return self.place[:, 1].long()
+        """(K,) int64, slot of sweep t+1 at the same position; that of sweep `step` is `step` slots on."""
+        return self.place[:, 0].long()
 
     @cached_property
     def window(self) -> Tensor:
@@ -148,21 +144,16 @@ class Columns:
         Returns:
             (K, C) uint8, or (K,) without shifts; 0 outside of the images.
         """
-        slot = pixels.first_slot + step
         if shift is None:
-            return self.slices.view(-1).index_select(0, pixels.column * self.num_slots + slot)
+            return self.slices.view(-1).index_select(0, pixels.first_slot + step)
+        slot = pixels.first_slot % self.num_slots + step  # in its column
         index = self._column_at(pixels, shift) * self.num_slots + slot[:, None]  # [K, C]
         return self.slices.view(-1).index_select(0, index.view(-1)).view_as(index)
 
     def _column_at(self, pixels: Pixels, shift: Tensor) -> Tensor:
         """Return the column at the positions that are `shift` away, (K, C) int32."""
         # These lines take 3 % of a window, so they are in place, and in 32 bits unless there are too many positions.
-        dtype = torch.int32 if len(self.image) <= torch.iinfo(torch.int32).max else torch.int64
-        row_col = pixels.place[:, 4:].to(dtype)
-        row = row_col[:, :1]
-        col = row_col[:, 1:]
-        position = self.position.index_select(0, pixels.column).to(dtype)
-        start = position[:, None] - row * self.stride - col  # of row 0 and column 0
+        _, start, _, _, row, col = pixels.place[..., None].unbind(1)  # [K, 1] each
         index = (row + shift[..., 0]).clamp_(-1, self.height).mul_(self.stride)  # [K, C]
         index += (col + shift[..., 1]).clamp_(-1, self.width)
         index += start
@@ -171,7 +162,7 @@ class Columns:
     def words(self, pixels: Pixels) -> Tensor:
         """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""
         words = self.slices.view(torch.int64)[:, : self.first_of_copies // _WORD]  # not of copies
-        return words.index_select(0, pixels.column)
+        return words.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
 
     def around(self, pixels: Pixels, reach: int, count: int) -> Groups:
         """Return which of the `count` pixels of the list are around K pixels, up to `reach` pixels each way.
@@ -179,16 +170,13 @@ class Columns:
         The result has an item for each pixel of the square in raster order, and for each of the K pixels:
         (2 reach + 1)^2 K items, grouped by the pixel of the list.
         """
-        position = self.position.index_select(0, pixels.column)
-        return self.pixel_at(self._slots_around(position, pixels.first_slot + pixels.step, reach).view(-1), count)
-
-    def _slots_around(self, position: Tensor, slot: Tensor, reach: int) -> Tensor:
-        """Return a slot of the columns around K positions, counted through all columns, ((2 reach + 1)^2, K) int64."""
         line = range(-reach, reach + 1)
         offsets = tuple((down * self.stride + right,) for down in line for right in line)
-        index = position + constant(offsets, torch.int64, self.image.device)  # [(2 reach + 1)^2, K]
-        column = self.image.index_select(0, index.view(-1)).view_as(index)
-        return column * self.num_slots + slot
+        column = floor_divide(pixels.first_slot, self.num_slots)
+        slot = pixels.first_slot - column * self.num_slots + pixels.step
+        position = self.position.index_select(0, column) + constant(offsets, torch.int64, column.device)
+        around = self.image.index_select(0, position.view(-1)).view_as(position)  # [(2 reach + 1)^2, K]
+        return self.pixel_at((around * self.num_slots + slot).view(-1), count)
 
     def pixel_at(self, slot: Tensor, count: int) -> Groups:
         """Group K slots, counted through all columns, (K,), by their pixel, one of `count` in the list."""
@@ -230,13 +218,16 @@ class Columns:
         window, row = split_index(line, self.height + 2 * REACH)
         if num_windows > 1:
             order = window.sort(stable=True).indices
-            window, step, column, row, col = torch.stack((window, step, column, row, col)).index_select(1, order)
+            listed = torch.stack((window, step, column, position, row, col)).index_select(1, order)
+            window, step, column, position, row, col = listed
         index = column * self.num_slots + (step + first)
         rank = torch.arange(pixels_before + 1, pixels_before + 1 + len(index), dtype=torch.int32, device=index.device)
         self.rank.view(-1).index_copy_(0, index, rank)
-        if first > 0:
-            window = window + num_windows
-        place = torch.stack((column, torch.full_like(column, first), window, step, row - REACH, col - REACH), 1).int()
+        start = position - row * self.stride - col + REACH * (self.stride + 1)
+        copy = window + num_windows if first > 0 else window
+        place = torch.stack((index - step, start, copy, step, row - REACH, col - REACH), 1)
+        is_small = max(len(self.image), self.rank.numel()) <= torch.iinfo(torch.int32).max
+        place = place.int() if is_small else place
         return Pixels(place, self.slices.view(-1).index_select(0, index) & OWN)
 
 

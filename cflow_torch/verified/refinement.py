@@ -117,12 +117,14 @@ class Source:
     voxel: Tensor  # (K,) int64
     objects: Groups  # the object of each voxel; each one is in a group
     centre: Tensor  # (2, K) float64, metres, x and y of the centre of its object at t
-    position: Tensor  # (3, K) float64, metres
+    offset: Tensor  # (2, K) float64, metres, x and y from that centre to the voxel
+    height: Tensor  # (1, K) float64, metres, z of the voxel
     covariance: Tensor  # (6, K) float64, square metres, of the surface and of the noise, as in ops/linear.py
     target_start: Tensor  # (K,) int64, number of the first pixel of t+1 of its window, see `pixel_key`
     target_layers: Tensor  # (3, K) int32, in which we search for the target
     elapsed: Tensor  # (K,) float64, sweep intervals from the voxel to t+1
     elapsed_of_t: Tensor  # (K,) float64, sweep intervals from t to t+1
+    before_t: Tensor  # (K,) float64, sweep intervals from the voxel to t
 
     @classmethod
     def of(cls, voxels: Voxels, covariance: Tensor, objects: Groups, centre: Tensor, elapsed: Tensor) -> Source:
@@ -141,16 +143,22 @@ class Source:
         num_steps = elapsed.shape[1]
         up = constant(((-1,), (0,), (1,)), torch.int64, voxel.device)
         noise = constant((_NOISE**2, 0.0, 0.0, _NOISE**2, 0.0, _NOISE**2), torch.float64, voxel.device)[:, None]
+        position = take_columns(voxels.position, voxel)  # [3, K]
+        centre = take_columns(centre, objects.of_item)  # [2, K]
+        elapsed_of_t = elapsed[:, 1].index_select(0, window)
+        elapsed = elapsed.view(-1).index_select(0, window * num_steps + voxels.step.index_select(0, voxel))
         return cls(
             voxel=voxel,
             objects=objects,
-            centre=take_columns(centre, objects.of_item),
-            position=take_columns(voxels.position, voxel),
+            centre=centre,
+            offset=position[:2] - centre,
+            height=position[2:],
             covariance=take_columns(covariance, voxel) + noise,
             target_start=pixel_key(voxels.grid, window * num_steps, constant(((0,), (0,)), torch.int64, voxel.device)),
             target_layers=((voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS).int(),
-            elapsed=elapsed.view(-1).index_select(0, window * num_steps + voxels.step.index_select(0, voxel)),
-            elapsed_of_t=elapsed[:, 1].index_select(0, window),
+            elapsed=elapsed,
+            elapsed_of_t=elapsed_of_t,
+            before_t=elapsed - elapsed_of_t,
         )
 
     def __len__(self) -> int:
@@ -162,12 +170,14 @@ class Source:
             voxel=self.voxel[some],
             objects=self.objects[some],
             centre=self.centre[:, some],
-            position=self.position[:, some],
+            offset=self.offset[:, some],
+            height=self.height[:, some],
             covariance=self.covariance[:, some],
             target_start=self.target_start[some],
             target_layers=self.target_layers[:, some],
             elapsed=self.elapsed[some],
             elapsed_of_t=self.elapsed_of_t[some],
+            before_t=self.before_t[some],
         )
 
 
@@ -180,8 +190,8 @@ class Correspondences:
     objects: Groups  # the object of both
     elapsed: Tensor  # (K,) float64, sweep intervals from the source to t+1
     arm: Tensor  # (2, K) float64, metres, from the centre of the object at t+1 to the moved voxel
-    residual: Tensor  # (3, K) float64, metres, from the moved voxel to the target
-    information: Tensor  # (3, 3, K) float64; the identity = a pair at distance 0 without surfaces
+    pull: Tensor  # (3, K) float64, metres, information times the residual from the moved voxel to the target
+    information: Tensor  # (3, 3, K) float64; the identity = a pair at distance 0 without surfaces, 0 = no pair
 
 
 class Registration:
@@ -239,10 +249,9 @@ class Registration:
         velocity = motion_of_voxel[:2]
         rotation = motion_of_voxel[2]
         # The object rotates about its centre, which moves on.
-        arm = source.position[:2] - source.centre + velocity * (source.elapsed - source.elapsed_of_t)
-        arm = rotate(rotation * source.elapsed, arm)
+        arm = rotate(rotation * source.elapsed, source.offset + velocity * source.before_t)
         moved = source.centre + velocity * source.elapsed_of_t + arm
-        moved = torch.cat((moved, source.position[2:]))  # [3, K]
+        moved = torch.cat((moved, source.height))  # [3, K]
 
         target = self._target.nearest(source.target_start, source.target_layers, moved)
         residual = take_columns(self._voxels.position, target) - moved
@@ -250,16 +259,17 @@ class Registration:
         is_same = self._voxels.object_id.index_select(0, target) == source.objects.of_item
         covariance = source.covariance + take_columns(self._covariance, target)
         information = full(inverse(covariance))
-        square = (residual * matvec(information, residual)).sum(0)  # Mahalanobis distance
-        weight = (_KERNEL / (_KERNEL + square)).square() * _NOISE**2
+        pull = matvec(information, residual)  # [3, K]
+        square = (residual * pull).sum(0)  # Mahalanobis distance
+        weight = (_KERNEL / (_KERNEL + square)).square() * _NOISE**2 * (is_near & is_same)
         return Correspondences(
             source=source.voxel,
             target=target,
             objects=source.objects,
             elapsed=source.elapsed,
             arm=arm,
-            residual=residual,
-            information=information * (weight * (is_near & is_same)),
+            pull=pull * weight,
+            information=information * weight,
         )
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
@@ -302,7 +312,7 @@ def _normal_equations(pairs: Correspondences) -> Tensor:
     hessian = torch.stack(
         (weight[0, 0], weight[0, 1], weighted_lever[0], weight[1, 1], weighted_lever[1], of_angle)
     )  # as in ops/linear.py
-    gradient = matvec(pairs.information[:2], pairs.residual)
+    gradient = pairs.pull[:2]
     torque = (lever * gradient).sum(0, keepdim=True)
     return torch.cat((hessian * pairs.elapsed.square(), torch.cat((gradient, torque)) * pairs.elapsed))
 

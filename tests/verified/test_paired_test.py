@@ -17,7 +17,7 @@ from cflow_torch.verified import in_place as in_place_module
 from cflow_torch.verified import paired_test as fast
 from cflow_torch.verified.aperture import both_ends_move, slides_along_itself
 from cflow_torch.verified.component_tree import NodeKind, Tree
-from cflow_torch.verified.in_place import count_in_place
+from cflow_torch.verified.in_place import are_covered, count_in_place
 
 
 def random_images(rng: np.random.Generator, shape: tuple) -> np.ndarray:
@@ -40,7 +40,8 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
         kept = (torch.arange(sweeps.num_pixels) % 7 > 0).nonzero()[:, 0]
         candidates = torch.from_numpy(np.where(rng.random((6, 5, 1)) < 0.7, rng.normal(0, 1.5, (6, 5, 2)), 0.0))
         wins = fast.count_wins(sweeps, sweeps.pixels[kept], Groups(component[kept], 6), candidates)
-        in_place = count_in_place(sweeps, sweeps.pixels[kept], Groups(component[kept], 6))
+        given = (sweeps, sweeps.pixels[kept], Groups(component[kept], 6))
+        in_place, covered = count_in_place(*given), are_covered(*given)
         component[::7] = 6
         for number in range(6):
             window = for_oracle(sweeps, number // 3)
@@ -49,9 +50,9 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
             for is_near, counts in ((False, wins.exact), (True, wins.near)):
                 expected = [oracle.count_wins(window, members, each, is_near).sum(1) for each in motions]
                 assert np.array_equal(torch.stack((counts.won[number], counts.lost[number]), 1), expected)
-            assert in_place.number[number] == oracle.found_in_place(window, members, window.image)[:, 0].sum()
-            assert in_place.is_covered[number] == aperture.is_covered(window, members)
-            num_covered += int(in_place.is_covered[number])
+            assert in_place[number] == oracle.found_in_place(window, members, window.image)[:, 0].sum()
+            assert covered[number] == aperture.is_covered(window, members)
+            num_covered += int(covered[number])
             far += int((candidates[number].abs().amax(1) > 1.5).sum())
     assert far > 20 and 0 < num_covered < 24
 
