@@ -147,21 +147,22 @@ def make_bags(points: KeyPoints, blocks: Blocks, reach: Tensor, config: Keypoint
     block, num_blocks = near_blocks(points, order, blocks, reach)
     part = (num_blocks.cumsum(0) - num_blocks) // max(1, num_pairs // BLOCK_SIZE)
     groups = Groups(part, int(part[-1]) + 1)
-    num_sources = groups.size().tolist()
-    num_bags = groups.sum(num_blocks).tolist()
+    num_sources, num_bags = torch.stack((groups.size(), groups.sum(num_blocks))).tolist()
     for source, number, near in zip(order.split(num_sources), num_blocks.split(num_sources), block.split(num_bags)):
         if near.numel() == 0:
             continue
         position = torch.arange(source.numel(), device=source.device)
-        yield Bags(source, Groups(torch.repeat_interleave(position, number), source.numel()), near)
+        of_source = torch.repeat_interleave(position, number, output_size=near.numel())
+        yield Bags(source, Groups(of_source, source.numel()), near)
 
 
 def shared_pixels(points: KeyPoints, bags: Bags, targets: Targets) -> Tensor:
     """Count the pixels that the key point of each bag shares with those of its block: (N, 64) int32."""
     num_pixels = points.patch.shape[1]
     energy = points.energy[bags.source]
-    num_sums = -(-int(energy.max()) // _MOST_ROWS)
-    length = -(-int(energy.max()) // num_sums)
+    most = int(energy.max())
+    num_sums = -(-most // _MOST_ROWS)
+    length = -(-most // num_sums)
     pixels = list_set_pixels(points.patch.index_select(0, bags.source), energy, length * num_sums)
     rows = pixels.index_select(0, bags.of_source.of_item)  # [N, length * num_sums]
     rows += bags.block[:, None].int() * (num_pixels + 1)

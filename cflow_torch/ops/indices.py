@@ -28,6 +28,14 @@ def flat_nonzero(mask: Tensor) -> Tensor:
     return mask.flatten().nonzero()[:, 0]
 
 
+def nonzero_pairs(mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Row and column of each True element of an (R, C) mask, (K,) int64 each, row by row. Cost: as `flat_nonzero`."""
+    if mask.device.type == "cpu":
+        return split_index(flat_nonzero(mask), max(mask.shape[1], 1))
+    row, col = mask.nonzero().unbind(1)
+    return row, col
+
+
 def gather(index: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
     """Select the same elements of several tensors: (K, ...) of (N, ...) each, by (K,) int64 indices."""
     return tuple(values.index_select(0, index) for values in tensors)

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, lazy_zeros, split_index
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, lazy_zeros, nonzero_pairs, split_index
 from cflow_torch.windows.bev_grid import Grid
 
 NUM_SLICES = 4
@@ -28,7 +28,7 @@ _WORD = 8  # sweeps whose slices make up one int64
 class Pixels:
     """K occupied pixels of sweeps. Step 0 is sweep t+1, 1 is t, 2 is t-1, ..."""
 
-    # (K, 6) int32 (int64 if that is too small): slot of t+1 in the same column, counted through all columns; position
+    # (K, 6) int32 or int64: slot of t+1 in the same column, counted through all columns; position
     # of row 0 and column 0 in the image; window, step, row, col. A row per pixel, because pixels are often selected at
     # random: rows take a quarter of the time of columns.
     place: Tensor
@@ -212,7 +212,7 @@ class Columns:
         words = self.as_words(slices)
         half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
         self.slices.view(torch.int64)[:, half] = words | self.or_around(words) << NUM_SLICES
-        step, column = split_index(flat_nonzero((slices != 0).t().contiguous()), len(self.position))
+        step, column = nonzero_pairs((slices != 0).t().contiguous())
         position = self.position.index_select(0, column)
         line, col = split_index(position, self.stride)
         window, row = split_index(line, self.height + 2 * REACH)
@@ -227,7 +227,8 @@ class Columns:
         copy = window + num_windows if first > 0 else window
         place = torch.stack((index - step, start, copy, step, row - REACH, col - REACH), 1)
         is_small = max(len(self.image), self.rank.numel()) <= torch.iinfo(torch.int32).max
-        place = place.int() if is_small else place
+        if is_small and place.device.type == "cpu":  # on a GPU, the conversions would cost more than the bytes
+            place = place.int()
         return Pixels(place, self.slices.view(-1).index_select(0, index) & OWN)
 
 

@@ -240,7 +240,7 @@ class Registration:
                 equations = pairs.objects.sum(_normal_equations(pairs))  # [9, G]
                 hessian = hessian + equations[:6]
                 gradient = gradient + equations[6:]
-            motion = motion + STEP_LENGTH * matvec(full(inverse(hessian)), gradient)
+            motion = torch.add(motion, matvec(full(inverse(hessian)), gradient), alpha=STEP_LENGTH)
         return RigidMotion(motion[:2].t(), motion[2], self._centre.nan_to_num(0.0).t())
 
     def _correspond(self, source: Source, motion: Tensor) -> Correspondences:
@@ -261,7 +261,7 @@ class Registration:
         information = full(inverse(covariance))
         pull = matvec(information, residual)  # [3, K]
         square = (residual * pull).sum(0)  # Mahalanobis distance
-        weight = (_KERNEL / (_KERNEL + square)).square() * _NOISE**2 * (is_near & is_same)
+        weight = (1 + square / _KERNEL).pow(-2) * _NOISE**2 * (is_near & is_same)
         return Correspondences(
             source=source.voxel,
             target=target,
@@ -304,8 +304,7 @@ def _normal_equations(pairs: Correspondences) -> Tensor:
     The parameters are x, y and the tangent of half the angle. A change of x or y moves the voxel by the elapsed time, a
     change of the tangent by the elapsed time times `lever`. No parameter changes z.
     """
-    x, y = pairs.arm
-    lever = torch.stack((-2 * y, 2 * x))  # [2, K]
+    lever = pairs.arm.flip(0) * constant(((-2.0,), (2.0,)), torch.float64, pairs.arm.device)  # [2, K]
     weight = pairs.information[:2, :2]  # [2, 2, K]
     weighted_lever = matvec(weight, lever)  # [2, K]
     of_angle = (lever * weighted_lever).sum(0)
@@ -314,7 +313,7 @@ def _normal_equations(pairs: Correspondences) -> Tensor:
     )  # as in ops/linear.py
     gradient = pairs.pull[:2]
     torque = (lever * gradient).sum(0, keepdim=True)
-    return torch.cat((hessian * pairs.elapsed.square(), torch.cat((gradient, torque)) * pairs.elapsed))
+    return torch.cat((hessian * pairs.elapsed, gradient, torque)) * pairs.elapsed
 
 
 def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> ObjectPoints:
