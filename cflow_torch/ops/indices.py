@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=1024)
 def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """A small tensor from nested tuples of numbers. It is uploaded to the device once; never write to it."""
     return torch.tensor(values, dtype=dtype, device=device)

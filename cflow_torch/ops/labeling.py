@@ -41,7 +41,7 @@ class Blocks:
 
     side: int  # pixels per side of a block
     cols: int  # blocks per row
-    first: int  # no component of these images has a smaller number
+    first: Tensor  # () int64, no component of these images has a smaller number
     num_components: int  # V, larger than the number of every component
     component: Tensor  # (all blocks,) int64, 0 ... V - 1; undefined for blocks without set pixels
 
@@ -101,9 +101,9 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
     source, block = _links(masks, nodes, kinds, first_blocks)
     root = union_find(len(nodes), source, node_of_block.index_select(0, block))
     components = node_of_block.scatter_(0, nodes, root).split(lengths)
-    first = [0]
+    first = [nodes.new_zeros(())]
     if len(kinds) > 1:
-        first += torch.searchsorted(nodes, first_blocks).tolist()
+        first += torch.searchsorted(nodes, first_blocks).unbind()
     return [
         Blocks(kind.side, kind.cols, number, len(nodes), component)
         for kind, number, component in zip(kinds, first, components)
