@@ -22,7 +22,7 @@ _LEAST_MOTION = 0.5  # metres a sweep; below, a wrong reading moves static objec
 _BASELINE = 6.0
 _MOST_SWEEPS = 5
 _PAIRS = 3
-_MOST_POINTS = 5000  # of the earlier sweep; the share is then within 0.006
+_MOST_POINTS = 3000  # of the earlier sweep; the share is then within 0.008
 _FEWEST_POINTS = 300
 # The best share must be larger than the next one by this factor. For raw drives it was larger by 1.2 at 1.2 m a sweep,
 # and by 1.3 at 2 m. For compensated or slow drives, the factor of a wrong reading was at most 1.007.
@@ -80,18 +80,18 @@ class DeskewedLog(LogWrapper):
         sweep = self._recent.sweep(index)
         if reading == "off" or sweep.pose is None:
             return sweep
-        seconds = self.seconds(sweep, reading)
+        seconds = self.seconds(sweep, reading, slice(None))
         points = self.move(as_numpy(sweep.points), seconds, index, reading)
         return replace(sweep, points=points, point_times=seconds.astype(np.float32))
 
-    def seconds(self, sweep: Sweep, reading: str) -> np.ndarray:
-        """Return the time from the instant of a sweep to each of its measurements, (N,) float64 seconds."""
+    def seconds(self, sweep: Sweep, reading: str, rows: Any) -> np.ndarray:
+        """Return the time from the instant of a sweep to some of its measurements, (N,) float64 seconds."""
         if reading != "times":
-            return self._interval * scan_fractions(sweep.points, reading, self.log.unwrapped.lidar_position)
+            return self._interval * scan_fractions(sweep.points[rows], reading, self.log.unwrapped.lidar_position)
         if sweep.point_times is None:
             others = ", ".join(name for name in CHOICES if name != "times")
             raise CFlowError(f"log {self.log_id} has no times of points for deskew=times: choose one of {others}")
-        return as_numpy(sweep.point_times).astype(np.float64)
+        return as_numpy(sweep.point_times)[rows].astype(np.float64)
 
     def move(self, points: np.ndarray, seconds: np.ndarray, index: int, reading: str) -> np.ndarray:
         """Move points of sweep `index`, (N, 3+), by the ego motion in the (N,) `seconds` to their measurement."""
@@ -181,7 +181,9 @@ def choose_reading(log: DeskewedLog) -> Reading:
     measured = f": {_described(shares)} of the static structure is in place some metres later" if shares else ""
     same = f"data.deskew={best} does the same without this line"
     if best == "off":
-        return Reading("off", f"its points have times, but seem to be de-skewed already, so we leave them{measured}. {same}")
+        return Reading(
+            "off", f"its points have times, but seem to be de-skewed already, so we leave them{measured}. {same}"
+        )
     by = "the times of its points" if best == "times" else f"the azimuth ({best}, seen from above; ahead = the instant)"
     note = f"its sweeps are not de-skewed, so we move each point by the ego motion according to {by}{measured}. {same}"
     return Reading(best, note + ", data.deskew=off leaves the points as they are")
@@ -227,7 +229,7 @@ def _shares_of_pair(log: DeskewedLog, earlier: int, later: int, readings: Sequen
         for sweep, chosen, index in zip(sweeps, rows, (earlier, later)):
             points = as_numpy(sweep.points)[chosen, :3]
             if reading != "off":
-                points = log.move(points, log.seconds(sweep, reading)[chosen], index, reading)
+                points = log.move(points, log.seconds(sweep, reading, chosen), index, reading)
             clouds.append(points)
         found.append(share_in_place(clouds[0], clouds[1], T_later_earlier))
     return found

@@ -63,9 +63,9 @@ class Log(Protocol):
     log_id: str
     timestamps: Sequence[int]
     # What `cflow_torch.data.deskewing` must know of a reader.
-    is_compensated = False
-    moves_by_times = False
-    has_raw_times = False
+    is_compensated: bool = False
+    moves_by_times: bool = False
+    has_raw_times: bool = False
     lidar_position: Any = (0.0, 0.0, 0.0)
 
     def sweep(self, index: int) -> Sweep:

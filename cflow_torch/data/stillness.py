@@ -61,6 +61,8 @@ def share_in_place(source: np.ndarray, target: np.ndarray, T_target_source: np.n
     points, keys = points[order], keys[order]
     in_place = np.zeros(len(moved), bool)
     cell = np.floor(moved / REACH).astype(np.int64)
+    order = np.argsort(_keys(cell))  # the searches below are several times faster in this order
+    moved, cell = moved[order], cell[order]
     for offset in _OFFSETS:  # z varies fastest in a key: the three cells above one another are one range of keys
         lowest = _keys(cell + (*offset, -1))
         start = np.searchsorted(keys, lowest, "left")

@@ -80,12 +80,12 @@ def _move_part(points: np.ndarray, share: np.ndarray, T: np.ndarray) -> np.ndarr
     Source: the formula of Rodrigues, with another angle for each point.
     """
     moved = points + share[:, None] * T[:3, 3]
-    difference = T[:3, :3] - T[:3, :3].T  # 2 sin(angle) times the matrix of the cross product with the axis
-    axis = np.array([difference[2, 1], difference[0, 2], difference[1, 0]]) / 2
-    sine = float(np.linalg.norm(axis))
+    cross = (T[:3, :3] - T[:3, :3].T) / 2  # sin(angle) times the matrix of the cross product with the axis
+    sine = float(np.linalg.norm(cross)) / np.sqrt(2)
     if sine < _SMALLEST_SINE:
         return moved
+    cross /= sine
     angle = share * np.arctan2(sine, (np.trace(T[:3, :3]) - 1) / 2)
-    across = np.cross(axis / sine, points)
-    further = np.cross(axis / sine, across)
-    return moved + np.sin(angle)[:, None] * across + (1 - np.cos(angle))[:, None] * further  # type: ignore[no-any-return]
+    moved += np.sin(angle)[:, None] * (points @ cross.T)
+    moved += (1 - np.cos(angle))[:, None] * (points @ (cross @ cross).T)
+    return moved  # type: ignore[no-any-return]

@@ -68,7 +68,7 @@ class ArraysLog(Log):
         pose per sweep. The ego frame should have z up, because the method works in the bird's-eye view.
     """
 
-    has_raw_times = True
+    has_raw_times: bool = True
 
     def __init__(
         self,

@@ -67,7 +67,7 @@ class BagLog(Log):
     Cost: opening a bag reads all its clouds, poses and transforms once.
     """
 
-    has_raw_times = True
+    has_raw_times: bool = True
 
     def __init__(
         self,
