@@ -46,6 +46,10 @@ DATA_SETS: dict[str, DataSet] = {
     "waymo": DataSet("WaymoLog", "Waymo segment", ("lidar/*.parquet",), "find_waymo_segments"),
     "pandaset": DataSet("PandaSetLog", "PandaSet sequence", ("lidar/poses.json",), depth=2),
     "aevascenes": DataSet("AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
+    # Folders velodyne with other files than KITTI's are folders of point clouds, see `recognise`.
+    "kitti": DataSet(
+        "KITTILog", "drive of KITTI", ("velodyne_points", "velodyne", "velodyne_points/data"), "find_kitti_drives"
+    ),
     "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
@@ -79,6 +83,8 @@ def recognise(root: Any) -> str:
             if fitting:
                 break
             level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+    if fitting == {"kitti"} and not _has_logs("kitti", root):
+        fitting = set()
     found = [name for name in DATA_SETS if name in fitting] or ["arrays"]
     if len(found) > 1 or not fitting:  # nuScenes and TruckScenes have the same file names
         found = [name for name in found if _has_logs(name, root)]

@@ -9,12 +9,14 @@ from typing import Any, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
+from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.data.stillness import share_in_place, static_rows, thinned_rows
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, deskew_points, scan_fractions
 from cflow_torch.windows.ego_motion import relative_transform
 
 CHOICES = ("auto", "times", *DIRECTIONS, "off")
+_DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
 _INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
 _LEAST_MOTION = 0.5  # metres a sweep; below, a wrong reading moves static objects by millimetres only
 # The later sweep of a pair comes after about 6 m, at most 5 sweeps. There, a wrong reading shows several times as
@@ -52,7 +54,9 @@ class DeskewedLog(LogWrapper):
           the last pose, it continues.
         - Points that are moved by their azimuth get `point_times`, from which the verified method corrects the motion
           of objects. The instant of their sweep is when the LiDAR looks ahead.
-        - Labels keep the residual flow. The total flow changes by the part that ego motion adds at the new position.
+        - Labels keep the residual flow of static points. By the azimuth, we take those of dynamic points as motions
+          between points as measured, because boxes are drawn around these. So we move both ends to the instants of
+          their sweeps, and divide the motion by the turns between the two measurements.
     """
 
     def __init__(self, log: Log, deskew: str = "auto") -> None:
@@ -87,11 +91,14 @@ class DeskewedLog(LogWrapper):
     def seconds(self, sweep: Sweep, reading: str, rows: Any) -> np.ndarray:
         """Return the time from the instant of a sweep to some of its measurements, (N,) float64 seconds."""
         if reading != "times":
-            return self._interval * scan_fractions(sweep.points[rows], reading, self.log.unwrapped.lidar_position)
+            return self._seconds_by_azimuth(as_numpy(sweep.points)[rows], reading)
         if sweep.point_times is None:
             others = ", ".join(name for name in CHOICES if name != "times")
             raise CFlowError(f"log {self.log_id} has no times of points for deskew=times: choose one of {others}")
         return as_numpy(sweep.point_times)[rows].astype(np.float64)
+
+    def _seconds_by_azimuth(self, points: np.ndarray, direction: str) -> np.ndarray:
+        return self._interval * scan_fractions(points, direction, self.log.unwrapped.lidar_position)
 
     def move(self, points: np.ndarray, seconds: np.ndarray, index: int, reading: str) -> np.ndarray:
         """Move points of sweep `index`, (N, 3+), by the ego motion in the (N,) `seconds` to their measurement."""
@@ -105,13 +112,25 @@ class DeskewedLog(LogWrapper):
 
     def labels(self, index: int) -> FlowLabels | None:
         labels = self.log.labels(index)
-        stored = self._recent.sweep(index) if labels is not None else None
-        if labels is None or stored is None or stored.pose is None or self.reading.name == "off":
+        reading = self.reading.name
+        stored = self._recent.sweep(index) if labels is not None and reading != "off" else None
+        if labels is None or stored is None or stored.pose is None:
             return labels
+        T_ego1_ego0 = self._motion(index)
+        start = as_numpy(stored.points)[:, :3].astype(np.float64)
+        end = start + labels.flow
+        residual = end - transform_points(start, T_ego1_ego0)
         moved = as_numpy(self.sweep(index).points)[:, :3].astype(np.float64)
-        step = moved - as_numpy(stored.points)[:, :3]
-        change = step @ (self._motion(index)[:3, :3] - np.eye(3)).T
-        flow = np.where(np.isfinite(change), labels.flow + change, labels.flow)
+        if reading != "times":
+            rows = np.flatnonzero(np.linalg.norm(residual, axis=1) >= _DYNAMIC)
+            before = self.seconds(stored, reading, rows)
+            after = self._seconds_by_azimuth(end[rows], reading)
+            reached = self.move(end[rows], after, index + 1, reading)
+            turns = 1 + (after - before) / self._interval
+            turns = np.where((turns > 0.5) & (turns < 1.5), turns, 1)  # else the object passes the seam of the turn
+            residual[rows] = (reached - transform_points(moved[rows], T_ego1_ego0)) / turns[:, None]
+        flow = transform_points(moved, T_ego1_ego0) + residual - moved
+        flow = np.where(np.isfinite(flow), flow, labels.flow)
         return replace(labels, flow=flow.astype(labels.flow.dtype))
 
     @cached_property
