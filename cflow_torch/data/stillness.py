@@ -31,10 +31,15 @@ def static_rows(sweep: Sweep) -> np.ndarray:
 
 
 def thinned_rows(points: np.ndarray) -> np.ndarray:
-    """Return the first row of each voxel of 0.3 m, (K,) int64, ascending. `points` are (N, 3), finite, metres."""
+    """Return a row of each voxel of 0.3 m, (K,) int64, ascending. `points` are (N, 3), finite, metres.
+
+    The choice is random with a fixed seed. The first row would lie at an edge of its voxel, as scans are ordered, and
+    two scans of a smooth wall would then match best if they are moved by whole voxels.
+    """
     voxel = np.floor(np.asarray(points, np.float64) / VOXEL).astype(np.int64)
-    _, first = np.unique(_keys(voxel), return_index=True)
-    return np.sort(first)
+    order = np.random.default_rng(0).permutation(len(voxel))
+    _, first = np.unique(_keys(voxel)[order], return_index=True)
+    return np.sort(order[first])
 
 
 def share_in_place(source: np.ndarray, target: np.ndarray, T_target_source: np.ndarray) -> float:
