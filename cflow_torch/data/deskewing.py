@@ -12,10 +12,10 @@ from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.data.stillness import share_in_place, static_rows, thinned_rows
 from cflow_torch.types import CFlowError, Sweep, as_numpy
-from cflow_torch.windows.deskewing import DIRECTIONS, deskew_points, scan_fractions
+from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS, deskew_points, scan_fractions
 from cflow_torch.windows.ego_motion import relative_transform
 
-CHOICES = ("auto", "times", *DIRECTIONS, "off")
+CHOICES = ("auto", "times", "off", *SCANS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
 _INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
 _LEAST_MOTION = 0.5  # metres a sweep; below, a wrong reading moves static objects by millimetres only
@@ -29,6 +29,7 @@ _FEWEST_POINTS = 300
 # The best share must be larger than the next one by this factor. For raw drives it was larger by 1.2 at 1.2 m a sweep,
 # and by 1.3 at 2 m, by 1.055 at 0.6 m. For compensated drives, the factor of a wrong reading was at most 1.02.
 _CLEARLY = 1.08
+_LIKELY = 1.03  # for the order of the readings, and for another start of the turn
 # After a shift along the path (metres), the share must be smaller by this factor. It was 1.6 on raw drives.
 _SHIFT, _PEAK = 0.15, 1.2
 
@@ -36,7 +37,7 @@ _SHIFT, _PEAK = 0.15, 1.2
 class Reading(NamedTuple):
     """How the sweeps of a log are read."""
 
-    name: str  # "times", "clockwise", "counterclockwise" or "off"
+    name: str  # one of `CHOICES` but "auto"
     note: str = ""  # what "auto" found, for the user; "" = nothing to tell
 
 
@@ -45,8 +46,8 @@ class DeskewedLog(LogWrapper):
 
     Args:
         log: the log; sweeps without poses stay as they are.
-        deskew: "times" = by `Sweep.point_times`; "clockwise", "counterclockwise" = by the azimuth, see
-            `scan_fractions`; "off" = the sweeps are compensated already; "auto" = by `choose_reading`.
+        deskew: "times" = by `Sweep.point_times`; "clockwise", "counterclockwise", "clockwise_left", ... = by the
+            azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = by `choose_reading`.
 
     Attributes:
         reading: the `Reading` in use. It is decided at first use, from the log alone.
@@ -82,7 +83,7 @@ class DeskewedLog(LogWrapper):
         return self.read(index, self.reading.name)
 
     def read(self, index: int, reading: str) -> Sweep:
-        """Read a sweep under another reading: "times", "clockwise", "counterclockwise" or "off"."""
+        """Read a sweep under any reading, one of `CHOICES` but "auto"."""
         sweep = self._recent.sweep(index)
         if reading == "off" or sweep.pose is None:
             return sweep
@@ -176,9 +177,10 @@ def choose_reading(log: DeskewedLog) -> Reading:
         - If the vehicle moves by more than half a metre a sweep, the static world decides: three pairs of sweeps some
           6 m apart, and the share of the structure of the earlier one that is in place in the later one. If the log has
           times, we compare the readings "times" and "off", otherwise "off" and both directions. We depart from the
-          above only for a reading that is better than the next one by 8 %, and better than "off" in every pair. With
-          a wrong direction, the error of "off" doubles, so "off" must also be better than the other direction. And the
-          share must fall by a sixth if we shift the earlier sweep by 15 cm: along smooth walls it does not.
+          above only for a reading that is better than "off" by 8 %, and better in every pair. With a wrong direction,
+          the error of "off" doubles, so "off" must also be better than the other direction, by 3 %. And the share must
+          fall by a sixth if we shift the earlier sweep by 15 cm: along smooth walls it does not.
+        - Of the starts of a turn, we take the one with the largest share, and the one behind if none is better by 3 %.
 
     Cost: 0.3 s and up to six sweeps; nothing where the format or the speed decides.
     """
@@ -195,10 +197,15 @@ def choose_reading(log: DeskewedLog) -> Reading:
     if shares:
         ranked = sorted(shares, key=lambda name: float(shares[name].mean()), reverse=True)
         means = [float(shares[name].mean()) for name in ranked]
-        is_clear = all(better >= _CLEARLY * worse for better, worse in zip(means, means[1:]))
+        found = ranked[0]
+        is_ordered = found != expected and ranked[1] == expected and means[0] >= _LIKELY * means[1]
+        if is_ordered and found in DIRECTIONS:
+            found, shares[ranked[0]] = _best_start(log, found, shares[found])
+        is_ordered &= all(better >= _LIKELY * worse for better, worse in zip(means[1:], means[2:]))
+        is_clear = is_ordered and shares[ranked[0]].mean() >= _CLEARLY * means[1]
         if is_clear and (shares[ranked[0]] > shares[expected]).all():
-            shifted = _shares(log, ranked[:1], _SHIFT)[ranked[0]]
-            best = ranked[0] if means[0] > _PEAK * float(shifted.mean()) else expected
+            shifted = _shares(log, [found], _SHIFT)[found]
+            best = found if shares[ranked[0]].mean() > _PEAK * shifted.mean() else expected
     if best == "off" and expected == "off":
         return Reading("off")
     measured = f": {_described(shares)} of the static structure is in place some metres later" if shares else ""
@@ -207,9 +214,17 @@ def choose_reading(log: DeskewedLog) -> Reading:
         return Reading(
             "off", f"its points have times, but seem to be de-skewed already, so we leave them{measured}. {same}"
         )
-    by = "the times of its points" if best == "times" else f"the azimuth ({best}, seen from above; ahead = the instant)"
+    by = "the times of its points" if best == "times" else f"the azimuth ({best}; ahead = the instant)"
     note = f"its sweeps are not de-skewed, so we move each point by the ego motion according to {by}{measured}. {same}"
     return Reading(best, note + ", data.deskew=off leaves the points as they are")
+
+
+def _best_start(log: DeskewedLog, direction: str, behind: np.ndarray) -> tuple[str, np.ndarray]:
+    """Return where a turn begins, as the name of the reading, and its shares. `behind` are those of a start behind."""
+    shares = _shares(log, [direction + start for start in STARTS if start])
+    best = max(shares, key=lambda name: float(shares[name].mean()))
+    is_better = shares[best].mean() >= _LIKELY * behind.mean()
+    return (best, shares[best]) if is_better else (direction, behind)
 
 
 def _described(shares: dict[str, np.ndarray]) -> str:

@@ -10,25 +10,35 @@ from cflow_torch.types import Array, CFlowError, as_numpy, check_array, point_ro
 from cflow_torch.windows.ego_motion import rigid_transform
 
 DIRECTIONS = {"clockwise": -1.0, "counterclockwise": 1.0}  # seen from above -> sign of the growing azimuth
+STARTS = {"": 0.5, "_left": 0.25, "_ahead": 0.0, "_right": -0.25}  # ending of the name -> azimuth of the start, turns
+SCANS = {f"{name}{start}": (name, start) for start in STARTS for name in DIRECTIONS}
+"""Names of scans: clockwise and counterclockwise begin behind the vehicle, clockwise_left at its left, and so on."""
 _SMALLEST_SINE = 1e-12  # of the angle; a smaller rotation has no axis, and moves no point by a nanometre
 
 
 def scan_fractions(points: Array, direction: str, origin: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """Return when a rotating LiDAR measured each point, from its azimuth, in turns: (N,) float64 in (-0.5, 0.5].
+    """Return when a rotating LiDAR measured each point, from its azimuth, in turns: (N,) float64.
 
     Args:
         points: (N, 3+) float, metres, as measured, x forward and y left.
-        direction: "clockwise" or "counterclockwise", seen from above. KITTI's LiDAR turns clockwise.
+        direction: "clockwise" or "counterclockwise", seen from above, for a turn that begins behind the vehicle. With
+            the ending "_left", "_ahead" or "_right" the turn begins there. KITTI's LiDAR turns clockwise from behind.
         origin: (3,) float, metres, position of the LiDAR in the frame of the points.
 
-    Convention: 0 = ahead, negative = earlier. So the instant of the sweep is when the LiDAR looks ahead, and a turn
-        begins and ends behind the vehicle, as in KITTI. If the turn of your LiDAR begins elsewhere, some points are one
-        turn off. They are so in every sweep, so what is static still stays in place.
+    Convention: 0 = ahead, negative = earlier. So the instant of the sweep is when the LiDAR looks ahead. The result is
+        in (-0.5, 0.5] for a turn that begins behind, as KITTI's, [-0.25, 0.75) for "clockwise_left", and [0, 1) for one
+        that begins ahead. If you name a wrong start, some points are one turn off in every sweep: static objects still
+        stay in place, unless they pass the start.
     """
-    if direction not in DIRECTIONS:
-        raise CFlowError(f"direction={direction!r}: choose one of {', '.join(DIRECTIONS)}")
+    if direction not in SCANS:
+        raise CFlowError(f"direction={direction!r}: choose one of {', '.join(SCANS)}")
+    name, start = SCANS[direction]
     x, y, _ = (point_rows("points", points) - np.asarray(origin, np.float64)).T
-    return DIRECTIONS[direction] * np.arctan2(y, x) / (2 * np.pi)
+    turns = DIRECTIONS[name] * np.arctan2(y, x) / (2 * np.pi)
+    if not start:
+        return turns
+    first = -((-DIRECTIONS[name] * STARTS[start]) % 1)  # between -1 and 0
+    return first + (turns - first) % 1
 
 
 def deskew_points(points: Array, fraction: Array, T_ego1_ego0: Any, T_ego0_before: Any = None) -> np.ndarray:

@@ -55,6 +55,20 @@ def test_a_clockwise_lidar_looks_left_first_then_ahead_then_right():
     assert np.allclose(scan_fractions(points + (3, 4, 5), "clockwise", (3, 4, 5)), [0, -0.25, 0.25, -0.5, 0.5])
 
 
+def test_a_turn_may_begin_elsewhere():
+    azimuth = np.radians([0, 80, 100, 170, -170, -100, -80, -10])
+    points = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
+    degrees = {
+        "clockwise_left": [0, -80, 260, 190, 170, 100, 80, 10],
+        "clockwise_ahead": [0, 280, 260, 190, 170, 100, 80, 10],
+        "clockwise_right": [0, -80, -100, -170, -190, -260, 80, 10],
+        "counterclockwise_left": [0, 80, -260, -190, -170, -100, -80, -10],
+        "counterclockwise_right": [0, 80, 100, 170, 190, 260, -80, -10],
+    }
+    for name, expected in degrees.items():
+        assert np.allclose(360 * scan_fractions(points, name), expected), name
+
+
 @pytest.mark.parametrize(
     "change, complaint",
     [

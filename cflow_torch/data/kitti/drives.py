@@ -81,7 +81,7 @@ def _has_clouds(folder: Path) -> bool:
 def _with_distinct_names(drives: list[KITTIDrive]) -> list[KITTIDrive]:
     named = []
     for drive in drives:
-        # Folder names above the drive, nearest first; those that belong to the layout say nothing.
+        # Folder names above the drive, nearest first, without those that belong to the layout.
         parents: Any = drive.root.resolve() if drive.layout == "tracking" else drive.root.resolve().parent
         above = [part for part in parents.parts[1:] if part not in ("sequences", "dataset")]
         named.append((drive, above[::-1]))
