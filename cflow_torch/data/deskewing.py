@@ -154,12 +154,13 @@ class DeskewedLog(LogWrapper):
         if stamp is None:
             return np.full(len(self) - 1, _INTERVAL)
         unit = 1e-6 if stamp == 1000 * self.timestamps[0] != self.timestamps[0] else 1e-9
-        return np.diff(np.array(self.timestamps, np.int64)) * unit
+        gaps = np.diff(np.array(self.timestamps, np.int64)) * unit
+        return np.where(gaps > 0, gaps, _INTERVAL)
 
     @cached_property
     def _interval(self) -> float:
         """Seconds of one turn."""
-        return float(np.median(self._gaps))
+        return self.log.unwrapped.turn_seconds or float(np.median(self._gaps))
 
 
 def has_moved_by_times(log: DeskewedLog) -> bool:

@@ -234,6 +234,22 @@ def test_the_command_line_takes_the_setting(raw: Drive, tmp_path: Path, capsys: 
     assert "deskew='sideways'" in capsys.readouterr().err
 
 
+def test_a_log_of_every_second_sweep_is_moved_by_turns_not_by_pose_intervals(raw: Drive, truth: Drive) -> None:
+    class Half(Untimed):
+        turn_seconds = 0.1
+
+        def __init__(self, log: Drive) -> None:
+            super().__init__(log)
+            self.timestamps = log.timestamps[1::2]
+            self.poses = log.poses[1::2]
+
+        def sweep(self, index: int) -> Sweep:
+            return super().sweep(2 * index + 1)
+
+    moved = np.asarray(DeskewedLog(Half(raw), "clockwise").sweep(1).points)
+    assert np.linalg.norm(moved - truth.sweep(3).points, axis=1).max() < 0.06  # chords of twice the length
+
+
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 

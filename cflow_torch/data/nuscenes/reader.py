@@ -122,6 +122,7 @@ class NuScenesLog(Log):
         self._check_count(f"scene {self.log_id} in {folder}")
         self._poses, self._T_ego_world = reference.ego[kept], np.linalg.inv(reference.ego[kept])
         self.lidar_position = reference.mount[0, :3, 3]
+        self.turn_seconds = float(np.median(np.diff(reference.times))) * 1e-6  # of all sweeps, not only of those kept
         self._odometry = (reference.times, reference.ego)
         self._tracks = Tracks(sample_times, annotations)
 
