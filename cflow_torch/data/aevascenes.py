@@ -78,6 +78,7 @@ class AevaScenesLog(BoxLog):
         if clouds not in _PATHS:
             raise CFlowError(f"clouds={clouds!r}: choose one of {', '.join(_PATHS)}")
         self._clouds, self._ground = clouds, ground
+        self.is_compensated = clouds != "raw"
         self._clouds_of = lru_cache(1)(self._open_clouds)  # we read several arrays of the same clouds
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _HINT):
@@ -94,6 +95,11 @@ class AevaScenesLog(BoxLog):
             self._mounts = self._poses_of([mounts[name] for name in self.lidars], "extrinsics")
             self._poses = self._poses_of([frame["ego_pose"] for frame in self._frames], "ego poses")
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(K, 4, 4) float64 `T_world_ego` of every sweep."""
+        return self._poses
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`. If a cloud lacks class names, the mask is None; if a cloud lacks times, the times are."""

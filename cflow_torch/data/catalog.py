@@ -8,6 +8,8 @@ from dataclasses import replace
 from importlib import import_module
 from typing import Any, Mapping, NamedTuple, Sequence
 
+from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
+from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.files import find_folders, shortened
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
@@ -16,7 +18,7 @@ from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
 
-_OF_ALL = ("find_ground", "odometry", "check")  # settings of every data set
+_OF_ALL = ("find_ground", "odometry", "deskew", "check")  # settings of every data set
 AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
@@ -44,6 +46,10 @@ DATA_SETS: dict[str, DataSet] = {
     "waymo": DataSet("WaymoLog", "Waymo segment", ("lidar/*.parquet",), "find_waymo_segments"),
     "pandaset": DataSet("PandaSetLog", "PandaSet sequence", ("lidar/poses.json",), depth=2),
     "aevascenes": DataSet("AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
+    # Folders velodyne with other files than KITTI's are folders of point clouds, see `recognise`.
+    "kitti": DataSet(
+        "KITTILog", "drive of KITTI", ("velodyne_points", "velodyne", "velodyne_points/data"), "find_kitti_drives"
+    ),
     "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
@@ -77,6 +83,8 @@ def recognise(root: Any) -> str:
             if fitting:
                 break
             level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+    if fitting == {"kitti"} and not _has_logs("kitti", root):
+        fitting = set()
     found = [name for name in DATA_SETS if name in fitting] or ["arrays"]
     if len(found) > 1 or not fitting:  # nuScenes and TruckScenes have the same file names
         found = [name for name in found if _has_logs(name, root)]
@@ -143,7 +151,13 @@ def find_sources(name: str, root: Any) -> Sequence[Any]:
 
 
 def open_log(
-    name: str, source: Any, find_ground: Any = "auto", odometry: bool = False, check: bool = True, **settings: Any
+    name: str,
+    source: Any,
+    find_ground: Any = "auto",
+    odometry: bool = False,
+    check: bool = True,
+    deskew: Any = "auto",
+    **settings: Any,
 ) -> Log:
     """Open one log.
 
@@ -154,6 +168,8 @@ def open_log(
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
+        deskew: how to move points to the instant of their sweep, see `cflow_torch.data.deskewing.DeskewedLog`; False
+            (what `off` means in YAML) = "off", True = "auto".
         **settings: keyword arguments of the reader.
 
     Raises:
@@ -162,14 +178,25 @@ def open_log(
     """
     if find_ground not in CHOICES:
         raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")
+    if isinstance(deskew, bool):
+        deskew = "auto" if deskew else "off"
+    if deskew not in DESKEW_CHOICES:
+        raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
-    log = _user_logs(name, settings)[source.number] if isinstance(source, UserSource) else _open(name, source, settings)
+    if isinstance(source, UserSource):
+        log = _user_logs(name, settings)[source.number]
+    else:
+        _, reader = _reader(name)
+        moves = "deskew" in inspect.signature(reader.__init__).parameters  # by more poses than one per sweep
+        log = _open(name, source, {**settings, "deskew": deskew in ("auto", "times")} if moves else settings)
     safe_name(log.log_id, f"{source}: the log")  # names the folder of its results
     if odometry:
         from cflow_torch.data.odometry import with_poses
 
         log = with_poses(log)
+    if deskew != "off":
+        log = DeskewedLog(log, deskew)
     if find_ground is not None:
         log = GroundSegmentedLog(log, find_ground)
     if check:

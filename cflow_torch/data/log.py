@@ -45,6 +45,11 @@ class Log(Protocol):
     Attributes:
         log_id: name of the log, safe as a folder name; the name of its file or folder unless the reader says otherwise.
         timestamps: sweep times, ascending; in nanoseconds, unless the reader says otherwise.
+        is_compensated: True = the format is known to be compensated for ego motion within a sweep.
+        moves_by_times: True = the reader compensates ego motion itself in sweeps that have `point_times`.
+        has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
+        lidar_position: (3,) metres, position of the rotating LiDAR in the frame of the points.
+        turn_seconds: duration of a turn of the LiDAR; None = the median time between two sweeps.
 
     Convention: our readers return float32 points and float64 poses `T_world_ego`. Opening a log reads its poses and
         times, and `sweep` and `labels` read the rest.
@@ -58,6 +63,12 @@ class Log(Protocol):
 
     log_id: str
     timestamps: Sequence[int]
+    # What `cflow_torch.data.deskewing` must know of a reader.
+    is_compensated: bool = False
+    moves_by_times: bool = False
+    has_raw_times: bool = False
+    lidar_position: Any = (0.0, 0.0, 0.0)
+    turn_seconds: float | None = None
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: float32 points, float64 pose `T_world_ego`, ground mask, time."""

@@ -186,13 +186,14 @@ def _ground(log: Any) -> str:
     )
 
 
-def _skew(log: Log) -> str:
+def _skew(log: Any) -> str:
+    note = getattr(getattr(log, "reading", None), "note", "")
     sweep = log.sweep(0)
-    if not getattr(log, "deskew", False) or sweep.pose is None or sweep.point_times is not None:
-        return ""
+    if note or not getattr(log, "deskew", False) or sweep.pose is None or sweep.point_times is not None:
+        return str(note)
     return (
         "it has no times of points, so its sweeps are not de-skewed, and static objects are smeared while the vehicle "
-        "moves. If the clouds are already compensated, set data.deskew=false"
+        "moves. If the clouds are already compensated, set data.deskew=off"
     )
 
 

@@ -60,6 +60,8 @@ class PandaSetLog(Log):
           it is part of an object. Smoke, exhaust, spray and reflections are not valid.
     """
 
+    is_compensated: bool = True
+
     def __init__(self, folder: PathLike) -> None:
         self.folder = as_path(folder)
         self.log_id = self.folder.resolve().name

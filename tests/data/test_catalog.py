@@ -64,7 +64,7 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
 @pytest.mark.parametrize(
     "name, settings, complaint",
     [
-        ("kitti", {}, "one of av2, hdf5"),
+        ("lyft", {}, "one of av2, hdf5"),
         ("arrays", {"clouds": "raw"}, "no setting clouds; it has poses"),
         ("arrays", {"find_ground": "magic"}, "find_ground='magic'"),
         ("arrays", {"suffix": 5}, "arrays cannot be opened with suffix=5"),

@@ -46,11 +46,18 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     Raises:
         CFlowError: no such file, an unknown suffix, or a file that is truncated or has other contents.
     """
+    return read_table(path, bin_columns)[0]
+
+
+def read_table(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Read the positions and the other columns of a cloud at once, see `read_cloud` and `read_columns`."""
     path = as_path(path)
     with file_errors(path, _hint(path)):
-        points = np.stack(_positions(_read(path, bin_columns)), axis=1)
+        fields = _read(path, bin_columns)
+        points = np.stack(_positions(fields), axis=1)
         check_array(points, "its cloud", (None, 3), "f", "(N,) floating-point metres each for x, y and z")
-    return points.astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
+    precision = np.float32 if points.dtype.itemsize < 8 else np.float64
+    return points.astype(precision, copy=False), _other_columns(fields)
 
 
 def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, np.ndarray]:
@@ -59,10 +66,14 @@ def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, 
     Columns without a name (`.bin` files, plain arrays) are called column_3, column_4, ... We leave out texts, objects
     and columns of several numbers per point.
     """
-    path, kept = as_path(path), {}
+    path = as_path(path)
     with file_errors(path, _hint(path)):
-        fields = _read(path, bin_columns)
-        shape = _positions(fields)[0].shape
+        return _other_columns(_read(path, bin_columns))
+
+
+def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    shape = _positions(fields)[0].shape
+    kept = {}
     for name, values in fields.items():
         kind = values.dtype
         if name not in _AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:

@@ -9,8 +9,9 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays import poses_text
-from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud, read_columns
+from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_columns, read_table
 from cflow_torch.data.arrays.poses_text import Trajectory
+from cflow_torch.data.bags.messages import TIME_FIELDS, seconds_after
 from cflow_torch.data.files import find_folders, read_npy
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote
@@ -67,6 +68,8 @@ class ArraysLog(Log):
         pose per sweep. The ego frame should have z up, because the method works in the bird's-eye view.
     """
 
+    has_raw_times: bool = True
+
     def __init__(
         self,
         folder: PathLike,
@@ -89,6 +92,7 @@ class ArraysLog(Log):
         self._bin_columns = bin_columns
         self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
+        self.lidar_position = self.ego_T_lidar[:3, 3]
         trajectory, are_of_lidar = self._trajectory(poses, calibration)
         stamps = self._times(times, trajectory)
         self._has_times = stamps is not None
@@ -98,15 +102,16 @@ class ArraysLog(Log):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and time where they are known."""
+        """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and times where they are known."""
         self._timestamp(index)
-        points = read_cloud(self.files[index], self._bin_columns)
+        points, columns = read_table(self.files[index], self._bin_columns)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = transform_points(points, self.ego_T_lidar)
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
         time = self.timestamps[index] if self._has_times else None
-        return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time)
+        seconds = (seconds_after(columns[name], time or 0) for name in TIME_FIELDS if name in columns)
+        return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time, next(seconds, None))
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""

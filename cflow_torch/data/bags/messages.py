@@ -11,7 +11,7 @@ from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions
 from cflow_torch.types import CFlowError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
-TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp")
+TIME_FIELDS = ("t", "time", "timestamp", "offset", "offset_time", "time_stamp")
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
 _SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 1000, so that only one unit fits
 

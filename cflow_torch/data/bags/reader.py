@@ -67,6 +67,8 @@ class BagLog(Log):
     Cost: opening a bag reads all its clouds, poses and transforms once.
     """
 
+    has_raw_times: bool = True
+
     def __init__(
         self,
         path: PathLike,
@@ -80,7 +82,7 @@ class BagLog(Log):
         if is_remote(self.path):
             raise CFlowError(f"{self.path} is remote: bags are read from this machine only; copy it here")
         self.log_id = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
-        self.deskew = deskew
+        self.deskew = self.moves_by_times = deskew
         self.poses: np.ndarray | None = None
         self._opened: tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
@@ -101,8 +103,10 @@ class BagLog(Log):
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             if poses is not None:
                 self.poses = covered_poses(Trajectory(matrices, times, "bag", poses), self.timestamps)
-            if self._mount is None:
-                self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
+            mount = self._mount
+            if mount is None:
+                mount = self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))[0]
+            self.lidar_position = mount[:3, 3]
 
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)

@@ -67,6 +67,7 @@ class HDF5Log(Log):
         with scene_errors(self.file):
             self.timestamps = sorted(int(name) for name in self._scene if is_timestamp(name))
         self._check_count(self.file)
+        self.is_compensated = is_argoverse2(self.timestamps[0])
         if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
             ego_T_lidar = self._stated_extrinsics()
         elif ego_T_lidar is None:

@@ -102,7 +102,8 @@ class NuScenesLog(Log):
     ) -> None:
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: pass 1 for all sweeps, 2 for every second one")
-        self.log_id, self._root, self._deskew = source.name, as_path(source.root), deskew
+        self.log_id, self._root = source.name, as_path(source.root)
+        self._deskew = self.moves_by_times = deskew
         self._own_vehicle = self.OWN_VEHICLE if own_vehicle == "auto" else own_vehicle
         folder = self._root / source.version
         sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.name)
@@ -120,8 +121,15 @@ class NuScenesLog(Log):
         self.timestamps = reference.times[kept].tolist()
         self._check_count(f"scene {self.log_id} in {folder}")
         self._poses, self._T_ego_world = reference.ego[kept], np.linalg.inv(reference.ego[kept])
+        self.lidar_position = reference.mount[0, :3, 3]
+        self.turn_seconds = float(np.median(np.diff(reference.times))) * 1e-6  # of all sweeps, not only of those kept
         self._odometry = (reference.times, reference.ego)
         self._tracks = Tracks(sample_times, annotations)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(K, 4, 4) float64 `T_world_ego` of every sweep."""
+        return self._poses
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: all LiDARs in one ego frame, in the order of `lidars`, else of sensor.json."""
