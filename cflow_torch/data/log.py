@@ -9,6 +9,7 @@ from typing import Any, Iterator, Mapping, Protocol, Sequence, TypeVar, overload
 import numpy as np
 from torch.utils.data import Dataset
 
+from cflow_torch.errors import warn
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
 
 _Log = TypeVar("_Log", bound="Log")
@@ -82,6 +83,18 @@ class Log(Protocol):
         """
         self._timestamp(index)
         return {}
+
+    @property
+    def notes(self) -> list[str]:
+        """What the reader assumed, left out or could not use so far: sentences, each also given as a `CFlowWarning`."""
+        return list(self.__dict__.get("_notes", {}).values())
+
+    def _note(self, text: str, kind: str = "") -> None:
+        """Warn, but only once in a log for texts of one `kind`; "" = once for each text."""
+        notes = self.__dict__.setdefault("_notes", {})
+        if text and (kind or text) not in notes:
+            notes[kind or text] = text
+            warn(f"log {self.log_id}: {text}")
 
     def close(self) -> None:
         """Close the files that the log holds open."""
@@ -191,6 +204,10 @@ class LogWrapper(Log):
 
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
         return self.log.columns(index)
+
+    @property
+    def notes(self) -> list[str]:
+        return self.log.notes
 
     def close(self) -> None:
         self.log.close()

@@ -11,9 +11,6 @@ from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions
 from cflow_torch.types import CFlowError
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
-TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp")
-_UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
-_SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 1000, so that only one unit fits
 
 
 def cloud_columns(message: Any) -> dict[str, np.ndarray]:
@@ -37,28 +34,6 @@ def cloud_columns(message: Any) -> dict[str, np.ndarray]:
     points = np.stack([table[axis] for axis in "xyz"], axis=1)
     table = table[np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)]
     return {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
-
-
-def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:
-    """Convert (N,) times of any unit to (N,) float64 seconds after the stamp of their sweep; None if that fails.
-
-    The unit is the one of s, ms, us and ns in which the times span 5 ms to 5 s. If the first time is at most 5 s, times
-    count from the stamp, otherwise from 1970. If the first time since 1970 is more than 5 s away from the stamp, the
-    times come from another clock, and we assume that the first shot was at the stamp.
-    """
-    if not len(values):
-        return None
-    first = values.min()
-    span = float(values.max() - first)
-    unit = next((unit for unit in _UNITS if _SHORTEST <= span * unit < _LONGEST), None)
-    if unit is None:
-        return None
-    start = float(first) * unit
-    if abs(start) > _LONGEST:
-        start = (int(first) * round(unit * 1e9) if first.dtype.kind in "iu" else round(start * 1e9)) - stamp_ns
-        start = start * 1e-9 if abs(start) <= _LONGEST * 1e9 else 0.0
-    since: np.ndarray = (values - first).astype(np.float64) * unit + start
-    return since
 
 
 Sample = Tuple[float, ...]  # nanoseconds (int), x, y, z, and the quaternion w, x, y, z

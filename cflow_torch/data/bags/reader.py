@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.arrays.poses_text import Trajectory, covered_poses
-from cflow_torch.data.bags.messages import TIME_FIELDS, Frames, cloud_columns, sample, seconds_after, sorted_poses
+from cflow_torch.data.bags.messages import Frames, cloud_columns, sample, sorted_poses
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
+from cflow_torch.data.point_times import TIME_FIELDS, seconds_after
 from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.types import Sweep
@@ -62,7 +63,7 @@ class BagLog(Log):
 
     Convention: points are in the ego frame. Poses are interpolated at the time of the cloud. The world is the root of
         the transforms, or the world of the topic. A topic gives the poses of its `child_frame_id` if transforms connect
-        this frame to the ego frame, otherwise the poses of the ego frame. Times of points: `messages.seconds_after`.
+        this frame to the ego frame, otherwise the poses of the ego frame. Times of points: `point_times.seconds_after`.
 
     Cost: opening a bag reads all its clouds, poses and transforms once.
     """
@@ -101,16 +102,17 @@ class BagLog(Log):
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             if poses is not None:
                 self.poses = covered_poses(Trajectory(matrices, times, "bag", poses), self.timestamps)
+            self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
             if self._mount is None:
                 self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
 
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
-        columns, mount = self._cloud(time), self._mount
-        times = next((seconds_after(columns[name], time) for name in TIME_FIELDS if name in columns), None)
+        columns, times = self._timed_cloud(time)
+        mount = self._mount
         if mount is None:
             mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
-        points = transform_points(np.stack([columns[axis] for axis in "xyz"], axis=1), mount)
+        points = transform_points(_points(columns), mount)
         if self.poses is None:
             return Sweep(points.astype(np.float32), None, None, time, times)
         if times is not None and self.deskew:
@@ -121,8 +123,24 @@ class BagLog(Log):
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the fields besides x, y, z, such as intensity and ring, of the points of sweep `index`."""
-        columns = self._cloud(self._timestamp(index))
+        columns, _ = self._timed_cloud(self._timestamp(index))
         return {name: values for name, values in columns.items() if name not in ("x", "y", "z")}
+
+    def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
+        columns = self._cloud(time)
+        points, names = _points(columns), [name for name in TIME_FIELDS if name in columns]
+        found = [seconds_after(columns[name], time, self._period, points) for name in names]
+        usable = [times for times in found if times.seconds is not None]
+        for times in usable[:1] or found:
+            self._note(times.note, "times of points")
+        if not usable or usable[0].seconds is None:
+            return columns, None
+        kept = ~usable[0].is_stray
+        if not kept.all():
+            text = f"{(~kept).sum()} of {len(kept)} points of the sweep at {time} ns have stray times and are left out"
+            self._note(text + ", also in other sweeps", "stray times")
+        return {name: values[kept] for name, values in columns.items()}, usable[0].seconds[kept]
 
     def _reader(self) -> Any:
         """Return the open bag. Each process opens it itself, also after a fork or unpickling."""
@@ -204,6 +222,11 @@ class BagLog(Log):
                 if _stamp(message, arrived) == time:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
+
+
+def _points(columns: dict[str, np.ndarray]) -> np.ndarray:
+    """Return (N, 3) points in the frame of the cloud."""
+    return np.stack([columns[axis] for axis in "xyz"], axis=1)
 
 
 def _stamp(message: Any, arrived: int) -> int:
