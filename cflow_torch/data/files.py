@@ -57,6 +57,12 @@ def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], hint:
         raise CFlowError(f"{file} has several columns {repeated}; keep one of each")
 
 
+def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
+    """Number the repetitions of a name: intensity, intensity_2. The name of `padding` stays."""
+    counts = [list(names[:k]).count(name) for k, name in enumerate(names, 1)]
+    return [name if count == 1 or name == padding else f"{name}_{count}" for name, count in zip(names, counts)]
+
+
 def read_npy(path: Path, hint: str) -> np.ndarray:
     """Read the array of a .npy file; pickled objects are never loaded. Errors as in `file_errors`."""
     with file_errors(path, hint):

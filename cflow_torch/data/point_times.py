@@ -101,7 +101,7 @@ def _is_share(known: np.ndarray) -> bool:
 
 
 def _turns(shares: np.ndarray, points: np.ndarray) -> float:
-    """Return the turns, at most 1, of a LiDAR that measured points at these shares of a sweep; 1 if it does not rotate."""
+    """Return the turns, at most 1, of a LiDAR that measures points at shares of a sweep; 1 if it does not rotate."""
     part = (shares * _PARTS).astype(np.int64).clip(0, _PARTS - 1)
     angle = np.arctan2(points[:, 1], points[:, 0])
     sines, cosines = (np.bincount(part, f(angle), _PARTS) for f in (np.sin, np.cos))

@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather, parquet
 
+from cflow_torch.data.arrays.pcd import pcd_fields, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.files import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.errors import import_optional
 from cflow_torch.types import CFlowError, check_array
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
@@ -65,7 +65,7 @@ def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, 
         shape = _positions(fields)[0].shape
     for name, values in fields.items():
         kind = values.dtype
-        if name not in _AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
+        if name.lower() not in _AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
             kept[name] = values.astype(kind.newbyteorder("="), copy=False)
     return kept
 
@@ -101,9 +101,9 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
         points, named = np.column_stack([points, *named.values()]), {}
     with atomic_file(path) as file:
         if suffix == ".pcd":
-            pypcd4, kinds = _pypcd4(), [values.dtype for values in fields.values()]
-            cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
-            cloud.save(file, pypcd4.Encoding.BINARY)
+            pcd, kinds = pypcd4(), [values.dtype for values in fields.values()]
+            cloud = pcd.PointCloud.from_points(list(fields.values()), list(fields), kinds)
+            cloud.save(file, pcd.Encoding.BINARY)
         elif suffix == ".ply":
             file.write(ply_bytes(fields))
         elif suffix == ".bin":
@@ -143,6 +143,8 @@ def _storable(values: np.ndarray, suffix: str) -> np.ndarray:
 
 
 def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    if not set(_AXES) <= set(fields):
+        fields = {name.lower(): values for name, values in fields.items()}  # X, Y, Z
     if not set(_AXES) <= set(fields):
         raise CFlowError(f"it has {list(fields)}; it needs x, y, z")
     return [fields[axis] for axis in _AXES]
@@ -205,24 +207,3 @@ def _table_columns(read: Any, content: bytes) -> dict[str, np.ndarray]:
         for name, column in zip(table.column_names, table.columns)
         if any(is_kind(column.type) for is_kind in kinds)
     }
-
-
-def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
-    """Read the fields of a `.pcd` file of version 0.7: name -> (N,) array of the stated dtype.
-
-    Organised clouds (HEIGHT above 1) are flattened row by row. Padding and fields of several values (COUNT above 1) are
-    left out. VIEWPOINT is not applied, so points stay in their stored frame. NaN points stay. A file that is damaged or
-    not a `.pcd` file may raise any exception, which the caller reports.
-    """
-    cloud = _pypcd4().PointCloud.from_fileobj(io.BytesIO(content))
-    header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
-    if len(table) != header.width * header.height:
-        raise ValueError(f"it has {len(table)} points, but its header states {header.width} x {header.height}")
-    # pypcd4 names padding "#...", splits fields of several values, and mixes these fields up in compressed files.
-    names = [name for name, count in zip(header.fields, header.count) if count == 1 and name[0] != "#"]
-    # pypcd4 1.4 makes a two-dimensional table of a cloud without points.
-    return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}
-
-
-def _pypcd4() -> Any:
-    return import_optional("pypcd4", "PCD files need pypcd4: pip install pypcd4")
