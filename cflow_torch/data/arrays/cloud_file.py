@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather, parquet
 
+from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bin_layout
 from cflow_torch.data.arrays.pcd import pcd_fields, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
@@ -20,17 +21,16 @@ from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError, check_array
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
-KITTI_COLUMNS = 4  # x, y, z, reflectance
 _AXES = ("x", "y", "z")
 _CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file with more than one table
 
 
-def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
+def read_cloud(path: PathLike, bin_columns: int | BinLayout | None = None) -> np.ndarray:
     """Read the positions of a point cloud.
 
     Args:
         path: file; its suffix tells the format (see Convention).
-        bin_columns: float32 numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes.
+        bin_columns: numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes; None = see `find_bin_layout`.
 
     Returns:
         (N, 3) in the precision of the file: float32 or float64; float16 becomes float32.
@@ -38,7 +38,7 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     Convention:
         - `.npy`: (N, 3+) floats, columns x, y, z first; or a structured array with fields x, y, z.
         - `.npz`: arrays x, y, z; or one (N, 3+) array, called points, lidar, xyz or pc if there are several.
-        - `.bin`: little-endian float32, `bin_columns` per point.
+        - `.bin`: little-endian float32 or float64, `bin_columns` per point.
         - `.pcd` (extra `clouds`), `.ply`: fields x, y, z.
         - `.feather`, `.parquet`: columns x, y, z; without these names, the first three.
         Nothing is unpickled. `read_columns` reads the other columns.
@@ -53,7 +53,7 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     return points.astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
 
 
-def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, np.ndarray]:
+def read_columns(path: PathLike, bin_columns: int | BinLayout | None = None) -> dict[str, np.ndarray]:
     """Read the other columns of a cloud, name -> (N,) bool, integers or floats as stored; errors as `read_cloud`.
 
     Columns without a name (`.bin` files, plain arrays) are called column_3, column_4, ... We leave out texts, objects
@@ -150,7 +150,7 @@ def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:
     return [fields[axis] for axis in _AXES]
 
 
-def _read(path: Path, bin_columns: int) -> Mapping[str, np.ndarray]:
+def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.ndarray]:
     """Read all columns by name; those without a name are x, y, z, column_3, ..."""
     suffix, content = _suffix(path), read_bytes(path)
     if suffix in (".pcd", ".ply"):
@@ -161,12 +161,13 @@ def _read(path: Path, bin_columns: int) -> Mapping[str, np.ndarray]:
         return _archive_columns(content)
     if suffix == ".npy":
         return _array_columns(np.load(io.BytesIO(content), allow_pickle=False))
-    if len(content) % (4 * bin_columns):
+    layout = bin_columns if isinstance(bin_columns, BinLayout) else find_bin_layout(content, bin_columns)
+    if len(content) % layout.step:
         raise CFlowError(
-            f"it has {len(content)} bytes, not a multiple of {4 * bin_columns} ({bin_columns} float32 per point): it "
-            "is truncated, or has another number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
+            f"it has {len(content)} bytes, not a multiple of {layout.step} ({layout}): it is truncated, or has another "
+            "number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
         )
-    return _array_columns(np.frombuffer(content, "<f4").reshape(-1, bin_columns))
+    return _array_columns(np.frombuffer(content, layout.kind).reshape(-1, layout.columns))
 
 
 def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,11 +9,12 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays import poses_text
-from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud, read_columns
+from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, read_columns
 from cflow_torch.data.arrays.poses_text import Trajectory
-from cflow_torch.data.files import find_folders, read_npy
+from cflow_torch.data.files import file_errors, find_folders, read_npy
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote
+from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
@@ -53,7 +54,7 @@ class ArraysLog(Log):
             cloud, of the same name, with (N,) bool or 0 and 1.
         ego_T_lidar: (4, 4), maps the frame of the stored points to the ego frame; None = they are the same.
         suffix: suffix of the clouds to read, if a folder has several kinds.
-        bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes.
+        bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes; "auto" = `find_bin_layout`.
 
     Attributes:
         files: the clouds, in order.
@@ -77,16 +78,16 @@ class ArraysLog(Log):
         ground: PathLike | None = "auto",
         ego_T_lidar: Any = None,
         suffix: str | None = None,
-        bin_columns: int = KITTI_COLUMNS,
+        bin_columns: int | str = "auto",
     ) -> None:
         self.folder = as_path(folder)
         if poses_of not in ("ego", "lidar"):
             raise CFlowError(f"poses_of={poses_of!r}: pass 'ego' or 'lidar'")
-        if type(bin_columns) is not int or bin_columns < 3:
-            raise CFlowError(f"bin_columns={bin_columns!r}: pass an integer of at least 3")
+        if bin_columns != "auto" and (type(bin_columns) is not int or bin_columns < 3):
+            raise CFlowError(f"bin_columns={bin_columns!r}: pass 'auto' or an integer of at least 3")
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
-        self._bin_columns = bin_columns
+        self._bin_layout = self._find_bin_layout(bin_columns)
         self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         trajectory, are_of_lidar = self._trajectory(poses, calibration)
@@ -100,7 +101,7 @@ class ArraysLog(Log):
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and time where they are known."""
         self._timestamp(index)
-        points = read_cloud(self.files[index], self._bin_columns)
+        points = read_cloud(self.files[index], self._bin_layout)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = transform_points(points, self.ego_T_lidar)
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
@@ -111,7 +112,18 @@ class ArraysLog(Log):
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
         self._timestamp(index)
-        return read_columns(self.files[index], self._bin_columns)
+        return read_columns(self.files[index], self._bin_layout)
+
+    def _find_bin_layout(self, columns: Any) -> BinLayout | None:
+        """Return the layout of `.bin` files; None = the files have another suffix. We say if it is not KITTI's."""
+        first = self.files[0]
+        if first.suffix.lower() != ".bin":
+            return None
+        with file_errors(first):
+            layout = find_bin_layout(read_bytes(first), None if columns == "auto" else columns)
+        if columns == "auto" and layout != BinLayout():
+            self._note(f"its .bin files look like {layout}; data.bin_columns sets another number")
+        return layout
 
     def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, bool]:
         """Return the poses, and whether a calibration converted them to the LiDAR's."""
