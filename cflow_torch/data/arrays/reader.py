@@ -15,6 +15,7 @@ from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.files import file_errors, find_folders, read_npy
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes
+from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
@@ -63,6 +64,7 @@ class ArraysLog(Log):
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
 
     Convention:
+        `missing_returns` stay, as NaN, so that results have a row for every row of the file.
         Sweeps are in the ego frame: points are transformed by `ego_T_lidar` in float64, then rounded to float32. Poses
         with times (TUM) are interpolated at the times of the sweeps, if these are known. Otherwise there must be one
         pose per sweep. The ego frame should have z up, because the method works in the bird's-eye view.
@@ -102,6 +104,9 @@ class ArraysLog(Log):
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and time where they are known."""
         self._timestamp(index)
         points = read_cloud(self.files[index], self._bin_layout)
+        is_missing = missing_returns(points)
+        if is_missing.any():
+            points = np.where(is_missing[:, None], np.float32(np.nan), points)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = transform_points(points, self.ego_T_lidar)
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))

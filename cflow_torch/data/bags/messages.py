@@ -7,6 +7,7 @@ from typing import Any, Tuple
 import numpy as np
 
 from cflow_torch.data.files import shortened
+from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions
 from cflow_torch.types import CFlowError
 
@@ -16,7 +17,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 def cloud_columns(message: Any) -> dict[str, np.ndarray]:
     """Return the fields of a PointCloud2, x, y, z and others: name -> (N,) numbers as stored.
 
-    We leave out points that are not finite or lie at the origin, because they mean "no return". A cloud without x, y or
+    We leave out `missing_returns`. A cloud without x, y or
     z, or with less data than it states, is a ValueError.
     """
     fields = {field.name: field for field in message.fields if field.count <= 1 and field.datatype in _TYPES}
@@ -32,7 +33,7 @@ def cloud_columns(message: Any) -> dict[str, np.ndarray]:
     rows = np.frombuffer(message.data, np.uint8, message.height * row_step).reshape(message.height, row_step)
     table = np.ascontiguousarray(rows[:, : message.width * step]).view(kind).reshape(-1)
     points = np.stack([table[axis] for axis in "xyz"], axis=1)
-    table = table[np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)]
+    table = table[~missing_returns(points)]
     return {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
 
 

@@ -12,6 +12,7 @@ from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
+from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
@@ -173,7 +174,7 @@ class NuScenesLog(Log):
         local, times = self._points_of(file)
         points = transform_points(local, chain.mount[row])
         # We remove the own vehicle before compensation, because it moves with its LiDARs.
-        kept = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1) & ~self._is_own(points, index)
+        kept = ~missing_returns(local) & ~self._is_own(points, index)
         points, T_ego_world = points[kept], self._T_ego_world[index]
         if times is None:
             at = np.broadcast_to(T_ego_world @ chain.ego[row], (len(points), 4, 4))
