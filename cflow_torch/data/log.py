@@ -46,6 +46,8 @@ class Log(Protocol):
     Attributes:
         log_id: name of the log, safe as a folder name; the name of its file or folder unless the reader says otherwise.
         timestamps: sweep times, ascending; in nanoseconds, unless the reader says otherwise.
+        gaps: indices of sweeps after which the reader left out sweeps. No window reaches over a gap for its history or
+            future, and `cflow flow` leaves out the pair over it.
 
     Convention: our readers return float32 points and float64 poses `T_world_ego`. Opening a log reads its poses and
         times, and `sweep` and `labels` read the rest.
@@ -59,6 +61,7 @@ class Log(Protocol):
 
     log_id: str
     timestamps: Sequence[int]
+    gaps: frozenset[int] = frozenset()
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: float32 points, float64 pose `T_world_ego`, ground mask, time."""
@@ -141,15 +144,30 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
     If fewer than `num_history` sweeps precede `index`, or fewer than `num_future` follow `index + 1`, the window has
-    only these. If `index + 1` does not exist, or a sweep cannot be read, that is a `CFlowError`.
+    only these. It also ends at a gap of the log, and at a sweep of the history or future that cannot be read, with a
+    warning. If `index + 1` does not exist, or one of the pair cannot be read, that is a `CFlowError`.
     """
     count = len(log.timestamps)
     if not 0 <= index < count - 1:
         raise CFlowError(f"log {log.log_id} has {count} sweeps; a pair needs 0 <= index < {count - 1}, got {index}")
     history = range(index - 1, max(index - 1 - num_history, -1), -1)
     future = range(index + 2, min(index + 2 + num_future, count))
-    past, later = (tuple(log.sweep(i) for i in indices) for indices in (history, future))
-    return Window(log.sweep(index), log.sweep(index + 1), past, later)
+    pair = log.sweep(index), log.sweep(index + 1)
+    return Window(*pair, *(tuple(_readable(log, indices)) for indices in (history, future)))
+
+
+def _readable(log: Log, indices: range) -> Iterator[Sweep]:
+    """Yield the sweeps of a history or future, up to a gap of the log or a sweep that cannot be read."""
+    gaps = getattr(log, "gaps", ())
+    for index in indices:
+        if (index if indices.step < 0 else index - 1) in gaps:
+            return
+        try:
+            sweep = log.sweep(index)
+        except (CFlowError, OSError) as error:
+            warn(f"log {log.log_id}: sweep {index} cannot be read, so windows beside it are shorter: {error}")
+            return
+        yield sweep
 
 
 def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
@@ -198,6 +216,7 @@ class LogWrapper(Log):
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
+        self.gaps = getattr(log, "gaps", frozenset())
 
     def labels(self, index: int) -> FlowLabels | None:
         return self.log.labels(index)
@@ -208,6 +227,9 @@ class LogWrapper(Log):
     @property
     def notes(self) -> list[str]:
         return self.log.notes
+
+    def _note(self, text: str, kind: str = "") -> None:
+        self.log._note(text, kind)
 
     def close(self) -> None:
         self.log.close()

@@ -285,12 +285,11 @@ def test_poses_of_another_rate_are_interpolated(tmp_path):
         at = 0.1 * k - 0.007
         assert np.abs(pose - scenes.pose(10 * at, 0, 0.5 * at)).max() < 1e-12
     poses_text.write_times(folder / "times.txt", [time + 10**12 for time in SmallLog().timestamps])
-    with pytest.raises(CFlowError, match="same time"):
+    with pytest.raises(CFlowError, match="clocks differ by about 999.973 s"):
         ArraysLog(folder)
     gap = poses_text.Trajectory(truth[:2], np.array([0, 10**9]), "tum", "x")
     assert np.array_equal(poses_text.covered_poses(gap, [0, 10**9]), gap.poses), "a pose at its time is kept"
-    with pytest.raises(CFlowError, match="no pose near"):
-        poses_text.covered_poses(gap, [5 * 10**8])
+    assert poses_text.are_covered(gap, [0, 5 * 10**8, 10**9 + 10**6, 10**9 + 10**7]).tolist() == [1, 0, 1, 0]
 
 
 def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):
@@ -329,7 +328,7 @@ def test_points_and_poses_of_a_lidar_are_transformed_to_the_ego_frame(folder):
         ("poses.txt", "2 0 0 0 0 1 0 0 0 0 1 0\n" * 3, {}, "not rigid"),
         ("poses.txt", "0 0 0 0 0 0 0 2\n", {}, "pose 0 is not a rigid motion"),
         ("poses.txt", "1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", {}, "ascend"),
-        ("times.txt", "1700000000123456789\n" * 3, {}, "nanoseconds"),
+        ("times.txt", "1700000000123456789\n" * 3, {}, "ascend"),
         ("poses.npy", np.eye(4), {}, "several"),
         ("poses.npy", np.eye(4), {"poses": "poses.npy"}, "shape"),
         ("points/a.ply", np.ones((1, 3)), {}, "several kinds of clouds"),

@@ -21,11 +21,13 @@ from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds")  # where the clouds may lie below the log's folder
-POSE_FILES = ("poses.txt", "poses.npy", "trajectory.txt")
+POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # file names that are times: 16, 17 digits = us, 18, 19 = ns
+# File names that are times: 16, 17 digits = us, 18, 19 = ns; and seconds with decimals or nanoseconds.
+_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")
+_SECONDS = re.compile(r"\D*([0-9]+)\.([0-9]+)|\D*([0-9]{9,10})_([0-9]+)")
 _FIRST_NANOSECOND = 10**17
 
 
@@ -45,8 +47,9 @@ class ArraysLog(Log):
     Args:
         folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
             velodyne or clouds that does. Clouds are sorted naturally: 2 before 10.
-        poses: "auto" = poses.txt, poses.npy or trajectory.txt in the folder, or KITTI's ../../poses/<name>.txt, if
-            there is one; None = no poses; or a file (see `read_poses`), or a (K, 4, 4) array.
+        poses: "auto" = poses.txt, odometry.csv or the like (`POSE_FILES`) in the folder, or KITTI's
+            ../../poses/<name>.txt, if there is one; None = no poses; or a file (see `read_poses`); or a (K, 4, 4)
+            array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
@@ -59,9 +62,11 @@ class ArraysLog(Log):
 
     Attributes:
         files: the clouds, in order.
-        timestamps: nanoseconds from `times`, else from file names of 16 digits or more (microseconds, nanoseconds),
-            else from TUM poses, if each cloud has one. Otherwise 0, 1, 2, ..., and sweeps have no `timestamp_ns`.
-        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
+        timestamps: nanoseconds from `times`, else from file names (see `times_of_names`), else from TUM poses, if each
+            cloud has one. Otherwise 0, 1, 2, ..., and sweeps have no `timestamp_ns`.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown. Sweeps before the first pose, after the
+            last one, or in a gap of the poses of more than half a second are left out.
+        gaps: indices of sweeps after which sweeps were left out.
 
     Convention:
         `missing_returns` stay, as NaN, so that results have a row for every row of the file.
@@ -96,6 +101,7 @@ class ArraysLog(Log):
         stamps = self._times(times, trajectory)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
+        self.gaps = frozenset()
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
         if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
@@ -154,16 +160,22 @@ class ArraysLog(Log):
             if len(stamps) != count:
                 raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
             return stamps
-        names = [path.stem for path in self.files]
-        if all(_STAMP.fullmatch(name) for name in names):
-            return [int(name) * (1 if int(name) >= _FIRST_NANOSECOND else 1000) for name in names]
+        stamps = times_of_names([path.stem for path in self.files])
+        if stamps is not None:
+            return stamps
         if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
             return trajectory.times_ns.tolist()
         return None
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
         if trajectory.times_ns is not None and stamps is not None:
-            return poses_text.covered_poses(trajectory, stamps)
+            covered = poses_text.are_covered(trajectory, stamps)
+            self._note(poses_text.describe_uncovered(trajectory, stamps, covered))
+            kept = np.flatnonzero(covered)
+            self.files, self.timestamps = [self.files[k] for k in kept], [stamps[k] for k in kept]
+            self.gaps = frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
+            self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
+            return poses_text.covered_poses(trajectory, self.timestamps)
         if len(trajectory.poses) != len(self.files):
             raise CFlowError(
                 f"{trajectory.source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, "
@@ -175,6 +187,25 @@ class ArraysLog(Log):
 def natural_key(name: str) -> tuple[Any, ...]:
     """Return a key for sorting that compares digits in names as numbers: 2 before 10."""
     return tuple((0, int(run), run) if run.isdecimal() else (1, 0, run) for run in re.findall(r"\d+|\D+", name))
+
+
+def times_of_names(names: Sequence[str]) -> list[int] | None:
+    """Return the nanoseconds that names of files state; None if they are not times.
+
+    Names are digits (16, 17 = microseconds, 18, 19 = nanoseconds), or seconds and a fraction, "1700000000.05" or
+    "1700000000_050000000", also after a text without digits. Fractions are decimals, unless their numbers of digits
+    differ and the longest has nine: then they are nanoseconds without leading zeros.
+    """
+    if all(_STAMP.fullmatch(name) for name in names):
+        return [int(name) * (1 if int(name) >= _FIRST_NANOSECOND else 1000) for name in names]
+    matches = [_SECONDS.fullmatch(name) for name in names]
+    pairs = [[word for word in match.groups() if word is not None] for match in matches if match is not None]
+    if len(pairs) < len(names) or any(len(second) > 10 for second, _ in pairs):
+        return None
+    digits = {len(fraction) for _, fraction in pairs}
+    are_decimals = max(digits) != 9 or len(digits) == 1
+    fractions = [int(fraction[:9].ljust(9, "0") if are_decimals else fraction) for _, fraction in pairs]
+    return [int(second) * 10**9 + fraction for (second, _), fraction in zip(pairs, fractions)]
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
@@ -202,7 +233,9 @@ def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
         )
     if len(kinds) > 1:
         raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
-    return sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
+    files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
+    stamps = times_of_names([path.stem for path in files])
+    return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
 
 
 def _resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
