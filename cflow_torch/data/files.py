@@ -13,7 +13,7 @@ import numpy as np
 
 from cflow_torch.data.atomic import write_text
 from cflow_torch.data.paths import PathLike, read_bytes
-from cflow_torch.errors import CFlowError
+from cflow_torch.errors import CFlowError, MissingFile
 
 Test = Callable[[Path], bool]
 _SHOWN = 5  # changed settings that a message lists
@@ -34,7 +34,7 @@ def file_errors(file: Any, hint: str = "copy it again", doing: str = "read") -> 
             raise
         raise CFlowError(f"{file}: {error}") from error
     except FileNotFoundError:
-        raise CFlowError(f"{file} is missing; {hint}") from None
+        raise MissingFile(f"{file} is missing; {hint}") from None
     except Exception as error:
         cause = f"{type(error).__name__}: {shortened(error)}"
         guess = "it may be truncated or damaged, " if doing == "read" else ""

@@ -9,7 +9,7 @@ from typing import Any, Iterator, Mapping, Protocol, Sequence, TypeVar, overload
 import numpy as np
 from torch.utils.data import Dataset
 
-from cflow_torch.errors import warn
+from cflow_torch.errors import MissingFile, warn
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
 
 _Log = TypeVar("_Log", bound="Log")
@@ -144,8 +144,8 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
     If fewer than `num_history` sweeps precede `index`, or fewer than `num_future` follow `index + 1`, the window has
-    only these. It also ends at a gap of the log, and at a sweep of the history or future that cannot be read, with a
-    warning. If `index + 1` does not exist, or one of the pair cannot be read, that is a `CFlowError`.
+    only these. It also ends at a gap of the log and, with a warning, at a sweep of the history or future whose file is
+    missing. If `index + 1` does not exist, or one of the pair cannot be read, that is a `CFlowError`.
     """
     count = len(log.timestamps)
     if not 0 <= index < count - 1:
@@ -157,15 +157,15 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
 
 
 def _readable(log: Log, indices: range) -> Iterator[Sweep]:
-    """Yield the sweeps of a history or future, up to a gap of the log or a sweep that cannot be read."""
+    """Yield the sweeps of a history or future, up to a gap of the log or a sweep whose file is missing."""
     gaps = getattr(log, "gaps", ())
     for index in indices:
         if (index if indices.step < 0 else index - 1) in gaps:
             return
         try:
             sweep = log.sweep(index)
-        except (CFlowError, OSError) as error:
-            warn(f"log {log.log_id}: sweep {index} cannot be read, so windows beside it are shorter: {error}")
+        except MissingFile as error:
+            warn(f"log {log.log_id}: windows near sweep {index} are shorter, because {error}")
             return
         yield sweep
 

@@ -11,18 +11,21 @@ import numpy as np
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, read_columns
+from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
 from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.files import file_errors, find_folders, read_npy
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes, read_start
 from cflow_torch.data.returns import missing_returns
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
+from cflow_torch.data.stillness import share_in_place, static_rows, thinned_rows
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds")  # where the clouds may lie below the log's folder
 POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
 GROUND_FOLDER = "ground"
+_VIEWPOINT = "VIEWPOINT"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
 # File names that are times: 16, 17 digits = us, 18, 19 = ns; and seconds with decimals or nanoseconds.
@@ -48,8 +51,8 @@ class ArraysLog(Log):
         folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
             velodyne or clouds that does. Clouds are sorted naturally: 2 before 10.
         poses: "auto" = poses.txt, odometry.csv or the like (`POSE_FILES`) in the folder, or KITTI's
-            ../../poses/<name>.txt, if there is one; None = no poses; or a file (see `read_poses`); or a (K, 4, 4)
-            array.
+            ../../poses/<name>.txt, if there is one, or VIEWPOINT of `.pcd` files if it is set; None = no poses; or a
+            file (see `read_poses`); or a (K, 4, 4) array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
@@ -59,6 +62,8 @@ class ArraysLog(Log):
         ego_T_lidar: (4, 4), maps the frame of the stored points to the ego frame; None = they are the same.
         suffix: suffix of the clouds to read, if a folder has several kinds.
         bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes; "auto" = `find_bin_layout`.
+        points_frame: "lidar", or "world" = the stored points are in the world's frame, and we move them back by the
+            poses; "auto" = "lidar", but with poses from VIEWPOINT the one under which the static world stands still.
 
     Attributes:
         files: the clouds, in order.
@@ -86,12 +91,15 @@ class ArraysLog(Log):
         ego_T_lidar: Any = None,
         suffix: str | None = None,
         bin_columns: int | str = "auto",
+        points_frame: str = "auto",
     ) -> None:
         self.folder = as_path(folder)
         if poses_of not in ("ego", "lidar"):
             raise CFlowError(f"poses_of={poses_of!r}: pass 'ego' or 'lidar'")
         if bin_columns != "auto" and (type(bin_columns) is not int or bin_columns < 3):
             raise CFlowError(f"bin_columns={bin_columns!r}: pass 'auto' or an integer of at least 3")
+        if points_frame not in ("auto", "lidar", "world"):
+            raise CFlowError(f"points_frame={points_frame!r}: pass 'auto', 'lidar' or 'world'")
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
         self._bin_layout = self._find_bin_layout(bin_columns)
@@ -105,6 +113,13 @@ class ArraysLog(Log):
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
         if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
+        self._are_in_world = points_frame == "world"
+        if points_frame == "world" and self.poses is None:
+            raise CFlowError(f"points_frame=world: {self.folder} has no poses; pass the poses of the LiDAR")
+        if points_frame == "auto" and trajectory is not None and trajectory.source == _VIEWPOINT:
+            self._are_in_world = self._world_stands_stiller()
+            frame = "the world's frame, and move them back" if self._are_in_world else "the sensor's frame"
+            self._note(f"its poses come from VIEWPOINT; we take its points to be in {frame} (data.points_frame)")
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and time where they are known."""
@@ -113,7 +128,9 @@ class ArraysLog(Log):
         is_missing = missing_returns(points)
         if is_missing.any():
             points = np.where(is_missing[:, None], np.float32(np.nan), points)
-        if not np.array_equal(self.ego_T_lidar, np.eye(4)):
+        if self._are_in_world and self.poses is not None:
+            points = transform_points(points, np.linalg.inv(self.poses[index]))
+        elif not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = transform_points(points, self.ego_T_lidar)
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
@@ -143,13 +160,42 @@ class ArraysLog(Log):
         kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
         file = _resolve(self.folder, poses, POSE_FILES, "poses", kitti)
         if file is None:
-            return None, False
+            return self._viewpoints() if poses == "auto" else None, False
         trajectory = poses_text.read_poses(file)
         chosen = _resolve(self.folder, calibration, ("calib.txt",), "calibration")
         if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
             return trajectory, False
         T_cam_lidar = poses_text.read_calibration(chosen)
         return trajectory._replace(poses=np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar), True
+
+    def _viewpoints(self) -> Trajectory | None:
+        """Read the poses in VIEWPOINT of `.pcd` files; None if no file has one."""
+        if self.files[0].suffix.lower() != ".pcd":
+            return None
+        numbers = np.tile(np.eye(7)[3], (len(self.files), 1))
+        for row, file in zip(numbers, self.files):
+            with file_errors(file):
+                viewpoint = pcd_viewpoint(read_start(file, LONGEST_HEADER))
+            row[:] = row if viewpoint is None else viewpoint
+        if (numbers == np.eye(7)[3]).all():
+            return None
+        poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
+        return Trajectory(poses, None, "matrix", _VIEWPOINT)
+
+    def _world_stands_stiller(self) -> bool:
+        """Test whether the static world stands stiller if the stored points are in the world's frame."""
+        assert self.poses is not None
+        last, shares = len(self.files) - 1, []
+        for self._are_in_world in (False, True):
+            total = 0.0
+            for first in sorted({0, last // 2, last - 1}):
+                pair = [self.sweep(first), self.sweep(first + 1)]
+                source, target = (np.asarray(sweep.points)[static_rows(sweep)] for sweep in pair)
+                T_target_source = np.linalg.inv(self.poses[first + 1]) @ self.poses[first]
+                share = share_in_place(source[thinned_rows(source)], target, T_target_source)
+                total += 0.0 if np.isnan(share) else share
+            shares.append(total)
+        return shares[1] > shares[0]
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
