@@ -44,7 +44,7 @@ DATA_SETS: dict[str, DataSet] = {
     "waymo": DataSet("WaymoLog", "Waymo segment", ("lidar/*.parquet",), "find_waymo_segments"),
     "pandaset": DataSet("PandaSetLog", "PandaSet sequence", ("lidar/poses.json",), depth=2),
     "aevascenes": DataSet("AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
-    "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
+    "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3", "*.bag.active"), "find_bags"),
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
 }
