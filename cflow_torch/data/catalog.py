@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import logging
+from collections import Counter
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Mapping, NamedTuple, Sequence
 
 from cflow_torch.data.files import find_folders, shortened
@@ -81,9 +83,37 @@ def recognise(root: Any) -> str:
     if len(found) > 1 or not fitting:  # nuScenes and TruckScenes have the same file names
         found = [name for name in found if _has_logs(name, root)]
     if len(found) != 1:
-        why = f"several formats fit, {' and '.join(found)}" if found else "no format fits its contents"
+        why = f"several formats fit, {' and '.join(found)}" if found else _why_nothing_fits(top)
         raise CFlowError(f"{root}: {why}; choose one with data={'|'.join(DATA_SETS)}")
     return found[0]
+
+
+_CONVERSIONS = {
+    **dict.fromkeys((".las", ".laz"), "convert them with pdal translate IN.las OUT.ply"),
+    **dict.fromkeys((".xyz", ".txt", ".csv", ".asc", ".pts"), "convert them with numpy.save(OUT, numpy.loadtxt(IN))"),
+    **dict.fromkeys((".pcap", ".pcapng"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"),
+    **dict.fromkeys((".e57", ".drc", ".rcp"), "convert them to .ply"),
+    ".tfrecord": "Waymo's version 1 is not read; download version 2",
+}
+
+
+def _why_nothing_fits(top: Path) -> str:
+    """Say what a file or folder without a log has instead."""
+    from cflow_torch.data.arrays.cloud_file import SUFFIXES
+
+    level, suffixes = [top], Counter()  # type: ignore[var-annotated]
+    for _ in range(_DEEPEST):
+        suffixes.update(path.suffix.lower() for path in level if path.is_file())
+        level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+    if not suffixes:
+        return "it has no files" if top.is_dir() else "no format fits its contents"
+    suffix, count = suffixes.most_common(1)[0]
+    clouds = [kind for kind in suffixes if kind in SUFFIXES]
+    if clouds and all(suffixes[kind] == 1 for kind in clouds):
+        return f"it has one point cloud ({clouds[0]}); scene flow needs two sweeps or more of a log in one folder"
+    if suffix in _CONVERSIONS:
+        return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}"
+    return "no format fits its contents"
 
 
 def _has_logs(name: str, root: Any) -> bool:

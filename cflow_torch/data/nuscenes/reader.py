@@ -11,7 +11,7 @@ from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, poi
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
-from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes, remote_errors
 from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
@@ -120,9 +120,29 @@ class NuScenesLog(Log):
         kept = np.flatnonzero((row - last_key) % sweep_step == 0)
         self.timestamps = reference.times[kept].tolist()
         self._check_count(f"scene {self.log_id} in {folder}")
+        self._check_files(reference, kept, int((row - last_key).max()) + 1)
         self._poses, self._T_ego_world = reference.ego[kept], np.linalg.inv(reference.ego[kept])
         self._odometry = (reference.times, reference.ego)
         self._tracks = Tracks(sample_times, annotations)
+
+    def _check_files(self, chain: LidarChain, kept: np.ndarray, step: int) -> None:
+        """Say in one error if only key frames are there, or no file of the scene. We look at three files of a kind."""
+        kinds = []
+        for is_key_frame in (True, False):
+            rows = kept[chain.is_key_frame[kept] == is_key_frame]
+            chosen = rows[[0, len(rows) // 2, -1]] if len(rows) else rows
+            files = [path_inside(self._root, chain.files[row], self.log_id) for row in chosen]
+            with remote_errors(self._root):
+                kinds.append(any(file.exists() for file in files))
+        if kinds == [True, False] and not chain.is_key_frame[kept].all():
+            raise CFlowError(
+                f"scene {self.log_id}: only its key frames are in {self._root}. Pass sweep_step={step} (in commands "
+                f"data.sweep_step={step}) to use them alone, at 2 Hz, or download the folder sweeps"
+            )
+        if not any(kinds):
+            raise CFlowError(
+                f"scene {self.log_id}: its files are not in {self._root}; another part of the set has them"
+            )
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: all LiDARs in one ego frame, in the order of `lidars`, else of sensor.json."""
