@@ -83,8 +83,9 @@ def recognise(root: Any) -> str:
     if len(found) > 1 or not fitting:  # nuScenes and TruckScenes have the same file names
         found = [name for name in found if _has_logs(name, root)]
     if len(found) != 1:
-        why = f"several formats fit, {' and '.join(found)}" if found else _why_nothing_fits(top)
-        raise CFlowError(f"{root}: {why}; choose one with data={'|'.join(DATA_SETS)}")
+        choose = f"choose one with data={'|'.join(DATA_SETS)}"
+        fits = f"several formats fit, {' and '.join(found)}; {choose}"
+        raise CFlowError(f"{root}: {fits if found else _why_nothing_fits(top) or f'no format fits; {choose}'}")
     return found[0]
 
 
@@ -98,7 +99,7 @@ _CONVERSIONS = {
 
 
 def _why_nothing_fits(top: Path) -> str:
-    """Say what a file or folder without a log has instead."""
+    """Say what a file or folder without a log has instead; "" = we do not know."""
     from cflow_torch.data.arrays.cloud_file import SUFFIXES
 
     level, suffixes = [top], Counter()  # type: ignore[var-annotated]
@@ -106,14 +107,14 @@ def _why_nothing_fits(top: Path) -> str:
         suffixes.update(path.suffix.lower() for path in level if path.is_file())
         level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
     if not suffixes:
-        return "it has no files" if top.is_dir() else "no format fits its contents"
+        return "it has no files" if top.is_dir() else ""
     suffix, count = suffixes.most_common(1)[0]
     clouds = [kind for kind in suffixes if kind in SUFFIXES]
     if clouds and all(suffixes[kind] == 1 for kind in clouds):
         return f"it has one point cloud ({clouds[0]}); scene flow needs two sweeps or more of a log in one folder"
     if suffix in _CONVERSIONS:
         return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}"
-    return "no format fits its contents"
+    return ""
 
 
 def _has_logs(name: str, root: Any) -> bool:
