@@ -31,6 +31,9 @@ def test_the_layout_is_recognised(tmp_path, columns: int, kind: str, shuffled: b
     table = street(columns, kind, shuffled=shuffled)
     assert find_bin_layout(table.tobytes()) == BinLayout(columns, kind)
     assert find_bin_layout((table * 1000).tobytes()).columns == columns, "millimetres"
+    few_digits = (np.round(table * 64) / 64).astype(kind)
+    assert find_bin_layout(few_digits.tobytes()) == BinLayout(columns, kind)
+    assert find_bin_layout(table.astype("f4").astype(kind).tobytes()) == BinLayout(columns, kind)
     (tmp_path / "a.bin").write_bytes(table.tobytes())
     found = read_cloud(tmp_path / "a.bin")
     assert found.dtype == np.dtype(kind) and np.array_equal(found, table[:, :3])
