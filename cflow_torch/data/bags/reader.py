@@ -263,6 +263,10 @@ class BagLog(Log):
                 tracks.setdefault(connection.topic, []).append(at)
                 self._child[connection.topic] = getattr(message, "child_frame_id", "").lstrip("/")
         self._frames = Frames(parents, links)
+        return self._arrivals(stamps), tracks
+
+    def _arrivals(self, stamps: list[tuple[int, int]]) -> dict[int, int]:
+        """Return the time of each cloud and its arrival, from header stamps and arrivals. We say if stamps repeat."""
         count = len({stamp for stamp, _ in stamps})
         self._use_arrival = len(stamps) > 1 and count <= max(1, len(stamps) // 10)
         if self._use_arrival:
@@ -273,7 +277,7 @@ class BagLog(Log):
             self._note(
                 f"{repeated} clouds repeat the time stamp of an earlier one and are left out; was it played twice?"
             )
-        return dict(reversed(stamps)), tracks
+        return dict(reversed(stamps))
 
     def _trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:
         """Return (M,) int64 times of transforms or messages, and (M, 4, 4) `T_world_ego` at these times."""
