@@ -145,11 +145,16 @@ def split(arguments: list[str]) -> tuple[list[str], list[str]]:
     for before, word in zip(["", *arguments], arguments):
         if word.startswith("-") or before in _WITH_VALUE:
             options.append(word)
-        elif "=" in word or word[0:1] in ("+", "~"):
+        elif ("=" in word or word[0:1] in ("+", "~")) and not _is_path(word):
             overrides.append(_quoted(word))
         else:
             overrides.append(f"data.root={_text(word)}")
     return overrides, options
+
+
+def _is_path(word: str) -> bool:
+    """Test whether a word with "=" is a path, such as date=2024-01-05/drive, and not a setting."""
+    return word.startswith(("/", "./", "../", "~/")) or os.path.exists(word)
 
 
 def unknown_options(options: list[str]) -> list[str]:

@@ -14,6 +14,7 @@ from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.files import file_errors, read_json, shortened
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
 from cflow_torch.data.pickles import load_array
+from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array
 
@@ -163,7 +164,8 @@ class AevaScenesLog(BoxLog):
 class Cloud:
     """One .npz file in memory; a missing or damaged file or array is a `CFlowError`.
 
-    Attributes: `keys`, the names of its arrays, and `points`, (N, 3) float32 metres in the frame of the LiDAR.
+    Attributes: `keys`, the names of its arrays, and `points`, (N, 3) float32 metres in the frame of the LiDAR; NaN =
+    no return.
     """
 
     def __init__(self, file: Path) -> None:
@@ -174,7 +176,7 @@ class Cloud:
         with file_errors(f"{file}: xyz", _HINT):
             points = self._arrays["xyz"]
             check_array(points, "xyz", (None, 3), "f", "(N, 3) floats, metres")
-        self.points = points.astype(np.float32, copy=False)
+        self.points = np.where(missing_returns(points)[:, None], np.nan, points).astype(np.float32)
 
     def column(self, key: str, dtype: Any) -> np.ndarray:
         """Return one value per point, (N,) of `dtype`; np.str_ gives an object array of strings."""

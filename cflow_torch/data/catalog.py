@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import logging
+from collections import Counter
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Mapping, NamedTuple, Sequence
 
 from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
@@ -50,7 +52,7 @@ DATA_SETS: dict[str, DataSet] = {
     "kitti": DataSet(
         "KITTILog", "drive of KITTI", ("velodyne_points", "velodyne", "velodyne_points/data"), "find_kitti_drives"
     ),
-    "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
+    "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3", "*.bag.active"), "find_bags"),
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
 }
@@ -89,9 +91,38 @@ def recognise(root: Any) -> str:
     if len(found) > 1 or not fitting:  # nuScenes and TruckScenes have the same file names
         found = [name for name in found if _has_logs(name, root)]
     if len(found) != 1:
-        why = f"several formats fit, {' and '.join(found)}" if found else "no format fits its contents"
-        raise CFlowError(f"{root}: {why}; choose one with data={'|'.join(DATA_SETS)}")
+        choose = f"choose one with data={'|'.join(DATA_SETS)}"
+        fits = f"several formats fit, {' and '.join(found)}; {choose}"
+        raise CFlowError(f"{root}: {fits if found else _why_nothing_fits(top) or f'no format fits; {choose}'}")
     return found[0]
+
+
+_CONVERSIONS = {
+    **dict.fromkeys((".las", ".laz"), "convert them with pdal translate IN.las OUT.ply"),
+    **dict.fromkeys((".xyz", ".txt", ".csv", ".asc", ".pts"), "convert them with numpy.save(OUT, numpy.loadtxt(IN))"),
+    **dict.fromkeys((".pcap", ".pcapng"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"),
+    **dict.fromkeys((".e57", ".drc", ".rcp"), "convert them to .ply"),
+    ".tfrecord": "Waymo's version 1 is not read; download version 2",
+}
+
+
+def _why_nothing_fits(top: Path) -> str:
+    """Say what a file or folder without a log has instead; "" = we do not know."""
+    from cflow_torch.data.arrays.cloud_file import SUFFIXES
+
+    level, suffixes = [top], Counter()  # type: ignore[var-annotated]
+    for _ in range(_DEEPEST):
+        suffixes.update(path.suffix.lower() for path in level if path.is_file())
+        level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+    if not suffixes:
+        return "it has no files" if top.is_dir() else ""
+    suffix, count = suffixes.most_common(1)[0]
+    clouds = [kind for kind in suffixes if kind in SUFFIXES]
+    if clouds and all(suffixes[kind] == 1 for kind in clouds):
+        return f"it has one point cloud ({clouds[0]}); scene flow needs two sweeps or more of a log in one folder"
+    if suffix in _CONVERSIONS:
+        return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}"
+    return ""
 
 
 def _has_logs(name: str, root: Any) -> bool:
