@@ -12,11 +12,12 @@ from cflow_torch.data.files import find_folders, shortened
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
+from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
 
-_OF_ALL = ("find_ground", "odometry", "check")  # settings of every data set
+_OF_ALL = ("find_ground", "odometry", "read_as", "check")  # settings of every data set
 AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
@@ -143,7 +144,13 @@ def find_sources(name: str, root: Any) -> Sequence[Any]:
 
 
 def open_log(
-    name: str, source: Any, find_ground: Any = "auto", odometry: bool = False, check: bool = True, **settings: Any
+    name: str,
+    source: Any,
+    find_ground: Any = "auto",
+    odometry: bool = False,
+    check: bool = True,
+    read_as: str | None = "auto",
+    **settings: Any,
 ) -> Log:
     """Open one log.
 
@@ -154,6 +161,7 @@ def open_log(
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
+        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`.
         **settings: keyword arguments of the reader.
 
     Raises:
@@ -170,6 +178,7 @@ def open_log(
         from cflow_torch.data.odometry import with_poses
 
         log = with_poses(log)
+    log = read_log_as(log, read_as)
     if find_ground is not None:
         log = GroundSegmentedLog(log, find_ground)
     if check:

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from cflow_torch.data.rigid_motion import transform_points
-from cflow_torch.data.stillness import REACH, share_in_place, static_rows, thinned_rows
 from cflow_torch.types import Sweep
+from cflow_torch.windows.stillness import REACH, share_in_place, static_rows, thinned_rows
 
 
 def test_the_share_equals_that_of_all_pairwise_distances():
