@@ -47,9 +47,9 @@ class Inspection:
         self._has_seen_points = self._has_seen_structure = False
 
     def __call__(self, windows: Sequence[Window]) -> None:
-        for window in windows:
-            if repeats(window.pc0, window.pc1):
-                warn(REPEATED)
+        is_repeated = [repeats(window.pc0, window.pc1) for window in windows]
+        for _ in filter(None, is_repeated):
+            warn(REPEATED)
         if not windows or len(windows[0].pc0.points) == 0:
             return
         first = windows[0]
@@ -60,7 +60,7 @@ class Inspection:
                 warn(problem)
             elif first.pc0.is_ground is None and has_ground(first.pc0.points):
                 warn(_GROUND)
-        if not self._has_seen_structure:
+        if not self._has_seen_structure and not is_repeated[0]:
             judgement = judge([make_pair(first.pc0, first.pc1)])
             self._has_seen_structure = bool(judgement.shares)
             if judgement.best:

@@ -48,6 +48,10 @@ AXES = {
     "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
     "upside_down": np.diag([1.0, -1.0, -1.0]),
 }
+# The search for an unknown motion correlates occupied cells of a square.
+_CELL, _CELLS = 0.1, 640  # metres, and cells along a side
+_TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4])
+_FARTHEST_SHIFT = 5.0  # metres
 # What each reading says. The settings are values of `read_as` in `cflow_torch.data.catalog.open_log`.
 CAUSES = {
     WORLD: "the points are in the world's frame",
@@ -151,9 +155,10 @@ def _transforms(
         if difference(T, shifted) >= _LEAST_MOTION:
             found[name] = shifted
     for name in (CAMERA, "left", "back", "right"):
-        found[name] = as_matrix(AXES[name]) @ T @ np.linalg.inv(as_matrix(AXES[name]))
-    for name, unit in _UNITS.items() if np.linalg.norm(T[:3, 3]) >= _LEAST_SCALED else ():
-        found[name] = np.block([[T[:3, :3], T[:3, 3:] * unit], [T[3:]]])
+        axes = as_matrix(AXES[name])
+        found[name] = axes @ T @ axes.T
+    if np.linalg.norm(T[:3, 3]) >= _LEAST_SCALED:
+        found.update({name: as_matrix(T[:3, :3], unit * T[:3, 3]) for name, unit in _UNITS.items()})
     if turn_of(T) >= _LEAST_TURN:
         for x in _MOUNTS:
             mount = as_matrix(np.eye(3), (x, 0, 0))
@@ -175,27 +180,28 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
 
 
 def _judge(pairs: Sequence[Pair]) -> Judgement:
-    shares: dict[str, list[float]] = {}
-    given: dict[str, list[float]] = {}  # the share as given of the pairs that have the reading
-    for pair in pairs:
-        of_pair = _shares(pair)
-        for name, share in of_pair.items():
-            shares.setdefault(name, []).append(share)
-            given.setdefault(name, []).append(of_pair[GIVEN])
-    mean = {name: float(np.mean(values)) for name, values in shares.items()}
-    # A reading counts with the pairs that have it: only a turn shows another mounting.
-    gain = {name: mean[name] / max(float(np.mean(given[name])), 1e-3) for name in mean}
-    clear = [name for name in mean if name != GIVEN and mean[name] >= _LEAST_SHARE and gain[name] > _margin(name)]
-    clear = [name for name in clear if all(s > g for s, g in zip(shares[name], given[name]))]
+    """Compare the readings of pairs whose poses differ."""
+    of_pairs = [_shares(pair) for pair in pairs]
+    names = list(dict.fromkeys(name for shares in of_pairs for name in shares))
+    mean: dict[str, float] = {}
+    clear = []  # readings that fit clearly better in the pairs that show them: only a turn shows another mounting
+    for name in names:
+        shown = [shares for shares in of_pairs if name in shares]
+        mean[name] = float(np.mean([shares[name] for shares in shown]))
+        given = float(np.mean([shares[GIVEN] for shares in shown]))
+        is_always_better = all(shares[name] > shares[GIVEN] for shares in shown)
+        if is_always_better and mean[name] > max(_margin(name) * given, _LEAST_SHARE):
+            clear.append(name)
+    if any(len(shares) == 1 for shares in of_pairs):  # as given is certain there, so what all pairs show is refuted
+        clear = [name for name in clear if name in (LATE, EARLY) or name.startswith(MOUNT)]
     if not clear:
         return Judgement(mean, (NO_READING,) if mean[GIVEN] < _HOPELESS else ())
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return Judgement(mean, (WORLD,))
-    winner = max(clear, key=mean.__getitem__)
-    equal = [name for name in mean if name in clear and mean[name] >= _EQUAL * mean[winner]]
-    if any(name.startswith(MOUNT) for name in equal):  # neighbouring positions are nearly equal: the best one counts
-        mount = max((name for name in equal if name.startswith(MOUNT)), key=mean.__getitem__)
-        return Judgement({**mean, MOUNT: mean[mount]}, (MOUNT,), float(mount.split()[-1]))
+    best = max(clear, key=mean.__getitem__)
+    if best.startswith(MOUNT):
+        return Judgement({**mean, MOUNT: mean[best]}, (MOUNT,), float(best.split()[-1]))
+    equal = [name for name in clear if mean[name] >= _EQUAL * mean[best] and not name.startswith(MOUNT)]
     return Judgement(mean, tuple(equal))
 
 
@@ -225,29 +231,23 @@ def _search(pair: Pair) -> Judgement:
     return Judgement(shares, (UNKNOWN,) if is_better else (), motion=motion)
 
 
-_CELL, _CELLS = 0.1, 640  # metres, and cells of the square in which the sweeps are correlated
-_TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4])
-_FARTHEST_SHIFT = 5.0  # metres
-
-
 def find_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Find the rotation and shift in the plane that brings most points of the source into cells of the target.
 
     Both are (N, 3) float64, metres. Return (4, 4) float64. Each rotation costs one correlation by FFT, 10 ms.
     """
-    width = _CELLS // 2 + 1
     image = np.fft.rfft2(_image(target, 1))
-    best, found = -1.0, np.eye(4)
     reach = int(_FARTHEST_SHIFT / _CELL)
     steps = np.r_[0 : reach + 1, -reach:0]
+    most, found = -1.0, np.eye(4)
     for turn in _TURNS:
         T = as_matrix(rotation_about_z(turn))
-        counts = np.fft.irfft2(image * np.conj(np.fft.rfft2(_image(source @ T[:3, :3].T, 0)))[:, :width], (_CELLS,) * 2)
-        near = counts[np.ix_(steps, steps)]
-        row, col = np.unravel_index(int(near.argmax()), near.shape)
-        if near[row, col] > best + 0.5:
-            best = float(near[row, col])
-            T[:2, 3] = steps[row] * _CELL, steps[col] * _CELL
+        turned = np.fft.rfft2(_image(source @ T[:3, :3].T, 0))
+        counts = np.fft.irfft2(image * np.conj(turned), (_CELLS, _CELLS))[np.ix_(steps, steps)]
+        row, column = np.unravel_index(int(counts.argmax()), counts.shape)
+        if counts[row, column] > most + 0.5:  # counts are whole but for rounding; ties: the first
+            most = float(counts[row, column])
+            T[:2, 3] = _CELL * steps[row], _CELL * steps[column]
             found = T
     return found
 
