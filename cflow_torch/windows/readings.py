@@ -206,7 +206,7 @@ def _judge(pairs: Sequence[Pair]) -> Judgement:
 
 
 def _shares(pair: Pair) -> dict[str, float]:
-    """Return the share of structure in place under each reading, from few points where it is no better than given."""
+    """Return the share of structure in place under each reading; from few points, unless it is about as good as given."""
     target = Structure(pair.target)
     few = pair.source[:_FEW_POINTS]
     given = target.share(few, pair.transforms[GIVEN])
