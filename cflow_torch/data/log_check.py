@@ -118,7 +118,7 @@ def _motion_of(log: Log, count: int) -> Finding | None:
     elif name == MOUNT:
         why, fix = "in turns,", f"pass data.ego_T_lidar with about x = {judgement.offset:g} m (data=arrays or hdf5)"
     elif name == NO_READING:
-        why, fix = "under no reading of the poses", "check that the poses belong to this log, their times and units"
+        why, fix = "", "check that the poses belong to this log, their times and units"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(f"data.read_as={each}" for each in judgement.best)
@@ -131,7 +131,7 @@ def _lapses(log: Log) -> Finding | None:
     if not lapses:
         return None
     texts = [
-        f"the pose of sweep {each.sweep} is {each.metres:.1f} m off"
+        f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
         if each.is_single
         else f"the poses jump by {each.metres:.1f} m before sweep {each.sweep}"
         for each in lapses

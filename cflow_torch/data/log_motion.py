@@ -8,7 +8,7 @@ import numpy as np
 
 from cflow_torch.data.log import Log
 from cflow_torch.errors import CFlowError
-from cflow_torch.windows.readings import WORLD, Judgement, difference, is_around, judge, make_pair, turn_of
+from cflow_torch.windows.readings import CERTAIN, WORLD, Judgement, difference, is_around, judge, make_pair, turn_of
 from cflow_torch.windows.stillness import Structure
 
 _LONGEST_STEP, _MOST_SWEEPS = 3.2, 5  # metres and sweeps between the two sweeps of a pair
@@ -77,6 +77,13 @@ def _change(poses: np.ndarray, first: int, second: int, step: int) -> float:
 def judge_log(log: Log, count: int = 3) -> Judgement:
     """Compare the readings of the poses of a log over `count` pairs. Cost: reads two sweeps per pair, 0.1 s each."""
     poses = known_poses(log)
+    judgement = _judge_pairs(log, poses, count)
+    if poses is not None and not judgement.has_motion and judgement.given < CERTAIN and not judgement.best:
+        return _judge_pairs(log, None, count)  # the sensor may move although the poses do not: neighbouring sweeps
+    return judgement
+
+
+def _judge_pairs(log: Log, poses: np.ndarray | None, count: int) -> Judgement:
     in_world = None if poses is None else _surrounds_poses(log, poses)
     pairs = []
     for first, second in choose_pairs(len(log.timestamps), poses, count):

@@ -22,7 +22,7 @@ MOUNT, UNKNOWN, NO_READING = "mount", "unknown", "none"
 # Points of the source. All readings are compared by the first few, those that are about as good as given by more.
 _FEW_POINTS, _MOST_POINTS = 300, 1500
 _NEAR_GIVEN = 0.95  # share of a reading over that as given
-_CERTAIN = 0.6  # share as given; other readings are not compared
+CERTAIN = 0.6  # share as given; other readings are not compared
 _FEWEST_POINTS = 150  # of source and target; fewer do not show anything
 # A sweep shows only readings that move points 20 m away by at least this.
 _LEAST_MOTION, _ARM = 0.2, 20.0  # metres
@@ -90,6 +90,7 @@ class Judgement:
     best: tuple[str, ...] = ()  # readings that fit clearly better than as given; equal ones together
     offset: float = 0.0  # metres, of `MOUNT`: x of the LiDAR in the frame of the poses
     motion: np.ndarray | None = None  # of `UNKNOWN`: T_target_source of the first pair
+    has_motion: bool = True  # False: the poses of no pair differ, so only an unknown motion can be found
 
     @property
     def given(self) -> float:
@@ -103,7 +104,7 @@ class Judgement:
         name = self.best[0]
         share = f"({self.given:.2f} of the static structure is in place as given, {self.shares.get(name, 0):.2f} then)"
         if name == NO_READING:
-            return f"the sweeps do not fit: only {self.given:.2f} of the static structure is in place under the poses"
+            return f"the sweeps fit under no reading of the poses (only {self.given:.2f} of the structure is in place)"
         if name == UNKNOWN:
             x, y, _ = (0.0, 0.0, 0.0) if self.motion is None else self.motion[:3, 3]
             return f"the sensor moves by about {np.hypot(x, y):.1f} m between two sweeps {share}"
@@ -206,11 +207,11 @@ def _judge(pairs: Sequence[Pair]) -> Judgement:
 
 
 def _shares(pair: Pair) -> dict[str, float]:
-    """Return the share of structure in place under each reading; from few points, unless it is about as good as given."""
+    """Return the share of structure in place under each reading, from few points if it is worse than given."""
     target = Structure(pair.target)
     few = pair.source[:_FEW_POINTS]
     given = target.share(few, pair.transforms[GIVEN])
-    if given >= _CERTAIN:
+    if given >= CERTAIN:
         return {GIVEN: given}
     shares = {name: target.share(few, T) for name, T in pair.transforms.items()}
     rivals = [name for name, share in shares.items() if share >= _NEAR_GIVEN * shares[GIVEN]]
@@ -224,11 +225,11 @@ def _search(pair: Pair) -> Judgement:
     target = Structure(pair.target)
     given = target.share(pair.source, pair.transforms[GIVEN])
     if given * _margin(UNKNOWN) >= 1:
-        return Judgement({GIVEN: given})
+        return Judgement({GIVEN: given}, has_motion=False)
     motion = find_motion(pair.source, pair.target)
     shares = {GIVEN: given, UNKNOWN: target.share(pair.source, motion)}
     is_better = shares[UNKNOWN] > max(_margin(UNKNOWN) * given, _LEAST_SHARE)
-    return Judgement(shares, (UNKNOWN,) if is_better else (), motion=motion)
+    return Judgement(shares, (UNKNOWN,) if is_better else (), motion=motion, has_motion=False)
 
 
 def find_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
