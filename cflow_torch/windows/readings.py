@@ -24,6 +24,7 @@ _FEW_POINTS, _MOST_POINTS = 300, 1500
 _NEAR_GIVEN = 0.95  # share of a reading over that as given
 CERTAIN = 0.6  # share as given; other readings are not compared
 _FEWEST_POINTS = 150  # of source and target; fewer do not show anything
+_BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
 # A sweep shows only readings that move points 20 m away by at least this.
 _LEAST_MOTION, _ARM = 0.2, 20.0  # metres
 # The best share must exceed the share as given by this factor, and be at least `_LEAST_SHARE`. Right poses gave at most
@@ -134,7 +135,7 @@ def make_pair(
         in_world = has_poses and is_around(pc1.points, pose1)
     centre = pose1[:3, 3] if in_world else np.zeros(3)
     source, target = (_structure(each, centre) for each in (pc0, pc1))
-    if min(len(source), len(target)) < _FEWEST_POINTS:
+    if min(len(source), len(target)) < _FEWEST_POINTS or _num_blocks(source) < _FEWEST_BLOCKS:
         return None
     source = source[thinned_rows(source)]
     source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
@@ -326,6 +327,11 @@ def _structure(sweep: Sweep, centre: np.ndarray) -> np.ndarray:
     height = points[order, 2]
     is_tall = height[start + count - 1] - height[start] >= _TALL
     return points[np.sort(order[np.repeat(is_tall, count)])]
+
+
+def _num_blocks(points: np.ndarray) -> int:
+    """Return how many blocks of 5 m in the plane hold points."""
+    return len(np.unique(np.floor(points[:, :2] / _BLOCK), axis=0))
 
 
 def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:
