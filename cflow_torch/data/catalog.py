@@ -16,11 +16,12 @@ from cflow_torch.data.files import find_folders, shortened
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
+from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
 
-_OF_ALL = ("find_ground", "odometry", "deskew", "check")  # settings of every data set
+_OF_ALL = ("find_ground", "odometry", "read_as", "deskew", "check")  # settings of every data set
 AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
@@ -188,6 +189,7 @@ def open_log(
     odometry: bool = False,
     check: bool = True,
     deskew: Any = "auto",
+    read_as: str | None = "auto",
     **settings: Any,
 ) -> Log:
     """Open one log.
@@ -199,6 +201,7 @@ def open_log(
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
+        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`.
         deskew: how to move points to the instant of their sweep, see `cflow_torch.data.deskewing.DeskewedLog`; False
             (what `off` means in YAML) = "off", True = "auto".
         **settings: keyword arguments of the reader.
@@ -226,6 +229,7 @@ def open_log(
         from cflow_torch.data.odometry import with_poses
 
         log = with_poses(log)
+    log = read_log_as(log, read_as)
     if deskew != "off":
         log = DeskewedLog(log, deskew)
     if find_ground is not None:

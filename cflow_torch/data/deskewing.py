@@ -10,10 +10,10 @@ import numpy as np
 
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
 from cflow_torch.data.rigid_motion import transform_points
-from cflow_torch.data.stillness import share_in_place, static_rows, thinned_rows
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS, deskew_points, scan_fractions
 from cflow_torch.windows.ego_motion import relative_transform
+from cflow_torch.windows.stillness import share_in_place, static_rows, thinned_rows
 
 CHOICES = ("auto", "times", "off", *SCANS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static

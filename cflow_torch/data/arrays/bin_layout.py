@@ -49,7 +49,7 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
     """
     kinds = [kind for kind in _TYPES if are_plausible(_numbers(content, kind))]
     is_zero = _numbers(content, "<f4") == 0
-    if kinds == list(_TYPES) and is_zero[::2].mean() > _SHARE and is_zero[1::2].mean() < 0.5:
+    if kinds == list(_TYPES) and len(is_zero) > 1 and is_zero[::2].mean() > _SHARE and is_zero[1::2].mean() < 0.5:
         kinds = ["<f8"]  # the lower halves of float64 numbers with few digits are zeros
     if columns is not None:
         return BinLayout(columns, "<f8" if kinds == ["<f8"] and len(content) % (8 * columns) == 0 else "<f4")

@@ -19,9 +19,9 @@ from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, r
 from cflow_torch.data.point_times import TIME_FIELDS, PointTimes, seconds_after
 from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
-from cflow_torch.data.stillness import share_in_place, static_rows, thinned_rows
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
+from cflow_torch.windows.stillness import share_in_place, static_rows, thinned_rows
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds")  # where the clouds may lie below the log's folder
 POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.ground import find_ground
 
@@ -57,26 +56,37 @@ def share_in_place(source: np.ndarray, target: np.ndarray, T_target_source: np.n
 
     Cost: 0.1 s for 20,000 source and 20,000 target points.
     """
-    if len(source) == 0:
-        return float("nan")
-    moved = np.clip(transform_points(source, T_target_source), -_MOST, _MOST)
-    points = np.clip(np.asarray(target, np.float64), -_MOST, _MOST)
-    keys = _keys(np.floor(points / REACH).astype(np.int64))
-    order = np.argsort(keys, kind="stable")
-    points, keys = points[order], keys[order]
-    in_place = np.zeros(len(moved), bool)
-    cell = np.floor(moved / REACH).astype(np.int64)
-    order = np.argsort(_keys(cell))  # the searches below are several times faster in this order
-    moved, cell = moved[order], cell[order]
-    for offset in _OFFSETS:  # z varies fastest in a key: the three cells above one another are one range of keys
-        lowest = _keys(cell + (*offset, -1))
-        start = np.searchsorted(keys, lowest, "left")
-        count = np.searchsorted(keys, lowest + 2, "right") - start
-        row = np.repeat(np.arange(len(moved)), count)
-        neighbour = np.arange(len(row)) + np.repeat(start - np.cumsum(count) + count, count)
-        distance = np.linalg.norm(moved[row] - points[neighbour], axis=1)
-        in_place[row[distance <= REACH]] = True
-    return float(in_place.mean())
+    return Structure(target).share(source, T_target_source)
+
+
+class Structure:
+    """The structure of a sweep, (M, 3) float, metres, sorted once to be compared under many transforms."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        points = np.clip(np.asarray(points, np.float64), -_MOST, _MOST)
+        keys = _keys(np.floor(points / REACH).astype(np.int64))
+        order = np.argsort(keys, kind="stable")
+        self._points, self._sorted = points[order], keys[order]
+
+    def share(self, source: np.ndarray, T_target_source: np.ndarray) -> float:
+        """Return the share of `source` in place, see `share_in_place`. Cost: 6 ms for 1500 source points."""
+        if len(source) == 0:
+            return float("nan")
+        moved = np.asarray(source, np.float64) @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+        moved = np.clip(moved, -_MOST, _MOST)
+        in_place = np.zeros(len(moved), bool)
+        cell = np.floor(moved / REACH).astype(np.int64)
+        order = np.argsort(_keys(cell))  # the searches below are several times faster in this order
+        moved, cell = moved[order], cell[order]
+        for offset in _OFFSETS:  # z varies fastest in a key: the three cells above one another are one range of keys
+            lowest = _keys(cell + (*offset, -1))
+            start = np.searchsorted(self._sorted, lowest, "left")
+            count = np.searchsorted(self._sorted, lowest + 2, "right") - start
+            row = np.repeat(np.arange(len(moved)), count)
+            neighbour = np.arange(len(row)) + np.repeat(start - np.cumsum(count) + count, count)
+            distance = np.linalg.norm(moved[row] - self._points[neighbour], axis=1)
+            in_place[row[distance <= REACH]] = True
+        return float(in_place.mean())
 
 
 def _keys(cell: np.ndarray) -> np.ndarray:
