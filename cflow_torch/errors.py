@@ -17,6 +17,10 @@ class CFlowError(ValueError):
     """
 
 
+class MissingFile(CFlowError):
+    """A file of a sweep does not exist. Windows that need it only as history or future are shorter."""
+
+
 class CFlowWarning(UserWarning):
     """Input that is allowed, but likely a mistake."""
 

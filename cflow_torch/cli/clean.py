@@ -24,7 +24,8 @@ from omegaconf import DictConfig
 from cflow_torch.applications.cleaning import CleanLog, static_map
 from cflow_torch.cli import run
 from cflow_torch.data.arrays import ArraysLog, write_array_log
-from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, write_cloud
+from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.bev import plot_map, save_picture
 

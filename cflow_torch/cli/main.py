@@ -15,6 +15,7 @@ from cflow_torch import __version__
 
 COMMANDS = {
     "demo": "simulate a drive, estimate its flow, score it and draw it",
+    "check": "say what is right and what is wrong in your data, and how to fix it",
     "flow": "estimate the flow of every pair of sweeps: resumable, parallel, on many machines",
     "label": "write pseudo-labels for self-supervised training into OpenSceneFlow's scenes",
     "eval": "estimate and score all labelled pairs of a data set",
@@ -44,6 +45,7 @@ usage: cflow COMMAND [SETTING=VALUE ...]
 
 first steps:
   cflow demo                    simulate a street and show its flow: outputs/demo/flow.html
+  cflow check /data/my_drive    check your data: frames, poses, times, ground
   cflow flow /data/av2/val      estimate the flow of your data, one file per pair of sweeps
   cflow eval /data/av2/val      score the flow, if the data has labels
 
@@ -90,6 +92,8 @@ def _run(arguments: list[str]) -> None:
     has_settings = command not in _WITHOUT_SETTINGS
     if "-h" in rest or "--help" in rest:
         return print(_help(command, has_settings), end="")
+    if command == "check":
+        return _run_for_each_path(command, rest)
     if has_settings:
         return _run_with_settings(command, rest)
     try:
@@ -105,6 +109,23 @@ def _help(command: str, has_settings: bool) -> str:
     spec: Any = find_spec(f"cflow_torch.cli.{command}")
     text = ast.get_docstring(ast.parse(spec.loader.get_source(spec.name)))
     return f"cflow {command}: {COMMANDS[command]}\n\n{text}\n{settings_help(command) if has_settings else ''}"
+
+
+def _run_for_each_path(command: str, rest: list[str]) -> None:
+    """Run a command once for each path among its arguments; exit with the largest status."""
+    overrides, options = split(rest)
+    paths = [word for word in overrides if word.startswith("data.root=")] or [""]
+    others = [word for word in overrides if word not in paths]
+    status = 0
+    for path in paths:
+        try:
+            _run_with_settings(command, [*filter(None, [path]), *others, *options])
+        except SystemExit as end:
+            if len(paths) == 1:
+                raise
+            status = max(status, int(end.code or 0))
+    if status:
+        raise SystemExit(status)
 
 
 def _run_with_settings(command: str, rest: list[str]) -> None:
@@ -145,11 +166,16 @@ def split(arguments: list[str]) -> tuple[list[str], list[str]]:
     for before, word in zip(["", *arguments], arguments):
         if word.startswith("-") or before in _WITH_VALUE:
             options.append(word)
-        elif "=" in word or word[0:1] in ("+", "~"):
+        elif ("=" in word or word[0:1] in ("+", "~")) and not _is_path(word):
             overrides.append(_quoted(word))
         else:
             overrides.append(f"data.root={_text(word)}")
     return overrides, options
+
+
+def _is_path(word: str) -> bool:
+    """Test whether a word with "=" is a path, such as date=2024-01-05/drive, and not a setting."""
+    return word.startswith(("/", "./", "../", "~/")) or os.path.exists(word)
 
 
 def unknown_options(options: list[str]) -> list[str]:
@@ -191,7 +217,7 @@ def _run_job(command: str, cfg: Any) -> Any:
         from cflow_torch.fleet.progress import show_warnings_as_lines
 
         show_warnings_as_lines()
-        cfg.data = complete_data(cfg.data)
+        cfg.data = complete_data(cfg.data, sys.stderr if cfg.get("json") else sys.stdout)
         return import_module(f"cflow_torch.cli.{command}").task(cfg)
     except UnfinishedJob:
         raise

@@ -7,7 +7,7 @@ import platform
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Callable, Iterator, List, NamedTuple, Sequence, Tuple
+from typing import Any, Callable, Iterator, List, NamedTuple, Sequence, TextIO, Tuple
 
 import numpy as np
 import torch
@@ -89,8 +89,9 @@ def local_folder(cfg: DictConfig) -> Path:
     return output
 
 
-def complete_data(data: DictConfig) -> DictConfig:
-    """Replace data=auto by the settings of the recognised format, and print it; add defaults for your own reader."""
+def complete_data(data: DictConfig, out: TextIO | None = None) -> DictConfig:
+    """Replace data=auto by the settings of the recognised format, and print it to `out` (stdout); add defaults for
+    your own reader."""
     if "_target_" in data:
         defaults = {"label": HydraConfig.get().runtime.choices["data"], "first": 0, "step": 1}
         return OmegaConf.merge(defaults, data)  # type: ignore[return-value]
@@ -99,7 +100,7 @@ def complete_data(data: DictConfig) -> DictConfig:
     name = "synthetic"
     if data.root is not None:
         name = recognise(data.root)
-        print(f"{data.root}: data={name}")
+        print(f"{data.root}: data={name}", file=out or sys.stdout)
     settings = OmegaConf.load(CONFIGS / "data" / f"{name}.yaml")
     others = own_settings(CONFIGS / "data" / f"{AUTO}.yaml").keys() - set(settings)
     given = {key: value for key, value in data.items() if key not in others}

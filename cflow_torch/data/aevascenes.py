@@ -14,6 +14,7 @@ from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.files import file_errors, read_json, shortened
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
 from cflow_torch.data.pickles import load_array
+from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array
 
@@ -78,6 +79,7 @@ class AevaScenesLog(BoxLog):
         if clouds not in _PATHS:
             raise CFlowError(f"clouds={clouds!r}: choose one of {', '.join(_PATHS)}")
         self._clouds, self._ground = clouds, ground
+        self.is_compensated = clouds != "raw"
         self._clouds_of = lru_cache(1)(self._open_clouds)  # we read several arrays of the same clouds
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _HINT):
@@ -94,6 +96,11 @@ class AevaScenesLog(BoxLog):
             self._mounts = self._poses_of([mounts[name] for name in self.lidars], "extrinsics")
             self._poses = self._poses_of([frame["ego_pose"] for frame in self._frames], "ego poses")
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(K, 4, 4) float64 `T_world_ego` of every sweep."""
+        return self._poses
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`. If a cloud lacks class names, the mask is None; if a cloud lacks times, the times are."""
@@ -157,7 +164,8 @@ class AevaScenesLog(BoxLog):
 class Cloud:
     """One .npz file in memory; a missing or damaged file or array is a `CFlowError`.
 
-    Attributes: `keys`, the names of its arrays, and `points`, (N, 3) float32 metres in the frame of the LiDAR.
+    Attributes: `keys`, the names of its arrays, and `points`, (N, 3) float32 metres in the frame of the LiDAR; NaN =
+    no return.
     """
 
     def __init__(self, file: Path) -> None:
@@ -168,7 +176,7 @@ class Cloud:
         with file_errors(f"{file}: xyz", _HINT):
             points = self._arrays["xyz"]
             check_array(points, "xyz", (None, 3), "f", "(N, 3) floats, metres")
-        self.points = points.astype(np.float32, copy=False)
+        self.points = np.where(missing_returns(points)[:, None], np.nan, points).astype(np.float32)
 
     def column(self, key: str, dtype: Any) -> np.ndarray:
         """Return one value per point, (N,) of `dtype`; np.str_ gives an object array of strings."""

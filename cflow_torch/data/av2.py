@@ -93,6 +93,8 @@ class AV2Log(BoxLog):
           `annotations.feather`, for pairs inside the annotated time. Boxes without points are dropped, as in av2-api.
     """
 
+    is_compensated: bool = True
+
     def __init__(self, folder: PathLike, ground: str | None = "av2-api") -> None:
         self.folder = as_path(folder)
         sweeps = self.folder / "sensors" / "lidar"

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import inspect
 import logging
+from collections import Counter
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Mapping, NamedTuple, Sequence
 
+from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
+from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.files import find_folders, shortened
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
+from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
 
-_OF_ALL = ("find_ground", "odometry", "check")  # settings of every data set
+_OF_ALL = ("find_ground", "odometry", "read_as", "deskew", "check")  # settings of every data set
 AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
@@ -44,7 +49,11 @@ DATA_SETS: dict[str, DataSet] = {
     "waymo": DataSet("WaymoLog", "Waymo segment", ("lidar/*.parquet",), "find_waymo_segments"),
     "pandaset": DataSet("PandaSetLog", "PandaSet sequence", ("lidar/poses.json",), depth=2),
     "aevascenes": DataSet("AevaScenesLog", "AevaScenes sequence", ("sequence.json",), depth=3),
-    "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3"), "find_bags"),
+    # Folders velodyne with other files than KITTI's are folders of point clouds, see `recognise`.
+    "kitti": DataSet(
+        "KITTILog", "drive of KITTI", ("velodyne_points", "velodyne", "velodyne_points/data"), "find_kitti_drives"
+    ),
+    "bags": DataSet("BagLog", "bag", ("*.bag", "*.mcap", "*.db3", "*.bag.active"), "find_bags"),
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
 }
@@ -77,13 +86,44 @@ def recognise(root: Any) -> str:
             if fitting:
                 break
             level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+    if fitting == {"kitti"} and not _has_logs("kitti", root):
+        fitting = set()
     found = [name for name in DATA_SETS if name in fitting] or ["arrays"]
     if len(found) > 1 or not fitting:  # nuScenes and TruckScenes have the same file names
         found = [name for name in found if _has_logs(name, root)]
     if len(found) != 1:
-        why = f"several formats fit, {' and '.join(found)}" if found else "no format fits its contents"
-        raise CFlowError(f"{root}: {why}; choose one with data={'|'.join(DATA_SETS)}")
+        choose = f"choose one with data={'|'.join(DATA_SETS)}"
+        fits = f"several formats fit, {' and '.join(found)}; {choose}"
+        raise CFlowError(f"{root}: {fits if found else _why_nothing_fits(top) or f'no format fits; {choose}'}")
     return found[0]
+
+
+_CONVERSIONS = {
+    **dict.fromkeys((".las", ".laz"), "convert them with pdal translate IN.las OUT.ply"),
+    **dict.fromkeys((".xyz", ".txt", ".csv", ".asc", ".pts"), "convert them with numpy.save(OUT, numpy.loadtxt(IN))"),
+    **dict.fromkeys((".pcap", ".pcapng"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"),
+    **dict.fromkeys((".e57", ".drc", ".rcp"), "convert them to .ply"),
+    ".tfrecord": "Waymo's version 1 is not read; download version 2",
+}
+
+
+def _why_nothing_fits(top: Path) -> str:
+    """Say what a file or folder without a log has instead; "" = we do not know."""
+    from cflow_torch.data.arrays.cloud_file import SUFFIXES
+
+    level, suffixes = [top], Counter()  # type: ignore[var-annotated]
+    for _ in range(_DEEPEST):
+        suffixes.update(path.suffix.lower() for path in level if path.is_file())
+        level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+    if not suffixes:
+        return "it has no files" if top.is_dir() else ""
+    suffix, count = suffixes.most_common(1)[0]
+    clouds = [kind for kind in suffixes if kind in SUFFIXES]
+    if clouds and all(suffixes[kind] == 1 for kind in clouds):
+        return f"it has one point cloud ({clouds[0]}); scene flow needs two sweeps or more of a log in one folder"
+    if suffix in _CONVERSIONS:
+        return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}"
+    return ""
 
 
 def _has_logs(name: str, root: Any) -> bool:
@@ -143,7 +183,14 @@ def find_sources(name: str, root: Any) -> Sequence[Any]:
 
 
 def open_log(
-    name: str, source: Any, find_ground: Any = "auto", odometry: bool = False, check: bool = True, **settings: Any
+    name: str,
+    source: Any,
+    find_ground: Any = "auto",
+    odometry: bool = False,
+    check: bool = True,
+    deskew: Any = "auto",
+    read_as: str | None = "auto",
+    **settings: Any,
 ) -> Log:
     """Open one log.
 
@@ -154,6 +201,9 @@ def open_log(
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
+        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`.
+        deskew: how to move points to the instant of their sweep, see `cflow_torch.data.deskewing.DeskewedLog`; False
+            (what `off` means in YAML) = "off", True = "auto".
         **settings: keyword arguments of the reader.
 
     Raises:
@@ -162,14 +212,26 @@ def open_log(
     """
     if find_ground not in CHOICES:
         raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")
+    if isinstance(deskew, bool):
+        deskew = "auto" if deskew else "off"
+    if deskew not in DESKEW_CHOICES:
+        raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
-    log = _user_logs(name, settings)[source.number] if isinstance(source, UserSource) else _open(name, source, settings)
+    if isinstance(source, UserSource):
+        log = _user_logs(name, settings)[source.number]
+    else:
+        _, reader = _reader(name)
+        moves = "deskew" in inspect.signature(reader.__init__).parameters  # by more poses than one per sweep
+        log = _open(name, source, {**settings, "deskew": deskew in ("auto", "times")} if moves else settings)
     safe_name(log.log_id, f"{source}: the log")  # names the folder of its results
     if odometry:
         from cflow_torch.data.odometry import with_poses
 
         log = with_poses(log)
+    log = read_log_as(log, read_as)
+    if deskew != "off":
+        log = DeskewedLog(log, deskew)
     if find_ground is not None:
         log = GroundSegmentedLog(log, find_ground)
     if check:

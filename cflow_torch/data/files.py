@@ -13,7 +13,7 @@ import numpy as np
 
 from cflow_torch.data.atomic import write_text
 from cflow_torch.data.paths import PathLike, read_bytes
-from cflow_torch.errors import CFlowError
+from cflow_torch.errors import CFlowError, MissingFile
 
 Test = Callable[[Path], bool]
 _SHOWN = 5  # changed settings that a message lists
@@ -34,7 +34,7 @@ def file_errors(file: Any, hint: str = "copy it again", doing: str = "read") -> 
             raise
         raise CFlowError(f"{file}: {error}") from error
     except FileNotFoundError:
-        raise CFlowError(f"{file} is missing; {hint}") from None
+        raise MissingFile(f"{file} is missing; {hint}") from None
     except Exception as error:
         cause = f"{type(error).__name__}: {shortened(error)}"
         guess = "it may be truncated or damaged, " if doing == "read" else ""
@@ -55,6 +55,12 @@ def check_columns(file: Any, names: Sequence[str], columns: Sequence[str], hint:
     repeated = [name for name in columns if names.count(name) > 1]
     if repeated:
         raise CFlowError(f"{file} has several columns {repeated}; keep one of each")
+
+
+def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
+    """Number the repetitions of a name: intensity, intensity_2. The name of `padding` stays."""
+    counts = [list(names[:k]).count(name) for k, name in enumerate(names, 1)]
+    return [name if count == 1 or name == padding else f"{name}_{count}" for name, count in zip(names, counts)]
 
 
 def read_npy(path: Path, hint: str) -> np.ndarray:

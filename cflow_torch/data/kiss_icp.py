@@ -28,6 +28,7 @@ class KissICPLog(Log):
 
     Attributes:
         log_id: name of the file or folder, and the sequence.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None if the data set has none.
         timestamps: 0, 1, 2, ... Sweeps have no times, because the loaders have no common way to return them. Models
             assume `sweep_interval` (0.1 s) between them.
 
@@ -49,7 +50,7 @@ class KissICPLog(Log):
             self._dataset = datasets.dataset_factory(loader, self.root, **settings)
             self.timestamps = range(len(self._dataset))
             poses = getattr(self._dataset, "gt_poses", None)
-            self._poses = None if poses is None else np.asarray(poses, np.float64).reshape(len(self), 4, 4)
+            self.poses = None if poses is None else np.asarray(poses, np.float64).reshape(len(self), 4, 4)
         self._check_count(self._what)
 
     def sweep(self, index: int) -> Sweep:
@@ -57,7 +58,7 @@ class KissICPLog(Log):
         with _loader_errors(f"{self._what}, sweep {index}"):
             found = self._dataset[index]
             points = np.asarray(found[0] if isinstance(found, tuple) else found, np.float32)[:, :3]
-        pose = None if self._poses is None else rigid_transform(self._poses[index], f"{self._what}: pose {index}")
+        pose = None if self.poses is None else rigid_transform(self.poses[index], f"{self._what}: pose {index}")
         return Sweep(points, None, pose)
 
 

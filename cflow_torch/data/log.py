@@ -9,6 +9,7 @@ from typing import Any, Iterator, Mapping, Protocol, Sequence, TypeVar, overload
 import numpy as np
 from torch.utils.data import Dataset
 
+from cflow_torch.errors import MissingFile, warn
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
 
 _Log = TypeVar("_Log", bound="Log")
@@ -45,6 +46,13 @@ class Log(Protocol):
     Attributes:
         log_id: name of the log, safe as a folder name; the name of its file or folder unless the reader says otherwise.
         timestamps: sweep times, ascending; in nanoseconds, unless the reader says otherwise.
+        gaps: indices of sweeps after which the reader left out sweeps. No window reaches over a gap for its history or
+            future, and `cflow flow` leaves out the pair over it.
+        is_compensated: True = the format is known to be compensated for ego motion within a sweep.
+        moves_by_times: True = the reader compensates ego motion itself in sweeps that have `point_times`.
+        has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
+        lidar_position: (3,) metres, position of the rotating LiDAR in the frame of the points.
+        turn_seconds: duration of a turn of the LiDAR; None = the median time between two sweeps.
 
     Convention: our readers return float32 points and float64 poses `T_world_ego`. Opening a log reads its poses and
         times, and `sweep` and `labels` read the rest.
@@ -58,6 +66,13 @@ class Log(Protocol):
 
     log_id: str
     timestamps: Sequence[int]
+    gaps: frozenset[int] = frozenset()
+    # What `cflow_torch.data.deskewing` must know of a reader.
+    is_compensated: bool = False
+    moves_by_times: bool = False
+    has_raw_times: bool = False
+    lidar_position: Any = (0.0, 0.0, 0.0)
+    turn_seconds: float | None = None
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: float32 points, float64 pose `T_world_ego`, ground mask, time."""
@@ -82,6 +97,18 @@ class Log(Protocol):
         """
         self._timestamp(index)
         return {}
+
+    @property
+    def notes(self) -> list[str]:
+        """What the reader assumed, left out or could not use so far: sentences, each also given as a `CFlowWarning`."""
+        return list(self.__dict__.get("_notes", {}).values())
+
+    def _note(self, text: str, kind: str = "") -> None:
+        """Warn, but only once in a log for texts of one `kind`; "" = once for each text."""
+        notes = self.__dict__.setdefault("_notes", {})
+        if text and (kind or text) not in notes:
+            notes[kind or text] = text
+            warn(f"log {self.log_id}: {text}")
 
     def close(self) -> None:
         """Close the files that the log holds open."""
@@ -128,15 +155,30 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
     If fewer than `num_history` sweeps precede `index`, or fewer than `num_future` follow `index + 1`, the window has
-    only these. If `index + 1` does not exist, or a sweep cannot be read, that is a `CFlowError`.
+    only these. It also ends at a gap of the log and, with a warning, at a sweep of the history or future whose file is
+    missing. If `index + 1` does not exist, or one of the pair cannot be read, that is a `CFlowError`.
     """
     count = len(log.timestamps)
     if not 0 <= index < count - 1:
         raise CFlowError(f"log {log.log_id} has {count} sweeps; a pair needs 0 <= index < {count - 1}, got {index}")
     history = range(index - 1, max(index - 1 - num_history, -1), -1)
     future = range(index + 2, min(index + 2 + num_future, count))
-    past, later = (tuple(log.sweep(i) for i in indices) for indices in (history, future))
-    return Window(log.sweep(index), log.sweep(index + 1), past, later)
+    pair = log.sweep(index), log.sweep(index + 1)
+    return Window(*pair, *(tuple(_readable(log, indices)) for indices in (history, future)))
+
+
+def _readable(log: Log, indices: range) -> Iterator[Sweep]:
+    """Yield the sweeps of a history or future, up to a gap of the log or a sweep whose file is missing."""
+    gaps = getattr(log, "gaps", ())
+    for index in indices:
+        if (index if indices.step < 0 else index - 1) in gaps:
+            return
+        try:
+            sweep = log.sweep(index)
+        except MissingFile as error:
+            warn(f"log {log.log_id}: windows near sweep {index} are shorter, because {error}")
+            return
+        yield sweep
 
 
 def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
@@ -185,12 +227,20 @@ class LogWrapper(Log):
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
+        self.gaps = getattr(log, "gaps", frozenset())
 
     def labels(self, index: int) -> FlowLabels | None:
         return self.log.labels(index)
 
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
         return self.log.columns(index)
+
+    @property
+    def notes(self) -> list[str]:
+        return self.log.notes
+
+    def _note(self, text: str, kind: str = "") -> None:
+        self.log._note(text, kind)
 
     def close(self) -> None:
         self.log.close()

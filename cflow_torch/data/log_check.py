@@ -1,145 +1,38 @@
-"""Find likely mistakes in a log before its flow is used: units, axes, ground, de-skewing, repeated sweeps, poses."""
+"""Check a log before its flow is used: what is right, what was found, what is wrong, and how to fix it."""
 
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, Callable, Iterable, NamedTuple
 
 import numpy as np
 
-from cflow_torch.data.log import Log
+from cflow_torch.data.log import CachedLog, Log
+from cflow_torch.data.log_motion import find_lapses, judge_log, known_poses
 from cflow_torch.errors import CFlowError, warn
-from cflow_torch.windows.ego_motion import rigid_transform
-from cflow_torch.windows.ground import is_upside_down
-from cflow_torch.windows.ground_plane import REACH
-from cflow_torch.windows.inspection import BACKWARD, REPEATED, UPSIDE_DOWN, has_moved, is_backward, repeats
-from cflow_torch.windows.structure import FEWEST_IN_PLACE, Patches, is_better_inverted, move, structure
+from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.windows.inspection import REPEATED, repeats
+from cflow_torch.windows.point_frame import frame_problem
+from cflow_torch.windows.readings import CAUSES, MOUNT, NO_READING, STILL, UNKNOWN, WORLD
 
-BASELINE = 5  # sweeps from the older to the later one of a pair: only a turn of the vehicle shows a wrong frame
-_PAIRS = 2  # pairs per log
-_MOST_POINTS = 8000  # of the older sweep
-# Tolerances. With correct poses, the shift was at most 13 mm on a real drive without de-skewing and 7 mm on simulated
-# drives. At the beginning of a turn without de-skewing, it was 58 mm, with a rotation of 0.7 degrees.
-_SHIFT, _SHIFT_PER_METRE, _SHIFT_PER_RADIAN = 0.03, 0.01, 10.0
-_ROTATION = np.radians(1.5)
-_BETTER, _GOOD = 2.0, 0.15  # poses do not fit if the identity agrees better by this factor, and at least this well
-# They do not fit, either, if both agreements (before, after alignment) are below these shares of the best possible.
-# Correct poses gave 0.27 in that turn, else above 0.5. A LiDAR at a wrong position gave 0.7 or more after alignment.
-_HOPELESS, _ALIGNED = 0.2, 0.5
+RIGHT, FOUND, WRONG = "right", "found and used", "wrong"
+_CACHED = 12  # sweeps that several checks read
+_PAIRS, _ALL_PAIRS = 3, 6  # pairs that are compared in the quick check and in the whole one
+_INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
+_OWN_REACH, _OWN_CELL = 2.7, 0.25  # metres: returns of the own vehicle are this near, and stay in cells of this side
+_OWN_SHARE, _OWN_DISTANCE = 0.8, 2.0  # of the compared sweeps; metres that the vehicle must have moved
+_FEWEST_OWN = 20  # points
+_GAP = 2.5  # usual intervals between sweeps; a longer one is a gap
+_LONGEST_GAP = 0.5  # seconds
 
 
-@dataclass(frozen=True)
-class StaticResidual:
-    """Motion of the static world that remains after ego motion is removed, between the sweeps `index` and `later`."""
+class Finding(NamedTuple):
+    """One line of a check."""
 
-    index: int
-    later: int
-    # (2,) float64, x and y, metres, frame of `later`. After the transform by the poses, `rotation` and `shift` move the
-    # structure of `index` onto the structure of `later`.
-    shift: np.ndarray
-    rotation: float  # radians about z
-    # 0 ... 1, how well the structures coincide under the poses: 0.3 to 0.5 on a street. NaN = too few points to judge.
-    agreement: float
-    aligned: float  # agreement after `shift` and `rotation` are removed
-    verdict: str  # the likely mistake, "" = none
-
-
-def static_world_residual(log: Log, index: int, baseline: int = BASELINE) -> StaticResidual:
-    """Compare the sweeps `index` and `index + baseline` of a log in one frame.
-
-    Without poses the sensor is assumed to be static. Without ground masks, a simple rule removes low points. Only the
-    horizontal plane is compared. The points of the later sweep above ground, 2.5 to 50 m away, become Gaussian patches
-    in cells of 1 m. A Gauss-Newton fit with robust weights (for moving objects) finds the shift and rotation that align
-    the older sweep with them. Along a wall without corners no shift is detected. If the LiDAR is not where the poses
-    assume it, a shift appears only when the vehicle turns. It is the offset of the LiDAR times the rotation: 12 cm
-    for 1.35 m and 5 degrees.
-
-    Cost: reads two sweeps and takes about 0.15 s on one core.
-
-    Source: the fit is the normal distributions transform in the plane (Biber and Strasser, 2003).
-    """
-    older, newer = log.sweep(index), log.sweep(index + baseline)
-    has_poses = older.pose is not None and newer.pose is not None
-    pose0, pose1 = (rigid_transform(s.pose, "pose") if has_poses else np.eye(4) for s in (older, newer))
-    T_1_0 = np.linalg.inv(pose1) @ pose0
-    source, target = structure(older), structure(newer)[:, :2]
-    patches = Patches(target)
-    source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
-    moved = move(source, T_1_0)
-    agreement, (shift, rotation, aligned) = patches.agreement(moved), patches.fit(moved)
-    best = patches.agreement(target)  # of the later sweep with itself: an upper bound for other sweeps
-    if best * min(len(source), len(target)) < FEWEST_IN_PLACE:
-        return StaticResidual(index, index + baseline, shift, rotation, float("nan"), float("nan"), "")
-    inverted = patches.agreement(move(source, pose1 @ np.linalg.inv(pose0)))
-    unmoved = patches.agreement(source[:, :2])
-    size, distance = float(np.linalg.norm(shift)), float(np.linalg.norm(T_1_0[:3, 3]))
-    verdict = ""
-    if is_better_inverted(agreement, unmoved, inverted):
-        verdict = "The poses seem to be inverted. They must map ego coordinates to the world (T_world_ego)."
-    elif unmoved > max(_BETTER * agreement, _GOOD) or max(agreement / _HOPELESS, aligned / _ALIGNED) < best:
-        verdict = (
-            "The sweeps do not fit. Do the poses have another log, other axes (a camera's), times or units? Or are the "
-            "points already in one common frame (then pass no poses)?"
-        )
-    elif abs(rotation) > _ROTATION or size > _SHIFT + _SHIFT_PER_METRE * distance + _SHIFT_PER_RADIAN * abs(rotation):
-        verdict = (
-            f"It is off by {100 * size:.0f} cm and {np.degrees(abs(rotation)):.1f} degrees. Points in the frame of the "
-            "LiDAR with poses of the vehicle cause this in turns: pass ego_T_lidar. Other causes: axes or times of the "
-            "poses, sweeps that are not de-skewed."
-        )
-    if verdict and not has_poses:
-        verdict = (
-            "There are no poses, but the sensor seems to move. Pass poses, or set data.odometry=true (in Python "
-            "`with_poses` of cflow_torch.data.odometry)."
-        )
-    return StaticResidual(index, index + baseline, shift, rotation, agreement, aligned, verdict)
-
-
-def check_static_world(log: Log) -> list[StaticResidual]:
-    """Measure whether the static world moves between two sweeps of a log, and warn if it does.
-
-    We compare up to two pairs of sweeps and return their residuals. If the log has the attribute `poses`, we choose the
-    pairs over which the vehicle turns most, otherwise the first and the last pair. A log of one sweep has no pair. The
-    warning gives the verdict on the worst pair.
-
-    Cost: reads two sweeps per pair; 0.15 s each.
-    """
-    found = _residuals(log)
-    if _worst(found):
-        warn(f"log {log.log_id}: {_worst(found)}")
-    return found
-
-
-def _worst(found: list[StaticResidual]) -> str:
-    bad = [residual for residual in found if residual.verdict]
-    if not bad:
-        return ""
-    worst = max(bad, key=lambda residual: float(np.linalg.norm(residual.shift)))
-    return f"from sweep {worst.index} to {worst.later} the static world moves. {worst.verdict}"
-
-
-def _residuals(log: Log) -> list[StaticResidual]:
-    baseline = min(BASELINE, len(log.timestamps) - 1)
-    return [static_world_residual(log, index, baseline) for index in _choose(log, baseline)] if baseline > 0 else []
-
-
-def _choose(log: Any, baseline: int) -> list[int]:
-    """Return the index of the first sweep of each pair. Pairs do not overlap; the largest rotation comes first."""
-    last = len(log.timestamps) - 1 - baseline
-    poses: np.ndarray | None = getattr(log, "poses", None)
-    if poses is None:
-        return sorted({0, last})
-    relative = np.linalg.inv(poses[baseline:]) @ poses[:-baseline]
-    order = np.argsort(-np.abs(np.arctan2(relative[:, 1, 0], relative[:, 0, 0])), kind="stable")
-    chosen: list[int] = []
-    for index in order.tolist():
-        if len(chosen) < _PAIRS and all(abs(index - other) >= baseline for other in chosen):
-            chosen.append(index)
-    return chosen
-
-
-_SMALLEST = 2.0  # metres; if all points are closer to the origin, they are not in metres
+    topic: str  # sensor, points, frame, ground, poses, times, ...
+    status: str  # RIGHT, FOUND or WRONG
+    text: str  # what was found; if it is wrong, with the fix
+    is_quick: bool = False  # commands print it if it is not right
 
 
 def check_log(log: Log) -> None:
@@ -149,58 +42,260 @@ def check_log(log: Log) -> None:
 
 
 def find_problems(log: Log) -> list[str]:
-    """List likely mistakes that raise no error, and say if we find the ground because masks are missing.
+    """List likely mistakes that raise no error, and say if we find the ground or the frame of the points.
 
     We skip a check if a sweep that it needs cannot be read. Reading this sweep later raises the error.
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    problems = []
-    for check in (_points, _ground, _skew, _order, lambda log: _worst(_residuals(log))):
+    cached = CachedLog(log, _CACHED)
+    findings = _collect(cached, (_frame, _reading, _ground, _mask, _deskew, _repeated, _motion, _lapses))
+    return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
+
+
+def examine(log: Log) -> list[Finding]:
+    """Check everything that `cflow check` shows, in the order of its page.
+
+    Cost: reads up to 20 sweeps, and two of each step between poses that is suspect; 1 to 2 s.
+    """
+    cached = CachedLog(log, _CACHED)
+    checks = (
+        *(_sensor, _frame, _reading, _times, _poses, _lapses, _motion_of_all, _deskew),
+        *(_repeated, _ground, _mask, _own_vehicle, _labels),
+    )
+    findings = _collect(cached, checks)
+    notes = getattr(log, "notes", ())  # complete only now, as readers note what they see in the sweeps
+    return [*findings, *(Finding("reader", FOUND, note) for note in notes)]
+
+
+def _collect(log: Log, checks: Iterable[Callable[[Log], Finding | None]]) -> list[Finding]:
+    found: list[Finding] = []
+    for check in checks:
         with suppress(CFlowError, OSError):
-            problems.append(check(log))
-    return [text for text in problems if text]
+            finding = check(log)
+            if finding is not None:
+                found.append(finding)
+    return found
 
 
-def _points(log: Log) -> str:
-    points = np.asarray(log.sweep(0).points)[:, :3]
-    points = points[np.isfinite(points).all(1)]
-    if len(points) == 0:
-        return ""
-    size = np.abs(points[:, :2]).max(1)
-    if size.min() >= REACH or size.max() < _SMALLEST:
-        return (
-            f"the points of its first sweep are {size.min():.4g} to {size.max():.4g} m away from the origin: are they "
-            "in metres, in the frame of the LiDAR or of the vehicle?"
-        )
-    return UPSIDE_DOWN if is_upside_down(points) else ""
+def _frame(log: Log) -> Finding:
+    reading, problem = frame_problem(log.sweep(0).points)
+    if not problem:
+        return Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
+    fix = f"; data.read_as={reading} converts them" if reading else ""
+    return Finding("frame", WRONG, f"in the first sweep {problem}{fix}", True)
 
 
-def _ground(log: Any) -> str:
+def _reading(log: Any) -> Finding | None:
+    reading = getattr(log, "read_as", None)
+    if reading is None:
+        return None
+    what = CAUSES.get(reading, f"the log is read as {reading}")
+    if not getattr(log, "is_reading_found", False):
+        return Finding("frame", RIGHT, f"as you say, {what} (read_as={reading})")
+    fix = f"we move them to that of the vehicle. data.read_as={reading} does the same without this line"
+    return Finding("frame", FOUND, f"{what}, so {fix}", True)
+
+
+def _motion(log: Log) -> Finding | None:
+    return _motion_of(log, _PAIRS)
+
+
+def _motion_of_all(log: Log) -> Finding | None:
+    return _motion_of(log, _ALL_PAIRS)
+
+
+def _motion_of(log: Log, count: int) -> Finding | None:
+    judgement = judge_log(log, count)
+    if not judgement.shares:
+        return None
+    has_poses = log.sweep(0).pose is not None
+    if not judgement.best:
+        text = f"{judgement.given:.2f} of the static structure is in place in the next sweep"
+        return Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)
+    name = judgement.best[0]
+    if name == UNKNOWN:
+        why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
+        fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
+    elif name == MOUNT:
+        why, fix = "in turns,", f"pass data.ego_T_lidar with about x = {judgement.offset:g} m (data=arrays or hdf5)"
+    elif name == NO_READING:
+        why, fix = "", "check that the poses belong to this log, their times and units"
+    else:
+        why = "the static world moves under the poses:" if name != WORLD else ""
+        fix = " or ".join(f"data.read_as={each}" for each in judgement.best)
+        fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
+    return Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)
+
+
+def _lapses(log: Log) -> Finding | None:
+    lapses = find_lapses(log)
+    if not lapses:
+        return None
+    texts = [
+        f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
+        if each.is_single
+        else f"the poses jump by {each.metres:.1f} m before sweep {each.sweep}"
+        for each in lapses
+    ]
+    fix = "correct it, or remove the sweep; for a jump, give poses of a continuous frame (odometry, not the map)"
+    return Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)
+
+
+def _ground(log: Any) -> Finding | None:
     log.sweep(0)
     if not getattr(log, "has_found_ground", False):
-        return ""
-    return (
+        return None
+    text = (
         "it has no ground masks, so we find the ground (find_ground=auto). data.find_ground=grid does the same without "
         "this line, data.find_ground=null leaves all points in"
     )
+    return Finding("ground", FOUND, text, True)
 
 
-def _skew(log: Log) -> str:
+def _mask(log: Log) -> Finding:
     sweep = log.sweep(0)
-    if not getattr(log, "deskew", False) or sweep.pose is None or sweep.point_times is not None:
-        return ""
-    return (
+    if sweep.is_ground is None:
+        return Finding("ground", RIGHT, "no masks, so no point is taken for ground (data.find_ground=grid finds it)")
+    mask = as_numpy(sweep.is_ground)
+    above = _median_height(sweep, ~mask) - _median_height(sweep, mask)
+    if above < -_INVERTED_BY:
+        text = f"the points masked as ground lie {-above:.1f} m above the others: invert the mask, True = ground"
+        return Finding("ground", WRONG, text, True)
+    share = float(mask.mean()) if len(mask) else 0.0
+    return Finding("ground", RIGHT, f"{100 * share:.0f} % of the points of the first sweep", True)
+
+
+def _median_height(sweep: Sweep, rows: np.ndarray) -> float:
+    heights = as_numpy(sweep.points)[rows, 2]
+    heights = heights[np.isfinite(heights)]
+    return float(np.median(heights)) if len(heights) else float("nan")
+
+
+def _deskew(log: Any) -> Finding | None:
+    note = getattr(getattr(log, "reading", None), "note", "")
+    if note:
+        return Finding("de-skewing", FOUND, note, True)
+    sweep = log.sweep(0)
+    if sweep.point_times is not None:
+        spread = np.ptp(as_numpy(sweep.point_times)) if len(sweep.point_times) else 0.0
+        return Finding("de-skewing", RIGHT, f"points have times over {spread:.3f} s", True)
+    if not getattr(log, "deskew", False) or sweep.pose is None:
+        return None
+    text = (
         "it has no times of points, so its sweeps are not de-skewed, and static objects are smeared while the vehicle "
-        "moves. If the clouds are already compensated, set data.deskew=false"
+        "moves. If the clouds are already compensated, set data.deskew=off"
     )
+    return Finding("de-skewing", WRONG, text, True)
 
 
-def _order(log: Log) -> str:
+def _repeated(log: Log) -> Finding | None:
     first = [log.sweep(index) for index in range(min(3, len(log.timestamps)))]
-    for pc0, pc1 in zip(first, first[1:]):
-        if repeats(pc0, pc1):
-            return REPEATED
-        if has_moved(pc0, pc1) and is_backward(pc0, pc1):
-            return BACKWARD
-    return ""
+    if any(repeats(pc0, pc1) for pc0, pc1 in zip(first, first[1:])):
+        return Finding("sweeps", WRONG, REPEATED, True)
+    return None
+
+
+def _sensor(log: Log) -> Finding:
+    sweep = log.sweep(0)
+    points = as_numpy(sweep.points)[:, :3].astype(np.float64)
+    kept = points[np.isfinite(points).all(1)]
+    distance = np.linalg.norm(kept, axis=1)
+    parts = [f"{len(log.timestamps)} sweeps", f"{len(points):,} points in the first"]
+    if len(kept) < len(points):
+        parts.append(f"{len(points) - len(kept):,} of them not finite")
+    if len(kept):
+        parts.append(f"range {np.quantile(distance, 0.01):.1f} to {np.quantile(distance, 0.99):.0f} m")
+        beams, spacing = _beams(kept)
+        parts += [f"about {beams} beams"] if beams else []
+        parts += [f"{spacing:.2f} degrees between points"] if spacing else []
+    columns = sorted(log.columns(0))
+    parts += [f"columns {', '.join(columns)}"] if columns else []
+    return Finding("sensor", RIGHT, ", ".join(parts))
+
+
+def _beams(points: np.ndarray) -> tuple[int, float]:
+    """Estimate the number of beams, and the angle between neighbouring points of a beam in degrees; 0 = unknown.
+
+    Points in the order of a scan follow one beam, or one column. The origin must be near the LiDAR, else the elevations
+    of a beam are not equal.
+    """
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    steps = np.abs((np.diff(azimuth) + 180) % 360 - 180)
+    along = steps[(steps > 0.01) & (steps < 2)]
+    spacing = float(np.median(along)) if len(along) > len(points) // 4 else 0.0
+    counts, _ = np.histogram(elevation, np.arange(-40, 40, 0.1))
+    peaks = (counts[1:-1] > counts[:-2]) & (counts[1:-1] >= counts[2:]) & (counts[1:-1] > 3 * counts.mean())
+    beams = int(peaks.sum()) if counts[1:-1][peaks].sum() > 0.3 * len(points) else 0
+    return beams, spacing
+
+
+def _times(log: Log) -> Finding:
+    if log.sweep(0).timestamp_ns is None:
+        return Finding("times", RIGHT, "the sweeps have no times, so motion is known per sweep, not per second")
+    stamps = np.array([int(stamp) for stamp in log.timestamps], np.float64)
+    nanoseconds = log.sweep(0).timestamp_ns or stamps[0]
+    unit = 1e-9 * (nanoseconds / stamps[0] if stamps[0] else 1.0)
+    interval = np.diff(stamps) * unit
+    usual = float(np.median(interval))
+    if usual <= 0 or (interval <= 0).any():
+        return Finding("times", WRONG, "times of sweeps do not ascend: give the time of each sweep")
+    gaps = np.flatnonzero((interval > _GAP * usual) & (interval > _LONGEST_GAP))
+    text = f"{1 / usual:.1f} Hz"
+    if len(gaps):
+        longest = int(gaps[interval[gaps].argmax()])
+        text += f"; {len(gaps)} gaps, the longest of {interval[longest]:.1f} s after sweep {longest}"
+        if set(gaps.tolist()) <= set(getattr(log, "gaps", ())):
+            return Finding("times", FOUND, f"{text}. No window reaches over them")
+        return Finding("times", WRONG, f"{text}: split the log there")
+    if not 0.01 <= usual <= 1:
+        return Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")
+    return Finding("times", RIGHT, text)
+
+
+def _poses(log: Log) -> Finding:
+    poses = known_poses(log)
+    if poses is None:
+        pose = log.sweep(0).pose
+        if pose is None:
+            return Finding("poses", RIGHT, "none: we take the sensor for static (data.odometry=true estimates them)")
+        return Finding("poses", RIGHT, "of each sweep, read with its points")
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    text = f"of all sweeps; the vehicle moves {steps.sum():.1f} m, up to {steps.max(initial=0):.2f} m a sweep"
+    return Finding("poses", RIGHT, text)
+
+
+def _own_vehicle(log: Log) -> Finding | None:
+    """Look for returns that stay at the same place of the vehicle's frame while it drives."""
+    indices = np.unique(np.linspace(0, len(log.timestamps) - 1, 5).astype(int))
+    sweeps = [log.sweep(int(index)) for index in indices]
+    if any(sweep.pose is None for sweep in sweeps):
+        return None
+    positions = np.array([np.asarray(sweep.pose)[:3, 3] for sweep in sweeps])
+    if np.linalg.norm(np.diff(positions, axis=0), axis=1).min(initial=np.inf) < _OWN_DISTANCE:
+        return None
+    cells = []
+    for sweep in sweeps:
+        points = as_numpy(sweep.points)[:, :3].astype(np.float64)
+        near = np.isfinite(points).all(1) & (np.abs(points[:, :2]) < _OWN_REACH).all(1)
+        near &= ~as_numpy(sweep.is_ground) if sweep.is_ground is not None else True
+        cells.append(np.unique(np.floor(points[near] / _OWN_CELL).astype(np.int64), axis=0))
+    cell, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
+    fixed = cell[count >= _OWN_SHARE * len(sweeps)]
+    if len(fixed) < _FEWEST_OWN:
+        return Finding("own vehicle", RIGHT, "none of its returns are seen")
+    low, high = fixed[:, :2].min(0) * _OWN_CELL, (fixed[:, :2].max(0) + 1) * _OWN_CELL
+    box = ",".join(f"{value:.1f}" for value in (*low, *high))
+    text = f"some {len(fixed)} returns within {_OWN_REACH:g} m ride along: give model.ego_box=[{box}]"
+    return Finding("own vehicle", WRONG, text)
+
+
+def _labels(log: Log) -> Finding:
+    indices = np.unique(np.linspace(0, len(log.timestamps) - 2, 5).astype(int)).tolist()
+    labels = next(filter(None, map(log.labels, indices)), None)
+    if labels is None:
+        return Finding("labels", RIGHT, "none: `cflow flow` needs none, `cflow eval` does")
+    valid = float(labels.is_valid.mean()) if len(labels.is_valid) else 0.0
+    longest = float(np.linalg.norm(labels.flow[labels.is_valid], axis=1).max(initial=0))
+    return Finding("labels", RIGHT, f"flow of {100 * valid:.0f} % of the points, up to {longest:.2f} m a sweep")

@@ -18,6 +18,7 @@ from cflow_torch.data.pickles import load_columns
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
+_GZIP = b"\x1f\x8b"  # first bytes of a compressed file
 _LIDARS = (0, 1)  # Pandar64, which rotates, and PandarGT, which looks forward
 _EVERY_LIDAR = -1  # sensor_id of a cuboid for both LiDARs; an object may instead have one cuboid for each
 _POSITION, _SIZE = ("position.x", "position.y", "position.z"), ("dimensions.y", "dimensions.x", "dimensions.z")
@@ -49,7 +50,7 @@ class PandaSetLog(Log):
     """One sequence.
 
     Args:
-        folder: sequence folder with `lidar/00.pkl.gz` ..., `lidar/poses.json` and `lidar/timestamps.json`.
+        folder: sequence folder with `lidar/00.pkl.gz` (or 00.pkl) ..., `lidar/poses.json` and `lidar/timestamps.json`.
 
     Convention:
         - Points are stored in the world frame, compensated for ego motion. We return them in the frame of the stored
@@ -60,11 +61,13 @@ class PandaSetLog(Log):
           it is part of an object. Smoke, exhaust, spray and reflections are not valid.
     """
 
+    is_compensated: bool = True
+
     def __init__(self, folder: PathLike) -> None:
         self.folder = as_path(folder)
         self.log_id = self.folder.resolve().name
         lidar = self.folder / "lidar"
-        self._files = sorted(lidar.glob("*.pkl.gz"))
+        self._files = sorted(lidar.glob("*.pkl.gz")) or sorted(lidar.glob("*.pkl"))
         times, poses = lidar / "timestamps.json", lidar / "poses.json"
         with file_errors(times):
             self.timestamps = [round(float(seconds) * 1e9) for seconds in read_json(times)]
@@ -153,7 +156,9 @@ class PandaSetLog(Log):
 def _columns(file: Path, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
     """Read columns of a pickled data frame; None = all."""
     with file_errors(file):
-        columns = load_columns(io.BytesIO(gzip.decompress(read_bytes(file))))
+        content = read_bytes(file)
+        is_compressed = content.startswith(_GZIP)  # copies of the data set hold the files without compression
+        columns = load_columns(io.BytesIO(gzip.decompress(content) if is_compressed else content))
         names = list(columns) if names is None else names
         check_columns(file, list(columns), names)
         return {name: columns[name] for name in names}

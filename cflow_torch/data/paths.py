@@ -105,6 +105,15 @@ def read_bytes(path: Path) -> bytes:
         return bytes(remote.fs.cat_file(remote.path))  # pathlib's interface would ask for the size first
 
 
+def read_start(path: Path, count: int) -> bytes:
+    """Read at most `count` bytes from the start of a file; errors as in `read_bytes`."""
+    if is_remote(path):
+        return read_bytes(path)[:count]
+    check_file(path)
+    with open(path, "rb") as file:
+        return file.read(count)
+
+
 def source_for_random_access(path: Path) -> Any:
     """Return a large file for a library that reads parts of it: its name, or an open file if it is remote.
 

@@ -100,8 +100,9 @@ def count_frames(job: Job, units: Iterable[Unit]) -> Iterator[tuple[str, int, in
     """
     for unit in units:
         try:
-            with open_log(job.reader, unit.source, **{**job.settings, "check": False, "odometry": False}) as log:
-                stamps = {int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
+            settings = {**job.settings, "check": False, "odometry": False, "read_as": None}
+            with open_log(job.reader, unit.source, **settings) as log:
+                stamps = {int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1) if i not in log.gaps}
                 complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
                 yield log.log_id, len(stamps), len(stamps - complete)
         except Exception as error:

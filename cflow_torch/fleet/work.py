@@ -77,7 +77,7 @@ class Worker:
     def _run(self, unit: Unit, stop: Callable[[], bool]) -> Iterator[Event]:
         log = self._open(unit.source)
         folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
-        stamps = {i: int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1)}
+        stamps = {i: int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1) if i not in log.gaps}
         if unit.only is not None:
             stamps = {i: stamp for i, stamp in stamps.items() if stamp in unit.only}
         complete = set() if self._job.redo else complete_frames(folder)

@@ -1,4 +1,4 @@
-"""Warn of input that is allowed, but likely a mistake: units, axes, order of sweeps, poses, ground without a mask."""
+"""Warn of input that is allowed, but likely a mistake: units, axes, poses, repeated sweeps, ground without a mask."""
 
 from __future__ import annotations
 
@@ -12,55 +12,59 @@ import torch
 from cflow_torch.config import Config
 from cflow_torch.errors import CFlowError, NoActivePoints, warn
 from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
-from cflow_torch.windows.ego_motion import relative_transform
-from cflow_torch.windows.ground import has_ground, is_upside_down
-from cflow_torch.windows.structure import FEWEST_IN_PLACE, Patches, is_better_inverted, move, structure
+from cflow_torch.windows.ground import has_ground
+from cflow_torch.windows.point_frame import frame_problem
+from cflow_torch.windows.readings import INVERTED, NO_READING, STILL, UNKNOWN, WORLD, judge, make_pair
 from cflow_torch.windows.validation import have_same_points
 
-UPSIDE_DOWN = "z seems to point down, because nearly all points lie below the ground: give points with z up"
 REPEATED = "pc1 has the same points as pc0, so everything seems to move with the sensor: give two different sweeps"
 _GROUND = (
     "a sweep without a ground mask contains ground, which joins the objects on it into one cluster, so moving objects "
     "are missed: give masks (Sweep.is_ground, see cflow_torch.windows.ground.find_ground), all False if this is not "
     "ground"
 )
-BACKWARD = (
-    "two sweeps in a row fit better if the motion between them is inverted: are poses inverted (they must be "
-    "T_world_ego, and T_ego1_ego0 maps from t to t+1), or are sweeps interchanged?"
-)
+# What to do about a `Judgement` of two sweeps, by the first of its best readings.
+_ADVICE = {
+    INVERTED: "poses must be T_world_ego, and T_ego1_ego0 maps from t to t+1",
+    STILL: "if the clouds are in one frame, leave out the transforms and poses",
+    WORLD: "move them to the frame of the vehicle, or leave out the transforms and poses",
+    UNKNOWN: "give T_ego1_ego0, or poses, unless most of the scene moves",
+    NO_READING: "check frame, units and times of the poses (T_ego1_ego0)",
+}
+_ADVICE_ELSE = "convert the poses (T_ego1_ego0) to the frame of the points, in metres"
 _FEWEST_REPEATED = 100  # this many equal points are no coincidence
-_MOST_POINTS = 20_000  # of a sweep, for the comparison of two sweeps
-_LEAST_MOTION, _REACH = 0.3, 30.0  # metres; we judge ego motions that move a point 30 m away by at least 0.3 m
 
 
 class Inspection:
     """Warns of likely mistakes in the windows of a model.
 
     In every window, it checks that pc1 does not repeat pc0. It makes the other checks once each, only in the first
-    window of a call. Once such a window has points, it checks that z points up and ground is masked. Once the sensor
-    moves in such a window, it checks poses and order of sweeps. Cost: about 20 ms, once; 5 us for each window.
+    window of a call. Once such a window has points, it checks units, axes and ground. Once such a window has static
+    structure, it checks the ego motion. Cost: about 60 ms, once; 5 us for each window.
     """
 
     def __init__(self) -> None:
-        self._has_seen_points = self._has_seen_motion = False
+        self._has_seen_points = self._has_seen_structure = False
 
     def __call__(self, windows: Sequence[Window]) -> None:
-        for window in windows:
-            if repeats(window.pc0, window.pc1):
-                warn(REPEATED)
+        is_repeated = [repeats(window.pc0, window.pc1) for window in windows]
+        for _ in filter(None, is_repeated):
+            warn(REPEATED)
         if not windows or len(windows[0].pc0.points) == 0:
             return
         first = windows[0]
         if not self._has_seen_points:
             self._has_seen_points = True
-            if is_upside_down(first.pc0.points):
-                warn(UPSIDE_DOWN)
+            _, problem = frame_problem(first.pc0.points)
+            if problem:
+                warn(problem)
             elif first.pc0.is_ground is None and has_ground(first.pc0.points):
                 warn(_GROUND)
-        if not self._has_seen_motion and has_moved(first.pc0, first.pc1):
-            self._has_seen_motion = True
-            if is_backward(first.pc0, first.pc1):
-                warn(BACKWARD)
+        if not self._has_seen_structure and not is_repeated[0]:
+            judgement = judge([make_pair(first.pc0, first.pc1)])
+            self._has_seen_structure = bool(judgement.shares)
+            if judgement.best:
+                warn(f"{judgement}: {_ADVICE.get(judgement.best[0], _ADVICE_ELSE)}")
 
 
 def repeats(pc0: Sweep, pc1: Sweep) -> bool:
@@ -69,32 +73,6 @@ def repeats(pc0: Sweep, pc1: Sweep) -> bool:
         if len(points) < _FEWEST_REPEATED or (isinstance(points, torch.Tensor) and points.device.type != "cpu"):
             return False
     return have_same_points(pc0, pc1)
-
-
-def has_moved(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether the poses differ enough to judge the direction of the ego motion. False without poses."""
-    if pc0.pose is None or pc1.pose is None:
-        return False
-    T = relative_transform(pc1.pose, pc0.pose)
-    return bool(np.linalg.norm(T[:3, 3]) + _REACH * np.abs(T[:2, :2] - np.eye(2)).max() >= _LEAST_MOTION)
-
-
-def is_backward(pc0: Sweep, pc1: Sweep) -> bool:
-    """Test whether the static structure of two sweeps fits better if the ego motion from their poses is inverted."""
-    T_ego1_ego0 = relative_transform(pc1.pose, pc0.pose)
-    older, newer = (structure(_thinned(sweep)) for sweep in (pc0, pc1))
-    patches = Patches(newer[:, :2])
-    given, none, inverted = (
-        patches.agreement(move(older, T)) for T in (T_ego1_ego0, np.eye(4), np.linalg.inv(T_ego1_ego0))
-    )
-    return inverted * len(older) > FEWEST_IN_PLACE and is_better_inverted(given, none, inverted)
-
-
-def _thinned(sweep: Sweep) -> Sweep:
-    """Return every k-th point of a sweep, with its ground mask."""
-    step = max(1, -(-len(sweep.points) // _MOST_POINTS))
-    is_ground = None if sweep.is_ground is None else as_numpy(sweep.is_ground[::step])
-    return Sweep(as_numpy(sweep.points[::step]), is_ground)
 
 
 def warn_of_inactive(windows: Sequence[Window], results: Sequence[FlowResult], config: Config) -> None:

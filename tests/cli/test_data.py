@@ -31,7 +31,7 @@ def test_a_path_is_enough(name, tmp_path, cflow, capsys):
 
 def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path):
     (tmp_path / "empty").mkdir()
-    for place, message in (("absent", "no such file or folder"), ("empty", "no format fits its contents")):
+    for place, message in (("absent", "no such file or folder"), ("empty", "it has no files")):
         with pytest.raises(CFlowError, match=message):
             recognise(tmp_path / place)
     (tmp_path / "both" / "a" / "sensors" / "lidar").mkdir(parents=True)
@@ -48,6 +48,14 @@ def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path):
 def test_a_path_by_itself_is_the_data_root():
     call = ["-m", "/a b/c", "model=paper,default", "--config-dir", "conf", "-p", "model"]
     assert split(call) == (['data.root="/a b/c"', "model=paper,default"], ["-m", "--config-dir", "conf", "-p", "model"])
+    paths = ["/a/date=2024-01-05", "./date=2024", "model=paper"]
+    assert split(paths) == (['data.root="/a/date=2024-01-05"', 'data.root="./date=2024"', "model=paper"], [])
+
+
+def test_a_name_with_an_equals_sign_that_exists_is_a_path(tmp_path, monkeypatch):
+    (tmp_path / "date=2024").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert split(["date=2024", "date=2025"])[0] == ['data.root="date=2024"', "date=2025"]
 
 
 READER = """

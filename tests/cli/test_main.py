@@ -36,7 +36,7 @@ def test_help_explains_a_command_with_examples_and_settings(command, cflow, caps
 
 # Mistakes that are found without torch, then the others.
 CHEAP = (
-    ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, flow,"),
+    ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, check, flow,"),
     ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
     ("flow num_history=2", "(did you mean model.num_history?)"),
     ("eval model=papr", "model=papr (did you mean paper?): give one of default, keypoints, offline, paper"),

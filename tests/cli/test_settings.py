@@ -39,7 +39,8 @@ def test_every_choice_of_every_group_composes(compose):
             call = {group: names[number % len(names)] for group, names in choices.items()}
             cfg = compose(command, *(f"{group}={name}" for group, name in call.items()))
             assert call.items() <= dict(cfg.hydra.runtime.choices).items()
-            make_model(cfg)
+            if "device" in cfg:  # `cflow check` makes no model
+                make_model(cfg)
 
 
 def test_examples_use_existing_settings_and_choices(compose):

@@ -84,9 +84,9 @@ def test_boxes_become_flow(folder: Path) -> None:
     """In the vehicle frame, the box of the car moves 1 m forward and the world 1 m back; poles are static."""
     for lidar in ("left_lidar", "rear_lidar"):
         file = folder / "pointcloud_compensated" / f"{lidar}_{STAMPS[0]}.npz"
-        save(file, xyz=np.array([[0, 0, 0], [0, -2.5, 0.0]], np.float32), velocity=np.zeros((2, 1), np.float32))
+        save(file, xyz=np.array([[0, -1e-3, 0], [0, -2.5, 0.0]], np.float32), velocity=np.zeros((2, 1), np.float32))
     labels = AevaScenesLog(folder).labels(0)
-    # Vehicle frame: left (0, 1, 0), (2.5, 1, 0); rear (-1, 0, 2), (-1, 2.5, 2). The car extends from x = 0 to 4.
+    # Vehicle frame: left (0.001, 1, 0), (2.5, 1, 0); rear (-1, 0.001, 2), (-1, 2.5, 2). The car is at x = 0 to 4.
     np.testing.assert_array_equal(labels.category, [19, 19, 0, 0])
     np.testing.assert_allclose(labels.flow, [[1, 0, 0], [1, 0, 0], [-1, 0, 0], [-1, 0, 0]], atol=1e-6)
     assert labels.is_valid.all() and AevaScenesLog(folder).labels(2) is None

@@ -14,7 +14,7 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog
-from cflow_torch.data.bags.messages import cloud_columns, seconds_after
+from cflow_torch.data.bags.messages import cloud_columns
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import window
 from cflow_torch.data.log_check import check_log
@@ -118,27 +118,3 @@ def test_broken_bags_are_refused(recording: TinyRecording, tmp_path: Path) -> No
     cloud.fields = cloud.fields[:2]
     with pytest.raises(ValueError, match=r"lacks the fields \['x', 'z'\]"):
         cloud_columns(cloud)
-
-
-STAMP = 1_700_000_000_123_456_789
-
-
-@pytest.mark.parametrize(
-    ("values", "first"),
-    [
-        (np.array([0, 50_000_000, 100_000_000], np.uint32), 0.0),  # Ouster: nanoseconds after the stamp
-        (np.array([-0.1, -0.05, 0.0], np.float32), -0.1),  # Velodyne: seconds, up to the stamp
-        (np.array([0.0, 50.0, 100.0]), 0.0),  # milliseconds
-        (np.array([0, 50_000, 100_000], np.uint32), 0.0),  # microseconds
-        (STAMP * 1e-9 + np.array([0.0, 0.05, 0.1]), 0.0),  # Hesai: unix seconds
-        (STAMP + np.array([2_000_000, 52_000_000, 102_000_000], np.uint64), 0.002),  # unix nanoseconds
-        (np.array([7e17, 7e17 + 5e7, 7e17 + 1e8]), 0.0),  # Livox without a common clock
-    ],
-)
-def test_the_unit_of_times_is_recognised(values: np.ndarray, first: float) -> None:
-    assert np.allclose(seconds_after(values, STAMP), first + np.array([0, 0.05, 0.1]), atol=1e-6)
-
-
-def test_times_without_a_plausible_duration_are_ignored() -> None:
-    for values in (np.zeros(3), np.zeros(0), np.array([0.0, 1e-4]), np.array([0, 1 << 63], np.uint64)):
-        assert seconds_after(values, STAMP) is None

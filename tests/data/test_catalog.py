@@ -14,7 +14,7 @@ from command_line import cflow
 from small_logs import make_small_drive
 
 from cflow_torch.data.arrays import write_array_log
-from cflow_torch.data.catalog import GroundSegmentedLog, find_sources, open_log
+from cflow_torch.data.catalog import GroundSegmentedLog, find_sources, open_log, recognise
 from cflow_torch.simulator import Drive
 from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.types import CFlowError, CFlowWarning
@@ -64,7 +64,7 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
 @pytest.mark.parametrize(
     "name, settings, complaint",
     [
-        ("kitti", {}, "one of av2, hdf5"),
+        ("lyft", {}, "one of av2, hdf5"),
         ("arrays", {"clouds": "raw"}, "no setting clouds; it has poses"),
         ("arrays", {"find_ground": "magic"}, "find_ground='magic'"),
         ("arrays", {"suffix": 5}, "arrays cannot be opened with suffix=5"),
@@ -89,3 +89,24 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
     assert find_sources(name, tmp_path / "b") == [tmp_path / "b"]
     with pytest.raises(CFlowError, match="nowhere is not a folder"):
         find_sources(name, tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ([], "it has no files"),
+        (["a.las", "b.laz", "c.las"], "its 2 .las files are not read: convert them with pdal"),
+        (["a/1.xyz"], "its 1 .xyz files are not read"),
+        (["1.pcd"], "it has one point cloud"),
+        (["a.pcap"], "its 1 .pcap files are not read"),
+    ],
+)
+def test_what_is_not_read_is_said(names: list, message: str, tmp_path: Path) -> None:
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(CFlowError, match=message):
+        recognise(tmp_path)
+    if len(names) == 1:
+        with pytest.raises(CFlowError, match=message):
+            recognise(tmp_path / names[0])

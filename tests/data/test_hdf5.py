@@ -177,3 +177,22 @@ def test_argoverse_scenes_without_extrinsics_are_recognised(drive, tmp_path):
             assert np.array_equal(plain.sweep(0).pose, drive.poses[0].astype(np.float32))
     with pytest.raises(CFlowError, match="ego_T_lidar of"):
         HDF5Log(file, ego_T_lidar=np.ones((4, 4)))
+
+
+@pytest.mark.parametrize(
+    ("name", "stamps", "has_times"),
+    [
+        ("{:06d}", [0, 1, 2], False),
+        ("1700000000.{}", [1_700_000_000_000_000_000 + k * 10**8 for k in range(3)], True),
+    ],
+)
+def test_groups_may_be_numbered_or_called_by_seconds(tmp_path, name, stamps, has_times):
+    file, h5py = write_scene(tmp_path / "a.h5"), pytest.importorskip("h5py")
+    before = [sweep.points for sweep in HDF5Log(file)]
+    with h5py.File(file, "r+") as scene:
+        for k, stamp in enumerate(STAMPS):
+            scene.move(str(stamp), name.format(k))
+    log = HDF5Log(file)
+    assert list(log.timestamps) == stamps
+    assert all(map(np.array_equal, before, [sweep.points for sweep in log]))
+    assert log.sweep(1).timestamp_ns == (stamps[1] if has_times else None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any, Callable
 
@@ -121,6 +122,8 @@ def test_scenes_of_a_version_share_their_tables(tiny, tmp_path):
     for file in (second / VERSION).iterdir():  # two scenes of one version, as in the real data set
         if file.stem not in ("visibility", "attribute"):
             edit(tiny, file.stem, lambda rows, file=file: rows + json.loads(file.read_text()))
+    for kind in ("samples", "sweeps"):
+        shutil.copytree(second / kind, tiny / kind, dirs_exist_ok=True)
     for root in (tiny, tiny / VERSION):
         sources = find_nuscenes_scenes(root)
         assert [(source.root, source.version, source.name) for source in sources] == [
@@ -201,3 +204,17 @@ def test_a_real_sweep_is_read(data_root: Path, tmp_path: Path) -> None:
     assert len(kept) == 34_688 - 8_526
     assert np.linalg.norm(kept - [0.943713, 0.0, 1.84023], axis=1).min() > 3
     assert len(open_log(data, own_vehicle=None).sweep(0).points) == 34_688
+
+
+def test_a_scene_with_key_frames_only_names_the_setting(tmp_path):
+    folder = write_nuscenes(TinyRecording(("LIDAR_TOP",), num_sweeps=11), tmp_path / "data", key_frame_interval=0.5)
+    complete = open_log(folder, sweep_step=5)
+    points = [sweep.points for sweep in complete]
+    (folder / "sweeps").rename(tmp_path / "elsewhere")
+    with pytest.raises(CFlowError, match=r"only its key frames .* data\.sweep_step=5"):
+        open_log(folder)
+    log = open_log(folder, sweep_step=5)
+    assert len(log) == 3 and all(map(np.array_equal, points, [sweep.points for sweep in log]))
+    (folder / "samples").rename(tmp_path / "other")
+    with pytest.raises(CFlowError, match="its files are not in"):
+        open_log(folder)

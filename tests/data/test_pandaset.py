@@ -149,3 +149,14 @@ def test_other_pickles_are_refused(content: bytes, message: str, sequence: Path)
             log.sweep(1), log.labels(0)
         assert str(sequence / file) in str(error.value)
         (sequence / file).write_bytes(whole)
+
+
+def test_files_without_compression_are_read(sequence: Path) -> None:
+    before = [PandaSetLog(sequence).sweep(k).points for k in range(3)]
+    flow = PandaSetLog(sequence).labels(0).flow
+    for file in list(sequence.rglob("*.pkl.gz")):
+        file.with_suffix("").write_bytes(gzip.decompress(file.read_bytes()))
+        file.unlink()
+    log = PandaSetLog(sequence)
+    assert all(np.array_equal(log.sweep(k).points, points) for k, points in enumerate(before))
+    assert np.array_equal(log.labels(0).flow, flow)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError
-from cflow_torch.data.arrays.cloud_file import pcd_fields, read_cloud, write_cloud
+from cflow_torch.data.arrays.cloud_file import read_cloud, read_columns, write_cloud
+from cflow_torch.data.arrays.pcd import pcd_fields, pcd_viewpoint
 
 DTYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 
@@ -55,6 +56,44 @@ def test_padding_and_vector_fields_are_left_out(tmp_path):
     cloud = pcd_fields((tmp_path / "a.pcd").read_bytes())
     assert list(cloud) == ["x", "t"] and cloud["t"].tolist() == [3, 2**60 + 1]
     assert np.array_equal(cloud["x"], rows["x"], equal_nan=True)
+
+
+HEADER = (
+    "# .PCD v.7\nVERSION .7\nFIELDS x y z _ i i _\nSIZE 4 4 4 1 2 2 2\nTYPE F F F U U U U\nCOUNT 1 1 1 3 1 1 0\n"
+    "WIDTH 20\nHEIGHT 1\nVIEWPOINT 1 2 3 1 0 0 0\nPOINTS 20\nDATA binary\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("", ""),
+        ("\n", "\r\n"),
+        ("VERSION .7\nFIELDS", "VERSION .5\nCOLUMNS"),
+        ("POINTS 20\n", ""),
+        ("HEIGHT 1\n", ""),
+        ("VIEWPOINT 1 2 3 1 0 0 0\n", ""),
+        ("WIDTH 20\nHEIGHT 1", "WIDTH 5\nHEIGHT 4"),
+        ("TYPE F F F U U U U", "type f f f u u u u"),
+        ("# .PCD v.7", "\ufeff# von Hand: Stra\u00dfe \u6771\u4eac"),
+        ("DATA", "# stamp 3.5\nDATA"),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le"])
+def test_headers_of_other_programs_are_read(tmp_path, old, new, encoding):
+    """Repeated fields, padding with and without values, missing lines, comments of any encoding."""
+    table = np.zeros(20, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("pad", "V3"), ("i", "<u2"), ("j", "<u2")])
+    rng = np.random.default_rng(0)
+    for name in "xyzij":
+        table[name] = rng.integers(0, 2**15, 20)
+    comment = "# \u00fc\n".encode(encoding)
+    file = tmp_path / "a.pcd"
+    file.write_bytes(comment + HEADER.replace(old, new, 1 if len(old) > 1 else -1).encode() + table.tobytes())
+    assert np.array_equal(read_cloud(file), np.stack([table[axis] for axis in "xyz"], 1))
+    columns = read_columns(file)
+    assert list(columns) == ["i", "i_2"]
+    assert np.array_equal(columns["i"], table["i"]) and np.array_equal(columns["i_2"], table["j"])
+    assert (pcd_viewpoint(file.read_bytes()) is None) == old.startswith("VIEWPOINT")
 
 
 def test_without_pypcd4_the_message_names_it(tmp_path, monkeypatch):

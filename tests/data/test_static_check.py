@@ -1,144 +1,385 @@
-"""Warnings when a log is opened: wrong poses, frames, units, axes and orders of sweeps."""
+"""What a check says of logs that are wrong on purpose: poses, frames, units, axes, masks, repeated sweeps."""
 
 from __future__ import annotations
 
+import json
 import warnings
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
 
 from cflow_torch import CFlowError, Sweep
+from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.log import CachedLog
-from cflow_torch.data.log_check import check_log, check_static_world, find_problems, static_world_residual
+from cflow_torch.data.catalog import open_log
+from cflow_torch.data.log import CachedLog, Log
+from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
+from cflow_torch.data.log_motion import find_lapses, judge_log
+from cflow_torch.data.read_as import read_as
 from cflow_torch.simulator import make_drive
 from cflow_torch.types import CFlowWarning
+from cflow_torch.windows.readings import (
+    AXES,
+    CAMERA,
+    MOUNT,
+    NO_READING,
+    UNKNOWN,
+    WORLD,
+    as_matrix,
+    rotation_about_z,
+)
+
+MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
 
 
-class Changed:
-    """A log with other poses, ground masks, points or order of sweeps; of a broken one no sweep can be read."""
+class Wrong(Log):
+    """A log with other points, poses, masks or order of sweeps. `points` is called with the points and the pose."""
 
-    def __init__(self, log, pose=lambda pose: pose, masks=True, ground=True, points=None, order=None, is_broken=False):
-        self.log, self.log_id, self.timestamps, self.labels = log, log.log_id, log.timestamps, log.labels
-        self.pose, self.masks, self.ground, self.points, self.is_broken = pose, masks, ground, points, is_broken
-        self.order = range(8) if order is None else order
-
-    @property
-    def poses(self):
-        return self.pose and np.stack([self.pose(pose) for pose in self.log.poses])
+    def __init__(self, log, points=None, poses=None, masks=True, order=None, is_broken=False, name=""):
+        self.log, self.log_id, self.timestamps = log, name or log.log_id, log.timestamps
+        self.points, self.masks, self.is_broken = points, masks, is_broken
+        self.order = order or range(len(log.timestamps))
+        true = np.stack([log.sweep(index).pose for index in range(len(log.timestamps))])
+        self.true, self.poses = true, true
+        if poses is not None:
+            self.poses = poses(true)
 
     def sweep(self, index):
         if self.is_broken:
             raise CFlowError("broken")
-        sweep = self.log.sweep(index)
-        pose = None if self.pose is None else self.pose(sweep.pose)
-        if callable(self.points):
-            return Sweep(self.points(self.log.sweep(self.order[index]).points), None, pose, sweep.timestamp_ns)
-        if self.points is not None:
-            return Sweep(self.points, None, pose, sweep.timestamp_ns)
-        kept = np.ones(len(sweep.points), bool) if self.ground else ~np.asarray(sweep.is_ground)
-        mask = np.asarray(sweep.is_ground)[kept] if self.masks else None
-        return Sweep(np.asarray(sweep.points)[kept], mask, pose, sweep.timestamp_ns)
+        sweep = self.log.sweep(self.order[index])
+        points = np.asarray(sweep.points, np.float64)
+        points = points if self.points is None else self.points(points, self.true[index])
+        mask = sweep.is_ground if self.masks is True else self.masks(sweep.is_ground) if self.masks else None
+        pose = None if self.poses is None else self.poses[index]
+        return Sweep(points.astype(np.float32), mask, pose, sweep.timestamp_ns)
 
 
-def without_rotation(pose):
-    return np.block([[np.eye(3), pose[:3, 3:]], [np.zeros((1, 3)), np.ones((1, 1))]])
+def each(change):
+    """A change of all poses, from a change of one."""
+    return lambda poses: np.stack([change(pose) for pose in poses])
 
 
-def verdict(log) -> str:
-    """Return the warning of the check, "" = none."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        found = check_static_world(log)
-    messages = [str(w.message) for w in caught if issubclass(w.category, CFlowWarning)]
-    assert found and len(messages) <= 1
-    assert bool(messages) == any(residual.verdict for residual in found)
-    return messages[0] if messages else ""
+def to_world(points, pose):
+    return points @ pose[:3, :3].T + pose[:3, 3]
 
 
-@pytest.fixture(scope="module")
+def scaled(factor):
+    return each(lambda pose: as_matrix(pose[:3, :3], factor * pose[:3, 3]))
+
+
+def extrapolated(step):
+    """Poses that belong to the sweep `step` later."""
+
+    def change(poses):
+        first = poses[0] @ np.linalg.inv(poses[1]) @ poses[0]
+        last = poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
+        return np.concatenate([poses[1:], [last]]) if step > 0 else np.concatenate([[first], poses[:-1]])
+
+    return change
+
+
+@lru_cache(maxsize=None)
+def drive_of(seed=2, num_sweeps=12, profile="demo", scene="street"):
+    """Seed 2 of the street begins to turn in its first second."""
+    return CachedLog(make_drive(seed=seed, num_sweeps=num_sweeps, profile=profile, scene=scene), num_sweeps)
+
+
+@pytest.fixture
 def drive():
-    """A drive that begins to turn in its first second."""
-    return CachedLog(make_drive(seed=2, num_sweeps=8, profile="demo"), 8)
+    return drive_of()
 
 
-@pytest.mark.parametrize("profile", ["av2", "nuscenes", "waymo", "truckscenes"])
-def test_correct_poses_raise_no_warning(profile):
-    """Truck scenes are not de-skewed, which must not look like a wrong frame at the beginning of a turn."""
-    log = CachedLog(make_drive(seed=1, num_sweeps=6, profile=profile), 2)
-    assert verdict(log) == "" and verdict(Changed(log, masks=False)) == ""
-
-
-def test_mistakes_are_recognised(drive):
-    points = drive.sweep(0).points
-    assert verdict(Changed(drive, lambda pose: np.eye(4), points=points)) == "", "a static car"
-    assert "inverted" in verdict(Changed(drive, np.linalg.inv))
-    mixed = verdict(Changed(drive, lambda pose: pose @ np.linalg.inv(drive.units(0)[0].T_ego_sensor)))
-    assert "ego_T_lidar" in mixed and drive.log_id in mixed
-    millimetres = np.diag([1000.0, 1000, 1000, 1])
-    for change in (without_rotation, lambda pose: millimetres @ pose @ np.linalg.inv(millimetres)):
-        assert verdict(Changed(drive, change))
-    assert "common frame" in verdict(Changed(drive, points=points))
-    slow = Changed(drive, lambda pose: np.block([[np.eye(3), 0.15 * pose[:3, 3:]], [pose[3:]]]), points=points)
-    assert "common frame" in static_world_residual(slow, 2).verdict, "both fit, but no motion fits far better"
-    assert "no poses" in verdict(Changed(drive, pose=None))
-    assert verdict(Changed(drive, pose=None, points=points)) == "", "a static sensor needs no poses"
-
-
-def test_the_shift_equals_the_lever_arm(drive):
-    """Sensor points with ego poses are off by (R - 1) t, where t is the mounting position."""
-    to_sensor = np.linalg.inv(drive.units(0)[0].T_ego_sensor)
-    log = Changed(drive, lambda pose: pose @ to_sensor)
-    residual = static_world_residual(log, 1, 5)
-    T_1_0, right = (np.linalg.inv(poses[6]) @ poses[1] for poses in (log.poses, drive.poses))
-    miss = right[:2, 3] - T_1_0[:2, 3]
-    lever = (np.eye(3) - T_1_0[:3, :3]) @ to_sensor[:3, 3]
-    assert np.linalg.norm(miss) > 0.1 and np.allclose(miss, lever[:2], atol=1e-9)
-    assert np.linalg.norm(residual.shift - miss) < 0.01
-    assert residual.aligned > 2 * residual.agreement and abs(residual.rotation) < np.radians(0.05)
-
-
-def test_real_drives_are_judged_correctly(av2_folder, kitti_file):
+@pytest.fixture
+def real(kitti_file):
     hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
-    log = CachedLog(AV2Log(av2_folder), 2)
-    assert verdict(log) == "" and "inverted" in verdict(Changed(log, np.linalg.inv))
-    with CachedLog(hdf5.HDF5Log(kitti_file), 4) as log:
-        assert verdict(log) == "" and verdict(Changed(log, masks=False)) == ""
-        assert "inverted" in verdict(Changed(log, np.linalg.inv)) and verdict(Changed(log, without_rotation))
-        mount = np.eye(4)
-        mount[:3, 3] = 1.35, 0, 1.64
-        assert "ego_T_lidar" in verdict(Changed(log, lambda pose: pose @ np.linalg.inv(mount)))
-        residual = static_world_residual(log, 0, 5)
-        assert np.linalg.norm(residual.shift) < 0.02 and residual.agreement > 0.4
+    return CachedLog(hdf5.HDF5Log(kitti_file), 16)
 
 
-def test_too_few_points_raise_no_warning(drive):
-    for points in (np.zeros((0, 3), np.float32), np.ones((50, 3), np.float32), np.full((9, 3), np.nan, np.float32)):
-        log = Changed(drive, np.linalg.inv, points=points)
-        assert verdict(log) == "" and np.isnan(static_world_residual(log, 0).agreement)
+@pytest.fixture
+def turning(kitti_file):
+    """A real drive whose turn changes its direction."""
+    hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+    file = kitti_file.with_name("kitti-0000-c2.h5")
+    if not file.exists():
+        pytest.skip(f"needs {file.name}")
+    return CachedLog(hdf5.HDF5Log(file), 27)
+
+
+POSES = {
+    "inverted": np.linalg.inv,
+    CAMERA: lambda pose: pose @ as_matrix(AXES[CAMERA]),
+    "left": lambda pose: pose @ as_matrix(AXES["left"]),
+    "back": lambda pose: pose @ as_matrix(AXES["back"]),
+    "right": lambda pose: pose @ as_matrix(AXES["right"]),
+}
+WRONG_POSES = {
+    **{name: each(change) for name, change in POSES.items()},
+    "late": extrapolated(-1),
+    "early": extrapolated(1),
+    "millimetres": scaled(1000),
+    "centimetres": scaled(100),
+}
+
+
+@pytest.mark.parametrize("source", ["drive", "real"])
+@pytest.mark.parametrize("reading", WRONG_POSES)
+def test_wrong_poses_are_named_and_the_reading_undoes_them(reading, source, request):
+    if source == "real" and reading in ("late", "early"):
+        source = "turning"  # the motion must change, else a neighbour's pose is as good
+    good = request.getfixturevalue(source)
+    wrong = Wrong(good, poses=WRONG_POSES[reading])
+    (problem,) = [text for text in find_problems(wrong) if "ground masks" not in text]
+    assert f"data.read_as={reading}" in problem and "as given" in problem
+    again = read_as(wrong, reading)
+    assert find_problems(again) == []
+    true, read = (np.linalg.inv(log.poses[2:-1]) @ log.poses[1:-2] for log in (Wrong(good), again))
+    assert np.allclose(true, read, atol=1e-6), "the motion between the sweeps is the true one"
+
+
+@pytest.mark.parametrize("source", ["drive", "real"])
+def test_points_in_the_world_are_found_and_moved_back(source, request, tmp_path):
+    good = request.getfixturevalue(source)
+    world = Wrong(good, points=to_world)
+    assert judge_log(world).best == (WORLD,)
+    log = read_as(world)
+    assert np.allclose(log.sweep(9).points, good.sweep(9).points, atol=1e-4)
+    (text,) = find_problems(log)
+    assert "world's frame" in text and "data.read_as=world" in text
+    assert find_problems(read_as(world, "world")) == [], "what you say is not repeated"
+    assert "world's frame" in find_problems(world)[0] and read_as(good) is good
+
+
+def test_opening_a_folder_finds_points_in_the_world(drive, tmp_path):
+    write_array_log(Wrong(drive, points=to_world, masks=False, name="log"), tmp_path)
+    with pytest.warns(CFlowWarning, match="world's frame"):
+        log = open_log("arrays", tmp_path / "log", find_ground="grid")
+    assert np.allclose(log.sweep(11).points, drive.sweep(11).points, atol=1e-3)
+    assert not np.allclose(open_log("arrays", tmp_path / "log", read_as=None).sweep(11).points, log.sweep(11).points)
+    with pytest.raises(CFlowError, match="read_as='mirrored': give one of auto, null, world"):
+        open_log("arrays", tmp_path / "log", read_as="mirrored")
+
+
+def test_labels_move_with_the_points(drive):
+    """Flow in the world's axes becomes flow in the axes of the vehicle at t+1."""
+    truth = drive.labels(8)
+
+    class Labelled(Wrong):
+        def _labels(self, index):
+            end = to_world(drive.sweep(index).points + drive.labels(index).flow, self.true[index + 1])
+            return replace(drive.labels(index), flow=(end - self.sweep(index).points).astype(np.float32))
+
+    labels = read_as(Labelled(drive, points=to_world)).labels(8)
+    assert np.allclose(labels.flow, truth.flow, atol=1e-3) and len(labels.flow) == len(truth.flow)
+
+
+def test_poses_of_another_log_are_named(drive):
+    still = Wrong(drive, order=[0] * 12)
+    noise = np.random.default_rng(0)
+    noisy = Wrong(drive, points=lambda points, _: points + noise.normal(0, 0.005, points.shape), order=[0] * 12)
+    assert "data.read_as=still" in find_problems(noisy)[0]
+    assert judge_log(still).best == ("still",) and find_problems(read_as(noisy, "still")) == []
+    mixed = Wrong(drive, order=[0, 6, 1, 7, 2, 8, 3, 9, 4, 10, 5, 11])
+    assert judge_log(mixed).best == (NO_READING,) and "no reading" in find_problems(mixed)[0]
+
+
+@pytest.mark.parametrize("source", ["drive", "real"])
+def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, request):
+    mixed = Wrong(request.getfixturevalue(source), poses=each(lambda pose: pose @ np.linalg.inv(MOUNTING)))
+    judgement = judge_log(mixed)
+    assert judgement.best == (MOUNT,) and abs(judgement.offset - 1.35) < 0.4
+    assert "data.ego_T_lidar" in find_problems(mixed)[0]
+
+
+@pytest.mark.parametrize("source", ["drive", "real"])
+def test_missing_poses_are_named_if_the_sensor_moves(source, request):
+    good = request.getfixturevalue(source)
+    assert judge_log(Wrong(good, poses=lambda _: None), 4).best == (UNKNOWN,)
+    assert "no poses" in find_problems(Wrong(good, poses=lambda _: None))[0]
+    static = Wrong(good, poses=lambda _: None, order=[0] * len(good.timestamps))
+    assert judge_log(static).best == () and judge_log(static).given == 1
 
 
 @pytest.mark.parametrize(
-    ("change", "order", "found"),
+    ("profile", "scene", "seed"),
     [
-        (lambda points: 1000 * points, range(8), "in metres"),
-        (lambda points: 0.001 * points, range(8), "in metres"),
-        (lambda points: points + np.float32([500, 0, 0]), range(8), "frame of the LiDAR or of the vehicle"),
-        (lambda points: points * np.float32([1, -1, -1]), range(8), "z seems to point down"),
-        (lambda points: points, (0, 0, 2, 3, 4, 5, 6, 7), "the same points"),
-        (lambda points: points, (0, 2, 1, 3, 4, 5, 6, 7), "interchanged"),
+        *(("av2", "street", 1), ("nuscenes", "street", 1), ("waymo", "street", 1), ("truckscenes", "street", 1)),
+        *(("demo", "highway", seed) for seed in (1, 3, 4)),
+        *(("demo", "narrow", 1), ("demo", "car_park", 1), ("demo", "crossing", 1)),
     ],
-    ids=["millimetres", "kilometres", "elsewhere", "z down", "repeated", "interchanged"],
 )
-def test_wrong_sweeps_are_recognised(drive, change, order, found):
-    assert any(found in text for text in find_problems(Changed(drive, points=change, order=order)))
+def test_right_logs_stay_silent(profile, scene, seed):
+    """Raw truck scenes, vehicles of the same speed, and walls along the road must not look like wrong poses."""
+    log = drive_of(seed, 6, profile, scene)
+    assert find_problems(log) == []
+    bare = Wrong(log, masks=lambda mask: np.zeros_like(mask))
+    assert judge_log(bare).best == (), "ground that is not masked looks the same everywhere"
+
+
+def test_prepared_real_data_stay_silent(real, av2_folder):
+    data = av2_folder.parents[2]
+    hdf5 = pytest.importorskip("cflow_torch.data.hdf5")
+    names = ("kitti-0000/kitti-0000-c2", "pandaset-002/panda-002-a1", "pandaset-002/panda-002-c", "av2-crown/av2-crown")
+    others = [hdf5.HDF5Log(data / f"{name}.h5") for name in names if (data / f"{name}.h5").exists()]
+    for log in (real, AV2Log(av2_folder), *others):
+        assert find_problems(log) == [], log.log_id
+        assert [finding for finding in examine(log) if finding.status != RIGHT] == [], log.log_id
+
+
+def test_single_poses_that_are_off_are_found(drive):
+    def glitch(poses):
+        poses = poses.copy()
+        poses[6, 0, 3] += 0.6
+        return poses
+
+    def turned(poses):
+        poses = poses.copy()
+        poses[6] = poses[6] @ as_matrix(rotation_about_z(np.radians(5)))
+        return poses
+
+    def jump(poses):
+        poses = poses.copy()
+        poses[7:, 1, 3] += 1.5
+        return poses
+
+    for change, index, is_single in ((glitch, 6, True), (turned, 6, True), (jump, 7, False)):
+        (lapse,) = find_lapses(Wrong(drive, poses=change))
+        assert (lapse.sweep, lapse.is_single) == (index, is_single)
+    assert "jump by 1.5 m before sweep 7" in find_problems(Wrong(drive, poses=jump))[0]
+    assert find_lapses(Wrong(drive)) == []
+
+
+def camera_points(points, _):
+    return points @ AXES[CAMERA]
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda points, _: 1000 * points, "data.read_as=points_millimetres"),
+        (lambda points, _: 100 * points, "data.read_as=points_centimetres"),
+        (lambda points, _: 0.001 * points, "in metres"),
+        (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
+        (lambda points, _: points @ AXES["upside_down"], "data.read_as=points_upside_down"),
+        (camera_points, "data.read_as=points_camera"),
+    ],
+    ids=["millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera"],
+)
+@pytest.mark.parametrize("source", ["drive", "real"])
+def test_wrong_units_and_axes_are_recognised(source, change, found, request):
+    good = request.getfixturevalue(source)
+
+    def with_strays(points, pose):
+        return np.concatenate([change(points, pose), np.zeros((8, 3)), np.full((2, 3), 5.0)])
+
+    masks = {"masks": False}
+    (text,) = [text for text in find_problems(Wrong(good, points=with_strays, **masks)) if "sweep" in text][:1]
+    assert found in text
+    if "read_as=points" in found:
+        reading = found.split("=")[-1]
+        axes = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}.get(reading, np.eye(3))
+        wrong = Wrong(good, points=change, poses=each(lambda pose: pose @ as_matrix(axes)), masks=False)
+        again = read_as(wrong, reading)
+        assert np.allclose(again.sweep(3).points, good.sweep(3).points, atol=1e-3)
+        assert find_problems(again) == []
+
+
+def test_masks_and_repeated_sweeps_are_recognised(drive):
+    assert "invert the mask" in find_problems(Wrong(drive, masks=np.logical_not))[0]
+    repeated = Wrong(drive, order=[0, 0, *range(2, 12)])
+    assert any("the same points" in text for text in find_problems(repeated))
 
 
 def test_opening_a_log_warns_of_likely_mistakes(drive):
     with pytest.warns(CFlowWarning, match=f"log {drive.log_id}: .*static world moves"):
-        check_log(Changed(drive, lambda pose: np.eye(4)))
+        check_log(Wrong(drive, poses=WRONG_POSES["inverted"]))
+    few = Wrong(drive, points=lambda points, _: np.full((50, 3), 5.0), masks=False)
+    empty = Wrong(drive, points=lambda points, _: np.zeros((0, 3)), masks=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for good in (drive, Changed(drive, masks=False, ground=False), Changed(drive, is_broken=True)):
+        for good in (drive, few, empty, Wrong(drive, is_broken=True)):
             check_log(good)
-        assert find_problems(Changed(drive, points=np.asarray)) == []
+
+
+def test_the_page_says_what_was_found(drive, tmp_path):
+    at_lidar = each(lambda pose: pose @ as_matrix(np.eye(3), (1.35, 0, 1.64)))
+    in_sensor = Wrong(drive, points=lambda points, _: points - [1.35, 0, 1.64], poses=at_lidar)
+    findings = {one.topic: one for one in examine(in_sensor)}
+    assert {one.status for one in findings.values()} == {RIGHT}
+    assert "32 beams" in findings["sensor"].text
+    assert "10.0 Hz" in findings["times"].text and "none" in findings["labels"].text
+    late = Wrong(drive)
+    late.timestamps = [*drive.timestamps[:6], *(stamp + 700_000_000 for stamp in drive.timestamps[6:])]
+    times = next(one for one in examine(late) if one.topic == "times")
+    assert times.status == WRONG and "0.8 s after sweep 5" in times.text
+
+    long = drive_of(num_sweeps=24)
+    hood = np.random.default_rng(0).uniform([1.5, -0.8, 0.5], [2.4, 0.8, 0.9], (120, 3))
+    ride = Wrong(
+        long, points=lambda points, _: np.concatenate([points, hood]), masks=lambda m: np.append(m, [False] * 120)
+    )
+    own = next(one for one in examine(ride) if one.topic == "own vehicle")
+    assert own.status == WRONG and "model.ego_box=[1.5,-1.0,2.5,1.0]" in own.text
+    assert next(one for one in examine(long) if one.topic == "own vehicle").status == RIGHT
+
+
+def test_the_page_lists_notes_of_the_reader_and_knows_its_gaps(drive):
+    log = Wrong(drive)
+    log.timestamps = [time + 3 * 10**9 * (index > 5) for index, time in enumerate(drive.timestamps)]
+    page = {finding.topic: finding for finding in examine(log)}
+    assert page["times"].status == WRONG and "reader" not in page
+    log.gaps = frozenset([5])
+    with pytest.warns(CFlowWarning, match="it has a gap"):
+        log._note("it has a gap")
+    page = {finding.topic: finding for finding in examine(log)}
+    assert page["times"].status == FOUND and "after sweep 5" in page["times"].text
+    assert page["reader"][1:3] == (FOUND, "it has a gap")
+
+
+def test_two_clouds_without_their_transform_are_warned_of(drive, real):
+    from cflow_torch import estimate_flow
+
+    for log in (drive, real):
+        pc0, pc1 = log.sweep(2), log.sweep(3)
+        T = np.linalg.inv(pc1.pose) @ pc0.pose
+        given = {"gm0": pc0.is_ground, "gm1": pc1.is_ground}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            estimate_flow(pc0.points, pc1.points, T_ego1_ego0=T, **given)
+            estimate_flow(pc0.points, pc0.points + np.float32(0.004), gm0=pc0.is_ground, gm1=pc0.is_ground)
+        with pytest.warns(CFlowWarning, match="the sensor moves by about.*give T_ego1_ego0"):
+            estimate_flow(pc0.points, pc1.points, **given)
+        with pytest.warns(CFlowWarning, match="inverted"):
+            estimate_flow(pc0.points, pc1.points, T_ego1_ego0=np.linalg.inv(T), **given)
+        with pytest.warns(CFlowWarning, match="still without"):
+            estimate_flow(
+                pc0.points,
+                pc0.points + np.float32(0.004),
+                T_ego1_ego0=as_matrix(np.eye(3), (2, 1, 0)),
+                gm0=pc0.is_ground,
+                gm1=pc0.is_ground,
+            )
+        with pytest.warns(CFlowWarning, match="millimetres"):
+            points = [1000 * np.concatenate([each.points, np.zeros((5, 3), np.float32)]) for each in (pc0, pc1)]
+            estimate_flow(*points, T_ego1_ego0=T)
+
+
+def test_the_command_prints_a_page_or_json(drive, tmp_path, capsys):
+    pytest.importorskip("hydra")
+    from command_line import cflow
+
+    for name, change in (("good", None), ("bad", WRONG_POSES["inverted"])):
+        write_array_log(Wrong(drive, poses=change, name=name), tmp_path)
+    assert cflow("check", tmp_path / "good") == 0
+    page = capsys.readouterr().out
+    assert "good (arrays): nothing is wrong" in page and "ego motion   right" in page
+    assert cflow("check", tmp_path / "good", tmp_path / "bad") == 1
+    both = capsys.readouterr().out
+    assert "good (arrays): nothing is wrong" in both and "bad (arrays): 1 wrong" in both
+    assert cflow("check", tmp_path / "bad", "json=true") == 1
+    (log,) = json.loads(capsys.readouterr().out)
+    assert log["log"] == "bad" and {row["status"] for row in log["findings"]} == {RIGHT, WRONG}
+    assert cflow("check", tmp_path / "bad", "data.read_as=inverted") == 0
+    assert FOUND not in capsys.readouterr().out

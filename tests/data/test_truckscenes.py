@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from tiny_recording import CAR_VELOCITY, TinyRecording
 
-from cflow_torch.data.arrays.cloud_file import pcd_fields, read_cloud, write_cloud
+from cflow_torch.data.arrays.cloud_file import read_cloud, write_cloud
+from cflow_torch.data.arrays.pcd import pcd_fields
 from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.data.truckscenes import TruckScenesLog, find_truckscenes_scenes

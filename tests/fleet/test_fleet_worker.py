@@ -79,7 +79,7 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
     assert [event.timestamp for event in events if isinstance(event, Done)] == [drive.timestamps[i] for i in (0, 2, 3)]
     notes = [(event.name, event.message) for event in events if isinstance(event, Noted)]
     assert notes[-1] == (f"{drive.log_id}/{drive.timestamps[3]}", "the next sweep has the same points")
-    assert any("static world moves" in text for _, text in notes), "the log is checked by the unit of its first frame"
+    assert any("the sensor moves" in text for _, text in notes), "the log is checked by the unit of its first frame"
 
 
 def test_a_lost_gpu_ends_its_worker(source, tmp_path, monkeypatch):

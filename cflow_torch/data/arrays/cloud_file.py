@@ -12,25 +12,25 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather, parquet
 
+from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bin_layout
+from cflow_torch.data.arrays.pcd import pcd_fields, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.files import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.errors import import_optional
 from cflow_torch.types import CFlowError, check_array
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
-KITTI_COLUMNS = 4  # x, y, z, reflectance
 _AXES = ("x", "y", "z")
 _CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file with more than one table
 
 
-def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
+def read_cloud(path: PathLike, bin_columns: int | BinLayout | None = None) -> np.ndarray:
     """Read the positions of a point cloud.
 
     Args:
         path: file; its suffix tells the format (see Convention).
-        bin_columns: float32 numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes.
+        bin_columns: numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes; None = see `find_bin_layout`.
 
     Returns:
         (N, 3) in the precision of the file: float32 or float64; float16 becomes float32.
@@ -38,7 +38,7 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     Convention:
         - `.npy`: (N, 3+) floats, columns x, y, z first; or a structured array with fields x, y, z.
         - `.npz`: arrays x, y, z; or one (N, 3+) array, called points, lidar, xyz or pc if there are several.
-        - `.bin`: little-endian float32, `bin_columns` per point.
+        - `.bin`: little-endian float32 or float64, `bin_columns` per point.
         - `.pcd` (extra `clouds`), `.ply`: fields x, y, z.
         - `.feather`, `.parquet`: columns x, y, z; without these names, the first three.
         Nothing is unpickled. `read_columns` reads the other columns.
@@ -46,26 +46,37 @@ def read_cloud(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> np.ndarray:
     Raises:
         CFlowError: no such file, an unknown suffix, or a file that is truncated or has other contents.
     """
+    return read_table(path, bin_columns)[0]
+
+
+def read_table(path: PathLike, bin_columns: int | BinLayout | None = None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Read the positions and the other columns of a cloud at once, see `read_cloud` and `read_columns`."""
     path = as_path(path)
     with file_errors(path, _hint(path)):
-        points = np.stack(_positions(_read(path, bin_columns)), axis=1)
+        fields = _read(path, bin_columns)
+        points = np.stack(_positions(fields), axis=1)
         check_array(points, "its cloud", (None, 3), "f", "(N,) floating-point metres each for x, y and z")
-    return points.astype(np.float32 if points.dtype.itemsize < 8 else np.float64, copy=False)
+    precision = np.float32 if points.dtype.itemsize < 8 else np.float64
+    return points.astype(precision, copy=False), _other_columns(fields)
 
 
-def read_columns(path: PathLike, bin_columns: int = KITTI_COLUMNS) -> dict[str, np.ndarray]:
+def read_columns(path: PathLike, bin_columns: int | BinLayout | None = None) -> dict[str, np.ndarray]:
     """Read the other columns of a cloud, name -> (N,) bool, integers or floats as stored; errors as `read_cloud`.
 
     Columns without a name (`.bin` files, plain arrays) are called column_3, column_4, ... We leave out texts, objects
     and columns of several numbers per point.
     """
-    path, kept = as_path(path), {}
+    path = as_path(path)
     with file_errors(path, _hint(path)):
-        fields = _read(path, bin_columns)
-        shape = _positions(fields)[0].shape
+        return _other_columns(_read(path, bin_columns))
+
+
+def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    shape = _positions(fields)[0].shape
+    kept = {}
     for name, values in fields.items():
         kind = values.dtype
-        if name not in _AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
+        if name.lower() not in _AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
             kept[name] = values.astype(kind.newbyteorder("="), copy=False)
     return kept
 
@@ -101,9 +112,9 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
         points, named = np.column_stack([points, *named.values()]), {}
     with atomic_file(path) as file:
         if suffix == ".pcd":
-            pypcd4, kinds = _pypcd4(), [values.dtype for values in fields.values()]
-            cloud = pypcd4.PointCloud.from_points(list(fields.values()), list(fields), kinds)
-            cloud.save(file, pypcd4.Encoding.BINARY)
+            pcd, kinds = pypcd4(), [values.dtype for values in fields.values()]
+            cloud = pcd.PointCloud.from_points(list(fields.values()), list(fields), kinds)
+            cloud.save(file, pcd.Encoding.BINARY)
         elif suffix == ".ply":
             file.write(ply_bytes(fields))
         elif suffix == ".bin":
@@ -144,11 +155,13 @@ def _storable(values: np.ndarray, suffix: str) -> np.ndarray:
 
 def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:
     if not set(_AXES) <= set(fields):
+        fields = {name.lower(): values for name, values in fields.items()}  # X, Y, Z
+    if not set(_AXES) <= set(fields):
         raise CFlowError(f"it has {list(fields)}; it needs x, y, z")
     return [fields[axis] for axis in _AXES]
 
 
-def _read(path: Path, bin_columns: int) -> Mapping[str, np.ndarray]:
+def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.ndarray]:
     """Read all columns by name; those without a name are x, y, z, column_3, ..."""
     suffix, content = _suffix(path), read_bytes(path)
     if suffix in (".pcd", ".ply"):
@@ -159,12 +172,13 @@ def _read(path: Path, bin_columns: int) -> Mapping[str, np.ndarray]:
         return _archive_columns(content)
     if suffix == ".npy":
         return _array_columns(np.load(io.BytesIO(content), allow_pickle=False))
-    if len(content) % (4 * bin_columns):
+    layout = bin_columns if isinstance(bin_columns, BinLayout) else find_bin_layout(content, bin_columns)
+    if len(content) % layout.step:
         raise CFlowError(
-            f"it has {len(content)} bytes, not a multiple of {4 * bin_columns} ({bin_columns} float32 per point): it "
-            "is truncated, or has another number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
+            f"it has {len(content)} bytes, not a multiple of {layout.step} ({layout}): it is truncated, or has another "
+            "number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
         )
-    return _array_columns(np.frombuffer(content, "<f4").reshape(-1, bin_columns))
+    return _array_columns(np.frombuffer(content, layout.kind).reshape(-1, layout.columns))
 
 
 def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
@@ -205,24 +219,3 @@ def _table_columns(read: Any, content: bytes) -> dict[str, np.ndarray]:
         for name, column in zip(table.column_names, table.columns)
         if any(is_kind(column.type) for is_kind in kinds)
     }
-
-
-def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
-    """Read the fields of a `.pcd` file of version 0.7: name -> (N,) array of the stated dtype.
-
-    Organised clouds (HEIGHT above 1) are flattened row by row. Padding and fields of several values (COUNT above 1) are
-    left out. VIEWPOINT is not applied, so points stay in their stored frame. NaN points stay. A file that is damaged or
-    not a `.pcd` file may raise any exception, which the caller reports.
-    """
-    cloud = _pypcd4().PointCloud.from_fileobj(io.BytesIO(content))
-    header, table = cloud.metadata, np.atleast_1d(cloud.pc_data)
-    if len(table) != header.width * header.height:
-        raise ValueError(f"it has {len(table)} points, but its header states {header.width} x {header.height}")
-    # pypcd4 names padding "#...", splits fields of several values, and mixes these fields up in compressed files.
-    names = [name for name, count in zip(header.fields, header.count) if count == 1 and name[0] != "#"]
-    # pypcd4 1.4 makes a two-dimensional table of a cloud without points.
-    return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}
-
-
-def _pypcd4() -> Any:
-    return import_optional("pypcd4", "PCD files need pypcd4: pip install pypcd4")

@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 
 from cflow_torch.data.arrays import poses_text
-from cflow_torch.data.arrays.cloud_file import KITTI_COLUMNS, SUFFIXES, read_cloud, read_columns
+from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_columns, read_table
+from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
 from cflow_torch.data.arrays.poses_text import Trajectory
-from cflow_torch.data.files import find_folders, read_npy
+from cflow_torch.data.files import file_errors, find_folders, read_npy
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes, read_start
+from cflow_torch.data.point_times import TIME_FIELDS, PointTimes, seconds_after
+from cflow_torch.data.returns import missing_returns
+from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
+from cflow_torch.windows.stillness import share_in_place, static_rows, thinned_rows
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds")  # where the clouds may lie below the log's folder
-POSE_FILES = ("poses.txt", "poses.npy", "trajectory.txt")
+POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
 GROUND_FOLDER = "ground"
+_VIEWPOINT = "VIEWPOINT"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")  # file names that are times: 16, 17 digits = us, 18, 19 = ns
+# File names that are times: 16, 17 digits = us, 18, 19 = ns; and seconds with decimals or nanoseconds.
+_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")
+_SECONDS = re.compile(r"\D*([0-9]+)\.([0-9]+)|\D*([0-9]{9,10})_([0-9]+)")
 _FIRST_NANOSECOND = 10**17
 
 
@@ -43,8 +51,9 @@ class ArraysLog(Log):
     Args:
         folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
             velodyne or clouds that does. Clouds are sorted naturally: 2 before 10.
-        poses: "auto" = poses.txt, poses.npy or trajectory.txt in the folder, or KITTI's ../../poses/<name>.txt, if
-            there is one; None = no poses; or a file (see `read_poses`), or a (K, 4, 4) array.
+        poses: "auto" = poses.txt, odometry.csv or the like (`POSE_FILES`) in the folder, or KITTI's
+            ../../poses/<name>.txt, if there is one, or VIEWPOINT of `.pcd` files if it is set; None = no poses; or a
+            file (see `read_poses`); or a (K, 4, 4) array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
@@ -53,19 +62,26 @@ class ArraysLog(Log):
             cloud, of the same name, with (N,) bool or 0 and 1.
         ego_T_lidar: (4, 4), maps the frame of the stored points to the ego frame; None = they are the same.
         suffix: suffix of the clouds to read, if a folder has several kinds.
-        bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes.
+        bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes; "auto" = `find_bin_layout`.
+        points_frame: "lidar", or "world" = the stored points are in the world's frame, and we move them back by the
+            poses; "auto" = "lidar", but with poses from VIEWPOINT the one under which the static world stands still.
 
     Attributes:
         files: the clouds, in order.
-        timestamps: nanoseconds from `times`, else from file names of 16 digits or more (microseconds, nanoseconds),
-            else from TUM poses, if each cloud has one. Otherwise 0, 1, 2, ..., and sweeps have no `timestamp_ns`.
-        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
+        timestamps: nanoseconds from `times`, else from file names (see `times_of_names`), else from TUM poses, if each
+            cloud has one. Otherwise 0, 1, 2, ..., and sweeps have no `timestamp_ns`.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown. Sweeps before the first pose, after the
+            last one, or in a gap of the poses of more than half a second are left out.
+        gaps: indices of sweeps after which sweeps were left out.
 
     Convention:
+        `missing_returns` stay, as NaN, so that results have a row for every row of the file.
         Sweeps are in the ego frame: points are transformed by `ego_T_lidar` in float64, then rounded to float32. Poses
         with times (TUM) are interpolated at the times of the sweeps, if these are known. Otherwise there must be one
         pose per sweep. The ego frame should have z up, because the method works in the bird's-eye view.
     """
+
+    has_raw_times: bool = True
 
     def __init__(
         self,
@@ -77,41 +93,89 @@ class ArraysLog(Log):
         ground: PathLike | None = "auto",
         ego_T_lidar: Any = None,
         suffix: str | None = None,
-        bin_columns: int = KITTI_COLUMNS,
+        bin_columns: int | str = "auto",
+        points_frame: str = "auto",
     ) -> None:
         self.folder = as_path(folder)
         if poses_of not in ("ego", "lidar"):
             raise CFlowError(f"poses_of={poses_of!r}: pass 'ego' or 'lidar'")
-        if type(bin_columns) is not int or bin_columns < 3:
-            raise CFlowError(f"bin_columns={bin_columns!r}: pass an integer of at least 3")
+        if bin_columns != "auto" and (type(bin_columns) is not int or bin_columns < 3):
+            raise CFlowError(f"bin_columns={bin_columns!r}: pass 'auto' or an integer of at least 3")
+        if points_frame not in ("auto", "lidar", "world"):
+            raise CFlowError(f"points_frame={points_frame!r}: pass 'auto', 'lidar' or 'world'")
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
-        self._bin_columns = bin_columns
+        self._bin_layout = self._find_bin_layout(bin_columns)
         self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
+        self.lidar_position = self.ego_T_lidar[:3, 3]
         trajectory, are_of_lidar = self._trajectory(poses, calibration)
         stamps = self._times(times, trajectory)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
+        self.gaps = frozenset()
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
         if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
+        self._are_in_world = points_frame == "world"
+        if points_frame == "world" and self.poses is None:
+            raise CFlowError(f"points_frame=world: {self.folder} has no poses; pass the poses of the LiDAR")
+        if points_frame == "auto" and trajectory is not None and trajectory.source == _VIEWPOINT:
+            self._are_in_world = self._world_stands_stiller()
+            frame = "the world's frame, and move them back" if self._are_in_world else "the sensor's frame"
+            self._note(f"its poses come from VIEWPOINT; we take its points to be in {frame} (data.points_frame)")
 
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and time where they are known."""
+        """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and times where they are known."""
         self._timestamp(index)
-        points = read_cloud(self.files[index], self._bin_columns)
-        if not np.array_equal(self.ego_T_lidar, np.eye(4)):
+        points, columns = read_table(self.files[index], self._bin_layout)
+        time = self.timestamps[index] if self._has_times else None
+        times = self._point_times(columns, time, points)
+        is_missing = missing_returns(points)
+        if times is not None:
+            is_missing |= times.is_stray
+        if is_missing.any():
+            points = np.where(is_missing[:, None], np.float32(np.nan), points)
+        if self._are_in_world and self.poses is not None:
+            points = transform_points(points, np.linalg.inv(self.poses[index]))
+        elif not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = transform_points(points, self.ego_T_lidar)
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
-        time = self.timestamps[index] if self._has_times else None
-        return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time)
+        seconds = None if times is None else times.seconds
+        return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time, seconds)
+
+    def _point_times(
+        self, columns: Mapping[str, np.ndarray], time: int | None, points: np.ndarray
+    ) -> PointTimes | None:
+        """Return the times of the points of a sweep; None = unknown. We say what we assume or leave out."""
+        period = float(np.median(np.diff(self.timestamps))) * 1e-9 if self._has_times else None
+        names = [name for name in TIME_FIELDS if name in columns]
+        found = [seconds_after(columns[name], time or 0, period, points) for name in names]
+        usable = [times for times in found if times.seconds is not None]
+        for times in usable[:1] or found:
+            self._note(times.note, "times of points")
+        for times in usable[:1]:
+            if times.is_stray.any():
+                text = f"{times.is_stray.sum()} of {len(points)} points of a sweep have stray times and become NaN"
+                self._note(text + ", also in other sweeps", "stray times")
+        return usable[0] if usable else None
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
         self._timestamp(index)
-        return read_columns(self.files[index], self._bin_columns)
+        return read_columns(self.files[index], self._bin_layout)
+
+    def _find_bin_layout(self, columns: Any) -> BinLayout | None:
+        """Return the layout of `.bin` files; None = the files have another suffix. We say if it is not KITTI's."""
+        first = self.files[0]
+        if first.suffix.lower() != ".bin":
+            return None
+        with file_errors(first):
+            layout = find_bin_layout(read_bytes(first), None if columns == "auto" else columns)
+        if columns == "auto" and layout != BinLayout():
+            self._note(f"its .bin files look like {layout}; data.bin_columns sets another number")
+        return layout
 
     def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, bool]:
         """Return the poses, and whether a calibration converted them to the LiDAR's."""
@@ -120,13 +184,42 @@ class ArraysLog(Log):
         kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
         file = _resolve(self.folder, poses, POSE_FILES, "poses", kitti)
         if file is None:
-            return None, False
+            return self._viewpoints() if poses == "auto" else None, False
         trajectory = poses_text.read_poses(file)
         chosen = _resolve(self.folder, calibration, ("calib.txt",), "calibration")
         if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
             return trajectory, False
         T_cam_lidar = poses_text.read_calibration(chosen)
         return trajectory._replace(poses=np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar), True
+
+    def _viewpoints(self) -> Trajectory | None:
+        """Read the poses in VIEWPOINT of `.pcd` files; None if no file has one."""
+        if self.files[0].suffix.lower() != ".pcd":
+            return None
+        numbers = np.tile(np.eye(7)[3], (len(self.files), 1))
+        for row, file in zip(numbers, self.files):
+            with file_errors(file):
+                viewpoint = pcd_viewpoint(read_start(file, LONGEST_HEADER))
+            row[:] = row if viewpoint is None else viewpoint
+        if (numbers == np.eye(7)[3]).all():
+            return None
+        poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
+        return Trajectory(poses, None, "matrix", _VIEWPOINT)
+
+    def _world_stands_stiller(self) -> bool:
+        """Test whether the static world stands stiller if the stored points are in the world's frame."""
+        assert self.poses is not None
+        last, shares = len(self.files) - 1, []
+        for self._are_in_world in (False, True):
+            total = 0.0
+            for first in sorted({0, last // 2, last - 1}):
+                pair = [self.sweep(first), self.sweep(first + 1)]
+                source, target = (np.asarray(sweep.points)[static_rows(sweep)] for sweep in pair)
+                T_target_source = np.linalg.inv(self.poses[first + 1]) @ self.poses[first]
+                share = share_in_place(source[thinned_rows(source)], target, T_target_source)
+                total += 0.0 if np.isnan(share) else share
+            shares.append(total)
+        return shares[1] > shares[0]
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
@@ -137,16 +230,22 @@ class ArraysLog(Log):
             if len(stamps) != count:
                 raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
             return stamps
-        names = [path.stem for path in self.files]
-        if all(_STAMP.fullmatch(name) for name in names):
-            return [int(name) * (1 if int(name) >= _FIRST_NANOSECOND else 1000) for name in names]
+        stamps = times_of_names([path.stem for path in self.files])
+        if stamps is not None:
+            return stamps
         if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
             return trajectory.times_ns.tolist()
         return None
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
         if trajectory.times_ns is not None and stamps is not None:
-            return poses_text.covered_poses(trajectory, stamps)
+            covered = poses_text.are_covered(trajectory, stamps)
+            self._note(poses_text.describe_uncovered(trajectory, stamps, covered))
+            kept = np.flatnonzero(covered)
+            self.files, self.timestamps = [self.files[k] for k in kept], [stamps[k] for k in kept]
+            self.gaps = frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
+            self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
+            return poses_text.covered_poses(trajectory, self.timestamps)
         if len(trajectory.poses) != len(self.files):
             raise CFlowError(
                 f"{trajectory.source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, "
@@ -158,6 +257,25 @@ class ArraysLog(Log):
 def natural_key(name: str) -> tuple[Any, ...]:
     """Return a key for sorting that compares digits in names as numbers: 2 before 10."""
     return tuple((0, int(run), run) if run.isdecimal() else (1, 0, run) for run in re.findall(r"\d+|\D+", name))
+
+
+def times_of_names(names: Sequence[str]) -> list[int] | None:
+    """Return the nanoseconds that names of files state; None if they are not times.
+
+    Names are digits (16, 17 = microseconds, 18, 19 = nanoseconds), or seconds and a fraction, "1700000000.05" or
+    "1700000000_050000000", also after a text without digits. Fractions are decimals, unless their numbers of digits
+    differ and the longest has nine: then they are nanoseconds without leading zeros.
+    """
+    if all(_STAMP.fullmatch(name) for name in names):
+        return [int(name) * (1 if int(name) >= _FIRST_NANOSECOND else 1000) for name in names]
+    matches = [_SECONDS.fullmatch(name) for name in names]
+    pairs = [[word for word in match.groups() if word is not None] for match in matches if match is not None]
+    if len(pairs) < len(names) or any(len(second) > 10 for second, _ in pairs):
+        return None
+    digits = {len(fraction) for _, fraction in pairs}
+    are_decimals = max(digits) != 9 or len(digits) == 1
+    fractions = [int(fraction[:9].ljust(9, "0") if are_decimals else fraction) for _, fraction in pairs]
+    return [int(second) * 10**9 + fraction for (second, _), fraction in zip(pairs, fractions)]
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
@@ -185,7 +303,9 @@ def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
         )
     if len(kinds) > 1:
         raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
-    return sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
+    files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
+    stamps = times_of_names([path.stem for path in files])
+    return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
 
 
 def _resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:

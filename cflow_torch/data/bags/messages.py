@@ -6,59 +6,49 @@ from typing import Any, Tuple
 
 import numpy as np
 
+from cflow_torch.data.arrays.bin_layout import are_plausible
 from cflow_torch.data.files import shortened
+from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions
 from cflow_torch.types import CFlowError
 
+_CONSTANT = 1e-9  # metres, and entries of a rotation: the change of a constant transform by rounding
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype
-TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp")
-_UNITS = (1.0, 1e-3, 1e-6, 1e-9)  # seconds
-_SHORTEST, _LONGEST = 0.005, 5.0  # duration of a sweep in seconds: a factor of 1000, so that only one unit fits
 
 
 def cloud_columns(message: Any) -> dict[str, np.ndarray]:
-    """Return the fields of a PointCloud2, x, y, z and others: name -> (N,) numbers as stored.
+    """Return the fields of a PointCloud2 or of Livox' CustomMsg, x, y, z and others: name -> (N,) numbers as stored.
 
-    We leave out points that are not finite or lie at the origin, because they mean "no return". A cloud without x, y or
+    We leave out `missing_returns`. A cloud without x, y or
     z, or with less data than it states, is a ValueError.
     """
+    if hasattr(message, "points"):
+        return _livox_columns(message)
     fields = {field.name: field for field in message.fields if field.count <= 1 and field.datatype in _TYPES}
     names = [name for name in fields if name]
     missing = [axis for axis in "xyz" if axis not in names]
     if missing:
         raise ValueError(f"the cloud lacks the fields {missing}; it has {names}")
-    order = ">" if message.is_bigendian else "<"
-    kinds = [order + _TYPES[fields[name].datatype] for name in names]
     offsets, step = [fields[name].offset for name in names], message.point_step
-    kind = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": step})
     row_step = message.row_step or message.width * step
     rows = np.frombuffer(message.data, np.uint8, message.height * row_step).reshape(message.height, row_step)
-    table = np.ascontiguousarray(rows[:, : message.width * step]).view(kind).reshape(-1)
-    points = np.stack([table[axis] for axis in "xyz"], axis=1)
-    table = table[np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)]
+    octets = np.ascontiguousarray(rows[:, : message.width * step])
+    for order in "><" if message.is_bigendian else "<>":  # some drivers state the wrong order
+        kinds = [order + _TYPES[fields[name].datatype] for name in names]
+        kind = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": step})
+        table = octets.view(kind).reshape(-1)
+        points = np.stack([table[axis] for axis in "xyz"], axis=1)
+        if are_plausible(points):
+            break
+    table = table[~missing_returns(points)]
     return {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
 
 
-def seconds_after(values: np.ndarray, stamp_ns: int) -> np.ndarray | None:
-    """Convert (N,) times of any unit to (N,) float64 seconds after the stamp of their sweep; None if that fails.
-
-    The unit is the one of s, ms, us and ns in which the times span 5 ms to 5 s. If the first time is at most 5 s, times
-    count from the stamp, otherwise from 1970. If the first time since 1970 is more than 5 s away from the stamp, the
-    times come from another clock, and we assume that the first shot was at the stamp.
-    """
-    if not len(values):
-        return None
-    first = values.min()
-    span = float(values.max() - first)
-    unit = next((unit for unit in _UNITS if _SHORTEST <= span * unit < _LONGEST), None)
-    if unit is None:
-        return None
-    start = float(first) * unit
-    if abs(start) > _LONGEST:
-        start = (int(first) * round(unit * 1e9) if first.dtype.kind in "iu" else round(start * 1e9)) - stamp_ns
-        start = start * 1e-9 if abs(start) <= _LONGEST * 1e9 else 0.0
-    since: np.ndarray = (values - first).astype(np.float64) * unit + start
-    return since
+def _livox_columns(message: Any) -> dict[str, np.ndarray]:
+    kinds = {"x": "f4", "y": "f4", "z": "f4", "offset_time": "u4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
+    columns = {name: np.array([getattr(p, name) for p in message.points], kind) for name, kind in kinds.items()}
+    kept = ~missing_returns(np.stack([columns[axis] for axis in "xyz"], axis=1))
+    return {name: values[kept] for name, values in columns.items()}
 
 
 Sample = Tuple[float, ...]  # nanoseconds (int), x, y, z, and the quaternion w, x, y, z
@@ -101,6 +91,23 @@ class Frames:
             at = poses_at(np.clip(times_ns, times[0], times[-1]), times, poses) if len(times) > 1 else poses
             result = at @ result
         return result
+
+    def is_moving(self, child: str) -> bool:
+        """Test whether the transform from the parent of a frame to the frame changes."""
+        return child in self._links and len(self._links[child][0]) > 1
+
+    def world_of(self, frame: str) -> str:
+        """Return the frame in which the path of a frame is continuous: its root, or the one below corrections.
+
+        A localisation corrects odometry by a transform (map to odom) that jumps now and then, and is constant between.
+        """
+        moving = [child for child in self.chain(frame)[:-1] if self.is_moving(child)]
+        for child in moving[1:]:
+            poses = self._links[child][1]
+            is_constant = np.abs(np.diff(poses, axis=0)).max(axis=(1, 2)) < _CONSTANT
+            if child.split("/")[-1] == "odom" or is_constant.mean() > 0.5:
+                return child
+        return self.chain(frame)[-1]
 
     def between(self, target: str, source: str, times_ns: np.ndarray) -> np.ndarray:
         """Return (K, 4, 4) float64 `T_target_source` at the times. Frames that are not connected are a `CFlowError`."""

@@ -3,24 +3,42 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import Trajectory, covered_poses
-from cflow_torch.data.bags.messages import TIME_FIELDS, Frames, cloud_columns, sample, seconds_after, sorted_poses
+from cflow_torch.data.arrays.poses_text import Trajectory, are_covered, covered_poses, describe_uncovered
+from cflow_torch.data.bags.messages import Frames, cloud_columns, sample, sorted_poses
 from cflow_torch.data.files import file_errors, find_folders, shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
+from cflow_torch.data.point_times import TIME_FIELDS, seconds_after
 from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.types import Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
 
 SUFFIXES = (".bag", ".mcap", ".db3")
+_ACTIVE = ".active"  # of a recording that was not finished
+_PART = re.compile("(.+)_([0-9]+)")  # recorders number the parts of a bag from 0
+_LONGEST_STEP = 0.45  # seconds between sweeps; more, and 2.5 times as much as usual, is a gap
 SEARCH_DEPTH = 3
 _CLOUD = "sensor_msgs/msg/PointCloud2"
+_LIVOX = tuple(f"{name}/msg/CustomMsg" for name in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces"))
+# Messages that hold clouds which we do not decode, and what converts them to PointCloud2.
+_CONVERTERS = {
+    "CompressedPointCloud2": "point_cloud_transport's republish, or cloudini_rosbag_converter",
+    "VelodyneScan": "velodyne_pointcloud's transform node",
+    "PacketMsg": "ouster_ros' replay, or ouster-cli",
+    "UdpFrame": "the driver of Hesai",
+    "PandarScan": "the driver of Hesai, or nebula_ros",
+    "NebulaPackets": "nebula_ros",
+    "RslidarPacket": "rslidar_sdk",
+    "RslidarScan": "rslidar_sdk",
+}
+_REPAIR = "a recording that was cut off is repaired by rosbag reindex (.bag), mcap recover (.mcap) or sqlite3 (.db3)"
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped" for name in ("", "WithCovariance")))
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _NEED = "bags need rosbags: pip install rosbags"
@@ -31,7 +49,8 @@ _SLICE = 1e-4  # seconds during which we use one pose of the vehicle: 3 mm at 30
 def find_bags(root: PathLike) -> list[Path]:
     """Find all bags in a folder, at most three levels down, sorted; or return the given bag.
 
-    Bags are files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2).
+    Bags are files `.bag` (ROS 1), `.mcap`, `.db3`, and folders with a metadata.yaml (ROS 2). Files drive_0.bag,
+    drive_1.bag, ... are the parts of one bag. It is called by its first part, and `BagLog` opens them all.
     """
     root = as_path(root)
     if root.is_file():
@@ -45,7 +64,7 @@ class BagLog(Log):
 
     Args:
         path: a file, or the folder of a ROS 2 bag, on this machine.
-        topic: topic of the clouds (sensor_msgs/PointCloud2); None = the only one of this type.
+        topic: topic of the clouds (sensor_msgs/PointCloud2, or Livox' CustomMsg); None = the only one of this type.
         poses: "tf" = from the transforms; a topic of nav_msgs/Odometry, geometry_msgs/PoseStamped or
             PoseWithCovarianceStamped; None = no poses; "auto" = the first available of: transforms in which the ego
             frame moves, the only topic of these types, none.
@@ -62,10 +81,12 @@ class BagLog(Log):
 
     Convention: points are in the ego frame. Poses are interpolated at the time of the cloud. The world is the root of
         the transforms, or the world of the topic. A topic gives the poses of its `child_frame_id` if transforms connect
-        this frame to the ego frame, otherwise the poses of the ego frame. Times of points: `messages.seconds_after`.
+        this frame to the ego frame, otherwise the poses of the ego frame. Times of points: `point_times.seconds_after`.
 
     Cost: opening a bag reads all its clouds, poses and transforms once.
     """
+
+    has_raw_times: bool = True
 
     def __init__(
         self,
@@ -79,16 +100,27 @@ class BagLog(Log):
         self.path = as_path(path)
         if is_remote(self.path):
             raise CFlowError(f"{self.path} is remote: bags are read from this machine only; copy it here")
-        self.log_id = self.path.resolve().stem if self.path.is_file() else self.path.resolve().name
-        self.deskew = deskew
+        self._files = _parts(self.path)
+        part = _PART.fullmatch(self.path.resolve().stem) if len(self._files) > 1 else None
+        self.log_id = self.path.resolve().name if self.path.is_dir() else self.path.resolve().stem
+        self.log_id = part[1] if part and self.path.is_file() else self.log_id
+        if self.path.suffix == _ACTIVE:
+            raise CFlowError(
+                f"{self.path} is a recording that was not finished: run rosbag reindex, then rename it .bag"
+            )
+        self.deskew = self.moves_by_times = deskew
         self.poses: np.ndarray | None = None
         self._opened: tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
-        with file_errors(f"{self.path}", "is it a complete bag of ROS 1 (.bag), ROS 2 (folder) or MCAP?"):
+        hint = f"is it a complete bag of ROS 1 (.bag), ROS 2 (folder) or MCAP? {_REPAIR}"
+        with file_errors(f"{self.path}", hint):
             topics = {connection.topic: connection.msgtype for connection in self._reader().connections}
-            self.topic = self._chosen(topics, (_CLOUD,), topic, "topic")
+            has_clouds = _CLOUD in topics.values() or not set(_LIVOX) & set(topics.values())
+            self.topic = self._chosen(
+                topics, (_CLOUD,) if has_clouds and not topic else (_CLOUD, *_LIVOX), topic, "topic"
+            )
             self._arrival, tracks = self._scan()
-            self.frame = frame or (_BASE if self._frames.are_joined(_BASE, self._lidar) else self._lidar)
+            self.frame = frame or self._ego_frame()
             if poses == "auto":
                 has_tf = len(self._frames.change_times(self.frame)) > 1
                 poses = "tf" if has_tf else self._chosen(topics, _POSE_TYPES, None, "poses") if tracks else None
@@ -97,20 +129,27 @@ class BagLog(Log):
             self.timestamps = sorted(self._arrival)
             if poses is not None:
                 self._odometry = times, matrices = self._trajectory(poses, tracks)
-                self.timestamps = [time for time in self.timestamps if times[0] <= time <= times[-1]]
+                trajectory = Trajectory(matrices, times, "bag", f"{poses} of {self.path}")
+                covered = are_covered(trajectory, self.timestamps)
+                self._note(describe_uncovered(trajectory, self.timestamps, covered))
+                self.timestamps = [time for time, has_pose in zip(self.timestamps, covered) if has_pose]
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             if poses is not None:
-                self.poses = covered_poses(Trajectory(matrices, times, "bag", poses), self.timestamps)
-            if self._mount is None:
-                self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))
+                self.poses = covered_poses(trajectory, self.timestamps)
+            self.gaps = self._find_gaps()
+            self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
+            mount = self._mount
+            if mount is None:
+                mount = self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))[0]
+            self.lidar_position = mount[:3, 3]
 
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
-        columns, mount = self._cloud(time), self._mount
-        times = next((seconds_after(columns[name], time) for name in TIME_FIELDS if name in columns), None)
+        columns, times = self._timed_cloud(time)
+        mount = self._mount
         if mount is None:
             mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
-        points = transform_points(np.stack([columns[axis] for axis in "xyz"], axis=1), mount)
+        points = transform_points(_points(columns), mount)
         if self.poses is None:
             return Sweep(points.astype(np.float32), None, None, time, times)
         if times is not None and self.deskew:
@@ -121,18 +160,35 @@ class BagLog(Log):
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the fields besides x, y, z, such as intensity and ring, of the points of sweep `index`."""
-        columns = self._cloud(self._timestamp(index))
+        columns, _ = self._timed_cloud(self._timestamp(index))
         return {name: values for name, values in columns.items() if name not in ("x", "y", "z")}
+
+    def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
+        columns = self._cloud(time)
+        points, names = _points(columns), [name for name in TIME_FIELDS if name in columns]
+        found = [seconds_after(columns[name], time, self._period, points) for name in names]
+        usable = [times for times in found if times.seconds is not None]
+        for times in usable[:1] or found:
+            self._note(times.note, "times of points")
+        if not usable or usable[0].seconds is None:
+            return columns, None
+        kept = ~usable[0].is_stray
+        if not kept.all():
+            text = f"{(~kept).sum()} of {len(kept)} points of the sweep at {time} ns have stray times and are left out"
+            self._note(text + ", also in other sweeps", "stray times")
+        return {name: values[kept] for name, values in columns.items()}, usable[0].seconds[kept]
 
     def _reader(self) -> Any:
         """Return the open bag. Each process opens it itself, also after a fork or unpickling."""
         if self._opened[0] != os.getpid():
             rosbags, types = (import_optional(f"rosbags.{name}", _NEED) for name in ("highlevel", "typesys"))
-            for file in [self.path] if self.path.is_file() else self.path.iterdir():
-                check_file(file)
+            for path in self._files:
+                for file in [path] if path.is_file() else path.iterdir():
+                    check_file(file)
             # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
             types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
-            reader = rosbags.AnyReader([self.path], default_typestore=types_of_old_bags)
+            reader = rosbags.AnyReader(self._files, default_typestore=types_of_old_bags)
             reader.open()
             self._opened = (os.getpid(), reader)
         return self._opened[1]
@@ -146,17 +202,50 @@ class BagLog(Log):
         if len(found) != 1:
             available = shortened(", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())))
             what = f"{setting}={name}" if name else f"{len(found)} topics"
+            for topic, kind in sorted(topics.items()):
+                if _CLOUD in types and not found and kind.split("/")[-1] in _CONVERTERS:
+                    tool = _CONVERTERS[kind.split("/")[-1]]
+                    raise CFlowError(f"{topic} has messages {kind}, which we do not decode: convert it with {tool}")
             raise CFlowError(
                 f"{what} of type {' or '.join(types)}: choose one with {setting}=NAME, "
                 f"in commands data.{setting}=NAME; the bag has {available}"
             )
         return found[0]
 
+    def _ego_frame(self) -> str:
+        """Return the frame of the vehicle. Without transforms to the LiDAR, it is the LiDAR's own."""
+        frames, lidar = self._frames, self._lidar
+        if self._mount is not None and len(frames.change_times(_BASE)) > 1:
+            return _BASE
+        if frames.are_joined(_BASE, lidar):
+            return _BASE
+        if len(frames.change_times(lidar)) < 2:
+            moving = [child for child in self._child.values() if frames.is_moving(child)]
+            if len(moving) == 1 and frames.are_joined(moving[0], lidar):  # an odometry that publishes registered clouds
+                self._note(f"its clouds are in {lidar}, the frame of the world; we move them to {moving[0]}")
+                return moving[0]
+        named = [name for name in (_BASE, *self._child.values()) if name and name != lidar]
+        for name in named if self._mount is None else []:
+            if len(frames.change_times(name)) > 1 or name in self._child.values():
+                used = "We assume that both are in one place" if name in self._child.values() else "They are not used"
+                text = f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. {used}"
+                self._note(f"{text}; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)", "missing link")
+        return lidar
+
+    def _find_gaps(self) -> frozenset[int]:
+        """Return the indices of the sweeps after which no sweep follows for long, and say so."""
+        steps = np.diff(self.timestamps) * 1e-9
+        gaps = np.flatnonzero(steps > max(_LONGEST_STEP, 2.5 * float(np.median(steps))))
+        if len(gaps):
+            first = f"the first is {steps[gaps[0]]:.2g} s long, after sweep {gaps[0]}"
+            self._note(f"it has {len(gaps)} gaps between sweeps ({first}); no window reaches over them")
+        return frozenset(gaps.tolist())
+
     def _scan(self) -> tuple[dict[int, int], dict[str, list[Any]]]:
         """Read all messages once. Return the arrival time of each cloud and the pose samples of each topic."""
         self._lidar = ""
         self._child: dict[str, str] = {}
-        arrival: dict[int, int] = {}
+        stamps: list[tuple[int, int]] = []  # of each cloud: its header's, and its arrival
         parents: dict[str, str] = {}
         links: dict[str, list[Any]] = {}
         tracks: dict[str, list[Any]] = {}
@@ -165,7 +254,7 @@ class BagLog(Log):
         for connection, arrived, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
             if connection.topic == self.topic:
-                arrival.setdefault(_stamp(message, arrived), arrived)
+                stamps.append((_stamp(message, arrived), arrived))
                 self._lidar = self._lidar or message.header.frame_id.lstrip("/")
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
@@ -178,13 +267,32 @@ class BagLog(Log):
                 tracks.setdefault(connection.topic, []).append(at)
                 self._child[connection.topic] = getattr(message, "child_frame_id", "").lstrip("/")
         self._frames = Frames(parents, links)
-        return arrival, tracks
+        return self._arrivals(stamps), tracks
+
+    def _arrivals(self, stamps: list[tuple[int, int]]) -> dict[int, int]:
+        """Return the time of each cloud and its arrival, from header stamps and arrivals. We say if stamps repeat."""
+        count = len({stamp for stamp, _ in stamps})
+        self._use_arrival = len(stamps) > 1 and count <= max(1, len(stamps) // 10)
+        if self._use_arrival:
+            stamps = [(arrived, arrived) for _, arrived in stamps]
+            self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")
+        elif count < len(stamps):
+            repeated = len(stamps) - count
+            self._note(
+                f"{repeated} clouds repeat the time stamp of an earlier one and are left out; was it played twice?"
+            )
+        return dict(reversed(stamps))
 
     def _trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:
         """Return (M,) int64 times of transforms or messages, and (M, 4, 4) `T_world_ego` at these times."""
         if poses == "tf":
-            times = self._frames.change_times(self.frame)
-            matrices = self._frames.in_root(self.frame, times)
+            times, world = self._frames.change_times(self.frame), self._frames.world_of(self.frame)
+            matrices = self._frames.between(world, self.frame, times)
+            if world != self._frames.chain(self.frame)[-1]:
+                parent = self._frames.chain(world)[1]
+                self._note(
+                    f"the transform from {parent} to {world} jumps, so poses are in {world}, which is continuous"
+                )
         else:
             times, matrices = sorted_poses(tracks.get(poses, []), poses)
             child = self._child.get(poses, "")
@@ -201,9 +309,14 @@ class BagLog(Log):
             clouds = [connection for connection in reader.connections if connection.topic == self.topic]
             for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
                 message = reader.deserialize(data, connection.msgtype)
-                if _stamp(message, arrived) == time:
+                if self._use_arrival or _stamp(message, arrived) == time:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
+
+
+def _points(columns: dict[str, np.ndarray]) -> np.ndarray:
+    """Return (N, 3) points in the frame of the cloud."""
+    return np.stack([columns[axis] for axis in "xyz"], axis=1)
 
 
 def _stamp(message: Any, arrived: int) -> int:
@@ -215,4 +328,32 @@ def _stamp(message: Any, arrived: int) -> int:
 def _bags_in(folder: Path) -> list[Path]:
     if (folder / "metadata.yaml").is_file():
         return [folder]
-    return [file for file in folder.iterdir() if file.suffix in SUFFIXES and file.is_file()]
+    files = [file for file in folder.iterdir() if file.suffix in (*SUFFIXES, _ACTIVE) and file.is_file()]
+    parts = {part for file in files for part in _parts(file)[1:]}
+    return [file for file in files if file not in parts]
+
+
+def _parts(path: Path) -> list[Path]:
+    """Return the paths that rosbags must open for a bag."""
+    if path.is_dir():
+        description = path / "metadata.yaml"
+        text = description.read_text("utf-8", "replace") if description.is_file() else ""
+        named = re.findall(r"^\s*- (\S+\.(?:db3|mcap))\s*$", text, re.MULTILINE)
+        if all((path / name).is_file() for name in named):
+            return [path]
+        files = [file for file in path.iterdir() if file.suffix in SUFFIXES]  # renamed since
+        return sorted(files, key=_part_number) or [path]
+    match = _PART.fullmatch(path.stem)
+    if match is None or int(match[2]) != 0:
+        return [path]
+    others = [file for file in path.parent.glob(f"*{path.suffix}") if file.stem.startswith(f"{match[1]}_")]
+    numbered = {_part_number(file): file for file in others if _PART.fullmatch(file.stem)}
+    parts = [path]
+    while len(parts) in numbered:
+        parts.append(numbered[len(parts)])
+    return parts
+
+
+def _part_number(file: Path) -> int:
+    match = _PART.fullmatch(file.stem)
+    return int(match[2]) if match else 0

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cflow_torch.data.arrays.reader import times_of_names
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log
@@ -19,6 +20,7 @@ from cflow_torch.windows.ego_motion import rigid_transform
 
 # Time stamps count from 1970 or 1980: smaller ones are microseconds (16 digits), others nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
+_FIRST_MICROSECOND = 10**14
 _LARGEST_CATEGORY = 255
 EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` stores
 
@@ -44,7 +46,8 @@ class HDF5Log(Log):
 
     Attributes:
         timestamps: names of the groups as integers, ascending, in nanoseconds or microseconds as the data set has
-            them; the `timestamp_ns` of sweeps are nanoseconds.
+            them; the `timestamp_ns` of sweeps are nanoseconds. Names may be seconds with decimals, which become
+            nanoseconds, or numbers 000000, 000001, ... Then sweeps have no `timestamp_ns`.
         ego_T_lidar: (4, 4) float64, the transform in use.
 
     Convention:
@@ -65,8 +68,10 @@ class HDF5Log(Log):
         # HDF5 would close the file after the interpreter has ended, which crashes if it is a Python file object.
         weakref.finalize(self, self._scene.close)
         with scene_errors(self.file):
-            self.timestamps = sorted(int(name) for name in self._scene if is_timestamp(name))
+            self._names = sweep_names(self._scene)
+            self.timestamps = sorted(self._names)
         self._check_count(self.file)
+        self.is_compensated = is_argoverse2(self.timestamps[0])
         if isinstance(ego_T_lidar, str) and ego_T_lidar == "auto":
             ego_T_lidar = self._stated_extrinsics()
         elif ego_T_lidar is None:
@@ -88,8 +93,9 @@ class HDF5Log(Log):
         if pose is not None and not np.array_equal(self.ego_T_lidar, np.eye(4)):
             pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
+        time = None if self.timestamps[-1] < _FIRST_MICROSECOND else nanoseconds  # None: the groups are numbered
         times = self._values(index, "lidar_dt", rows, np.float32)
-        return Sweep(points[:, :3], is_ground, pose, nanoseconds, times)
+        return Sweep(points[:, :3], is_ground, pose, time, times)
 
     def labels(self, index: int) -> FlowLabels | None:
         """Read the truth of the pair (index, index + 1); None if the sweep has no `flow`."""
@@ -176,7 +182,7 @@ class HDF5Log(Log):
         return recognized_extrinsics(self.timestamps[0], points, is_ground)
 
     def _group(self, index: int) -> Any:
-        return member(self._scene, str(self._timestamp(index)), self.file)
+        return member(self._scene, self._names[self._timestamp(index)], self.file)
 
     def _rows(self, index: int) -> tuple[int]:
         """Return the number of points of a sweep without reading them, as the shape of a column."""
@@ -201,6 +207,14 @@ class HDF5Log(Log):
 
 _HINT = "write the scene again, as groups with arrays of plain numbers in the file itself"
 scene_errors = partial(file_errors, hint="copy or write the scene again")
+
+
+def sweep_names(scene: Any) -> dict[int, str]:
+    """Return the time stamp of each sweep of an open scene, and the name of its group."""
+    names = {int(name): name for name in scene if is_timestamp(name)}
+    decimals = [name for name in scene if "." in name]
+    stamps = None if names else times_of_names(decimals)
+    return names if stamps is None else dict(zip(stamps, decimals))
 
 
 def import_h5py() -> Any:

@@ -15,7 +15,15 @@ import numpy as np
 from cflow_torch.data.atomic import atomic_file, atomic_name
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.files import file_errors
-from cflow_torch.data.hdf5.reader import EXTRINSIC, HDF5Log, find_hdf5_scenes, import_h5py, member, open_scene
+from cflow_torch.data.hdf5.reader import (
+    EXTRINSIC,
+    HDF5Log,
+    find_hdf5_scenes,
+    import_h5py,
+    member,
+    open_scene,
+    sweep_names,
+)
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import is_timestamp
 from cflow_torch.types import Array, CFlowError, as_numpy, check_array
@@ -192,8 +200,9 @@ def _write(file: str | Path, sweeps: Iterable[Any], store: Callable[..., None], 
     with atomic_name(file) as copy:
         shutil.copy(file, copy)
         with _writing(file), import_h5py().File(copy, "r+") as scene:
+            names = sweep_names(scene)
             for timestamp, arrays in sweeps:
-                sweep = member(scene, str(timestamp), file)
+                sweep = member(scene, names.get(int(timestamp), str(timestamp)), file)
                 points = None if sweep is None else member(sweep, "lidar", f"{file}: sweep {timestamp}")
                 if points is None:
                     raise CFlowError(f"{file} has no sweep {timestamp}")

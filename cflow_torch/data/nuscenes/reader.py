@@ -11,7 +11,8 @@ from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, poi
 from cflow_torch.data.files import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
-from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
+from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes, remote_errors
+from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
@@ -102,7 +103,8 @@ class NuScenesLog(Log):
     ) -> None:
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: pass 1 for all sweeps, 2 for every second one")
-        self.log_id, self._root, self._deskew = source.name, as_path(source.root), deskew
+        self.log_id, self._root = source.name, as_path(source.root)
+        self._deskew = self.moves_by_times = deskew
         self._own_vehicle = self.OWN_VEHICLE if own_vehicle == "auto" else own_vehicle
         folder = self._root / source.version
         sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.name)
@@ -119,9 +121,42 @@ class NuScenesLog(Log):
         kept = np.flatnonzero((row - last_key) % sweep_step == 0)
         self.timestamps = reference.times[kept].tolist()
         self._check_count(f"scene {self.log_id} in {folder}")
+        self._check_files(reference, kept, int((row - last_key).max()) + 1)
         self._poses, self._T_ego_world = reference.ego[kept], np.linalg.inv(reference.ego[kept])
+        self.lidar_position = reference.mount[0, :3, 3]
+        self.turn_seconds = float(np.median(np.diff(reference.times))) * 1e-6  # of all sweeps, not only of those kept
         self._odometry = (reference.times, reference.ego)
         self._tracks = Tracks(sample_times, annotations)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """(K, 4, 4) float64 `T_world_ego` of every sweep."""
+        return self._poses
+
+    def _check_files(self, chain: LidarChain, kept: np.ndarray, step: int) -> None:
+        """Say in one error if only key frames are there, or no file of the scene. We look at three files of a kind."""
+        kinds = []
+        for is_key_frame in (True, False):
+            rows = kept[chain.is_key_frame[kept] == is_key_frame]
+            chosen = rows[[0, len(rows) // 2, -1]] if len(rows) else rows
+            with remote_errors(self._root):
+                kinds.append(any(self._has_file(chain.files[row]) for row in chosen))
+        if kinds == [True, False] and not chain.is_key_frame[kept].all():
+            raise CFlowError(
+                f"scene {self.log_id}: only its key frames are in {self._root}. Pass sweep_step={step} (in commands "
+                f"data.sweep_step={step}) to use them alone, at 2 Hz, or download the folder sweeps"
+            )
+        if not any(kinds):
+            raise CFlowError(
+                f"scene {self.log_id}: its files are not in {self._root}; another part of the set has them"
+            )
+
+    def _has_file(self, name: str) -> bool:
+        """Test whether a file exists. For a name that may not be read, `sweep` raises the error."""
+        try:
+            return path_inside(self._root, name, self.log_id).exists()
+        except CFlowError:
+            return True
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: all LiDARs in one ego frame, in the order of `lidars`, else of sensor.json."""
@@ -173,7 +208,7 @@ class NuScenesLog(Log):
         local, times = self._points_of(file)
         points = transform_points(local, chain.mount[row])
         # We remove the own vehicle before compensation, because it moves with its LiDARs.
-        kept = np.isfinite(local).all(axis=1) & (local != 0).any(axis=1) & ~self._is_own(points, index)
+        kept = ~missing_returns(local) & ~self._is_own(points, index)
         points, T_ego_world = points[kept], self._T_ego_world[index]
         if times is None:
             at = np.broadcast_to(T_ego_world @ chain.ego[row], (len(points), 4, 4))

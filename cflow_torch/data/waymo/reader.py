@@ -80,6 +80,8 @@ class WaymoLog(BoxLog):
         released files are not sorted by time, so that can be the whole file (seconds).
     """
 
+    is_compensated: bool = True
+
     def __init__(self, file: PathLike, lasers: Sequence[str] = tuple(LASERS), both_returns: bool = False) -> None:
         self.file = as_path(file)
         if self.file.parent.name != "lidar":

@@ -1,0 +1,105 @@
+"""Files of numbers without a header: find out how many numbers of which type make a point."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cflow_torch.types import CFlowError
+
+KITTI_COLUMNS = 4  # x, y, z, reflectance
+_COLUMNS = (4, 3, 5, 6, 7, 8)
+_TYPES = ("<f4", "<f8")
+_SMALLEST, _LARGEST = 1e-6, 1e7  # sizes that coordinates, intensities, rings and times have, besides 0
+_SHARE = 0.95  # of the numbers have such a size; of numbers read in a wrong type, less than 0.8
+_EXPLAINED, _AS_GOOD = 0.05, 0.9  # least share of the variance, and the share of the best that a smaller number needs
+_MOST, _BLOCK = 1 << 17, 840  # numbers that we test; a multiple of all numbers of columns
+
+
+class BinLayout(NamedTuple):
+    """Numbers of a point, x, y, z first."""
+
+    columns: int = KITTI_COLUMNS
+    kind: str = "<f4"
+
+    @property
+    def step(self) -> int:
+        """Bytes per point."""
+        return self.columns * np.dtype(self.kind).itemsize
+
+    def __str__(self) -> str:
+        return f"{self.columns} float{8 * np.dtype(self.kind).itemsize} per point"
+
+
+def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
+    """Recognise the layout of a headerless file.
+
+    Args:
+        content: the whole file.
+        columns: numbers per point; None = find out.
+
+    Convention: the type is the one, float32 or float64, in which numbers have sizes of coordinates. The columns of a
+        point differ in size (z is smaller than x and y, intensities are larger), so the column of a number explains a
+        part of the variance of log sizes. We choose the number of columns, 3 to 8, that explains most. Ties: the
+        smallest. The order of the points does not matter. A file that is empty or too short to tell is KITTI's.
+
+    Raises:
+        CFlowError: no layout fits. The message names `bin_columns`.
+    """
+    kinds = [kind for kind in _TYPES if are_plausible(_numbers(content, kind))]
+    is_zero = _numbers(content, "<f4") == 0
+    if kinds == list(_TYPES) and len(is_zero) > 1 and is_zero[::2].mean() > _SHARE and is_zero[1::2].mean() < 0.5:
+        kinds = ["<f8"]  # the lower halves of float64 numbers with few digits are zeros
+    if columns is not None:
+        return BinLayout(columns, "<f8" if kinds == ["<f8"] and len(content) % (8 * columns) == 0 else "<f4")
+    fitting = [BinLayout(count, kind) for kind in kinds for count in _COLUMNS]
+    fitting = [layout for layout in fitting if len(content) % layout.step == 0]
+    explained = [_explained(_numbers(content, layout.kind), layout.columns) for layout in fitting]
+    best = max(explained, default=0.0)
+    good = [layout for layout, share in zip(fitting, explained) if share >= max(_AS_GOOD * best, _EXPLAINED)]
+    if good:
+        return min(good, key=lambda layout: layout.columns)
+    if fitting and len(content) < 1000 * BinLayout().step and fitting[0] == BinLayout():
+        return BinLayout()
+    counts = ", ".join(map(str, sorted(_COLUMNS)))
+    raise CFlowError(
+        f"it has {len(content)} bytes, and does not look like points of {counts} float32 or float64 numbers, x, y, z "
+        "first. If it is complete, pass bin_columns, the numbers per point: 4 in KITTI, 5 in nuScenes. Convert packed "
+        "records of several types to .npy"
+    )
+
+
+def are_plausible(numbers: np.ndarray) -> bool:
+    """Test whether floats, of any shape, are in a type and byte order that fits: nearly all have usual sizes."""
+    size = np.abs(numbers)
+    is_usual = (size == 0) | np.isnan(size) | ((size > _SMALLEST) & (size < _LARGEST))
+    return bool(is_usual.sum() >= _SHARE * is_usual.size)
+
+
+def _numbers(content: bytes, kind: str) -> np.ndarray:
+    """Return the numbers of the file, or evenly spaced blocks of them. Blocks keep the column of each number."""
+    numbers = np.frombuffer(content, kind, len(content) // np.dtype(kind).itemsize)
+    if len(numbers) > _MOST:
+        blocks = numbers[: len(numbers) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)
+        numbers = blocks[:: len(numbers) // _MOST + 1].reshape(-1)
+    with np.errstate(invalid="ignore"):  # numbers of another type may be signalling NaN
+        return numbers.astype(np.float64)
+
+
+def _explained(numbers: np.ndarray, columns: int) -> float:
+    """Return the share of the variance of log sizes that the column explains, less what chance explains, 0 to 1.
+
+    Zeros and NaN are ignored, because they mean "no return". But a column of zeros besides x, y, z explains all.
+    """
+    known = np.abs(np.nan_to_num(numbers)) > 0
+    sizes = np.log(np.clip(np.abs(numbers[known]), 1e-2, None))
+    column = np.flatnonzero(known) % columns
+    counts = np.bincount(column, minlength=columns)
+    if not counts[:3].all():
+        return 0.0
+    if not counts.all():
+        return 1.0
+    means = np.bincount(column, sizes, columns) / counts
+    between = float(counts @ (means - sizes.mean()) ** 2) / len(sizes)
+    return max(between / max(float(sizes.var()), 1e-9) - 10 * columns / len(sizes), 0.0)

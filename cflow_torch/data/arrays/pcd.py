@@ -1,0 +1,70 @@
+"""Point clouds in the PCD format, by pypcd4 (extra `clouds`), with the headers that programs write."""
+
+from __future__ import annotations
+
+import io
+import re
+from typing import Any
+
+import numpy as np
+
+from cflow_torch.data.files import distinct_names
+from cflow_torch.errors import import_optional
+
+LONGEST_HEADER = 65536  # bytes
+_DATA = re.compile(rb"^[ \t]*DATA[ \t]+(\w+)[ \t]*\r?\n", re.MULTILINE | re.IGNORECASE)
+
+
+def pcd_fields(content: bytes) -> dict[str, np.ndarray]:
+    """Read the fields of a `.pcd` file: name -> (N,) array of the stated dtype.
+
+    Organised clouds (HEIGHT above 1) are flattened row by row. Padding and fields of several values (COUNT above 1) are
+    left out. VIEWPOINT is not applied, so points stay in their stored frame (see `pcd_viewpoint`). NaN points stay. A
+    file that is damaged or not a `.pcd` file may raise any exception, which the caller reports.
+    """
+    header, end = _header(content)
+    text = "".join(f"{key} {' '.join(words)}\n" for key, words in header.items())
+    cloud = pypcd4().PointCloud.from_fileobj(io.BytesIO(text.encode("utf-8") + content[end:]))
+    width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
+    table = np.atleast_1d(cloud.pc_data)
+    if len(table) != width * height:
+        raise ValueError(f"it has {len(table)} points, but its header states {width} x {height}")
+    # pypcd4 splits fields of several values, and mixes these fields up in compressed files.
+    names = [name for name, count in zip(header["FIELDS"], header["COUNT"]) if int(count) == 1 and name != "_"]
+    # pypcd4 1.4 makes a two-dimensional table of a cloud without points.
+    return {name: np.ascontiguousarray(table[name]).reshape(-1) for name in names}
+
+
+def pcd_viewpoint(content: bytes) -> np.ndarray | None:
+    """Read VIEWPOINT, (7,) float64 x, y, z and quaternion w, x, y, z; None if it is missing or not set.
+
+    `content` is the start of a `.pcd` file, at least its header.
+    """
+    numbers = np.array(_header(content)[0]["VIEWPOINT"], np.float64)
+    is_set = numbers.shape == (7,) and numbers[3:].any() and not np.array_equal(numbers, (0, 0, 0, 1, 0, 0, 0))
+    return numbers if is_set else None
+
+
+def pypcd4() -> Any:
+    return import_optional("pypcd4", "PCD files need pypcd4: pip install pypcd4")
+
+
+def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
+    """Return the words of each line of the header, complete and in the order of version 0.7, and the size in bytes."""
+    data = _DATA.search(content[:LONGEST_HEADER])
+    if data is None:
+        raise ValueError("it has no complete header")
+    lines = content[: data.start()].decode("latin-1").splitlines()  # comments may have any encoding
+    words = {line[0].upper(): line[1:] for line in map(str.split, lines) if line}
+    names = words.get("FIELDS") or words["COLUMNS"]  # version 0.5
+    types = {"SIZE": words["SIZE"], "TYPE": [kind.upper() for kind in words["TYPE"]]}
+    columns = {"FIELDS": distinct_names(names, "_"), **types, "COUNT": words.get("COUNT") or ["1"] * len(names)}
+    if {len(column) for column in columns.values()} != {len(names)}:
+        raise ValueError(f"its header has {len(names)} fields, but another number of sizes, types or counts")
+    has_values = [int(count) > 0 for count in columns["COUNT"]]
+    columns = {key: [word for word, has in zip(column, has_values) if has] for key, column in columns.items()}
+    width, height = words.get("WIDTH") or words["POINTS"], words.get("HEIGHT") or ["1"]
+    size = {"WIDTH": width, "HEIGHT": height}
+    rest = {"VIEWPOINT": words.get("VIEWPOINT") or ["0", "0", "0", "1", "0", "0", "0"]}
+    points = {"POINTS": [str(int(width[0]) * int(height[0]))], "DATA": [data[1].decode("ascii").lower()]}
+    return {"VERSION": ["0.7"], **columns, **size, **rest, **points}, data.end()

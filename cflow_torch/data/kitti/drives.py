@@ -1,0 +1,96 @@
+"""Find the drives of KITTI below a folder, in its layouts as unpacked."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cflow_torch.data.paths import PathLike, as_path
+from cflow_torch.errors import CFlowError
+
+_DEEPEST = 6  # levels below the root; <root>/kitti/raw/<date>/<drive> has four
+_FRAME = re.compile(r"[0-9]{6}|[0-9]{10}")  # names of clouds without .bin
+
+
+class KITTIDrive(NamedTuple):
+    """One drive: a source for `KITTILog`."""
+
+    root: Path  # raw: folder of the drive; sequence: its folder; tracking: the folder of velodyne, calib and label_02
+    clouds: Path  # folder of the .bin files
+    layout: str  # "raw", "sequence" or "tracking"
+    name: str  # log_id
+
+    def __str__(self) -> str:
+        return str(self.clouds)
+
+
+def find_kitti_drives(root: PathLike) -> list[KITTIDrive]:
+    """Find all drives at most six levels below a folder, sorted by path.
+
+    Convention:
+        - raw: `<drive>/velodyne_points/data/0000000000.bin`, named after the folder of the drive.
+        - sequence (odometry, SemanticKITTI): `<NN>/velodyne/000000.bin`, if the folder has calib.txt or labels, or lies
+          in a folder `sequences`. It is named NN.
+        - tracking: `velodyne/<NNNN>/000000.bin`, named NNNN.
+        If several drives have the same name, we put the names of their parent folders in front, as many as it needs.
+        You may also pass a folder inside a drive, down to its clouds.
+    """
+    top = as_path(root)
+    if not top.is_dir():
+        raise CFlowError(f"{root} is not a folder; pass a drive of KITTI, or a folder of drives")
+    found: list[KITTIDrive] = []
+    level = [top]
+    for _ in range(_DEEPEST + 1):
+        deeper = []
+        for folder in level:
+            drives = _drives_of(folder)
+            found += drives
+            deeper += [] if drives else [child for child in folder.iterdir() if child.name[0] != "." and child.is_dir()]
+        level = deeper
+    if not found:
+        resolved = top.resolve()
+        found = [drive for parent in (resolved.parent, resolved.parent.parent) for drive in _drives_of(parent)]
+        found = [drive for drive in found if resolved in (drive.clouds, drive.clouds.parent)]
+    return _with_distinct_names(sorted(found))
+
+
+def _drives_of(folder: Path) -> list[KITTIDrive]:
+    """Return the drive whose folder this is, or the drives of a tracking set."""
+    raw = folder / "velodyne_points" / "data"
+    if _has_clouds(raw):
+        return [KITTIDrive(folder, raw, "raw", folder.resolve().name)]
+    clouds = folder / "velodyne"
+    if not clouds.is_dir():
+        return []
+    if _has_clouds(clouds):
+        is_kitti = (folder / "calib.txt").exists() or (folder / "labels").is_dir()
+        is_kitti |= folder.resolve().parent.name == "sequences"
+        return [KITTIDrive(folder, clouds, "sequence", folder.resolve().name)] if is_kitti else []
+    drives = [child for child in clouds.iterdir() if child.name.isdigit() and _has_clouds(child)]
+    return [KITTIDrive(folder, drive, "tracking", drive.name) for drive in drives]
+
+
+def _has_clouds(folder: Path) -> bool:
+    if not folder.is_dir():
+        return False
+    return any(path.suffix == ".bin" and _FRAME.fullmatch(path.stem) for path in folder.iterdir())
+
+
+def _with_distinct_names(drives: list[KITTIDrive]) -> list[KITTIDrive]:
+    named = []
+    for drive in drives:
+        # Folder names above the drive, nearest first, without those that belong to the layout.
+        parents: Any = drive.root.resolve() if drive.layout == "tracking" else drive.root.resolve().parent
+        above = [part for part in parents.parts[1:] if part not in ("sequences", "dataset")]
+        named.append((drive, above[::-1]))
+    result = [drive for drive, _ in named]
+    for depth in range(1, 1 + max((len(above) for _, above in named), default=0)):
+        counts = Counter(drive.name for drive in result)
+        if max(counts.values()) == 1:
+            break
+        for k, (drive, above) in enumerate(named):
+            if counts[result[k].name] > 1:
+                result[k] = drive._replace(name="-".join([*above[:depth][::-1], drive.name]))
+    return result

@@ -1,0 +1,99 @@
+"""Calibration and GPS/IMU measurements (OXTS) of KITTI as transforms, in float64."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cflow_torch.data.files import file_errors
+from cflow_torch.data.paths import read_bytes
+from cflow_torch.types import CFlowError
+from cflow_torch.windows.ego_motion import rigid_transform
+
+_EARTH = 6378137.0  # metres, radius of the Mercator projection
+_NUM_OXTS = 30  # numbers per measurement: latitude, longitude, altitude, roll, pitch, yaw, ...
+IMAGE_SIZE = (1242, 375)  # pixels; the rectified images of all days are within 18 pixels of it
+
+
+def read_calibration(file: Path) -> dict[str, np.ndarray]:
+    """Read lines `KEY: numbers` as key -> (K,) float64. Lines without numbers (the time of calibration) are ignored."""
+    found = {}
+    with file_errors(file):
+        for line in read_bytes(file).decode("utf-8").splitlines():
+            key, *words = line.replace(":", " ", 1).split() or [""]
+            try:
+                found[key] = np.array(words, np.float64)
+            except ValueError:
+                continue
+    return found
+
+
+def transform(values: dict[str, np.ndarray], file: Path, *names: str) -> np.ndarray:
+    """Return the (4, 4) rigid transform of a calibration.
+
+    `names` are alternative names of a line with 12 numbers, or two names of lines with 9 and 3 numbers, joined by a
+    space. A line with 9 numbers alone is a rotation.
+    """
+    for name in names:
+        parts = [values[key] for key in name.split() if key in values]
+        sizes = [len(part) for part in parts]
+        if len(parts) == len(name.split()) and sizes in ([12], [9], [9, 3]):
+            T = np.eye(4)
+            if sizes == [12]:
+                T[:3] = parts[0].reshape(3, 4)
+            else:
+                T[:3, :3] = parts[0].reshape(3, 3)
+                T[:3, 3] = parts[1] if len(parts) > 1 else 0
+            return rigid_transform(T, f"{name} of {file}")
+    raise CFlowError(f"{file} has no line {' or '.join(names)}; it has {', '.join(values)}; copy it again")
+
+
+def poses_from_oxts(table: np.ndarray, file: Any) -> np.ndarray:
+    """Convert measurements, (K, 30) float64, to poses (K, 4, 4) `T_world_imu`. The world begins at the first one.
+
+    Convention: world x is east, y north, z up, by the Mercator projection at the latitude of the first measurement.
+        Roll, pitch and yaw are radians about x (ahead), y (left) and z (up); yaw 0 = east.
+
+    Source: the description of the data set, Geiger et al., "Vision meets Robotics: The KITTI Dataset", 2013.
+    """
+    if table.ndim != 2 or table.shape[1] < 6 or not np.isfinite(table[:, :6]).all():
+        raise CFlowError(f"{file} has shape {table.shape}; {_NUM_OXTS} finite numbers per measurement are expected")
+    latitude, longitude = np.radians(table[:, :2]).T
+    scale = _EARTH * np.cos(latitude[0])
+    north = np.log(np.tan(np.pi / 4 + latitude / 2))
+    position = np.stack([scale * longitude, scale * north, table[:, 2]], axis=1)
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3, 3] = position - position[0]
+    roll, pitch, yaw = table[:, 3:6].T
+    poses[:, :3, :3] = _rotations(yaw, 2) @ _rotations(pitch, 1) @ _rotations(roll, 0)
+    return poses
+
+
+def _rotations(angle: np.ndarray, axis: int) -> np.ndarray:
+    """Return (K, 3, 3) rotations about axis 0, 1 or 2."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    result = np.tile(np.eye(3), (len(angle), 1, 1))
+    result[:, first, first] = result[:, second, second] = np.cos(angle)
+    result[:, second, first] = np.sin(angle)
+    result[:, first, second] = -np.sin(angle)
+    return result
+
+
+def in_image(points: np.ndarray, projection: np.ndarray, regions: np.ndarray) -> np.ndarray:
+    """Return which of the (N, 3) points are in the image of the left colour camera, and in no region, (N,) bool.
+
+    Args:
+        points: (N, 3), metres, frame of the LiDAR.
+        projection: (3, 4) from the frame of the LiDAR to pixels, homogeneous.
+        regions: (K, 4) pixels: left, top, right, bottom.
+    """
+    u, v, depth = (points.astype(np.float64) @ projection[:, :3].T + projection[:, 3]).T
+    with np.errstate(all="ignore"):
+        u, v = u / depth, v / depth
+    width, height = IMAGE_SIZE
+    inside = (depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    for left, top, right, bottom in regions:
+        inside &= ~((u >= left) & (u <= right) & (v >= top) & (v <= bottom))
+    return inside  # type: ignore[no-any-return]

@@ -1,0 +1,267 @@
+"""Reader of KITTI: raw drives, sequences (odometry, SemanticKITTI) and tracking."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Sequence
+
+import numpy as np
+
+from cflow_torch.data.arrays.poses_text import Trajectory
+from cflow_torch.data.arrays.reader import ArraysLog
+from cflow_torch.data.boxes import flow_from_boxes
+from cflow_torch.data.files import file_errors
+from cflow_torch.data.kitti import labels as stored_labels
+from cflow_torch.data.kitti.drives import KITTIDrive, find_kitti_drives
+from cflow_torch.data.kitti.geometry import in_image, poses_from_oxts, read_calibration, transform
+from cflow_torch.data.kitti.labels import FrameBoxes
+from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.paths import PathLike, read_bytes, remote_errors
+from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.errors import CFlowError, warn
+from cflow_torch.types import Sweep
+
+_UNKNOWN_VIEW = np.radians(40.0)  # of the left colour camera, to each side, where its calibration is missing
+_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+
+
+class KITTILog(ArraysLog):
+    """One drive.
+
+    Args:
+        source: a drive from `find_kitti_drives`, or the folder of one.
+        poses: "auto" = those of the layout (see Convention); None = no poses; or a file or array of poses of the LiDAR,
+            as in `ArraysLog`.
+
+    Attributes:
+        log_id: 2011_09_26_drive_0027_sync in raw drives, 00 in sequences, 0000 in the tracking set.
+        timestamps: nanoseconds, from velodyne_points/timestamps.txt or times.txt. Otherwise 0, 1, 2, ...
+        poses: (K, 4, 4) float64 `T_world_lidar`; None = unknown.
+
+    Convention:
+        - Points are in the frame of the LiDAR: x ahead, y left, z up, 1.73 m above the road. There are no other frames.
+        - Raw drives and the tracking set have poses from OXTS (GPS and IMU), moved to the LiDAR by the calibration
+          (calib_imu_to_velo.txt in the folder of the drive or of its day; calib/NNNN.txt). Without calibration or with
+          fewer measurements than sweeps, we warn, and there are no poses.
+        - Poses of sequences (poses.txt, ../../poses/NN.txt) are of the camera, converted by `Tr` of calib.txt. If they
+          drive along x (the LiDAR's axis ahead) and not along z (the camera's), they are the LiDAR's, and we say so.
+        - Ground masks come from the classes of points in `labels`; otherwise there are none.
+        - Truth of raw drives and the tracking set comes from tracked boxes (tracklet_labels.xml, label_02). Only the
+          image of the left colour camera is annotated: elsewhere, and in regions DontCare, points are not valid.
+        - Truth of SemanticKITTI: points of the classes 252 to 259 move, by an unknown flow, so they are not valid, see
+          `moving`. All other labelled points are static.
+    """
+
+    def __init__(self, source: KITTIDrive | PathLike, poses: Any = "auto") -> None:
+        if not isinstance(source, KITTIDrive):
+            drives = find_kitti_drives(source)
+            if len(drives) != 1:
+                raise CFlowError(f"{source} has {len(drives)} drives of KITTI; pass one of find_kitti_drives")
+            source = drives[0]
+        self.drive = source
+        root, is_sequence = source.root, source.layout == "sequence"
+        is_auto = isinstance(poses, str) and poses == "auto"
+        with remote_errors(root):
+            self._label_files = root / "labels" if is_sequence and (root / "labels").is_dir() else None
+            if is_sequence:
+                calibration = "auto" if is_auto else None
+                super().__init__(root, poses, calibration=calibration, suffix=".bin")
+            else:
+                super().__init__(source.clouds, None if is_auto else poses, times=None, ground=None, suffix=".bin")
+        self.log_id = source.name
+        self._frames = [int(file.stem) for file in self.files]
+        self._boxes_of = lru_cache(1)(self._read_boxes)
+        if source.layout == "raw":
+            self._read_times()
+        if is_auto and not is_sequence:
+            self.poses = self._poses_from_oxts()
+
+    def __reduce__(self) -> Any:
+        return _restored, ({key: value for key, value in self.__dict__.items() if key != "_boxes_of"},)
+
+    def sweep(self, index: int) -> Sweep:
+        sweep = super().sweep(index)
+        if self._label_files is None or sweep.is_ground is not None:
+            return sweep
+        classes, _ = self._classes(index, len(sweep.points))
+        return Sweep(sweep.points, np.isin(classes, stored_labels.GROUND), sweep.pose, sweep.timestamp_ns)
+
+    def columns(self, index: int) -> dict[str, np.ndarray]:
+        """Read reflectance and, in SemanticKITTI, class and instance of the points of sweep `index`."""
+        columns = {"reflectance": super().columns(index)["column_3"]}
+        if self._label_files is not None:
+            columns["class"], columns["instance"] = self._classes(index, len(columns["reflectance"]))
+        return columns
+
+    def moving(self, index: int) -> np.ndarray | None:
+        """Read which points of sweep `index` belong to a class of moving points, (N,) bool; None without labels."""
+        self._timestamp(index)
+        if self._label_files is None:
+            return None
+        classes = self.columns(index)["class"]
+        first, last = stored_labels.MOVING
+        return (classes >= first) & (classes <= last)  # type: ignore[no-any-return]
+
+    def _labels(self, index: int) -> FlowLabels | None:
+        boxes = self._boxes_of()
+        if self.poses is None or (self._label_files is None and not boxes):
+            return None
+        points = np.asarray(super().sweep(index).points, np.float64)
+        T_ego1_ego0 = np.linalg.inv(self.poses[index + 1]) @ self.poses[index]
+        moving = self.moving(index)
+        if moving is not None:
+            classes = self.columns(index)["class"]
+            flow = (transform_points(points, T_ego1_ego0) - points).astype(np.float32)
+            is_valid = ~moving & ~np.isin(classes, stored_labels.UNLABELLED)
+            return FlowLabels(flow, stored_labels.class_categories()[classes], is_valid)
+        pair = [boxes.get(self._frames[k], stored_labels.no_boxes()) for k in (index, index + 1)]
+        labels = flow_from_boxes(points, pair[0].boxes, pair[1].boxes, T_ego1_ego0)
+        return FlowLabels(labels.flow, labels.category, labels.is_valid & self._is_annotated(points, pair[0]))
+
+    def _is_annotated(self, points: np.ndarray, boxes: FrameBoxes) -> np.ndarray:
+        projection = self._projection()
+        if projection is not None:
+            return in_image(points, projection, boxes.ignored)
+        return np.abs(np.arctan2(points[:, 1], points[:, 0])) < _UNKNOWN_VIEW  # type: ignore[no-any-return]
+
+    def _classes(self, index: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
+        folder: Any = self._label_files
+        return stored_labels.read_classes(folder / f"{self.files[index].stem}.label", rows)
+
+    def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, bool]:
+        trajectory, is_converted = super()._trajectory(poses, calibration)
+        if trajectory is None or not is_converted:
+            return trajectory, is_converted
+        stored, _ = super()._trajectory(poses, None)
+        if stored is not None and _drives_along_x(stored.poses) and not _drives_along_x(trajectory.poses):
+            warn(
+                f"log {self.folder.resolve().name}: {stored.source} has poses that drive along x, the LiDAR's axis "
+                "ahead, not along z, the camera's. So we take them for poses of the LiDAR, and ignore Tr of calib.txt"
+            )
+            return stored, True
+        return trajectory, True
+
+    def _read_times(self) -> None:
+        """Read the times of a raw drive: a line per frame, YYYY-MM-DD hh:mm:ss and 9 decimals."""
+        file = self.drive.root / "velodyne_points" / "timestamps.txt"
+        with remote_errors(file):
+            if not file.exists():
+                return
+        with file_errors(file):
+            lines = read_bytes(file).decode("utf-8").splitlines()
+            self.timestamps = [_nanoseconds(lines[frame]) for frame in self._frames]
+        if any(later <= earlier for earlier, later in zip(self.timestamps, self.timestamps[1:])):
+            raise CFlowError(f"{file}: times must ascend; copy it again")
+        self._has_times = True
+
+    def _poses_from_oxts(self) -> np.ndarray | None:
+        """Return the poses of the LiDAR; None, with a warning, if a file that they need is missing."""
+        root, name = self.drive.root, self.drive.clouds.name
+        is_raw = self.drive.layout == "raw"
+        calibration = self._calibration("calib_imu_to_velo.txt") if is_raw else root / "calib" / f"{name}.txt"
+        with remote_errors(root):
+            if is_raw:
+                files = {int(file.stem): file for file in (root / "oxts" / "data").glob("*.txt") if file.stem.isdigit()}
+                wanted = [files.get(frame) for frame in self._frames]
+                has_oxts = all(file is not None for file in wanted)
+                what = f"oxts/data has {sum(file is not None for file in wanted)} measurements for {len(wanted)} sweeps"
+            else:
+                wanted = [root / "oxts" / f"{name}.txt"]
+                has_oxts = bool(wanted[0] and wanted[0].exists())
+                what = f"there is no oxts/{name}.txt"
+            has_calibration = calibration is not None and calibration.exists()
+        if not has_oxts or not has_calibration or calibration is None:
+            missing = "calib_imu_to_velo.txt of its day is missing" if is_raw else f"calib/{name}.txt is missing"
+            warn(
+                f"log {self.log_id}: {missing if has_oxts else what}, so it has no poses. Download it to {root}"
+                f"{' or the folder of the day' if is_raw else ''}, or set data.odometry=true"
+            )
+            return None
+        table = np.concatenate([_numbers(file) for file in wanted if file is not None])
+        if not is_raw and len(table) <= max(self._frames):
+            raise CFlowError(
+                f"{wanted[0]} has {len(table)} lines; sweep {max(self._frames)} needs its own; copy it again"
+            )
+        poses = poses_from_oxts(table, wanted[0])
+        poses = poses if is_raw else poses[self._frames]
+        values = read_calibration(calibration)
+        T_lidar_imu = transform(values, calibration, "R T", "Tr_imu_velo", "Tr_imu_to_velo")
+        T_world_lidar = poses @ np.linalg.inv(T_lidar_imu)
+        return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar  # type: ignore[no-any-return]
+
+    def _calibration(self, name: str) -> Path | None:
+        """Return a calibration of a raw drive, in its folder or that of its day."""
+        files = [folder / name for folder in (self.drive.root, self.drive.root.resolve().parent)]
+        return next((file for file in files if file.exists()), None)
+
+    def _camera(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the (4, 4) `T_camera0_lidar` with rectification, and the (3, 4) projection of camera 2."""
+        if self.drive.layout == "tracking":
+            file: Any = self.drive.root / "calib" / f"{self.drive.clouds.name}.txt"
+            if not file.exists():
+                return None
+            values = read_calibration(file)
+            T_camera_lidar = transform(values, file, "Tr_velo_cam", "Tr_velo_to_cam")
+            rectification = transform(values, file, "R_rect", "R0_rect")
+            projection = values.get("P2")
+        else:
+            file, to_camera = (self._calibration(f"calib_{name}.txt") for name in ("cam_to_cam", "velo_to_cam"))
+            if file is None or to_camera is None:
+                return None
+            values = read_calibration(file)
+            T_camera_lidar = transform(read_calibration(to_camera), to_camera, "R T")
+            rectification = transform(values, file, "R_rect_00")
+            projection = values.get("P_rect_02")
+        if projection is None or len(projection) != 12:
+            raise CFlowError(f"{file} has no projection of camera 2 with 12 numbers; copy it again")
+        return rectification @ T_camera_lidar, projection.reshape(3, 4)
+
+    def _projection(self) -> np.ndarray | None:
+        camera = self._camera()
+        return None if camera is None else camera[1] @ camera[0]
+
+    def _read_boxes(self) -> dict[int, FrameBoxes]:
+        """Read the boxes of all frames; {} if the drive has none."""
+        root = self.drive.root
+        tracklets = root / "tracklet_labels.xml"
+        tracks = root / "label_02" / f"{self.drive.clouds.name}.txt"
+        with remote_errors(root):
+            if self.drive.layout == "raw" and tracklets.exists():
+                return stored_labels.read_tracklets(tracklets)
+            if self.drive.layout == "tracking" and tracks.exists():
+                camera = self._camera()
+                if camera is None:
+                    raise CFlowError(
+                        f"{tracks} needs the calibration calib/{tracks.name}, which is missing; download it"
+                    )
+                return stored_labels.read_tracking_labels(tracks, np.linalg.inv(camera[0]))
+        return {}
+
+
+def _restored(state: dict[str, Any]) -> KITTILog:
+    log = KITTILog.__new__(KITTILog)
+    log.__dict__.update(state)
+    log._boxes_of = lru_cache(1)(log._read_boxes)
+    return log
+
+
+def _drives_along_x(poses: np.ndarray) -> bool:
+    """Test whether poses (K, 4, 4) move along their own x axis more than along y and z."""
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    along = np.abs(steps[:, :3, 3]).sum(axis=0)
+    return bool(along[0] > along[1] + along[2])
+
+
+def _numbers(file: Path) -> np.ndarray:
+    with file_errors(file):
+        lines: Sequence[str] = read_bytes(file).decode("utf-8").splitlines()
+        return np.array([line.split() for line in lines if line.strip()], np.float64)
+
+
+def _nanoseconds(line: str) -> int:
+    """Convert a time like 2011-09-26 13:02:25.594360375 to nanoseconds since 1970."""
+    whole, _, decimals = line.strip().partition(".")
+    time = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+    return int((time - _EPOCH).total_seconds()) * 10**9 + int(decimals[:9].ljust(9, "0"))

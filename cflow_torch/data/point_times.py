@@ -1,0 +1,120 @@
+"""Times of points as LiDAR drivers store them: any unit, any clock, counters that wrapped, and stray values."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+TIME_FIELDS = ("t", "time", "timestamp", "offset", "offset_time", "time_stamp")
+_UNITS = (10**9, 10**6, 10**3, 1)  # nanoseconds in s, ms, us and ns
+# Seconds in which the middle half of the points is measured. The range is below a factor of 1000, so one unit fits.
+_SHORTEST_HALF, _LONGEST_HALF = 0.0015, 1.4
+_USUAL_PERIOD, _LONGEST_PERIOD = 0.1, 0.25  # seconds between sweeps; a log with more is thinned
+_LARGEST_LAG = 1.0  # seconds from the stamp of a sweep to its points; more means another clock
+_REPEATED = 0.01  # a single time of more points than this share is a default value, if no other time has many points
+_PARTS, _FEWEST_TURNS = 50, 0.1  # parts of a sweep in which we measure its rotation; a LiDAR that rotates less does not
+_COARSE = 8  # steps of a float in that half; with fewer, the type cannot hold the times
+
+
+class PointTimes(NamedTuple):
+    """Times of the points of one sweep."""
+
+    seconds: np.ndarray | None  # (N,) float64 seconds after the stamp of the sweep; None = the values are not times
+    is_stray: np.ndarray  # (N,) bool, True = this value is far from all others, so the time of the point is unknown
+    note: str  # what we assumed, or why there are no times; "" = nothing to say
+
+
+def seconds_after(
+    values: np.ndarray, stamp_ns: int, period: float | None = None, points: np.ndarray | None = None
+) -> PointTimes:
+    """Convert times of any unit and clock to seconds after the stamp of their sweep.
+
+    Args:
+        values: (N,) integers or floats.
+        stamp_ns: time of the sweep, nanoseconds.
+        period: seconds between the sweeps of the log; None = unknown.
+        points: (N, 2+) in the frame of the LiDAR, which tell how far it turned in a sweep; None = once.
+
+    Convention:
+        - Integers that wrapped go on: we take differences from the median modulo the range of their type.
+        - Stray values are not finite, or farther from the median than a sweep lasts, or one value that more than 1 % of
+          the points share (drivers write 0 for lost packets).
+        - The unit is the one of s, ms, us and ns in which a sweep has a plausible duration. Floats that fill the range
+          from 0 to 1 are shares of a sweep.
+        - Times count from the stamp or, if that is clearly closer to the stamp, from the epoch of the stamp. If neither
+          is within a second of the stamp, the times have another clock. Then the first point is at the stamp.
+    """
+    nothing = np.zeros(len(values), bool)
+    is_stray = ~np.isfinite(values) | _is_default(values)
+    if is_stray.all():
+        return PointTimes(None, nothing, "no time of a point is finite")
+    known = values[~is_stray]
+    centre = np.partition(known, len(known) // 2)[len(known) // 2]
+    ticks = _differences(values, centre)
+    early, late = np.quantile(ticks[~is_stray], (0.25, 0.75))
+    half = float(late - early)
+    if _is_share(known):
+        revolution = period if period is not None and period <= _LONGEST_PERIOD else _USUAL_PERIOD
+        duration = revolution * (1.0 if points is None else _turns(values[~is_stray], points[~is_stray]))
+        note = f"times of points go from 0 to 1, so we take them for shares of a sweep of {duration:.3g} s"
+        return PointTimes(values.astype(np.float64) * duration, is_stray, note)
+    if values.dtype.kind == "f" and abs(centre) > 1 and half < _COARSE * np.spacing(abs(centre)):
+        return PointTimes(
+            None, nothing, f"times of points near {centre:.10g} are too coarse in {values.dtype}: ignored"
+        )
+    longest = min(max(0.8 * (period or 0), 1.5 * _USUAL_PERIOD), _LONGEST_HALF)
+    unit = next((unit for unit in _UNITS if _SHORTEST_HALF <= half * unit * 1e-9 <= longest), None)
+    if unit is None:
+        why = "are all equal" if half == 0 else f"span about {2 * half:.4g}, which is not a sweep in s, ms, us or ns"
+        return PointTimes(None, nothing, f"times of points {why}: ignored")
+    seconds = ticks * (unit * 1e-9)
+    reach = max(1.1 * min(period or _LONGEST_PERIOD, _LONGEST_PERIOD), 3e-9 * half * unit)
+    is_stray |= ~(np.abs(seconds) <= reach)
+    lag, note = _lag(centre, unit, stamp_ns) * 1e-9, ""
+    if abs(lag) > _LARGEST_LAG:
+        note = f"times of points have another clock than the sweeps ({lag:+.6g} s), so the first one is at the stamp"
+        lag = -float(seconds[~is_stray].min())
+    return PointTimes(seconds + lag, is_stray, note)
+
+
+def _is_default(values: np.ndarray) -> np.ndarray:
+    """Test whether each value is the one that more than 1 % of the points have, and no other value comes close."""
+    distinct, counts = np.unique(values, return_counts=True)
+    most = np.sort(counts)[-2:]
+    if len(counts) < 3 or most[1] <= max(_REPEATED * len(values), 4 * most[0]):
+        return np.zeros(len(values), bool)
+    is_default: np.ndarray = values == distinct[counts.argmax()]
+    return is_default
+
+
+def _differences(values: np.ndarray, centre: Any) -> np.ndarray:
+    """Return values - centre as (N,) float64. Integers wrap as in their own type."""
+    if values.dtype.kind == "f":
+        return values.astype(np.float64) - float(centre)
+    signed = np.dtype(f"i{values.dtype.itemsize}")
+    return (values - centre).view(signed).astype(np.float64)
+
+
+def _is_share(known: np.ndarray) -> bool:
+    return known.dtype.kind == "f" and 0 <= known.min() <= 0.1 and 0.9 <= known.max() <= 1
+
+
+def _turns(shares: np.ndarray, points: np.ndarray) -> float:
+    """Return the turns, at most 1, of a LiDAR that measures points at shares of a sweep; 1 if it does not rotate."""
+    part = (shares * _PARTS).astype(np.int64).clip(0, _PARTS - 1)
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    sines, cosines = (np.bincount(part, f(angle), _PARTS) for f in (np.sin, np.cos))
+    steps = np.diff(np.unwrap(np.arctan2(sines, cosines)))
+    turns = abs(float(np.median(steps))) * _PARTS / (2 * np.pi)
+    return min(turns, 1.0) if turns > _FEWEST_TURNS else 1.0
+
+
+def _lag(centre: Any, unit: int, stamp_ns: int) -> int:
+    """Return the nanoseconds from the stamp to the median, under the most plausible origin of times."""
+    is_float = centre.dtype.kind == "f"
+    time = round(float(centre) * unit) if is_float else int(centre) * unit
+    wrapped = time - (unit << 8 * centre.dtype.itemsize)
+    after = time if centre.dtype.kind != "u" else min(time, wrapped, key=abs)
+    since_epoch = time - stamp_ns
+    return since_epoch if 2 * abs(since_epoch) < abs(after) else after

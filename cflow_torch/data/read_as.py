@@ -1,0 +1,125 @@
+"""Read a log whose poses or points have another convention: the setting `read_as` of `open_log`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Mapping
+
+import numpy as np
+
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper
+from cflow_torch.data.log_motion import is_in_world
+from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.errors import CFlowError
+from cflow_torch.types import Sweep
+from cflow_torch.windows.ego_motion import rigid_transform
+from cflow_torch.windows.readings import AXES, CAMERA, EARLY, INVERTED, LATE, STILL, WORLD, as_matrix
+
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}  # metres
+_OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
+_OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}  # axes of points and poses
+_OF_POSES = {name: AXES[name] for name in (CAMERA, "left", "back", "right")}
+READ_AS = (
+    *("auto", None, WORLD, INVERTED, STILL, LATE, EARLY),
+    *(*_OF_POSES, *_UNITS, *_OF_BOTH, *_OF_POINTS),
+)
+
+
+def read_as(log: Log, reading: str | None = "auto") -> Log:
+    """Return a log that is read in another way.
+
+    Args:
+        log: any log.
+        reading: None = as it is. "auto" = the same, unless the points are in the world's frame: then "world". What
+            else is allowed:
+
+            - "world": points are in the world's frame, and we move them to the frame of the vehicle;
+            - "inverted": poses are T_ego_world;
+            - "still": ignore the poses;
+            - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; the first, or last, is extrapolated;
+            - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
+              camera's, or the x axis points to the left, backward or to the right of that of the points;
+            - "millimetres", "centimetres": unit of the poses; "points_millimetres", "points_centimetres": of points;
+            - "points_camera", "points_upside_down": points and poses have a camera's axes (x right, y down, z
+              forward), or z points down and y to the right.
+    """
+    if reading not in READ_AS:
+        raise CFlowError(f"read_as={reading!r}: give one of {', '.join(str(one or 'null') for one in READ_AS)}")
+    if reading == "auto":
+        reading = WORLD if is_in_world(log) else None
+        return log if reading is None else ReadAs(log, reading, is_found=True)
+    return log if reading is None else ReadAs(log, reading)
+
+
+class ReadAs(LogWrapper):
+    """A log whose points and poses are converted, see `read_as`. `is_found` tells that we found the reading.
+
+    Labels are converted, too: flow is then in the axes of the converted points.
+    """
+
+    def __init__(self, log: Log, reading: str, is_found: bool = False) -> None:
+        super().__init__(log)
+        self.read_as, self.is_reading_found = reading, is_found
+
+    def sweep(self, index: int) -> Sweep:
+        sweep = self.log.sweep(index)
+        points = np.asarray(sweep.points)
+        moved = self._move(points, index, sweep.pose).astype(np.float32)
+        return replace(sweep, points=moved, pose=self._pose(index, sweep.pose))
+
+    def _labels(self, index: int) -> FlowLabels | None:
+        labels = self.log.labels(index)
+        if labels is None or self.read_as not in (WORLD, *_OF_BOTH, *_OF_POINTS):
+            return labels
+        sweep, pose1 = self.log.sweep(index), self.log.sweep(index + 1).pose
+        points = np.asarray(sweep.points)[:, :3].astype(np.float64)
+        start, end = self._move(points, index, sweep.pose), self._move(points + labels.flow, index + 1, pose1)
+        return replace(labels, flow=(end - start).astype(np.float32))
+
+    def labels(self, index: int) -> FlowLabels | None:
+        return Log.labels(self, index)
+
+    @property
+    def poses(self) -> np.ndarray | None:
+        """(K, 4, 4) float64 `T_world_ego` of every sweep, None without poses. Logs without `poses` lack it, too."""
+        log: Any = self.log
+        if log.poses is None:
+            return None
+        return np.array([self._pose(index, pose) for index, pose in enumerate(log.poses)])
+
+    def _move(self, points: np.ndarray, index: int, pose: Any) -> np.ndarray:
+        """Convert points of sweep `index`, (N, 3+), to metres in the frame of the vehicle."""
+        if self.read_as == WORLD:
+            return transform_points(points[:, :3], np.linalg.inv(self._given(index, pose)))
+        if self.read_as in _OF_BOTH:
+            return transform_points(points[:, :3], as_matrix(_OF_BOTH[self.read_as]))
+        return points[:, :3] * _OF_POINTS.get(self.read_as, 1.0)
+
+    def _pose(self, index: int, pose: Any) -> np.ndarray | None:
+        """Convert the pose of sweep `index`."""
+        if pose is None or self.read_as == STILL:
+            return None if pose is None else np.eye(4)
+        given = self._given(index, pose)
+        if self.read_as == INVERTED:
+            return np.linalg.inv(given)
+        if self.read_as in (LATE, EARLY):
+            return self._neighbour(index, 1 if self.read_as == LATE else -1)
+        if self.read_as in _UNITS:
+            return as_matrix(given[:3, :3], given[:3, 3] * _UNITS[self.read_as])
+        axes: Mapping[str, np.ndarray] = {**_OF_POSES, **_OF_BOTH}
+        return given @ as_matrix(axes[self.read_as]).T if self.read_as in axes else given
+
+    def _neighbour(self, index: int, step: int) -> np.ndarray:
+        """Return the pose of the next or last sweep; beyond the end the vehicle moves as between the two before."""
+        if 0 <= index + step < len(self):
+            return self._given(index + step)
+        here, before = self._given(index), self._given(index - step)
+        return here @ np.linalg.inv(before) @ here
+
+    def _given(self, index: int, pose: Any = None) -> np.ndarray:
+        if pose is None:
+            poses = getattr(self.log, "poses", None)
+            pose = self.log.sweep(index).pose if poses is None else poses[index]
+        if pose is None:
+            raise CFlowError(f"log {self.log_id}: sweep {index} has no pose, which read_as={self.read_as} needs")
+        return rigid_transform(pose, f"pose of sweep {index}")

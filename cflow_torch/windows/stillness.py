@@ -1,0 +1,95 @@
+"""Measure how still the static world stands between two sweeps: the share of its points that are found again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.windows.ground import find_ground
+
+NEAREST, FARTHEST = 3.0, 40.0  # metres from the origin in the plane: beyond the vehicle itself, and dense enough
+VOXEL = 0.3  # metres; one point per voxel, so that near surfaces do not outvote the rest
+REACH = 0.1  # metres; a point is in place if another is this near
+_OFFSETS = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], np.int64)
+_MOST = 1e5  # metres; coordinates are clamped to it, so that absurd poses do not overflow
+
+
+def static_rows(sweep: Sweep) -> np.ndarray:
+    """Return the rows of a sweep that can show whether the world stands still, (K,) int64, ascending.
+
+    These are its finite points that are not ground, 3 to 40 m from the origin. Without a ground mask, the ground is
+    found by the method "grid". Moving objects are included: they are few, and equally wrong under every reading.
+    """
+    points = as_numpy(sweep.points)[:, :3].astype(np.float64)
+    distance = np.hypot(points[:, 0], points[:, 1])
+    keep = np.isfinite(points).all(axis=1) & (distance > NEAREST) & (distance < FARTHEST)
+    is_ground: Any = find_ground(points, "grid") if sweep.is_ground is None else sweep.is_ground
+    return np.flatnonzero(keep & ~as_numpy(is_ground))
+
+
+def thinned_rows(points: np.ndarray) -> np.ndarray:
+    """Return a row of each voxel of 0.3 m, (K,) int64, ascending. `points` are (N, 3), finite, metres.
+
+    The choice is random with a fixed seed. The first row would lie at an edge of its voxel, as scans are ordered, and
+    two scans of a smooth wall would then match best if they are moved by whole voxels.
+    """
+    voxel = np.floor(np.asarray(points, np.float64) / VOXEL).astype(np.int64)
+    order = np.random.default_rng(0).permutation(len(voxel))
+    _, first = np.unique(_keys(voxel)[order], return_index=True)
+    return np.sort(order[first])
+
+
+def share_in_place(source: np.ndarray, target: np.ndarray, T_target_source: np.ndarray) -> float:
+    """Return the share of source points that have a target point within 0.1 m after the transform, 0 to 1.
+
+    Args:
+        source: (N, 3) float, metres; structure of one sweep (`static_rows`), thinned (`thinned_rows`).
+        target: (M, 3) float, metres; structure of another sweep. If it is thinned, too, the share is smaller, but it
+            differs more between a right and a wrong reading.
+        T_target_source: (4, 4) float64, maps the frame of the source to that of the target.
+
+    Returns:
+        NaN if there is no source point. Under the right transform, neighbouring thinned sweeps of real drives give 0.26
+        to 0.5.
+
+    Cost: 0.1 s for 20,000 source and 20,000 target points.
+    """
+    return Structure(target).share(source, T_target_source)
+
+
+class Structure:
+    """The structure of a sweep, (M, 3) float, metres, sorted once to be compared under many transforms."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        points = np.clip(np.asarray(points, np.float64), -_MOST, _MOST)
+        keys = _keys(np.floor(points / REACH).astype(np.int64))
+        order = np.argsort(keys, kind="stable")
+        self._points, self._sorted = points[order], keys[order]
+
+    def share(self, source: np.ndarray, T_target_source: np.ndarray) -> float:
+        """Return the share of `source` in place, see `share_in_place`. Cost: 6 ms for 1500 source points."""
+        if len(source) == 0:
+            return float("nan")
+        moved = np.asarray(source, np.float64) @ T_target_source[:3, :3].T + T_target_source[:3, 3]
+        moved = np.clip(moved, -_MOST, _MOST)
+        in_place = np.zeros(len(moved), bool)
+        cell = np.floor(moved / REACH).astype(np.int64)
+        order = np.argsort(_keys(cell))  # the searches below are several times faster in this order
+        moved, cell = moved[order], cell[order]
+        for offset in _OFFSETS:  # z varies fastest in a key: the three cells above one another are one range of keys
+            lowest = _keys(cell + (*offset, -1))
+            start = np.searchsorted(self._sorted, lowest, "left")
+            count = np.searchsorted(self._sorted, lowest + 2, "right") - start
+            row = np.repeat(np.arange(len(moved)), count)
+            neighbour = np.arange(len(row)) + np.repeat(start - np.cumsum(count) + count, count)
+            distance = np.linalg.norm(moved[row] - self._points[neighbour], axis=1)
+            in_place[row[distance <= REACH]] = True
+        return float(in_place.mean())
+
+
+def _keys(cell: np.ndarray) -> np.ndarray:
+    """Return one int64 per cell, (N,): 21 bits for each of x, y and z, which varies fastest."""
+    x, y, z = (cell + (1 << 20)).T
+    return (x << 42) + (y << 21) + z  # type: ignore[no-any-return]

@@ -1,0 +1,234 @@
+"""Bags as people have them: in parts, with missing links, other clocks, corrections, other messages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Callable
+
+import numpy as np
+import pytest
+from bag_writer import MOUNT, BagWriter, typesys, write_bag
+from test_bags import world_of
+from tiny_recording import TinyRecording
+
+from cflow_torch import CFlowError
+from cflow_torch.data.bags import BagLog, find_bags
+from cflow_torch.data.bags.messages import cloud_columns
+from cflow_torch.data.catalog import recognise
+from cflow_torch.types import CFlowWarning
+
+TF, CLOUD, ODOMETRY = "tf2_msgs/msg/TFMessage", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry"
+STEP = 20_000_000
+
+
+class Recorder:
+    """Write clouds, transforms and odometry of a tiny recording."""
+
+    def __init__(self, folder: Path, form: str = "ros1", num_sweeps: int = 8) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.writer, self.recording = BagWriter(folder, form), TinyRecording(("velodyne",), num_sweeps=num_sweeps)
+        self.recording.mounts["velodyne"] = MOUNT
+        self.stamps = self.recording.timestamps
+
+    def transform(self, stamp: int, parent: str, child: str, T: np.ndarray) -> None:
+        self.writer.write("/tf", stamp, TF, [self.writer.transform(stamp, parent, child, T)])
+
+    def mount(self) -> None:
+        self.transform(self.stamps[0], "base_link", "velodyne", MOUNT)
+
+    def drive(self, start: int = -2, end: int = 20, lag: int = 0) -> None:
+        """Transforms of the vehicle from sweep `start` to `end`, 50 a second."""
+        first = self.stamps[0]
+        for stamp in range(first + start * 10**8, first + end * 10**8, STEP):
+            self.transform(stamp + lag, "odom", "base_link", self.recording.pose_at(stamp))
+
+    def odometry(self, child: str = "base_link", parent: str = "odom") -> None:
+        make = self.writer.make
+        zero = make("geometry_msgs/msg/Vector3", 0, 0, 0)
+        twist = make("geometry_msgs/msg/TwistWithCovariance", make("geometry_msgs/msg/Twist", zero, zero), np.zeros(36))
+        for stamp in range(self.stamps[0] - 10**8, self.stamps[-1] + 2 * 10**8, STEP):
+            pose = self.writer.pose(self.recording.pose_at(stamp))
+            pose = make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
+            self.writer.write("/odom", stamp, ODOMETRY, self.writer.header(stamp, parent), child, pose, twist)
+
+    def clouds(self, sweeps: Any = None, stamp: Callable[[int], int] = int) -> None:
+        for k in range(8) if sweeps is None else sweeps:
+            unit = self.recording.units(k)[0]
+            fields = self.writer.cloud(stamp(self.stamps[k]), unit.points, None)
+            self.writer.write("/points", self.stamps[k], CLOUD, *fields)
+
+    def close(self) -> Path:
+        self.writer.bag.close()
+        return next(Path(self.writer.bag.path).parent.glob("drive*"))
+
+
+def world(log: BagLog, recording: TinyRecording) -> float:
+    """Largest error of static points in the world, of the sweeps that the log has, metres."""
+    errors = []
+    for sweep in log:
+        truth = recording.units(list(recording.timestamps).index(sweep.timestamp_ns))[0].points
+        lidar = recording.pose_at(sweep.timestamp_ns) @ MOUNT
+        errors.append(np.abs(world_of(sweep) - truth @ lidar[:3, :3].T - lidar[:3, 3]).max())
+    return float(max(errors))
+
+
+def test_parts_of_a_bag_are_joined(tmp_path) -> None:
+    """The second part alone has no mounting of the LiDAR."""
+    for number, sweeps in enumerate((range(4), range(4, 8))):
+        part = Recorder(tmp_path / str(number))
+        if number == 0:
+            part.mount()
+        part.drive(4 * number - 2, 4 * number + 6)
+        part.clouds(sweeps)
+        part.close().rename(tmp_path / f"drive_{number}.bag")
+    assert find_bags(tmp_path) == [tmp_path / "drive_0.bag"]
+    log = BagLog(tmp_path / "drive_0.bag")
+    assert log.log_id == "drive" and len(log) == 8 and world(log, part.recording) < 5e-3
+
+
+def test_folders_without_or_with_old_metadata_are_read(tmp_path) -> None:
+    folder = write_bag(tmp_path, "ros2", TinyRecording(("velodyne",), num_sweeps=3))
+    (file,) = folder.glob("*.db3")
+    file.rename(folder / "renamed.db3")
+    assert len(BagLog(folder)) == 3
+    (folder / "metadata.yaml").unlink()
+    assert [len(BagLog(bag)) for bag in find_bags(tmp_path)] == [3]
+
+
+def test_a_missing_link_is_named(tmp_path) -> None:
+    bag = Recorder(tmp_path / "a")
+    bag.odometry()
+    bag.clouds()
+    path = bag.close()
+    with pytest.warns(CFlowWarning, match=r"no transform connects its LiDAR \(velodyne\) to base_link.*ego_T_lidar"):
+        BagLog(path)
+    bag = Recorder(tmp_path / "b")
+    bag.drive()
+    bag.clouds()
+    path = bag.close()
+    with pytest.warns(CFlowWarning, match="They are not used"):
+        assert BagLog(path).poses is None
+    log = BagLog(path, ego_T_lidar=MOUNT)
+    assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
+
+
+def test_other_clocks_are_named_and_late_poses_counted(tmp_path) -> None:
+    for name, lag in (("clock", -(10**18)), ("late", 500_000_000)):
+        bag = Recorder(tmp_path / name)
+        bag.mount()
+        bag.drive(lag=lag)
+        bag.clouds()
+        path = bag.close()
+        if name == "clock":
+            with pytest.raises(CFlowError, match=r"the clocks differ by about 1e\+09 s"):
+                BagLog(path)
+        else:
+            with pytest.warns(CFlowWarning, match="3 of 8 sweeps have no pose .* 3 before the first pose"):
+                assert len(BagLog(path)) == 5
+
+
+def test_repeated_stamps_are_named(tmp_path) -> None:
+    same = Recorder(tmp_path / "same")
+    same.mount()
+    same.drive()
+    same.clouds(stamp=lambda stamp: same.stamps[0])
+    with pytest.warns(CFlowWarning, match="8 clouds have 1 different time stamps, so we use their times of arrival"):
+        log = BagLog(same.close())
+    assert [time - 40_000_000 for time in log.timestamps] == list(same.stamps)
+    assert len({tuple(sweep.points[0]) for sweep in log}) == 8
+    loop = Recorder(tmp_path / "loop")
+    loop.mount()
+    loop.drive()
+    loop.clouds([*range(8), *range(8)])
+    with pytest.warns(CFlowWarning, match="8 clouds repeat the time stamp of an earlier one"):
+        assert world(BagLog(loop.close()), loop.recording) < 5e-3
+
+
+def test_corrections_of_a_map_do_not_move_the_ego(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    for stamp in range(bag.stamps[0] - 10**8, bag.stamps[-1] + 10**8, 10**8):
+        jump = np.eye(4)
+        jump[0, 3] = 1.0 if stamp > bag.stamps[4] else 0.0
+        bag.transform(stamp, "map", "odom", jump)
+    bag.clouds()
+    with pytest.warns(CFlowWarning, match="the transform from map to odom jumps, so poses are in odom"):
+        log = BagLog(bag.close())
+    assert world(log, bag.recording) < 5e-3
+
+
+def test_a_gap_splits_windows(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    bag.clouds([0, 1, 2, 7])
+    with pytest.warns(CFlowWarning, match="1 gaps between sweeps .*0.5 s long, after sweep 2"):
+        assert BagLog(bag.close()).gaps == {2}
+
+
+def test_clouds_in_the_frame_of_the_world_are_moved_to_the_odometry(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.odometry("body", "camera_init")
+    for k, stamp in enumerate(bag.stamps):
+        bag.transform(stamp, "camera_init", "body", bag.recording.pose_at(stamp))
+        T = bag.recording.pose_at(stamp)
+        points = bag.recording.units(k)[0].points @ T[:3, :3].T + T[:3, 3]
+        header, *fields = bag.writer.cloud(stamp, points.astype(np.float32), None)
+        header.frame_id = "camera_init"
+        bag.writer.write("/registered", stamp, CLOUD, header, *fields)
+    with pytest.warns(CFlowWarning, match="clouds are in camera_init, the frame of the world; we move them to body"):
+        log = BagLog(bag.close())
+    assert np.allclose(log.sweep(3).points, bag.recording.units(3)[0].points, atol=5e-3)
+
+
+LIVOX = {
+    "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line",
+    "CustomMsg": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+    "livox_ros_driver2/CustomPoint[] points",
+}
+
+
+def test_custom_messages_of_livox_are_read(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    for name, definition in LIVOX.items():
+        bag.writer.types.register(typesys.get_types_from_msg(definition, f"livox_ros_driver2/msg/{name}"))
+    kinds = [f"livox_ros_driver2/msg/{name}" for name in LIVOX]
+    for k, stamp in enumerate(bag.stamps):
+        points = [
+            bag.writer.make(kinds[0], 2_500_000 * row, *map(float, point), row, 0, 1)
+            for row, point in enumerate([*bag.recording.units(k)[0].points, np.zeros(3)])
+        ]
+        header = bag.writer.header(stamp, "livox")
+        bag.writer.write("/livox", stamp, kinds[1], header, stamp, len(points), 0, np.zeros(3, np.uint8), points)
+    log = BagLog(bag.close())
+    assert np.allclose(log.sweep(2).points, bag.recording.units(2)[0].points, atol=1e-5)
+    assert np.allclose(log.sweep(2).point_times, np.arange(40) * 2.5e-3)
+    assert log.columns(2)["reflectivity"].tolist() == list(range(40))
+
+
+def test_messages_that_are_not_decoded_name_their_converter(tmp_path) -> None:
+    bag, kind = Recorder(tmp_path), "velodyne_msgs/msg/VelodyneScan"
+    bag.writer.types.register(typesys.get_types_from_msg("std_msgs/Header header", kind))
+    bag.writer.write("/packets", bag.stamps[0], kind, bag.writer.header(bag.stamps[0], "velodyne"))
+    with pytest.raises(CFlowError, match="VelodyneScan, which we do not decode: convert it with velodyne_pointcloud"):
+        BagLog(bag.close())
+
+
+def test_unfinished_recordings_say_what_to_do(tmp_path) -> None:
+    (tmp_path / "drive.bag.active").write_bytes(b"#ROSBAG V2.0\n")
+    for path in (tmp_path, tmp_path / "drive.bag.active"):
+        assert recognise(path) == "bags"
+    (bag,) = find_bags(tmp_path)
+    with pytest.raises(CFlowError, match="was not finished: run rosbag reindex"):
+        BagLog(bag)
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_a_wrong_byte_order_is_found(tmp_path, order: str) -> None:
+    writer, points = BagWriter(tmp_path, "ros1"), np.random.default_rng(0).normal(0, 20, (50, 3)).astype(np.float32)
+    message: Any = SimpleNamespace(**vars(writer.make(CLOUD, *writer.cloud(0, points, None, order))))
+    for message.is_bigendian in (False, True):
+        columns = cloud_columns(message)
+        assert np.array_equal(np.stack([columns[axis] for axis in "xyz"], 1).astype(np.float32), points)

@@ -1,0 +1,80 @@
+"""Files without a header: numbers per point and their type are recognised, in any order of points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cflow_torch import CFlowError
+from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
+from cflow_torch.data.arrays.cloud_file import read_cloud
+from cflow_torch.data.arrays.reader import ArraysLog
+from cflow_torch.types import CFlowWarning
+
+
+def street(columns: int, kind: str = "<f4", count: int = 2400, shuffled: bool = False) -> np.ndarray:
+    """Points of a scan, x, y, z, intensity, ring, time and two more columns."""
+    rng = np.random.default_rng(0)
+    angle, distance = np.linspace(0, 2 * np.pi, count), np.exp(rng.uniform(1, 4, count))
+    xyz = [distance * np.cos(angle), distance * np.sin(angle), rng.uniform(-2, 1, count)]
+    more = [rng.integers(0, 256, count), np.arange(count) % 32, angle / 63, rng.normal(size=count), rng.random(count)]
+    table = np.stack([*xyz, *more], axis=1)[:, :columns].astype(kind)
+    return rng.permutation(table) if shuffled else table
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize("kind", ["<f4", "<f8"])
+@pytest.mark.parametrize("columns", [3, 4, 5, 6, 8])
+def test_the_layout_is_recognised(tmp_path, columns: int, kind: str, shuffled: bool) -> None:
+    table = street(columns, kind, shuffled=shuffled)
+    assert find_bin_layout(table.tobytes()) == BinLayout(columns, kind)
+    assert find_bin_layout((table * 1000).tobytes()).columns == columns, "millimetres"
+    few_digits = (np.round(table * 64) / 64).astype(kind)
+    assert find_bin_layout(few_digits.tobytes()) == BinLayout(columns, kind)
+    assert find_bin_layout(table.astype("f4").astype(kind).tobytes()) == BinLayout(columns, kind)
+    (tmp_path / "a.bin").write_bytes(table.tobytes())
+    found = read_cloud(tmp_path / "a.bin")
+    assert found.dtype == np.dtype(kind) and np.array_equal(found, table[:, :3])
+    assert np.array_equal(read_cloud(tmp_path / "a.bin", columns), table[:, :3])
+
+
+def test_missing_returns_and_reflectances_of_zero_change_nothing() -> None:
+    for columns in (3, 4, 5):
+        table = street(columns)
+        table[::2] = 0
+        table[:, 3:] *= np.arange(len(table))[:, None] % 5 == 0
+        assert find_bin_layout(table.tobytes()).columns == columns
+        table[::2] = np.nan
+        assert find_bin_layout(table.tobytes()).columns == columns
+
+
+def packed() -> bytes:
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("i", "u1"), ("t", "<u4"), ("ring", "u1")]
+    table = np.zeros(2400, kinds)
+    for axis, values in zip("xyz", street(3).T):
+        table[axis] = values
+    table["i"], table["t"] = np.arange(2400) % 256, np.arange(2400) * 40_000
+    return table.tobytes()
+
+
+@pytest.mark.parametrize("content", [packed(), street(4).tobytes()[:-4], b"a text " * 9000])
+def test_other_files_are_refused_and_the_setting_is_named(tmp_path, content: bytes) -> None:
+    (tmp_path / "a.bin").write_bytes(content)
+    with pytest.raises(CFlowError, match=r"a\.bin.*bin_columns"):
+        read_cloud(tmp_path / "a.bin")
+
+
+def test_a_folder_has_one_layout_which_is_said(tmp_path, recwarn: Any) -> None:
+    for columns in (4, 5):
+        (tmp_path / str(columns)).mkdir()
+        for k in range(2):
+            (tmp_path / str(columns) / f"{k}.bin").write_bytes(street(columns)[k:].tobytes())
+    assert len(ArraysLog(tmp_path / "4").sweep(1).points) == 2399 and not recwarn.list
+    with pytest.warns(CFlowWarning, match="log 5: its .bin files look like 5 float32 per point"):
+        log = ArraysLog(tmp_path / "5")
+    assert np.array_equal(log.sweep(1).points, street(5)[1:, :3]) and log.notes
+    assert len(ArraysLog(tmp_path / "5", bin_columns=5).sweep(0).points) == 2400
+    with pytest.raises(CFlowError, match="not a multiple"):
+        ArraysLog(tmp_path / "5", bin_columns=7).sweep(0)

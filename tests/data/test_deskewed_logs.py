@@ -1,0 +1,271 @@
+"""Sweeps that were never de-skewed: made by the simulator, whose de-skewed twin of the same shots is the truth."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import cflow
+
+from cflow_torch.data.arrays.cloud_file import write_cloud
+from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
+from cflow_torch.data.catalog import open_log
+from cflow_torch.data.deskewing import DeskewedLog
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.profiles import PROFILES
+from cflow_torch.simulator.street import build_street
+from cflow_torch.types import CFlowError, CFlowWarning, Sweep
+from cflow_torch.windows.deskewing import scan_fractions
+from cflow_torch.windows.stillness import share_in_place, static_rows, thinned_rows
+
+LIDAR = PROFILES["demo"].units[0]
+
+
+def make(speed: float = 14.0, is_deskewed: bool = False, num_sweeps: int = 8, **lidar: Any) -> Drive:
+    """Drive past houses; the LiDAR turns clockwise, from behind, and the instant of a sweep is when it looks ahead."""
+    scene = build_street(np.random.default_rng([1, 0]))
+    scene = replace(scene, ego=replace(scene.ego, speed=speed))
+    profile = replace(PROFILES["demo"], units=(replace(LIDAR, **lidar),), reference=0.5)
+    return Drive(scene, replace(profile, is_rolling=True, is_deskewed=is_deskewed), 1, num_sweeps, "drive")
+
+
+class Untimed(LogWrapper):
+    """The log of a format that has no times of points."""
+
+    lidar_position = LIDAR.position
+
+    @property
+    def unwrapped(self) -> Log:
+        return self
+
+    def sweep(self, index: int) -> Sweep:
+        return replace(self.log.sweep(index), point_times=None)
+
+
+class Later(LogWrapper):
+    """A drive of another year: Argoverse 2, which is known to be compensated, is recognised by its time stamps."""
+
+    def __init__(self, log: Drive) -> None:
+        super().__init__(log)
+        self.timestamps = [stamp + 10**18 for stamp in log.timestamps]
+
+    def sweep(self, index: int) -> Sweep:
+        return replace(self.log.sweep(index), timestamp_ns=self.timestamps[index])
+
+
+@pytest.fixture(scope="module")
+def raw() -> Drive:
+    return make()
+
+
+@pytest.fixture(scope="module")
+def truth() -> Drive:
+    return make(is_deskewed=True)
+
+
+def largest_error(log: Log, truth: Log, index: int) -> float:
+    """Return the largest distance of static points from their truth, metres."""
+    points, expected = np.asarray(log.sweep(index).points), np.asarray(truth.sweep(index).points)
+    return float(np.linalg.norm(points - expected, axis=1).max())
+
+
+def test_the_direction_is_found_and_points_return_to_the_truth(raw: Drive, truth: Drive) -> None:
+    log = DeskewedLog(Untimed(raw))
+    assert log.reading.name == "clockwise" and "data.deskew=clockwise" in log.reading.note
+    assert largest_error(raw, truth, 3) > 0.5
+    # The vehicle turns by 4.5 degrees a sweep. A chord between two poses is off its arc by 1.4 cm.
+    assert max(largest_error(log, truth, index) for index in (3, 7)) < 0.015
+    assert np.abs(log.sweep(3).point_times - raw.sweep(3).point_times).max() < 2e-4
+    again = pickle.loads(pickle.dumps(log))
+    assert np.array_equal(again.sweep(3).points, log.sweep(3).points) and again.reading == log.reading
+
+
+def test_a_lidar_that_turns_the_other_way_is_found() -> None:
+    log = DeskewedLog(Untimed(make(start=-180.0, span=360.0)))
+    assert log.reading.name == "counterclockwise"
+
+
+@pytest.mark.parametrize(
+    ("start", "deskew", "reading"),
+    [(90.0, "auto", "clockwise_left"), (0.0, "clockwise_ahead", "clockwise_ahead")],
+)
+def test_a_turn_may_begin_elsewhere(start: float, deskew: str, reading: str) -> None:
+    raw, truth = (make(start=start, is_deskewed=is_deskewed) for is_deskewed in (False, True))
+    log = DeskewedLog(Untimed(raw), deskew)
+    assert log.reading.name == reading
+    # The instant of the simulated sweep is the middle of its turn. That of the reading is when the LiDAR looks ahead.
+    later = 0.05 - 0.1 * (start / 360)
+    times = log.sweep(4).point_times + later - 0.05 - raw.sweep(4).point_times
+    assert np.abs(times - np.median(times)).max() < 2e-4, "no point is a turn off"
+    shares = []
+    for given in (raw, log, truth):
+        sweeps = [given.sweep(index) for index in (2, 6)]
+        source, target = (np.asarray(sweep.points)[static_rows(sweep)] for sweep in sweeps)
+        T = np.linalg.inv(sweeps[1].pose) @ sweeps[0].pose
+        shares.append(share_in_place(source[thinned_rows(source)], target, T))
+    assert shares[0] < 0.85 * shares[2] and shares[1] > 0.95 * shares[2]
+
+
+@pytest.mark.parametrize("case", ["compensated", "slow"])
+def test_compensated_and_slow_sweeps_stay_as_they_are(case: str, truth: Drive) -> None:
+    given = truth if case == "compensated" else make(speed=4.0, num_sweeps=4)
+    log = DeskewedLog(Untimed(given))
+    assert log.reading == ("off", "")
+    assert np.array_equal(log.sweep(1).points, given.sweep(1).points) and log.sweep(1).point_times is None
+
+
+def write_clouds(drive: Drive, folder: Path, suffix: str, unit: float = 1e9, kind: Any = np.uint32) -> Path:
+    """Write a folder of clouds with a column t, the time since the first shot or, by `unit` 1e6, since 1970 in us."""
+    (folder / "points").mkdir(parents=True)
+    for index in range(len(drive)):
+        sweep = drive.sweep(index)
+        seconds = np.asarray(sweep.point_times)
+        times = (seconds * 1e9).round() if unit == 1e9 else drive.timestamps[index] / 1e3 + seconds * 1e6
+        name = f"{index:06d}{suffix}"
+        write_cloud(folder / "points" / name, sweep.points, {"t": times.astype(kind)})
+    write_kitti_poses(folder / "poses.txt", drive.poses)
+    write_times(folder / "times.txt", drive.timestamps)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("suffix", "unit", "kind"), [(".pcd", 1e9, np.int32), (".ply", 1e6, np.float64), (".npy", 1e6, np.int64)]
+)
+def test_times_in_files_are_used(raw: Drive, truth: Drive, tmp_path: Path, suffix: str, unit: float, kind: Any) -> None:
+    if suffix == ".pcd":
+        pytest.importorskip("pypcd4")
+    folder = write_clouds(raw, tmp_path / "drive", suffix, unit, kind)
+    with pytest.warns(CFlowWarning, match="moves? each point.*times of its points.*data.deskew=times"):
+        log: Any = open_log("arrays", folder)
+    assert log.reading.name == "times"
+    assert max(largest_error(log, truth, index) for index in (3, 7)) < 0.015
+    assert np.abs(log.sweep(3).point_times - raw.sweep(3).point_times).max() < 1e-5
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        chosen = open_log("arrays", folder, find_ground="grid", deskew="times")
+        stored = open_log("arrays", folder, find_ground="grid", deskew="off", check=False)
+    assert np.array_equal(chosen.sweep(3).points, log.sweep(3).points)
+    assert np.array_equal(stored.sweep(3).points, raw.sweep(3).points)
+
+
+def test_compensated_clouds_with_times_are_left_alone(truth: Drive, tmp_path: Path) -> None:
+    log: Any = open_log("arrays", write_clouds(truth, tmp_path / "drive", ".npy", kind=np.int64), check=False)
+    assert log.reading.name == "off" and "already" in log.reading.note
+    assert np.array_equal(log.sweep(3).points, truth.sweep(3).points)
+    assert np.allclose(log.sweep(3).point_times, truth.sweep(3).point_times, atol=1e-6)
+
+
+def test_a_scene_with_times_is_measured_before_they_are_used(raw: Drive, truth: Drive, tmp_path: Path) -> None:
+    pytest.importorskip("h5py")
+    from cflow_torch.data.hdf5 import write_hdf5_scene
+
+    for name, drive in (("raw", raw), ("truth", truth)):
+        write_hdf5_scene(Later(drive), tmp_path / f"{name}.h5", 0)
+    logs: Any = [open_log("hdf5", tmp_path / f"{name}.h5", check=False) for name in ("raw", "truth")]
+    assert [log.reading.name for log in logs] == ["times", "off"]
+    assert largest_error(logs[0], truth, 3) < 0.015 and largest_error(logs[1], truth, 3) == 0
+
+
+class OneCar(Log):
+    """A vehicle at 20 m/s meets a car at 15 m/s; boxes are drawn around points as a clockwise LiDAR measures them."""
+
+    log_id = "car"
+    timestamps = [0, 10**8, 2 * 10**8]
+    SPEED, CAR = 2.0, -1.5  # metres a sweep
+
+    def __init__(self) -> None:
+        self.poses = np.tile(np.eye(4), (3, 1, 1))
+        self.poses[:, 0, 3] = self.SPEED * np.arange(3)
+
+    def measured(self, index: int) -> np.ndarray:
+        """Return the car as seen, by iteration: the azimuth sets the time, and the time the place."""
+        fraction = np.zeros(5)
+        for _ in range(30):
+            x = 16 + self.CAR * (index + fraction) - self.SPEED * (index + fraction)
+            points = np.stack([x + np.arange(5), np.full(5, 4.0), np.zeros(5)], 1)
+            fraction = scan_fractions(points, "clockwise")
+        return points
+
+    def sweep(self, index: int) -> Sweep:
+        house = np.array([[3.0, 12, 1]])
+        points = np.concatenate([self.measured(index), house])
+        return Sweep(points.astype(np.float32), None, self.poses[index], self.timestamps[index])
+
+    def _labels(self, index: int) -> FlowLabels:
+        flow = np.concatenate([self.measured(index + 1) - self.measured(index), [[-self.SPEED, 0, 0]]])
+        return FlowLabels(flow.astype(np.float32), np.ones(6, np.uint8), np.ones(6, bool))
+
+
+def test_labels_of_moving_objects_become_motions_between_the_instants() -> None:
+    own = OneCar()
+    log = DeskewedLog(own, "clockwise")
+    before: Any = own.labels(1)
+    after: Any = log.labels(1)
+    residual = after.flow - (-own.SPEED, 0, 0)
+    assert np.abs(before.flow[:5, 0] + own.SPEED - own.CAR).max() > 0.05
+    assert np.abs(residual[:5] - (own.CAR, 0, 0)).max() < 1e-4, "the speed of the car"
+    assert np.abs(residual[5]).max() < 1e-6, "static points stay static"
+
+
+@pytest.mark.parametrize(
+    ("deskew", "message"),
+    [
+        ("left", "deskew='left'.*times, off, clockwise, counterclockwise"),
+        ("times", "no times of points for deskew=times"),
+    ],
+)
+def test_settings_that_cannot_be_used_are_refused(deskew: str, message: str, raw: Drive) -> None:
+    with pytest.raises(CFlowError, match=message):
+        DeskewedLog(Untimed(raw), deskew).sweep(0)
+    with pytest.raises(CFlowError, match="deskew='left'"):
+        open_log("arrays", "nowhere", deskew="left")
+
+
+def test_the_command_line_takes_the_setting(raw: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_clouds(raw, tmp_path / "drive", ".npy", kind=np.int64)
+    flow = ("flow", "data=arrays", f"data.root={folder}", "model=paper", "data.find_ground=grid")
+    assert cflow(*flow, f"output={tmp_path / 'out'}", "data.deskew=sideways") == 1
+    assert "deskew='sideways'" in capsys.readouterr().err
+
+
+def test_a_log_of_every_second_sweep_is_moved_by_turns_not_by_pose_intervals(raw: Drive, truth: Drive) -> None:
+    class Half(Untimed):
+        turn_seconds = 0.1
+
+        def __init__(self, log: Drive) -> None:
+            super().__init__(log)
+            self.timestamps = log.timestamps[1::2]
+            self.poses = log.poses[1::2]
+
+        def sweep(self, index: int) -> Sweep:
+            return super().sweep(2 * index + 1)
+
+    moved = np.asarray(DeskewedLog(Half(raw), "clockwise").sweep(1).points)
+    assert np.linalg.norm(moved - truth.sweep(3).points, axis=1).max() < 0.06  # chords of twice the length
+
+
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+@pytest.mark.skipif(not (REAL / "kitti-raw").is_dir(), reason="the real scenes are not here")
+@pytest.mark.parametrize(
+    ("scene", "reading"),
+    [
+        ("kitti-raw/kitti-raw-0027-a", "clockwise"),
+        ("kitti-raw/kitti-raw-0027-b2", "clockwise"),
+        ("kitti-raw/kitti-raw-0027-empty16", "clockwise"),
+        ("kitti-0000/kitti-0000-a", "off"),
+        ("kitti-0000/kitti-0000-c2", "off"),
+        ("pandaset-002/panda-002-c", "off"),
+    ],
+)
+def test_real_drives(scene: str, reading: str) -> None:
+    pytest.importorskip("h5py")
+    log: Any = open_log("hdf5", REAL / f"{scene}.h5", check=False)
+    assert log.reading.name == reading

@@ -1,0 +1,217 @@
+"""KITTI in its four layouts, written by hand: two poses of a vehicle, a box that drives, and a wall."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cflow_torch.data.catalog import find_sources, open_log, recognise
+from cflow_torch.data.kitti import KITTILog, find_kitti_drives
+from cflow_torch.types import CFlowError, CFlowWarning
+
+STEP, CAR = 0.4, 0.7  # metres a sweep: the vehicle, and the car in the world
+T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0.01], [0, 0, -1, -0.07], [1, 0, 0, -0.27], [0, 0, 0, 1]])
+T_LIDAR_IMU = np.array([[1.0, 0, 0, -0.81], [0, 1, 0, 0.32], [0, 0, 1, -0.8], [0, 0, 0, 1]])
+PROJECTION = np.array([[720.0, 0, 621, 45], [0, 720, 187, 0], [0, 0, 1, 0]])
+WALL = np.array([[12.0, -5, 0.1], [12, -4, 0.1], [-8, 3, 0.1], [12, -9, -0.2]])
+
+
+def cloud(index: int) -> np.ndarray:
+    """Return (N, 4): three points of a car ahead, then a wall, of which one point is behind and two are in view."""
+    car = np.array([[15.0, 1.2, -1], [15.5, 1, -0.6], [14.4, 0.8, -0.8]]) + ((CAR - STEP) * index, 0, 0)
+    points = np.concatenate([car, WALL - (STEP * index, 0, 0)])
+    return np.column_stack([points, np.linspace(0, 0.9, len(points))])
+
+
+def write_clouds(folder: Path, count: int, form: str = "{:06d}") -> None:
+    folder.mkdir(parents=True)
+    for index in range(count):
+        cloud(index).astype("<f4").tofile(folder / (form.format(index) + ".bin"))
+
+
+def text(matrix: np.ndarray) -> str:
+    return " ".join(f"{value:.12e}" for value in np.ravel(matrix))
+
+
+def oxts(index: int) -> str:
+    """Return a measurement of a vehicle that drives north-west at 49 degrees, 8.4 degrees east."""
+    metres = STEP * index / np.sqrt(2)
+    scale = 6378137.0 * np.cos(np.radians(49.0))
+    north = np.log(np.tan(np.pi / 4 + np.radians(49.0) / 2)) + metres / scale
+    latitude = np.degrees(2 * np.arctan(np.exp(north)) - np.pi / 2)
+    longitude = 8.4 - np.degrees(metres / scale)
+    return f"{latitude:.14f} {longitude:.14f} 112.0 0 0 {3 * np.pi / 4:.14f} " + "0 " * 24 + "\n"
+
+
+def write_raw(folder: Path, count: int = 3, first: int = 0) -> Path:
+    write_clouds(folder / "velodyne_points" / "data", count, "{:010d}")
+    lines = [f"2011-09-26 13:02:25.{594360375 + 103_000_000 * index:09d}\n" for index in range(3)]
+    (folder / "velodyne_points" / "timestamps.txt").write_text("".join(lines))
+    (folder / "oxts" / "data").mkdir(parents=True)
+    for index in range(count):
+        (folder / "oxts" / "data" / f"{index:010d}.txt").write_text(oxts(index))
+    poses = "".join(
+        f"<item><tx>{15 + (CAR - STEP) * index}</tx><ty>1</ty><tz>-1.6</tz><rx>0</rx><ry>0</ry><rz>0.1</rz>"
+        "<state>2</state><occlusion>0</occlusion><truncation>0</truncation></item>"
+        for index in range(count)
+    )
+    (folder / "tracklet_labels.xml").write_text(
+        '<?xml version="1.0"?><!DOCTYPE boost_serialization><boost_serialization><tracklets><count>1</count>'
+        f"<item><objectType>Van</objectType><h>2</h><w>1.8</w><l>4</l><first_frame>{first}</first_frame>"
+        f"<poses><count>{count}</count>{poses}</poses></item></tracklets></boost_serialization>"
+    )
+    day = folder.parent
+    rigid = f"R: {text(T_LIDAR_IMU[:3, :3])}\nT: {text(T_LIDAR_IMU[:3, 3])}\n"
+    (day / "calib_imu_to_velo.txt").write_text(f"calib_time: 25-May-2012 16:47:16\n{rigid}")
+    rigid = f"R: {text(T_CAMERA_LIDAR[:3, :3])}\nT: {text(T_CAMERA_LIDAR[:3, 3])}\n"
+    (day / "calib_velo_to_cam.txt").write_text(f"calib_time: 15-Mar-2012 11:37:16\n{rigid}delta_f: 0 0\n")
+    camera = f"corner_dist: 9.95e-02\nR_rect_00: {text(np.eye(3))}\nP_rect_02: {text(PROJECTION)}\n"
+    (day / "calib_cam_to_cam.txt").write_text(camera)
+    return folder
+
+
+def write_tracking(root: Path) -> Path:
+    write_clouds(root / "velodyne" / "0003", 3)
+    for name in ("calib", "oxts", "label_02"):
+        (root / name).mkdir()
+    (root / "calib" / "0003.txt").write_text(
+        f"P2: {text(PROJECTION)}\nR_rect {text(np.eye(3))}\nTr_velo_cam {text(T_CAMERA_LIDAR[:3])}\n"
+        f"Tr_imu_velo {text(T_LIDAR_IMU[:3])}\n"
+    )
+    (root / "oxts" / "0003.txt").write_text("".join(map(oxts, range(3))))
+    lines = []
+    for index in range(3):
+        x, y, z, _ = T_CAMERA_LIDAR @ (15 + (CAR - STEP) * index, 1, -1.6, 1)
+        lines.append(f"{index} 7 Van 0 0 -1.6 0 0 9 9 2 1.8 4 {x} {y} {z} {-np.pi / 2 - 0.1}\n")
+        lines.append(f"{index} -1 DontCare -1 -1 -10 900 100 950 200 -1 -1 -1 -1000 -1000 -1000 -10\n")
+    (root / "label_02" / "0003.txt").write_text("".join(lines))
+    return root
+
+
+def write_sequence(folder: Path, are_of_camera: bool = True, has_classes: bool = False) -> Path:
+    write_clouds(folder / "velodyne", 3)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = STEP * np.arange(3)
+    if are_of_camera:
+        poses = T_CAMERA_LIDAR @ poses @ np.linalg.inv(T_CAMERA_LIDAR)
+    (folder / "poses.txt").write_text("".join(text(pose[:3]) + "\n" for pose in poses))
+    (folder / "calib.txt").write_text(f"P0: {text(PROJECTION)}\nTr: {text(T_CAMERA_LIDAR[:3])}\n")
+    (folder / "times.txt").write_text("0.0\n0.103\n0.207\n")
+    if has_classes:
+        (folder / "labels").mkdir()
+        for index in range(3):
+            classes = np.array([258, 258, 10, 50, 0, 50, 40], "<u4") + (5 << 16)
+            classes.astype("<u4").tofile(folder / "labels" / f"{index:06d}.label")
+    return folder
+
+
+def check_motion(log: Any) -> None:
+    """Check the poses, and the truth of a car with a box."""
+    for index in (1, 2):
+        assert np.allclose(np.linalg.inv(log.poses[index - 1]) @ log.poses[index], step_pose(), atol=1e-5)
+    labels = log.labels(0)
+    residual = labels.flow + (STEP, 0, 0)
+    assert np.allclose(residual[:3], (CAR, 0, 0), atol=1e-4) and np.allclose(residual[3:], 0, atol=1e-4)
+    assert (labels.category > 0).tolist() == [True] * 3 + [False] * 4
+    assert log.labels(2) is None
+
+
+def step_pose() -> np.ndarray:
+    pose = np.eye(4)
+    pose[0, 3] = STEP
+    return pose
+
+
+def test_a_raw_drive_has_poses_of_the_lidar_times_and_boxes(tmp_path: Path) -> None:
+    folder = write_raw(tmp_path / "2011_09_26" / "2011_09_26_drive_0027_sync")
+    for path in (tmp_path, folder, folder / "velodyne_points" / "data"):
+        assert recognise(path) == "kitti" and len(find_sources("kitti", path)) == 1
+    log: Any = open_log("kitti", *find_sources("kitti", tmp_path), check=False)
+    assert log.log_id == "2011_09_26_drive_0027_sync"
+    assert log.timestamps == [1317042145_594360375 + 103_000_000 * index for index in range(3)]
+    check_motion(log)
+    assert log.labels(0).is_valid.tolist() == [True] * 5 + [False, True], "behind is not annotated"
+    assert np.allclose(log.columns(1)["reflectance"], np.linspace(0, 0.9, 7))
+    again = pickle.loads(pickle.dumps(log))
+    assert np.array_equal(again.labels(0).flow, log.labels(0).flow)
+    assert KITTILog(folder, poses=None).sweep(0).pose is None
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [("oxts/data/0000000001.txt", "2 measurements for 3 sweeps"), ("../calib_imu_to_velo.txt", "calib_imu_to_velo")],
+)
+def test_a_raw_drive_without_what_poses_need_says_so(missing: str, message: str, tmp_path: Path) -> None:
+    folder = write_raw(tmp_path / "day" / "drive")
+    (folder / missing).unlink()
+    with pytest.warns(CFlowWarning, match=f"{message}.*no poses.*odometry"):
+        log = KITTILog(folder)
+    assert log.poses is None and log.sweep(0).pose is None and log.labels(0) is None
+
+
+def test_a_lost_sweep_keeps_the_others_at_their_times_and_poses(tmp_path: Path) -> None:
+    folder = write_raw(tmp_path / "day" / "drive")
+    (folder / "velodyne_points" / "data" / "0000000001.bin").unlink()
+    log = KITTILog(folder)
+    assert np.diff(log.timestamps).tolist() == [206_000_000]
+    assert np.allclose(np.linalg.inv(log.poses[0]) @ log.poses[1], step_pose() @ step_pose(), atol=1e-5)
+
+
+def test_a_tracking_drive_is_read_in_the_frame_of_the_lidar(tmp_path: Path) -> None:
+    root = write_tracking(tmp_path / "training")
+    assert recognise(root) == "kitti"
+    log = open_log("kitti", *find_sources("kitti", root), check=False)
+    assert log.log_id == "0003" and log.sweep(1).timestamp_ns is None
+    check_motion(log)
+    u = 720 * 5 / 12 + 621
+    assert 900 < u < 950, "a point of the wall is in a region DontCare"
+    assert log.labels(0).is_valid.tolist() == [True] * 3 + [False, True, False, True]
+
+
+@pytest.mark.parametrize("are_of_camera", [True, False])
+def test_poses_of_a_sequence_are_of_the_camera_unless_they_drive_along_x(are_of_camera: bool, tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "sequences" / "04", are_of_camera)
+    if are_of_camera:
+        log = KITTILog(folder)
+    else:
+        with pytest.warns(CFlowWarning, match="poses of the LiDAR, and ignore Tr"):
+            log = KITTILog(folder)
+    assert log.log_id == "04" and log.timestamps == [0, 103_000_000, 207_000_000]
+    assert np.allclose(np.linalg.inv(log.poses[0]) @ log.poses[1], step_pose(), atol=1e-9)
+
+
+def test_classes_of_semantic_kitti_become_labels_and_ground(tmp_path: Path) -> None:
+    log = KITTILog(write_sequence(tmp_path / "dataset" / "sequences" / "08", has_classes=True))
+    moving: Any = log.moving(0)
+    assert moving.tolist() == [True, True] + [False] * 5
+    labels: Any = log.labels(0)
+    assert labels.is_valid.tolist() == [False, False, True, True, False, True, True]
+    assert (
+        np.allclose(labels.flow, (-STEP, 0, 0), atol=1e-6)
+        and (labels.category > 0).tolist() == [True] * 3 + [False] * 4
+    )
+    assert np.asarray(log.sweep(0).is_ground).tolist() == [False] * 6 + [True]
+    assert log.columns(0)["instance"].tolist() == [5] * 7
+    (tmp_path / "dataset" / "sequences" / "08" / "labels" / "000001.label").write_bytes(b"1234")
+    with pytest.raises(CFlowError, match="1 labels for 7 points"):
+        log.sweep(1)
+
+
+def test_drives_of_one_folder_have_distinct_names_nested_or_not(tmp_path: Path) -> None:
+    for name in ("2011_09_26/2011_09_26_drive_0001_sync", "2011_09_28/2011_09_28_drive_0001_sync", "drive_9_sync"):
+        write_raw(tmp_path / "raw" / name)
+    for data_set in ("a", "b"):
+        write_sequence(tmp_path / data_set / "sequences" / "00")
+    names = [drive.name for drive in find_kitti_drives(tmp_path)]
+    assert sorted(names) == ["2011_09_26_drive_0001_sync", "2011_09_28_drive_0001_sync", "a-00", "b-00", "drive_9_sync"]
+
+
+def test_a_folder_velodyne_of_other_clouds_is_a_folder_of_clouds(tmp_path: Path) -> None:
+    write_clouds(tmp_path / "mine" / "velodyne", 3, "{:06d}")
+    assert recognise(tmp_path) == "arrays"
+    with pytest.raises(CFlowError, match="no drive of KITTI"):
+        find_sources("kitti", tmp_path)

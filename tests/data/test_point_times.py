@@ -1,0 +1,102 @@
+"""Times of points in any unit, of any clock, with wraps and stray values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cflow_torch.data.point_times import seconds_after
+
+STAMP = 1_700_000_000_123_456_789
+SHARES = np.linspace(0, 1, 2001)
+NS = np.round(SHARES * 1e8).astype(np.int64)
+
+
+@pytest.mark.parametrize(
+    ("values", "first", "is_assumed"),
+    [
+        (NS.astype(np.uint32), 0.0, False),  # Ouster: nanoseconds after the stamp
+        ((SHARES - 1).astype(np.float32) * np.float32(0.1), -0.1, False),  # Velodyne: seconds, up to the stamp
+        (SHARES * 100, 0.0, False),  # milliseconds
+        ((NS // 1000).astype(np.uint32), 0.0, False),  # microseconds
+        (STAMP * 1e-9 + SHARES * 0.1, 0.0, False),  # Hesai: unix seconds
+        (STAMP * 1e-3 + SHARES * 1e5, 0.0, False),  # unix microseconds
+        (np.uint64(STAMP + 2_000_000) + NS.astype(np.uint64), 0.002, False),  # unix nanoseconds
+        (
+            (NS - 5_000_000).astype(np.uint32),
+            -0.005,
+            False,
+        ),  # the counter wraps
+        ((NS - 95_000_000).astype(np.uint32), -0.095, False),
+        (SHARES, 0.0, True),  # shares of the sweep
+        (SHARES.astype(np.float32), 0.0, True),
+        (7e17 + SHARES * 1e8, 0.0, True),  # Livox without a common clock
+        (STAMP * 1e-9 + 37 + SHARES * 0.1, 0.0, True),  # TAI
+    ],
+)
+def test_the_unit_and_origin_of_times_are_recognised(values: Any, first: float, is_assumed: bool) -> None:
+    times = seconds_after(values, STAMP, 0.1)
+    assert times.seconds is not None and not times.is_stray.any()
+    assert np.allclose(times.seconds, first + SHARES * 0.1, atol=2e-6)
+    assert (times.note == "") == (not is_assumed)
+
+
+@pytest.mark.parametrize("turn", [-2 * np.pi, 2 * np.pi, 4.0])
+def test_shares_of_a_sweep_last_as_long_as_the_lidar_turns(turn: float) -> None:
+    angle = 1.0 + SHARES * turn
+    points = np.stack([np.cos(angle), np.sin(angle)], 1) * 10
+    seconds = seconds_after(SHARES, STAMP, 0.1, points).seconds
+    assert np.allclose(seconds, SHARES * 0.1 * abs(turn) / (2 * np.pi), rtol=0.03)
+    assert np.allclose(seconds_after(SHARES, STAMP, 0.1, points[::-1] * 0 + [9, 1]).seconds, SHARES * 0.1)
+
+
+@pytest.mark.parametrize("boot", [0.0, 0.2, 3.0, 700.0])
+@pytest.mark.parametrize("is_relative", [False, True])
+def test_times_since_the_sensor_started_are_recognised_by_their_distance_to_the_stamp(boot, is_relative) -> None:
+    stamp = round((boot + 0.03) * 1e9)
+    values = SHARES * 0.1 + (0 if is_relative else stamp * 1e-9)
+    assert np.allclose(seconds_after(values, stamp, 0.1).seconds, SHARES * 0.1, atol=0.031 if boot == 0 else 1e-6)
+
+
+@pytest.mark.parametrize("stray", [0, 4_000_000_000, 900_000_000, 123_456_789_000])
+def test_stray_values_are_found_and_change_no_other_time(stray: int) -> None:
+    values = NS.astype(np.uint64) + np.uint64(STAMP)
+    is_wrong = np.arange(len(values)) % 33 == 7  # 3 %, as of lost packets
+    values[is_wrong] = stray if stray < 10**9 else np.uint64(STAMP) + np.uint64(stray)
+    times = seconds_after(values, STAMP, 0.1)
+    assert np.array_equal(times.is_stray, is_wrong)
+    assert np.allclose(times.seconds[~is_wrong], SHARES[~is_wrong] * 0.1, atol=1e-6)
+
+
+def test_points_of_lost_packets_at_time_zero_are_stray_within_the_sweep() -> None:
+    values = (np.arange(64_000) // 64 * 100_000).astype(np.uint32)  # 1000 columns of 64 points
+    is_lost = np.arange(len(values)) % 33 == 7
+    values[is_lost] = 0
+    assert (seconds_after(values, STAMP, 0.1).is_stray[is_lost]).all()
+    assert seconds_after(values, STAMP, 0.1).is_stray.sum() <= is_lost.sum() + 64
+    packets = (np.arange(64_000) // 6400 * 10_000_000).astype(np.uint32)  # ten times only
+    assert not seconds_after(packets, STAMP, 0.1).is_stray.any()
+
+
+def test_times_are_read_in_a_thinned_log_and_without_a_period() -> None:
+    for period in (None, 0.1, 0.05, 0.5, 5.0):
+        assert np.allclose(seconds_after(NS.astype(np.uint32), STAMP, period).seconds, SHARES * 0.1)
+        assert seconds_after(SHARES, STAMP, period).seconds.max() == (0.05 if period == 0.05 else 0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "note"),
+    [
+        (np.zeros(30), "all equal"),
+        (np.full(30, np.nan), "finite"),
+        (np.zeros(0), "finite"),
+        (np.array([0.0, 1e-4]), "span"),
+        (np.array([0, 1 << 62], np.uint64), "span"),
+        ((STAMP * 1e-9 + SHARES * 0.1).astype(np.float32), "too coarse in float32"),  # steps of 128 s
+    ],
+)
+def test_values_that_are_not_times_are_ignored_and_said(values: Any, note: str) -> None:
+    times = seconds_after(values, STAMP, 0.1)
+    assert times.seconds is None and note in times.note and not times.is_stray.any()

@@ -1,0 +1,165 @@
+"""Poses of odometry programs: late, early, rounded, with gaps, named columns, other units; and names that are times."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cflow_torch import CFlowError
+from cflow_torch.data.arrays import poses_text
+from cflow_torch.data.arrays.reader import ArraysLog, times_of_names
+from cflow_torch.data.log import Log, window
+from cflow_torch.types import CFlowWarning, Sweep
+
+START, COUNT = 1_700_000_000_123_456_789, 12
+STAMPS = [START + k * 100_000_123 for k in range(COUNT)]
+
+
+def clouds(folder: Path, names: Any = STAMPS) -> Path:
+    """Clouds whose first x is their number."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, name in enumerate(names):
+        np.save(folder / f"{name}.npy", np.full((4, 3), k + 1, np.float32))
+    return folder
+
+
+def line(k: int, time: str, order: str = "t x y z qx qy qz qw", separator: str = " ") -> str:
+    values = {"t": time, "x": k, "y": 0.5, "z": 0, "qx": 0, "qy": 0, "qz": 0.6, "qw": 0.8, "n": k, "vx": 9}
+    return separator.join(str(values[name]) for name in order.split())
+
+
+def seconds(stamp: int) -> str:
+    return f"{stamp // 10**9}.{stamp % 10**9:09d}"
+
+
+EXACT = [line(k, seconds(stamp)) for k, stamp in enumerate(STAMPS)]
+
+
+@pytest.mark.parametrize(
+    ("lines", "kept", "gaps", "note"),
+    [
+        (EXACT, range(12), [], ""),
+        ([line(k, f"{stamp * 1e-9:.7f}") for k, stamp in enumerate(STAMPS)], range(12), [], ""),  # through a float64
+        (EXACT[3:], range(3, 12), [], "3 of 12 sweeps .* 3 before the first pose"),
+        (EXACT[2:10], range(2, 10), [], "4 of 12 sweeps .* 2 before the first pose, 2 after the last pose"),
+        (EXACT[:4] + EXACT[10:], [0, 1, 2, 3, 10, 11], [3], "6 of 12 sweeps .* in gaps of more than 0.5 s"),
+        (EXACT[:5] + EXACT[4:], range(12), [], ""),  # one line twice
+        (EXACT[:4] + EXACT[7:], range(12), [], ""),  # we interpolate over 0.4 s
+    ],
+)
+def test_sweeps_without_a_pose_are_left_out_and_counted(tmp_path, recwarn, lines, kept, gaps, note) -> None:
+    (clouds(tmp_path) / "poses.txt").write_text("\n".join(lines))
+    log = ArraysLog(tmp_path)
+    assert [sweep.points[0, 0] - 1 for sweep in log] == list(kept) and log.gaps == set(gaps)
+    assert np.allclose(log.poses[:, 0, 3], list(kept), atol=1e-5)
+    texts = [str(warning.message) for warning in recwarn.list]
+    assert len(texts) == bool(note) and log.notes == [text.partition(": ")[2] for text in texts]
+    if note:
+        with pytest.warns(CFlowWarning, match=note):
+            ArraysLog(tmp_path)
+
+
+def test_windows_end_at_a_gap(tmp_path) -> None:
+    (clouds(tmp_path) / "poses.txt").write_text("\n".join(EXACT[:4] + EXACT[10:]))
+    with pytest.warns(CFlowWarning):
+        log = ArraysLog(tmp_path)
+    assert len(window(log, 2, 4, 4).pch) == 2 and len(window(log, 2, 4, 4).pcf) == 0
+    assert len(window(log, 4, 4, 4).pch) == 0 and len(window(log, 1, 4, 4).pcf) == 1
+
+
+def test_other_clocks_are_named(tmp_path) -> None:
+    folder = clouds(tmp_path)
+    (folder / "poses.txt").write_text("\n".join(line(k, str(k / 10)) for k in range(COUNT)))
+    with pytest.raises(CFlowError, match=r"clocks differ by about 1\.7e\+09 s"):
+        ArraysLog(folder)
+    (folder / "poses.txt").write_text("\n".join(line(k, seconds(START - 10**9 + k * 10**10)) for k in range(3)))
+    with pytest.raises(CFlowError, match="a pose every 10 s"):
+        ArraysLog(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "header", "order", "separator", "unit"),
+    [
+        ("poses.txt", "num t x y z qx qy qz qw", "n t x y z qx qy qz qw", " ", 10**9),
+        ("poses.txt", "timestamp x y z q_x q_y q_z q_w", "t x y z qx qy qz qw", " ", 10**9),
+        ("poses.txt", "# timestamp tx ty tz qw qx qy qz", "t x y z qw qx qy qz", " ", 10**9),
+        ("poses.csv", "timestamp,tx,ty,tz,qw,qx,qy,qz", "t x y z qw qx qy qz", ",", 10**9),
+        (
+            "poses.csv",
+            "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []",
+            "t x y z qw qx qy qz",
+            ",",
+            1,
+        ),
+        (
+            "odometry.csv",
+            "header.stamp,pose.pose.position.x,pose.pose.position.y,pose.pose.position.z,pose.pose.orientation.x,"
+            "pose.pose.orientation.y,pose.pose.orientation.z,pose.pose.orientation.w,twist.twist.linear.x",
+            "t x y z qx qy qz qw vx",
+            ",",
+            10**9,
+        ),
+        ("trajectory.txt", "", "t x y z qx qy qz qw", " ", 1),
+        ("trajectory.txt", "", "t x y z qx qy qz qw", " ", 1000),
+    ],
+)
+def test_columns_are_found_by_name_and_times_by_size(tmp_path, file, header, order, separator, unit) -> None:
+    texts = [seconds(stamp) if unit == 10**9 else str(stamp // unit) for stamp in STAMPS]
+    lines = [header] * bool(header) + [line(k, text, order, separator) for k, text in enumerate(texts)]
+    (clouds(tmp_path / "a") / file).write_text("\n".join(lines))
+    log: Any = ArraysLog(tmp_path / "a")
+    assert len(log) == COUNT and np.allclose(log.poses[:, 0, 3], range(COUNT), atol=1e-4)
+    assert np.allclose(log.poses[:, :2, :2], [[0.28, -0.96], [0.96, 0.28]], atol=1e-12)
+
+
+def test_seconds_and_nanoseconds_in_two_columns(tmp_path) -> None:
+    header = "secs,nsecs,x,y,z,qx,qy,qz,qw"
+    rows = [line(k, f"{s // 10**9},{s % 10**9}", separator=",") for k, s in enumerate(STAMPS)]
+    (tmp_path / "a.csv").write_text("\n".join([header, *rows]))
+    assert poses_text.read_poses(tmp_path / "a.csv").times_ns.tolist() == STAMPS
+    (tmp_path / "a.csv").write_text("\n".join(["note: these are\nmy poses", *rows]))
+    with pytest.raises(CFlowError, match=r"a\.csv.*text before its numbers"):
+        poses_text.read_poses(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("\n".join([*EXACT[:2], line(9, seconds(STAMPS[1]))]))
+    with pytest.raises(CFlowError, match="ascend, line 3"):
+        poses_text.read_poses(tmp_path / "a.csv")
+
+
+SHIFTED = [1_700_000_000_050_000_000 + k * 50_000_000 for k in range(24)]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        lambda stamp: str(stamp / 1e9),  # 1700000000.1, 1700000000.15, 1700000000.2
+        seconds,
+        lambda stamp: seconds(stamp).replace(".", "_"),
+        lambda stamp: f"{stamp // 10**9}_{stamp % 10**9}" if stamp != 1_700_000_001_000_000_000 else "1700000001_0",
+        lambda stamp: f"cloud_{stamp / 1e9:.6f}",
+        str,
+    ],
+)
+def test_names_are_times_and_sort_the_clouds(tmp_path, name: Any) -> None:
+    log = ArraysLog(clouds(tmp_path / "a", [name(stamp) for stamp in SHIFTED]))
+    assert np.abs(np.subtract(log.timestamps, SHIFTED)).max() < 1000, "a float has steps of 240 ns"
+    assert [sweep.points[0, 0] for sweep in log] == list(range(1, 25))
+
+
+def test_other_names_are_no_times() -> None:
+    for names in (["000001", "000002"], ["frame1", "frame2"], ["000_001", "000_002"], ["1.5", "a"], ["2024_01_05"] * 2):
+        assert times_of_names(names) is None
+
+
+def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
+    log: Log = ArraysLog(clouds(tmp_path))
+    (tmp_path / f"{STAMPS[5]}.npy").rename(tmp_path / "5.moved")
+    for index in (4, 5):
+        with pytest.raises(CFlowError, match=str(STAMPS[5])):
+            window(log, index, 4)
+    with pytest.warns(CFlowWarning, match="windows near sweep 5 are shorter, because .* is missing"):
+        found = window(log, 7, 4)
+    assert [sweep.points[0, 0] for sweep in found.pch] == [7] and isinstance(found.pc0, Sweep)
+    assert len(window(log, 1, 4, 4).pcf) == 2 and len(window(log, 10, 4).pch) == 4
