@@ -14,10 +14,11 @@ from preset_windows import small
 from scenes import RANGE, assert_same
 from scipy.spatial.transform import Rotation
 
-from cflow_torch import CorrelationFlow, Sweep, Window, make_config
+from cflow_torch import CorrelationFlow, Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
+from cflow_torch.verified.component_tree import movable_nodes
 
 S = 0.25  # pixel of the small scenes
 # (row, col, height, width) and the shift per sweep (rows, cols); objects do not touch within three sweeps.
@@ -204,9 +205,26 @@ def test_true_and_false_labels_are_counted(script: Any, scene: Path) -> None:
 
 
 def test_every_step_can_be_left_out(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the ablation replaces exists under the name that the script uses."""
+    """What the ablation replaces is a step of the method, and it replaces something but in the first row."""
     script("figures", "drives")
     steps = script("ablation", "steps")
-    monkeypatch.setattr(steps, "score_preset", lambda scored, preset, changes: changes)
+    monkeypatch.setattr(steps, "score_preset", lambda scored, preset, changes, replaced: (changes, replaced))
     for name in (*steps.STEPS, *steps.SETTINGS):
-        assert steps.score_without(None, name) == steps.SETTINGS.get(name, {})
+        changes, replaced = steps.score_without(None, name)
+        assert changes == steps.SETTINGS.get(name, {})
+        assert all(callable(getattr(VerifiedFlow, step)) for step in replaced)
+        assert bool(changes or replaced) == (name != "all steps")
+
+
+def test_a_step_of_a_model_can_be_replaced() -> None:
+    car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
+    window = Window(Sweep(car), Sweep(car + torch.tensor([0.5, 0.0, 0.0])))
+    model = VerifiedFlow.from_preset("default", num_history=0)
+    assert model([window])[0].residual_flow.any()
+    model.movable_nodes = _nothing_may_move
+    assert not model([window])[0].residual_flow.any()
+
+
+def _nothing_may_move(*given: Any) -> Any:
+    tree = movable_nodes(*given)
+    return tree.only(torch.zeros(tree.count, dtype=torch.bool))
