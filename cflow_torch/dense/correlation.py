@@ -16,7 +16,7 @@ from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.dense.packing import ImageClass, Packing, pack
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import cross_correlate
-from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import draw, exceeds, flat_nonzero, largest_of_rows, take_columns
 from cflow_torch.ops.window_counts import WindowCounts
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
@@ -291,7 +291,7 @@ def _best_of_each_pair(candidates: _Candidates, windows: WindowCounts, num_pairs
     # Among the best, the shortest shift wins, then the smallest dy, then the smallest dx.
     length = dy * dy + dx * dx
     of_pair = of_pair.where(is_best)
-    of_pair = of_pair.where(length == of_pair.spread(of_pair.min(length, empty=0)))
+    of_pair = of_pair.where(length == of_pair.spread(of_pair.min(length, empty=FAR)))
     raster = dy * 2 * LONGEST_SIDE + dx
-    of_pair = of_pair.where(raster == of_pair.spread(of_pair.min(raster, empty=0)))
+    of_pair = of_pair.where(raster == of_pair.spread(of_pair.min(raster, empty=FAR)))
     return _Best(*of_pair.sum(torch.stack((dy, dx, candidates.count, energy))))

@@ -17,7 +17,7 @@ from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.clustering import Pixels as ClusterPixels
 from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
-from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_empty, lazy_zeros
 from cflow_torch.ops.segments import masked_median
 from cflow_torch.verified.columns import OWN, Pixels, count_slices
@@ -137,7 +137,7 @@ def _boxes(nodes: Tree, members: Pixels, blocks: Sequence[int], num_steps: int) 
         the finest scale at which the box fits, or the coarsest if it fits nowhere.
     """
     block = constant(tuple(blocks), torch.int64, members.step.device)[:, None]  # [scales, 1], coarse to fine
-    first = nodes.members.min(members.row_col, empty=0)  # [2, N], finest pixels
+    first = nodes.members.min(members.row_col, empty=FAR)  # [2, N], finest pixels
     last = nodes.members.max(members.row_col, empty=0)
     first = torch.div(first[:, None], block, rounding_mode="floor")  # [2, scales, N]
     size = torch.div(last[:, None], block, rounding_mode="floor") - first + 1

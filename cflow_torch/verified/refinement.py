@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.chunks import chunks
-from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, take_columns
 from cflow_torch.ops.linear import full, inverse, matvec, upper
 from cflow_torch.verified.component_tree import Objects
@@ -334,7 +334,7 @@ def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion)
     pixel = pixel_key(sweeps.grid, points.window * sweeps.num_steps + points.step, row_col)
     pixel, number = torch.unique(pixel, return_inverse=True)
     pixels = Groups(number, len(pixel))
-    first_object = pixels.min(points.object_id, empty=0)
+    first_object = pixels.min(points.object_id, empty=FAR)
     return moved.at(flat_nonzero(points.object_id == pixels.spread(first_object)))
 
 
