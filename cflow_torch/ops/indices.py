@@ -75,22 +75,6 @@ def renumber(index: Tensor, size: int) -> Tensor:
     return position.scatter_(0, index, torch.arange(index.numel(), device=index.device))
 
 
-def members_of(groups: Tensor, group: Tensor, num_groups: int) -> tuple[Tensor, Tensor]:
-    """Select the members of some groups.
-
-    Args:
-        groups: (K,) int64, distinct, below G.
-        group: (N,) int64, group of each member, 0 ... G; G stands for "none".
-        num_groups: G.
-
-    Returns:
-        The positions of the selected members, ascending, and the position in `groups` of their groups, (M,) int64 each.
-    """
-    number = renumber(groups, num_groups).index_select(0, group)
-    kept = flat_nonzero(number < groups.numel())
-    return kept, number.index_select(0, kept)
-
-
 def unique_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the U distinct pairs of two (N,) int64 in lexicographic order; the numbers must be at least -1.
 

@@ -28,9 +28,9 @@ _WORD = 8  # sweeps whose slices make up one int64
 class Pixels:
     """K occupied pixels of sweeps. Step 0 is sweep t+1, 1 is t, 2 is t-1, ..."""
 
-    # (K, 6) int32 or int64: slot of t+1 in the same column, counted through all columns; position
-    # of row 0 and column 0 in the image; window, step, row, col. A row per pixel, because pixels are often selected at
-    # random: rows take a quarter of the time of columns.
+    # (K, 6) int32 or int64: slot of t+1 at the same position, counted through all columns; position of row 0 and col 0
+    # in the image; window, step, row, col. We keep a row per pixel, because pixels are often selected at random, which
+    # took a quarter of the time that a row per number took.
     place: Tensor
     slices: Tensor  # (K,) uint8, one bit for each height slice
 
@@ -68,7 +68,7 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of B windows. All index arithmetic of images is here.
+    """The columns of B windows. Only this class and `position_of` know how positions and slots are numbered.
 
     The image of a window has an empty border of `REACH` positions (b), so that only distant positions need a test:
 
@@ -230,6 +230,17 @@ class Columns:
         if is_small and place.device.type == "cpu":  # on a GPU, the conversions would cost more than the bytes
             place = place.int()
         return Pixels(place, self.slices.view(-1).index_select(0, index) & OWN)
+
+
+def position_of(grid: Grid, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
+    """Return the positions of pixels in the images of the windows, (K,) int64, never 0."""
+    line = window * (grid.height + 2 * REACH) + (row + REACH)
+    return line.long() * (grid.width + 2 * REACH) + (col + REACH)
+
+
+def num_positions(grid: Grid, num_windows: int) -> int:
+    """Return the number of positions in the images of B windows, with their borders."""
+    return num_windows * (grid.height + 2 * REACH) * (grid.width + 2 * REACH)
 
 
 def _dilate(image: Tensor, stride: int) -> Tensor:
