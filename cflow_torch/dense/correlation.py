@@ -17,7 +17,7 @@ from cflow_torch.dense.packing import ImageClass, Packing, pack
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.groups import FAR, Groups
-from cflow_torch.ops.indices import draw, exceeds, flat_nonzero, largest_of_rows, take_columns
+from cflow_torch.ops.indices import draw, exceeds, flat_nonzero, gather, largest_of_rows, take_columns
 from cflow_torch.ops.window_counts import WindowCounts
 from cflow_torch.windows.bev_grid import LONGEST_SIDE
 
@@ -97,10 +97,10 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
     if num_pairs == 0:
         return pairs.cluster.new_zeros((0, 2)), torch.zeros(0, dtype=torch.float32, device=pairs.size.device)
     packing = pack(pairs)
-    found = [_candidates(counts, packing, pairs.cluster) for counts in _correlate(packing, engine, max_memory)]
-    candidates = _Candidates(torch.cat([part.columns for part in found], 1))
     target = pairs.target
     windows = WindowCounts(target.image, target.row, target.col, packing.size)
+    found = [_candidates(counts, packing, pairs.cluster, windows) for counts in _correlate(packing, engine, max_memory)]
+    candidates = _Candidates(torch.cat([part.columns for part in found], 1))
     best = _best_of_each_pair(candidates, windows, num_pairs)
     energies = (packing.energy[:num_pairs] * best.energy).clamp(min=1)  # 0 where nothing overlaps
     score = best.count.double() / torch.sqrt(energies.double())
@@ -207,30 +207,39 @@ class _Call:
         return counts.flatten(1)[:, : self.images.num_searched]
 
 
-def _candidates(counts: _Counts, packing: Packing, cluster: Tensor) -> _Candidates:
+def _candidates(counts: _Counts, packing: Packing, cluster: Tensor, windows: WindowCounts) -> _Candidates:
     """Find the shifts that may be the best of their pair; `cluster` is the target of each pair, (J,) int64.
 
-    The energy of a window is at least the count and at most the energy of the target, so count^2 / energy lies between
-    count^2 / target energy and count. A shift whose count is below such a lower bound of another shift cannot win. We
-    take the bounds of two shifts: shift 0, and the shift of the largest count, clamped to the search range.
+    The value of a shift is count^2 / energy. We know the energy only within cheap bounds, and the count is one of them.
+    A shift whose highest value is below the lowest value of another shift cannot win. We compare all shifts with two:
+    shift 0, and the shift of the largest count, clamped to the search range. Division rounds monotonically, so no
+    winner is lost.
     """
     pair = packing.pair[counts.templates]
+    cluster = cluster.index_select(0, pair)
     search = packing.search[counts.templates]
     end = counts.ends()
     start = F.pad(end[:-1], (1, 0))
-    probe = search.clamp(search.shift_at(counts.largest()))
-    samples = torch.stack((search.sample_at(torch.zeros_like(probe)), search.sample_at(probe))) + start  # [2, n]
-    largest = counts.samples[samples].amax(0)
-    target_energy = packing.energy[len(cluster) + cluster[pair]]
-    # We subtract 1, because the quotient is rounded. A count of 0 never beats shift 0.
-    sample = counts.above((largest * largest / target_energy - 1).clamp(min=0.5))  # [K]
+    peak = search.clamp(search.shift_at(counts.largest()))
+    least_value = torch.zeros_like(end, dtype=torch.float64)
+    for shift in (torch.zeros_like(peak), peak):
+        _, most = windows.bounds(cluster, shift)
+        count = counts.samples.index_select(0, start + search.sample_at(shift)).double()
+        least_value = torch.maximum(least_value, count * count / most.clamp(min=1))
+    # We round the bound of the count down, because counts may be float32. A count of 0 never beats shift 0.
+    sample = counts.above((least_value * (1 - 2.0**-20)).clamp(min=0.5).to(counts.samples.dtype))  # [K]
 
     template = torch.searchsorted(end, sample, right=True)
     search = search[template]
-    shift = search.shift_at(sample - start[template])
-    pair = pair[template]
-    columns = torch.stack((pair, cluster[pair], *shift, counts.samples[sample].long()))
-    return _Candidates(take_columns(columns, flat_nonzero(search.contains(shift))))
+    shift = search.shift_at(sample - start.index_select(0, template))
+    is_inside = flat_nonzero(search.contains(shift))
+    template, sample = gather(is_inside, template, sample)
+    shift = take_columns(shift, is_inside)
+    pair, cluster, least_value = gather(template, pair, cluster, least_value)
+    count = counts.samples.index_select(0, sample).long()
+    least, _ = windows.bounds(cluster, shift)
+    may_win = flat_nonzero((count * count).double() / torch.maximum(least, count) >= least_value)
+    return _Candidates(take_columns(torch.stack((pair, cluster, *shift, count)), may_win))
 
 
 @dataclass(frozen=True)
@@ -255,10 +264,6 @@ class _Candidates:
     def count(self) -> Tensor:
         return self.columns[4]
 
-    def at(self, index: Tensor) -> _Candidates:
-        """Select some candidates."""
-        return _Candidates(take_columns(self.columns, index))
-
 
 @dataclass(frozen=True)
 class _Best:
@@ -276,13 +281,6 @@ def _best_of_each_pair(candidates: _Candidates, windows: WindowCounts, num_pairs
     The energy of a shift (denominator of Eq. norm_correlation) is the number of target pixels under the H x W window at
     that shift. Ties: as in `best_shifts`.
     """
-    # Cheap bounds of the energy leave few candidates. Division rounds monotonically, so no winner is lost.
-    least, most = windows.bounds(candidates.cluster, candidates.shift)
-    square = (candidates.count * candidates.count).double()
-    of_pair = Groups(candidates.pair, num_pairs)
-    lower = of_pair.spread(of_pair.max(square / most, empty=0.0))
-    candidates = candidates.at(flat_nonzero(square / torch.maximum(least, candidates.count) >= lower))
-
     energy = windows.count(candidates.cluster, candidates.shift)
     value = (candidates.count * candidates.count).double() / energy
     of_pair = Groups(candidates.pair, num_pairs)

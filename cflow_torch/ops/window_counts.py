@@ -33,6 +33,7 @@ class WindowCounts:
         # more than rows or columns. We count through all images, because differences are all that we need.
         line = torch.stack((row, col)) + take_columns(self._first_line, image) + 1
         self._num_before = scatter_count(line.flatten(), int(lines.sum())).cumsum(0)
+        self._total = scatter_count(image, len(size))  # (N,)
         # Number of pixels so far, in raster order. A row of W pixels has W + 1 entries:
         #
         #     row      . x x      entries   0 0 1 2
@@ -44,15 +45,12 @@ class WindowCounts:
     def bounds(self, image: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Lower and upper bounds of `count`, (K,) int64 each. Args as for `count`."""
         size = take_columns(self._size, image)
-        top_left = shift.clamp(min=0)
-        bottom_right = torch.minimum(size, size + shift)
-        lines = torch.stack((top_left, bottom_right, torch.zeros_like(size), size)) + take_columns(
-            self._first_line, image
-        )
-        counts = self._num_before.index_select(0, lines.view(-1)).view(lines.shape)  # [4, 2, K]
-        rows, cols = counts[1] - counts[0]  # pixels in the rows, and in the columns, of the window
-        total = counts[3, 0] - counts[2, 0]
-        return rows + cols - total, torch.minimum(rows, cols)
+        first = shift.clamp(min=0)  # [2, K], row and column
+        last = torch.minimum(size, size + shift)
+        lines = torch.stack((first, last)) + take_columns(self._first_line, image)  # [2, 2, K]
+        before_first, before_last = self._num_before.index_select(0, lines.view(-1)).view(lines.shape)
+        rows, cols = before_last - before_first  # pixels in the rows, and in the columns, of the window
+        return rows + cols - self._total.index_select(0, image), torch.minimum(rows, cols)
 
     def count(self, image: Tensor, shift: Tensor) -> Tensor:
         """(K,) int64, number of set pixels in rows dy ... H - 1 + dy and columns dx ... W - 1 + dx.

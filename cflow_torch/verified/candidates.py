@@ -57,12 +57,8 @@ def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, conf
     if sweeps.num_steps > 2:
         own = torch.cat((masked_median(own, estimates.available)[:, None], own), 1)
     own = own + 0.0  # turns -0.0 into 0.0
-    candidates = [own]
-    around = own[:, 0]
-    for _ in range(nodes.num_levels - 1):  # the parent's candidate, then that of the parent's parent, ...
-        around = nodes.children.spread(around)
-        candidates.append(around[:, None])
-    return Candidates(torch.cat(candidates, 1), estimates.newest_score())
+    of_parent = nodes.children.spread(own[:, 0])
+    return Candidates(torch.cat((own, of_parent[:, None]), 1), estimates.newest_score())
 
 
 @dataclass(frozen=True)
