@@ -13,7 +13,7 @@ from torch import Tensor
 from cflow_torch.config import DenseConfig
 from cflow_torch.dense.clustering import Clusters
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
-from cflow_torch.dense.packing import ImageClass, Packing, pack
+from cflow_torch.dense.packing import ImageClass, Packing, Search, pack
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.groups import FAR, Groups
@@ -98,7 +98,7 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
         return pairs.cluster.new_zeros((0, 2)), torch.zeros(0, dtype=torch.float32, device=pairs.size.device)
     packing = pack(pairs)
     target = pairs.target
-    windows = WindowCounts(target.image, target.row, target.col, packing.size)
+    windows = WindowCounts(target.image, target.row, target.col, packing.size, packing.energy[num_pairs:])
     found = [_candidates(counts, packing, pairs.cluster, windows) for counts in _correlate(packing, engine, max_memory)]
     candidates = _Candidates(torch.cat([part.columns for part in found], 1))
     best = _best_of_each_pair(candidates, windows, num_pairs)
@@ -220,26 +220,34 @@ def _candidates(counts: _Counts, packing: Packing, cluster: Tensor, windows: Win
     search = packing.search[counts.templates]
     end = counts.ends()
     start = F.pad(end[:-1], (1, 0))
-    peak = search.clamp(search.shift_at(counts.largest()))
-    least_value = torch.zeros_like(end, dtype=torch.float64)
-    for shift in (torch.zeros_like(peak), peak):
-        _, most = windows.bounds(cluster, shift)
-        count = counts.samples.index_select(0, start + search.sample_at(shift)).double()
-        least_value = torch.maximum(least_value, count * count / most.clamp(min=1))
-    # We round the bound of the count down, because counts may be float32. A count of 0 never beats shift 0.
-    sample = counts.above((least_value * (1 - 2.0**-20)).clamp(min=0.5).to(counts.samples.dtype))  # [K]
+    least_value = _least_value(counts, search, start, cluster, windows)  # [n]
+    # We round the bound of the count down, because counts may be float32.
+    sample = counts.above((least_value * (1 - 2.0**-20)).to(counts.samples.dtype))  # [K]
 
     template = torch.searchsorted(end, sample, right=True)
     search = search[template]
     shift = search.shift_at(sample - start.index_select(0, template))
-    is_inside = flat_nonzero(search.contains(shift))
-    template, sample = gather(is_inside, template, sample)
-    shift = take_columns(shift, is_inside)
-    pair, cluster, least_value = gather(template, pair, cluster, least_value)
     count = counts.samples.index_select(0, sample).long()
+    columns = take_columns(torch.stack((template, count, *shift)), flat_nonzero(search.contains(shift)))
+    template = columns[0]
+    count = columns[1]
+    shift = columns[2:]
+    pair, cluster, least_value = gather(template, pair, cluster, least_value)
     least, _ = windows.bounds(cluster, shift)
     may_win = flat_nonzero((count * count).double() / torch.maximum(least, count) >= least_value)
     return _Candidates(take_columns(torch.stack((pair, cluster, *shift, count)), may_win))
+
+
+def _least_value(counts: _Counts, search: Search, start: Tensor, cluster: Tensor, windows: WindowCounts) -> Tensor:
+    """Return what the best shift of each of n templates is worth at least, (n,) float64.
+
+    `start` is the first sample of each template, and `cluster` its target, (n,) int64 each.
+    """
+    peak = search.clamp(search.shift_at(counts.largest()))
+    samples = start + torch.stack((search.sample_at(torch.zeros_like(peak)), search.sample_at(peak)))  # [2, n]
+    _, most_at_peak = windows.bounds(cluster, peak)
+    most = torch.stack((windows.energy.index_select(0, cluster), most_at_peak)).clamp(min=1)
+    return (counts.samples[samples].double().square() / most).amax(0)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import concat_ranges, scatter_count, take_columns
+from cflow_torch.ops.indices import concat_ranges, draw, scatter_count, take_columns
 
 
 class WindowCounts:
@@ -15,11 +15,12 @@ class WindowCounts:
     Args:
         image, row, col: (P,) int64, image and position of each pixel, each pixel once.
         size: (N, 2) int64, height H and width W of each image; on the host, because table lengths depend on it.
+        energy: (N,) int64, number of set pixels of each image.
 
     Cost: linear in the area of the images.
     """
 
-    def __init__(self, image: Tensor, row: Tensor, col: Tensor, size: np.ndarray) -> None:
+    def __init__(self, image: Tensor, row: Tensor, col: Tensor, size: np.ndarray, energy: Tensor) -> None:
         lines = size.T + 1  # [2, N]: H + 1 and W + 1
         ends = lines.cumsum().reshape(lines.shape)
         area = size[:, 0] * lines[1]
@@ -33,14 +34,14 @@ class WindowCounts:
         # more than rows or columns. We count through all images, because differences are all that we need.
         line = torch.stack((row, col)) + take_columns(self._first_line, image) + 1
         self._num_before = scatter_count(line.flatten(), int(lines.sum())).cumsum(0)
-        self._total = scatter_count(image, len(size))  # (N,)
+        self.energy = energy
         # Number of pixels so far, in raster order. A row of W pixels has W + 1 entries:
         #
         #     row      . x x      entries   0 0 1 2
         #              x . x                2 3 3 4
         start, stride = take_columns(self._start_stride, image)
-        drawn = torch.zeros(int(area.sum()), dtype=torch.int32, device=image.device)
-        self._num_so_far = drawn.index_fill_(0, start + row * stride + col + 1, 1).cumsum(0)
+        drawn = draw(start + row * stride + col + 1, int(area.sum()))
+        self._num_so_far = drawn.cumsum(0)
 
     def bounds(self, image: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Lower and upper bounds of `count`, (K,) int64 each. Args as for `count`."""
@@ -50,7 +51,7 @@ class WindowCounts:
         lines = torch.stack((first, last)) + take_columns(self._first_line, image)  # [2, 2, K]
         before_first, before_last = self._num_before.index_select(0, lines.view(-1)).view(lines.shape)
         rows, cols = before_last - before_first  # pixels in the rows, and in the columns, of the window
-        return rows + cols - self._total.index_select(0, image), torch.minimum(rows, cols)
+        return rows + cols - self.energy.index_select(0, image), torch.minimum(rows, cols)
 
     def count(self, image: Tensor, shift: Tensor) -> Tensor:
         """(K,) int64, number of set pixels in rows dy ... H - 1 + dy and columns dx ... W - 1 + dx.

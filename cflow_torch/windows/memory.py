@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -13,6 +14,9 @@ from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.bev_grid import Grid
 
 _MUCH = 1 << 30  # bytes; we check only larger requests
+# Options of `mallopt` in the GNU C library.
+_M_TRIM_THRESHOLD = -1
+_M_MMAP_THRESHOLD = -3
 _CGROUP = Path("/sys/fs/cgroup")
 # Working memory of one pixel of one sweep (occupancy and cluster) before the clusters are known.
 _BYTES_PER_PIXEL = 10
@@ -62,6 +66,21 @@ def peak_memory() -> int | None:
         return None
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most if sys.platform == "darwin" else 1024 * most
+
+
+def keep_freed_memory() -> bool:
+    """Let this process keep the memory that it frees, for the next window, and return whether the system can do that.
+
+    A window on a CPU uses some hundred megabytes of tensors. By default, the GNU C library gives large ones back to the
+    system, which must clear each page before it is used again. The setting holds until the process ends. The process
+    then stays as large as its largest window. The commands do this in their own processes. Nothing changes on a GPU.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):  # not the GNU C library
+        return False
+    accepted = [mallopt(option, value) for option, value in ((_M_MMAP_THRESHOLD, 1 << 30), (_M_TRIM_THRESHOLD, -1))]
+    return all(accepted)
 
 
 def control_groups() -> list[Path]:
