@@ -32,6 +32,9 @@ LEVEL = 1
 DEBUG = {}
 BLOCK = 0.4
 LEAST_SHIFT = 0.3
+WIDTH = 0.4
+DIFFERENT = 0.5
+RIVAL = 0
 LEAST = 2
 SHARE = 2
 
@@ -63,6 +66,11 @@ def link_unlinked(
     of_pixel = Groups(owner, count)
     groups = Groups(parts.pixels.spread(owner, none=count), count)  # P pixels by node
     has = groups.any(sweeps.pixels.step == 0) & groups.any(sweeps.pixels.step > 0)
+    direction = velocity.t() / velocity.t().square().sum(0).sqrt().clamp(min=1e-9)  # [2, N]
+    row_col = sweeps.pixels.row_col
+    side = groups.spread(direction[1]) * row_col[0] - groups.spread(direction[0]) * row_col[1]
+    width = groups.max(side, empty=-math.inf) - groups.min(side, empty=math.inf)
+    has &= width * sweeps.grid.pixel_size >= WIDTH
     kept = flat_nonzero(has)
     groups = groups.select(kept)
     count = len(kept)
@@ -185,13 +193,23 @@ def _links(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> tuple
     if s == 2:
         cost = speed[:, 0]
     kept = flat_nonzero(enough)
-    found, cost, since, hit = found[kept], cost[kept], since[kept], hit[kept]
+    found, cost, since, hit, num = found[kept], cost[kept], since[kept], hit[kept], num[kept]
+    velocity = velocity[:, kept]
+    if s > 2:
+        of_first = Groups(found[:, 1], len(parts.size))
+        is_min = of_first.where(cost == of_first.spread(of_first.min(cost, empty=math.inf)))
+        of_min = is_min.first().clamp(max=max(len(cost) - 1, 0))  # [Q]
+        best_of = of_first.spread(of_min)
+        differs = (velocity - velocity[:, best_of]).square().sum(0).sqrt() > DIFFERENT * per_meter
+        rival = differs & (num >= num[best_of] - RIVAL)
+        ambiguous = of_first.spread(of_first.any(rival))
+        cost = cost.masked_fill(ambiguous, math.inf)
     # mutual best, then the first of equal ones
     is_best = torch.ones_like(cost, dtype=torch.bool)
     for part in (found[:, 1], found[:, 0]):
         groups = Groups(part, len(parts.size))
         is_best &= cost == groups.spread(groups.min(cost, empty=math.inf))
-    kept = flat_nonzero(is_best)
+    kept = flat_nonzero(is_best & (cost < math.inf))
     groups = Groups(found[kept, 1], len(parts.size))
     kept = kept[groups.spread(groups.first()) == torch.arange(len(kept), device=kept.device)]
     found, since, hit = found[kept], since[kept], hit[kept]
