@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -60,42 +60,66 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
     Source: the paper's multi-scale strategy and its figure.
     """
     if config is None:
-        config, window = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1)), replace(window, pch=(), pcf=())
+        config = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1))
+        window = replace(window, pch=(), pcf=())
     found, result = scales(window, config)
     of_point = result.cluster_id.numpy()
     cluster_id = choose_cluster(of_point, found[-1].flow, cluster_id)
     shown = np.full(len(of_point), False) if cluster_id is None else of_point == cluster_id
     _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
     flows = [*(scale.flow for scale in found), alone.residual_flow.double().numpy()]
-    count = len(found) + 1
-    left, gap, side = 0.8, 0.22, 1.75  # inches; `side` is for the legends
-    width = (16.0 - left - gap * count - side) / count
-    lines = 1 if count <= 4 else 2  # of the panels' names
-    more = 0.2 * (lines - 1)  # inches
-    below_y, above_y = 0.5, width + 1.2 + more
-    figure = style.blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
-    above, below = (
-        [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
-        for bottom in (above_y, below_y)
-    )
+    panels = _ScalePanels.blank(len(found) + 1)
     title = "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
-    style.add_heading(figure, 0.32, title if cluster_id is None else f"{title}; cluster {cluster_id}")
+    style.add_heading(panels.figure, 0.32, title if cluster_id is None else f"{title}; cluster {cluster_id}")
     position = point_rows("points", window.pc0.points) + result.pose_flow.numpy()
-    _draw_close_up(above, position, found, shown)
-    max_flow = _draw_flows(below, config, position, flows, result.is_valid.numpy())
-    for axes in (*above, *below):
-        name = axes.get_title().replace(": ", ":\n", lines - 1)
-        axes.set_title(name, fontsize=min(12, 8 * width), color=style.INK, pad=6)
+    _draw_close_up(panels.above, position, found, shown)
+    max_flow = _draw_flows(panels.below, config, position, flows, result.is_valid.numpy())
+    panels.add_names_and_legends(max_flow)
+    return panels.figure
 
-    marks = style.add_panel(figure, 16.0 - side, above_y, side, width)
-    marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=style.INK)
-    wheel, high = style.WHEEL_INCHES
-    box = style.add_panel(figure, 16.0 - wheel, below_y + (width - high) / 2, wheel, high)
-    style.fill_wheel(box, max_flow)
-    for axes in (marks, box):
-        axes.axis("off")
-    style.add_caption(figure, FLOW_CAPTION)
-    return figure
+
+@dataclass(frozen=True)
+class _ScalePanels:
+    """Two rows of panels, with room for the legends on their right."""
+
+    figure: Figure
+    above: list[Axes]
+    below: list[Axes]
+    width: float  # inches, of a panel, which is a square
+    num_lines: int  # of the panels' names
+
+    _SIDE: ClassVar[float] = 1.75  # inches, for the legends
+    _BOTTOM: ClassVar[float] = 0.5  # inches, below the lower row
+
+    @classmethod
+    def blank(cls, count: int) -> _ScalePanels:
+        """Make a figure, 16 inches wide, with `count` panels a row."""
+        left = 0.8  # inches
+        gap = 0.22
+        width = (16.0 - left - gap * count - cls._SIDE) / count
+        num_lines = 1 if count <= 4 else 2
+        more = 0.2 * (num_lines - 1)
+        figure = style.blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
+        above, below = (
+            [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
+            for bottom in (width + 1.2 + more, cls._BOTTOM)
+        )
+        return cls(figure, above, below, width, num_lines)
+
+    def add_names_and_legends(self, max_flow: float) -> None:
+        """Set the names of the drawn panels, and add the legends; full colour is `max_flow`, metres per sweep."""
+        for axes in (*self.above, *self.below):
+            name = axes.get_title().replace(": ", ":\n", self.num_lines - 1)
+            axes.set_title(name, fontsize=min(12, 8 * self.width), color=style.INK, pad=6)
+        above_y = self.width + 1.2 + 0.2 * (self.num_lines - 1)
+        marks = style.add_panel(self.figure, 16.0 - self._SIDE, above_y, self._SIDE, self.width)
+        marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=style.INK)
+        side, high = style.WHEEL_INCHES
+        box = style.add_panel(self.figure, 16.0 - side, self._BOTTOM + (self.width - high) / 2, side, high)
+        style.fill_wheel(box, max_flow)
+        for axes in (marks, box):
+            axes.axis("off")
+        style.add_caption(self.figure, FLOW_CAPTION)
 
 
 def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale], shown: np.ndarray) -> None:
