@@ -58,7 +58,8 @@ class CleanLog(Log):
     ) -> None:
         if standing is not None:
             raise CFlowError("standing= is now remove_stopped=")
-        self.log_id, self.timestamps = log.log_id, log.timestamps
+        self.log_id = log.log_id
+        self.timestamps = log.timestamps
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
         if flow is None and model is None:
@@ -71,14 +72,16 @@ class CleanLog(Log):
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index` without its moving points; pose and time as in the log."""
-        sweep, is_kept = self._log.sweep(index), ~self.moving(index)
+        sweep = self._log.sweep(index)
+        is_kept = ~self.moving(index)
         given = {name: getattr(sweep, name) for name in ("points", "is_ground", "point_times")}
         kept = {name: as_numpy(values)[is_kept] for name, values in given.items() if values is not None}
         return replace(sweep, **kept)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Other columns of sweep `index`, such as intensity, without the rows of moving points."""
-        is_kept, columns = ~self.moving(index), self._log.columns(index)
+        is_kept = ~self.moving(index)
+        columns = self._log.columns(index)
         for name, values in columns.items():
             what = f"column {name} of sweep {index}"
             check_array(values, what, is_kept.shape, "biuf", f"({len(is_kept)},) numbers, one per point")
@@ -114,7 +117,8 @@ class CleanLog(Log):
 
     def _reached(self, sweep: Sweep, index: int) -> np.ndarray:
         """(N,) bool, points of the last sweep in the boxes to which the clusters of the sweep before have moved."""
-        result, moves = self._flow(index - 1), self._moves(index - 1)
+        result = self._flow(index - 1)
+        moves = self._moves(index - 1)
         before = _world(self._log.sweep(index - 1))[moves]
         step = as_numpy(result.residual_flow, np.float64)[moves] @ pose_of(sweep)[:3, :3].T
         clusters, group = np.unique(as_numpy(result.cluster_id)[moves], return_inverse=True)

@@ -195,7 +195,8 @@ class Tracker:
         tracks.is_confirmed.logical_or_(tracks.have_shown_motion())
         tracks.travel[track_of_group] += flow  # to the next sweep
 
-        measured, step = torch.cat([matches.track, stopped]), torch.zeros_like(tracks.box)
+        measured = torch.cat([matches.track, stopped])
+        step = torch.zeros_like(tracks.box)
         step[track_of_group] = flow
         tracks.measure(measured, tracks.box[measured], step[measured] / times.interval, noise)
         return tracks, track_of_group
@@ -280,7 +281,9 @@ def track(
         model = make_model(make_config("default"))
         log = CachedLog(log, model.config.num_sweeps)
         results = enumerate(model([sweeps])[0] for sweeps in windows(log, model.config.num_history))
-    recent, tracker, tables = CachedLog(log, 2), Tracker(sweep_interval), []
+    recent = CachedLog(log, 2)
+    tracker = Tracker(sweep_interval)
+    tables = []
     for index, result in results:
         table = tracker.push(window(recent, index), result).table
         where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}

@@ -91,11 +91,14 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     keep &= ~has_nan
     flows = flows.at(keep)
     residual, true_residual = _residuals(frame, flows, keep, definition)
-    predicted_flow, true_flow = residual, true_residual
+    predicted_flow = residual
+    true_flow = true_residual
     if definition.three_way_flow == "total":
-        predicted_flow, true_flow = flows.total, flows.true_total
+        predicted_flow = flows.total
+        true_flow = flows.true_total
     if definition.half_precision:
-        predicted_flow, true_flow = predicted_flow.astype(np.float16), true_flow.astype(np.float16)
+        predicted_flow = predicted_flow.astype(np.float16)
+        true_flow = true_flow.astype(np.float16)
     reach = _reach(position, definition)
     threshold = np.float32(definition.dynamic_threshold)
     difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
@@ -173,7 +176,8 @@ def _predicted_total(frame: EvalFrame) -> np.ndarray:
 def _residual_at_t(points: np.ndarray, total: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
     """Return the (M, 3) float32 residual in the axes of t: end point in coordinates of t, minus the start point."""
     start = points.astype(np.float64)
-    rotation, translation = T_ego1_ego0[:3, :3], T_ego1_ego0[:3, 3]
+    rotation = T_ego1_ego0[:3, :3]
+    translation = T_ego1_ego0[:3, 3]
     return ((start + total - translation) @ rotation - start).astype(np.float32)
 
 

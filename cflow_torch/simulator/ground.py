@@ -63,7 +63,8 @@ class Ground:
             (..., 4, 4) float64 `T_world_body`: x axis ahead, z axis normal to the ground, origin on the ground. At a
             kerb, the height rises over half a metre, not in one step, so that bodies do not jump.
         """
-        slope_x, slope_y = self.slope[0] + self.curvature * x, np.broadcast_to(self.slope[1], x.shape)
+        slope_x = self.slope[0] + self.curvature * x
+        slope_y = np.broadcast_to(self.slope[1], x.shape)
         depth = self.pavement_depth(torch.from_numpy(x), torch.from_numpy(y)).numpy()
         z = self.road_height(x, y) + self.kerb * np.clip(0.5 + depth / 0.5, 0, 1)
         up = np.stack([-slope_x, -slope_y, np.ones_like(x)], -1)

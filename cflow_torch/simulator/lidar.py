@@ -87,7 +87,9 @@ def scan(
         T_solid_sensor = T_solid_ego @ torch.from_numpy(unit.T_ego_sensor)
 
         def cosine_at(ray: Tensor, image: RangeImage = image, T_solid_sensor: Tensor = T_solid_sensor) -> Tensor:
-            rays, distance, solid = image.rays.index_select(1, ray), image.distance[ray], image.solid[ray]
+            rays = image.rays.index_select(1, ray)
+            distance = image.distance[ray]
+            solid = image.solid[ray]
             return incidence(solids, T_solid_sensor, solid, rays, distance)
 
         hit, distance, reflected = _measure(image, unit, profile, solids, cosine_at, generator)
@@ -193,7 +195,9 @@ def _measure(
     luck = torch.rand(len(hit), generator=generator)
     dropout = profile.dropout if unit.dropout is None else unit.dropout
     lucky = (luck < 1 - dropout).nonzero()[:, 0]
-    hit, noise, luck = hit.index_select(0, lucky), noise.index_select(0, lucky), luck.index_select(0, lucky)
+    hit = hit.index_select(0, lucky)
+    noise = noise.index_select(0, lucky)
+    luck = luck.index_select(0, lucky)
 
     distance, solid, cosine = (values.index_select(0, hit) for values in (image.distance, image.solid, image.cosine))
     on_solid = (solid >= 0).nonzero()[:, 0]
@@ -226,7 +230,8 @@ def _returns(
     offset_ns: Tensor,
 ) -> Returns:
     """Returns of unit `number`."""
-    unit, first_laser = profile.units[number], sum(len(before.elevations) for before in profile.units[:number])
+    unit = profile.units[number]
+    first_laser = sum(len(before.elevations) for before in profile.units[:number])
     laser = torch.tensor(unit.elevations, dtype=torch.float64).sort().indices
     beam = hit % len(unit.elevations)
     return Returns(

@@ -26,7 +26,9 @@ class Motion:
     """
 
     def __init__(self, scene: Scene, profile: LidarProfile, stamps: np.ndarray) -> None:
-        self._scene, self._profile, self._stamps = scene, profile, stamps
+        self._scene = scene
+        self._profile = profile
+        self._stamps = stamps
         self._dynamic, solids = scene.dynamic_part()
         body = scene.body_of_solid
         self._row = np.full(len(body), -1)
@@ -46,7 +48,8 @@ class Motion:
         profile = self._profile
         interval = profile.sweep_interval_ns * 1e-9
         stamped = self.ego_poses(np.array([seconds]))[0]
-        poses, times = [], []
+        poses = []
+        times = []
         for unit in profile.units:
             columns = np.arange(*(unit.active_columns or (0, unit.num_columns)))
             shots = seconds + interval * (columns / unit.num_columns - profile.reference)
@@ -68,7 +71,8 @@ class Motion:
 
     def solids(self, index: int) -> MovingSolids:
         """All solids during sweep `index`."""
-        seconds, poses = float(self._stamps[index]), self._dynamic_poses[index]
+        seconds = float(self._stamps[index])
+        poses = self._dynamic_poses[index]
         knots = self._knots(seconds)
         origin = self.ego_poses(np.array([seconds]))[0, :3, 3]
         dynamic = np.stack([_inverse(self._dynamic.solids(t, p).pose.numpy()) for t, p in zip(knots.tolist(), poses)])
@@ -129,7 +133,8 @@ class Motion:
         self, seconds: float, shot: np.ndarray, returns: Returns, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """(n, 3) float64 each: world positions of the LiDAR at its shots, and of the points that they hit."""
-        profile, stamped = self._profile, self.ego_poses(np.array([seconds]))[0]
+        profile = self._profile
+        stamped = self.ego_poses(np.array([seconds]))[0]
         unit = returns.unit.numpy()[rows]
         is_virtual = np.array([u.is_virtual for u in profile.units])[unit]
         ego = self.ego_poses(shot)

@@ -67,7 +67,8 @@ class UnitRays(NamedTuple):
 
 def ray_directions(azimuth: Tensor, elevation: Tensor) -> Tensor:
     """Unit vectors of a range image, sensor frame: (3, C * B), ray index column * B + beam."""
-    horizontal, vertical = elevation.cos(), elevation.sin()
+    horizontal = elevation.cos()
+    vertical = elevation.sin()
     x = azimuth.cos()[:, None] * horizontal
     y = azimuth.sin()[:, None] * horizontal
     return torch.stack([x, y, vertical.expand_as(x)]).flatten(1)
@@ -102,7 +103,8 @@ def cast_solids(
     # From the sensor frame to the unit coordinates of each solid.
     to_unit = T_solid_sensor[:, :3] / half_size[:, :, None]
     origin, matrix = to_unit[..., 3].T.float(), to_unit[..., :3].permute(1, 2, 0).float()  # (3, P), (3, 3, P)
-    cos_azimuth, sin_azimuth = azimuth.cos().float(), azimuth.sin().float()
+    cos_azimuth = azimuth.cos().float()
+    sin_azimuth = azimuth.sin().float()
 
     def rays_at(solid: Tensor, column: Tensor) -> UnitRays:
         level = take(matrix[:, 0], solid) * take(cos_azimuth, column)
@@ -261,8 +263,10 @@ def covered_beams(
 def _hit_cube(origin: Tensor, direction: Tensor) -> Tensor:
     """(M,) range at which rays (3, M) enter the cube |x|, |y|, |z| <= 1, inf = no hit."""
     inverse = direction.reciprocal()
-    centre, half = -origin * inverse, inverse.abs()
-    enter, leave = (centre - half).amax(0), (centre + half).amin(0)
+    centre = -origin * inverse
+    half = inverse.abs()
+    enter = (centre - half).amax(0)
+    leave = (centre + half).amin(0)
     return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
 
 
@@ -270,8 +274,10 @@ def _hit_cylinder(origin: Tensor, direction: Tensor) -> Tensor:
     """(M,) range at which rays (3, M) enter the cylinder x^2 + y^2 <= 1, |z| <= 1, inf = no hit."""
     enter, leave = _chord(origin[:2], direction[:2])
     inverse = direction[2].reciprocal()
-    centre, half = -origin[2] * inverse, inverse.abs()
-    enter, leave = torch.maximum(enter, centre - half), torch.minimum(leave, centre + half)
+    centre = -origin[2] * inverse
+    half = inverse.abs()
+    enter = torch.maximum(enter, centre - half)
+    leave = torch.minimum(leave, centre + half)
     return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
 
 

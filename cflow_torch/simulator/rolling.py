@@ -285,9 +285,11 @@ def _columns(
     """Return the first column, and the number of columns, between the two sides of each solid, (E,) int64 each."""
     num_columns = len(shots.azimuth)
     # Columns count along `step`, which may be negative.
-    left, right = outline.left, outline.right
+    left = outline.left
+    right = outline.right
     if shots.step < 0:
-        left, right = -outline.right, -outline.left
+        left = -outline.right
+        right = -outline.left
     first = (column + (left - margin) / abs(shots.step)).ceil().long()
     end = (column + (right + margin) / abs(shots.step)).floor().long() + 1
     first = torch.where(is_around, 0, first).clamp(0, num_columns)
@@ -309,8 +311,10 @@ class RollingRays:
         self._moves = solids.row[blocks.solid] >= 0
         self._kind = solids.kind[blocks.solid]
         self._inverse_half = solids.half_size[blocks.solid].reciprocal().T.float().contiguous()
-        self._cos_elevation, self._sin_elevation = shots.elevation.cos().float(), shots.elevation.sin().float()
-        self._seconds, self._block_seconds = shots.seconds, seconds
+        self._cos_elevation = shots.elevation.cos().float()
+        self._sin_elevation = shots.elevation.sin().float()
+        self._seconds = shots.seconds
+        self._block_seconds = seconds
         level, up = shots.directions
         self._columns = torch.cat([shots.T_world_sensor[:, :3, 3].T.float(), level[..., 0], up[..., 0]])  # (9, C)
 
@@ -338,7 +342,8 @@ class RollingRays:
         Returns:
             (N,) float32 in [0, 1].
         """
-        rays, inverse_half = self(block, column), take(self._inverse_half, block)
+        rays = self(block, column)
+        inverse_half = take(self._inverse_half, block)
         direction = rays.level * take(self._cos_elevation, beam) + rays.up * take(self._sin_elevation, beam)
         at = rays.origin + direction * distance
         return cosine_of_incidence(take(self._kind, block), at, direction / inverse_half, inverse_half)

@@ -40,7 +40,8 @@ class PackedDrive:
         for name, value in {"max_flow": max_flow, "voxel": voxel}.items():
             if not 0 < value < np.inf:
                 raise CFlowError(f"{name}={value}: give a positive length in metres")
-        self.max_flow, self.voxel = max_flow, voxel
+        self.max_flow = max_flow
+        self.voxel = voxel
         self.frame = ViewerFrame()
         self.frames: list[dict[str, Any]] = []
         self.points: list[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]] = []  # units, colours, cluster
@@ -128,7 +129,8 @@ class PackedDrive:
         for frame, (units, entries, _) in zip(self.frames, self.points):
             missing = np.where(entries["flow"] == GROUND, GROUND, UNKNOWN).astype(np.uint8)
             frame["data"] = packed(_planes(units, [entries.get(c["name"], missing) for c in chosen]))
-        shown, side = sum(frame["count"] for frame in self.frames), self.voxel
+        shown = sum(frame["count"] for frame in self.frames)
+        side = self.voxel
         T = self.frame.T_world_viewer
         return {
             "frames": self.frames,
@@ -186,7 +188,9 @@ def _colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
     speed = max_flow / interval
     rim = f"right: ahead of the vehicle; rim: {max_flow:.4g} m per sweep, {speed:.3g}\u00a0m/s"
     faded = np.rint(_FADED * PALETTE + (1 - _FADED) * _GREY).astype(np.uint8)
-    wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), np.concatenate([PALETTE, faded]).tolist()
+    wheel = _wheel().tolist()
+    ramp = _ramp().tolist()
+    objects = np.concatenate([PALETTE, faded]).tolist()
     likely = "probability of an error below 0.1 m"
     rows = (
         # name, text, palette, scale, note, meaning of the greys

@@ -177,11 +177,13 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
     Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
     """
     if config is None:
-        config, window = make_config("paper"), replace(window, pch=(), pcf=())
+        config = make_config("paper")
+        window = replace(window, pch=(), pcf=())
     found = cluster_correlation(window, config, cluster_id)
     figure, panels = _lay_out(found.images.t.shape)
     style.add_heading(figure, 0.35, _title(found, config))
-    images, nothing = found.images, np.zeros_like(found.images.t)
+    images = found.images
+    nothing = np.zeros_like(found.images.t)
     height, width = nothing.shape
     # A shift is shorter than the box, so with this margin pixels that leave the box do not wrap around.
     padded = np.pad(images.t, ((0, height), (0, width)))
@@ -210,7 +212,8 @@ def _title(found: ClusterCorrelation, config: Config) -> str:
 
 def _lay_out(shape: tuple[int, int]) -> tuple[Figure, list[Any]]:
     """Create the figure and its axes: four images, colour bar, surface."""
-    left, right = 0.7, 5.25
+    left = 0.7
+    right = 5.25
     # Pixels are square, unless the box is so long and thin that nothing would be visible.
     height, width = np.maximum(3.35 * np.array(shape) / max(shape), 1.2)
     total = max(2 * height + 2.9, 6.4)
@@ -234,7 +237,8 @@ def _name(axes: Axes, title: str, x: str, y: str) -> None:
 def _draw_map(axes: Axes, colors: Axes, found: ClusterCorrelation) -> None:
     """Draw the scores as an image with its colour bar; shifts in pixels, those outside the search range in grey."""
     height, width = found.ncc.shape
-    low_y, low_x = -(height // 2) - 0.5, -(width // 2) - 0.5
+    low_y = -(height // 2) - 0.5
+    low_x = -(width // 2) - 0.5
     axes.set_facecolor("#d5d9de")
     extent = (low_x, low_x + width, low_y, low_y + height)
     options: Any = {"origin": "lower", "interpolation": "nearest", "aspect": "auto"}
@@ -299,7 +303,8 @@ def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
     """
     figure = style.blank_figure((16.0, 6.9), 100)
     if config is None:
-        config, window = make_config("keypoints"), replace(window, pch=(), pcf=())
+        config = make_config("keypoints")
+        window = replace(window, pch=(), pcf=())
     found = keypoint_matches(window, config)
     low, high = _busiest_view(found.start, found.end)
     title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; the view shows a part"
@@ -335,7 +340,8 @@ def _draw_matches(axes: Axes, found: KeyPointMatches, low: np.ndarray, high: np.
     from matplotlib.collections import LineCollection
 
     inside = ((found.start > low) & (found.start < high)).all(axis=1)
-    start, end = found.start[inside], found.end[inside]
+    start = found.start[inside]
+    end = found.end[inside]
     flow = end - start
     max_flow = longest_flow(flow)
     color = flow_to_rgb(flow, max_flow) / 255

@@ -87,7 +87,8 @@ def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tens
     Where the number is 0, the others are undefined. Heights are (N,) int64, mm, |height| < 2^36. Heights in the cell
     `num_cells` are ignored.
     """
-    offset, bits = 1 << 36, 37
+    offset = 1 << 36
+    bits = 37
     key = (cell << bits).add_(height).add_(offset).sort().values  # by cell, then by height
     count = torch.bincount(cell, minlength=num_cells + 1)[:-1]
     if key.numel() == 0:

@@ -180,7 +180,8 @@ def _laser_numbers(names: Sequence[str]) -> list[int]:
 
 def _calibration(unit: UnitReturns, elevations: np.ndarray) -> LaserCalibration:
     """Calibration of a unit. As for Waymo's small lasers, evenly spaced beams are given by their outer edges only."""
-    T_ego_sensor, elevations = np.asarray(unit.T_ego_sensor, np.float64), np.asarray(elevations, np.float64)
+    T_ego_sensor = np.asarray(unit.T_ego_sensor, np.float64)
+    elevations = np.asarray(elevations, np.float64)
     steps = np.diff(elevations)
     if len(steps) and np.ptp(steps) < 1e-12 and unit.name != "TOP":
         half = (elevations[-1] - elevations[0]) / len(steps) / 2
@@ -199,7 +200,8 @@ def _calibration_row(log_id: str, number: int, calibration: LaserCalibration) ->
 
 def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str, Any]]:
     """Boxes of one frame."""
-    boxes, rows = log.boxes(index), []
+    boxes = log.boxes(index)
+    rows = []
     for track, category, size, pose, count in zip(
         boxes.track_id, boxes.category, boxes.size, boxes.pose, boxes.num_points
     ):
