@@ -45,7 +45,8 @@ def write_truckscenes(recording: Recording, root: str | Path) -> Path:
 
     def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
         times = ((int(stamp_ns) + np.asarray(unit.offset_ns, dtype=np.int64)) // 1000).astype(np.uint64)
-        points, intensity = np.asarray(unit.points, dtype=np.float32), unit.intensity.astype(np.float32)
+        points = np.asarray(unit.points, dtype=np.float32)
+        intensity = unit.intensity.astype(np.float32)
         write_cloud(file, points, {"intensity": intensity, "timestamp": times})
 
     with new_folder(root, recording.log_id) as folder:
