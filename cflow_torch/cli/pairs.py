@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import closing
+from functools import partial
 from queue import SimpleQueue
 from typing import Any, Callable, Iterator, Sequence, Tuple
 
@@ -53,29 +54,13 @@ def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, A
     count = min(len(devices), len(pairs) // frames_per_worker(method.config)) if devices[0] == "cpu" else 1
     windows = _windows(pairs, method.config)
     if count < 2:
-        for pair, sweeps in zip(Progress(pairs), windows):
-            yield pair, lambda sweeps=sweeps: _estimate(model, sweeps)  # type: ignore[misc]
+        yield from zip(Progress(pairs), (partial(_estimate, model, sweeps) for sweeps in windows))
         return
-    with ExitStack() as stack:
-        idle: SimpleQueue[ProcessExecutor] = SimpleQueue()
-        for _ in range(count):
-            executor = ProcessExecutor(_Estimator, method)
-            stack.callback(executor.close)
-            idle.put(executor)
-        threads = stack.enter_context(ThreadPoolExecutor(count))
-
-        def compute(sweeps: Window | Exception) -> tuple[Window, FlowResult]:
-            executor = idle.get()
-            try:
-                arrays, seconds = _call(executor, _checked(sweeps))
-            finally:
-                idle.put(executor)
-            model.pairs.append(seconds)
-            return _checked(sweeps), FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
-
-        futures = stack.enter_context(closing(run_ahead(threads, compute, windows, _AHEAD * count)))
-        for pair, future in zip(Progress(pairs), futures):
-            yield pair, future.result
+    # At the end, the processes are closed before we wait for the threads, which wait for the processes.
+    with ThreadPoolExecutor(count) as threads, closing(_Processes(model, count)) as processes, closing(
+        run_ahead(threads, processes.estimate, windows, _AHEAD * count)
+    ) as futures:
+        yield from zip(Progress(pairs), (future.result for future in futures))
 
 
 def _windows(pairs: Sequence[Pair], config: Config) -> Iterator[Window | Exception]:
@@ -90,28 +75,51 @@ def _windows(pairs: Sequence[Pair], config: Config) -> Iterator[Window | Excepti
             yield error
 
 
-def _checked(sweeps: Window | Exception) -> Window:
+def _estimate(model: TimedModel, sweeps: Window | Exception) -> tuple[Window, FlowResult]:
     if isinstance(sweeps, Exception):
         raise sweeps
-    return sweeps
-
-
-def _estimate(model: TimedModel, sweeps: Window | Exception) -> tuple[Window, FlowResult]:
-    good = _checked(sweeps)
     with inactive_is_an_error():
-        return good, model([good])[0]
+        return sweeps, model([sweeps])[0]
 
 
-def _call(executor: ProcessExecutor, sweeps: Window) -> Any:
-    """Estimate in another process. If the process ends, try once more in a new one."""
-    how = ""
-    for _ in range(2):
+class _Processes:
+    """Worker processes for the threads that call `estimate`: each takes one that is idle."""
+
+    def __init__(self, model: TimedModel, count: int) -> None:
+        self._model, self._is_closed = model, False
+        self._executors = [ProcessExecutor(_Estimator, model.model) for _ in range(count)]
+        self._idle: SimpleQueue[ProcessExecutor] = SimpleQueue()
+        for executor in self._executors:
+            self._idle.put(executor)
+
+    def estimate(self, sweeps: Window | Exception) -> tuple[Window, FlowResult]:
+        if isinstance(sweeps, Exception):
+            raise sweeps
+        executor = self._idle.get()
         try:
-            return executor.submit("estimate", sweeps).result()
-        except BrokenExecutor as error:
-            how = executor.explain(error)
+            arrays, seconds = self._call(executor, sweeps)
+        finally:
+            self._idle.put(executor)
+        self._model.pairs.append(seconds)
+        return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+    def _call(self, executor: ProcessExecutor, sweeps: Window) -> Any:
+        """Estimate in a process. If it ends, try once more in a new one."""
+        how = ""
+        for _ in range(2):
+            try:
+                return executor.submit("estimate", sweeps).result()
+            except BrokenExecutor as error:
+                how = executor.explain(error)
+                executor.close()
+            if self._is_closed:
+                break
+        raise CFlowError(f"2 worker processes died on it, the last one: {how}")
+
+    def close(self) -> None:
+        self._is_closed = True
+        for executor in self._executors:
             executor.close()
-    raise CFlowError(f"2 worker processes died on it, the last one: {how}")
 
 
 class _Estimator:
