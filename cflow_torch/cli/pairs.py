@@ -17,7 +17,7 @@ import torch
 from cflow_torch.cli.run import Failures, collect_failures
 from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.fleet.executors import ProcessExecutor
+from cflow_torch.fleet.executors import ProcessExecutor, describe
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
 from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
 from cflow_torch.fleet.work import run_ahead
@@ -110,7 +110,7 @@ class _Processes:
             try:
                 return executor.submit("estimate", sweeps).result()
             except BrokenExecutor as error:
-                how = executor.explain(error)
+                how = describe(error)
                 executor.close()
             if self._is_closed:
                 break

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
+import traceback
 from abc import ABC, abstractmethod
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from threading import Thread
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from contextlib import suppress
+from threading import Lock
 from typing import Any, Callable
 
 from cflow_torch.errors import CFlowError
@@ -20,23 +20,22 @@ class CannotStart(CFlowError):
 
 
 class Executor(ABC):
-    """A process that holds one object. The first call starts it."""
+    """A process that holds one object. The first call starts it, and so does the first call after `close`."""
 
     @abstractmethod
     def submit(self, method: str, *arguments: Any) -> Future[Any]:
-        """Call a method of the object. Its errors are those of the future, or `CannotStart`, or a `BrokenExecutor`."""
+        """Call a method of the object. Errors of the future: `BrokenExecutor` if the process has ended, `CannotStart`,
+        and those of the method."""
 
     @abstractmethod
     def close(self) -> None:
-        """Kill the process, even during a call. The next call starts another one."""
-
-    def explain(self, error: BaseException) -> str:
-        """Return in one line why a call failed."""
-        return describe(error)
+        """Kill the process, even during a call."""
 
 
 class ProcessExecutor(Executor):
-    """A process of this machine. It ignores `SIGNALS` and ends when its parent does.
+    """A process of this machine. It ignores `SIGNALS`. When its parent ends, it ends after its call.
+
+    `CFlowError` and OSError arrive as they are, any other error as a RuntimeError with the traceback of the process.
 
     Args:
         make: called in the process; returns the object.
@@ -44,62 +43,69 @@ class ProcessExecutor(Executor):
     """
 
     def __init__(self, make: Callable[..., Any], *arguments: Any) -> None:
-        self._make, self._arguments = make, arguments
-        self._pool: ProcessPoolExecutor | None = None
+        self._make = (make, arguments)
+        self._caller = ThreadPoolExecutor(1)  # waits for the answers
+        self._lock = Lock()
         self._process: Any = None
+        self._pipe: Any = None
 
     def submit(self, method: str, *arguments: Any) -> Future[Any]:
-        try:
-            if self._pool is None:
-                spawn = multiprocessing.get_context("spawn")  # threads and CUDA do not survive a fork
-                self._pool = ProcessPoolExecutor(1, spawn, _prepare, (self._make, self._arguments))
-            future = self._pool.submit(_call, method, arguments)
-            (self._process,) = self._pool._processes.values()  # only Python 3.14 has a public `kill_workers`
-        except (BrokenExecutor, OSError) as error:  # the process has ended since the last call, or cannot start
-            future = Future()
-            future.set_exception(error)
-        return future
+        return self._caller.submit(self._call, method, arguments)
 
     def close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=False)
-        if self._process is not None:
-            self._process.kill()
-            self._process.join()
-        self._pool = self._process = None
+        with self._lock:
+            process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.join()
 
-    def explain(self, error: BaseException) -> str:
-        if self._process is None or not isinstance(error, BrokenProcessPool):
-            return describe(error)
-        self._process.join(1.0)
-        return _ending(self._process.exitcode)
+    def _call(self, method: str, arguments: tuple[Any, ...]) -> Any:
+        with self._lock:
+            if self._process is None:
+                self._start()
+            process, pipe = self._process, self._pipe
+        try:
+            pipe.send((method, arguments))
+            answer, error = pipe.recv()
+        except (EOFError, OSError):
+            process.join()
+            raise BrokenExecutor(_ending(process.exitcode)) from None
+        if error is not None:
+            raise error
+        return answer
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")  # threads and CUDA do not survive a fork
+        self._pipe, pipe = context.Pipe()
+        process = context.Process(target=_serve, args=(pipe, *self._make), daemon=True)
+        try:
+            process.start()
+        except OSError as error:
+            raise BrokenExecutor(f"it could not start: {describe(error)}") from error
+        finally:
+            pipe.close()
+        self._process = process
 
 
-# In the process of a `ProcessExecutor`: its object, and how to make it.
-_held: Any = None
-_make: Callable[[], Any] = dict
-
-
-def _prepare(make: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    global _make
-    _make = lambda: make(*arguments)  # noqa: E731
+def _serve(pipe: Any, make: Callable[..., Any], make_arguments: tuple[Any, ...]) -> None:
+    """Make the object at the first call, and answer calls until the parent ends."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)  # the parent receives them as well and says when to stop
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _call(method: str, arguments: tuple[Any, ...]) -> Any:
-    global _held
-    if _held is None:
-        _held = make_object(_make)
-    return getattr(_held, method)(*arguments)
+    held: Any = None
+    with suppress(EOFError, OSError):
+        while True:
+            method, arguments = pipe.recv()
+            answer: Any = None
+            error: Exception | None = None
+            try:
+                if held is None:
+                    held = make_object(make, *make_arguments)
+                answer = getattr(held, method)(*arguments)
+            except (CFlowError, OSError, BrokenExecutor) as caught:
+                error = caught
+            except Exception:
+                error = RuntimeError(traceback.format_exc())
+            pipe.send((answer, error))
 
 
 def make_object(make: Callable[..., Any], *arguments: Any) -> Any:

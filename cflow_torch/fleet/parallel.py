@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any, Callable, Iterator, Sequence
 
-from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor
+from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, describe
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.progress import log_line
@@ -112,7 +112,7 @@ class _Worker:
             self.part, self.problem = None, str(error)
             self.todo.appendleft(part)
         elif error is not None:
-            how = self.executor.explain(error)
+            how = describe(error)
             self.executor.close()
             self.part, self._num_lost = None, self._num_lost + 1
             if self._num_lost == _MAX_LOST:

@@ -271,13 +271,13 @@ def test_a_process_passes_answers_and_errors():
     try:
         assert executor.submit("pop").result(60) == 1
         assert executor.submit("index", 3).result(60) == 0, "the same object"
-        with pytest.raises(ValueError, match="not in list"):
+        with pytest.raises(RuntimeError, match="ValueError: .* not in list"):
             executor.submit("remove", 7).result(60)
         executor._process.kill()
         executor._process.join()
-        with pytest.raises(BrokenExecutor) as error:
-            executor.submit("pop").result(60)
-        assert executor.explain(error.value) == "signal 9, Killed (out of memory?)"
+        for _ in range(2):
+            with pytest.raises(BrokenExecutor, match="signal 9, Killed"):
+                executor.submit("pop").result(60)
         executor.close()
         assert executor.submit("pop").result(60) == 1, "another process"
     finally:
