@@ -11,7 +11,6 @@ from cflow_torch.config import KeypointsConfig
 from cflow_torch.dense.clustering import label_components
 from cflow_torch.keypoints.matching import Matches
 from cflow_torch.ops.indices import draw, flat_nonzero, index_in_group
-from cflow_torch.ops.kornia_engine import connected_components_kornia
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.ops.segments import segment_median
@@ -53,8 +52,7 @@ def densify(
     if config.densify == "clusters":
         component = label_components(images, pixel, pixel_size, config)
     else:
-        label = connected_components_kornia if config.labeling == "kornia" else connected_components
-        component = label(images, pixel, config.connectivity)
+        component = connected_components(images, pixel, config.connectivity, engine=config.labeling)
     is_first = component == torch.arange(pixel.numel(), device=pixel.device)
     group = (is_first.cumsum(0) - 1).index_select(0, component)
     first_pixel = pixel.index_select(0, flat_nonzero(is_first))

@@ -27,8 +27,8 @@ from cflow_torch.data.waymo.reader import (
     VEHICLE_POSE,
 )
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
 from cflow_torch.types import CFlowError
+from writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
 
 BOX_TYPE: dict[str, int] = {
     **dict.fromkeys(META_CLASSES["CAR"] + META_CLASSES["OTHER_VEHICLES"] + ("MOTORCYCLE", "MOTORCYCLIST"), 1),

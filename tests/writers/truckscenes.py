@@ -9,7 +9,7 @@ import numpy as np
 from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
+from writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
 
 _VERSION, _KEY_FRAME_INTERVAL = "v1.2-mini", 0.5  # seconds
 # The devkit also requires these tables, which nuScenes does not have. A simulated truck has no data for them.
