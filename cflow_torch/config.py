@@ -263,7 +263,8 @@ def make_config(preset: str | None = None, method: str | None = None, **override
         raise CFlowError(f"preset={preset!r}: give one of {', '.join(map(repr, PRESETS))}")
     own, changes = PRESETS[preset]
     if method == "keypoints" and preset == "paper":
-        own, changes = method, {}
+        own = method
+        changes = {}
     if method not in (None, own):
         raise CFlowError(f"preset={preset!r} is of method={own!r}, not of method={method!r}: leave one of them out")
     return CONFIGS[own](**changes).replace(**overrides)

@@ -42,7 +42,9 @@ def import_optional(module: str, need: str, name: str | None = None) -> Any:
 
 def warn(text: str, category: type[CFlowWarning] = CFlowWarning) -> None:
     """Warn, and name the line of the user's code that called the package."""
-    level, frame = 2, sys._getframe(1)
+    level = 2
+    frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in _NOT_OF_USERS:
-        level, frame = level + 1, frame.f_back
+        level = level + 1
+        frame = frame.f_back
     warnings.warn(text, category, stacklevel=level)

@@ -133,7 +133,8 @@ class SceneFlowModel(nn.Module):
             CFlowError: bad input, see `make_batch`.
         """
         check_windows(windows, self.config)
-        grid, device = self.grid(self.config.pixel_sizes[-1]), choose_device(windows, self.device)
+        grid = self.grid(self.config.pixel_sizes[-1])
+        device = choose_device(windows, self.device)
         results: list[FlowResult] = []
         with torch.autocast(device.type, enabled=False):  # counts would lose bits
             for some in split_windows(windows, grid, device, self.bytes_per_point, self.config.max_memory):
@@ -154,7 +155,8 @@ class SceneFlowModel(nn.Module):
 def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
     """One result per window, for all rows of its pc0. The results share memory with each other."""
     points = slice(batch.rows[0].start, batch.rows[-1].stop)
-    cluster, is_valid = motion.cluster(points), batch.has_result[points].clone()
+    cluster = motion.cluster(points)
+    is_valid = batch.has_result[points].clone()
     residual = motion.residual_flow(points, batch.positions[:, points]).add_(0.0)  # turns -0.0 into 0.0
     cluster_id, score = (values.index_select(0, cluster) for values in (motion.cluster_id, motion.score))
     confidence = motion.confidence

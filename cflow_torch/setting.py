@@ -44,7 +44,9 @@ def bounds(
 
 def describe(limits: Mapping[str, Any]) -> str:
     """The allowed values in words: "a number of at least 1 and of at most 2, or None"."""
-    low, above, high = limits["low"], limits["above"], limits["high"]
+    low = limits["low"]
+    above = limits["above"]
+    high = limits["high"]
     if limits["choices"]:
         return f"one of {', '.join(map(repr, limits['choices']))}"
     text = _NAMES[limits["kind"]]

@@ -31,7 +31,8 @@ def stage(name: str) -> Iterator[None]:
 @contextmanager
 def stage_seconds() -> Iterator[dict[str, float]]:
     """Collect the seconds of each stage by the clock of the host. On a GPU, this is the time to queue the work."""
-    before, _watched.seconds = getattr(_watched, "seconds", None), {}
+    before = getattr(_watched, "seconds", None)
+    _watched.seconds = {}
     try:
         yield _watched.seconds
     finally:
@@ -55,7 +56,8 @@ class TimedModel:
     """
 
     def __init__(self, model: FlowModel) -> None:
-        self.model, self.config = model, model.config
+        self.model = model
+        self.config = model.config
         self.pairs: list[tuple[float, dict[str, float]]] = []  # seconds of each call, and of its stages
 
     def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Sequence, Union
+from typing import Any, NamedTuple, Sequence, Union
 
 import numpy as np
 import torch
@@ -257,30 +257,19 @@ class FlowResult:
             )
         if not sweep_interval > 0:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds between two sweeps, for example 0.1")
-        given, cluster = self.numpy(), as_numpy(self.cluster_id)
-        order = np.argsort(cluster, kind="stable")
-        order = order[np.searchsorted(cluster[order], 0) :]
-        ids, first, inverse, count = np.unique(cluster[order], True, True, True)
-        objects = np.zeros(len(ids), _OBJECT)
-        if len(ids) == 0:
+        values = self.numpy()
+        clusters = _Clusters.of(as_numpy(self.cluster_id))
+        objects = np.zeros(len(clusters.id), _OBJECT)
+        if len(objects) == 0:
             return objects
-
-        def mean(values: np.ndarray) -> np.ndarray:
-            return (np.add.reduceat(values[order].astype(np.float64), first).T / count).T
-
-        objects["id"], objects["num_points"] = ids, count
-        objects["velocity"] = mean(given["residual_flow"]) / sweep_interval
+        objects["id"] = clusters.id
+        objects["num_points"] = clusters.num_points
+        objects["velocity"] = clusters.mean(values["residual_flow"]) / sweep_interval
         objects["heading"] = np.arctan2(objects["velocity"][:, 1], objects["velocity"][:, 0])
-        objects["confidence"] = mean(given["confidence"]) if "confidence" in given else np.nan
-        positions = (self._positions(points) + given["flow"])[order]
-        cos, sin = np.cos(objects["heading"]), np.sin(objects["heading"])
-        x, y, z = positions.T
-        ahead, left = cos[inverse] * x + sin[inverse] * y, cos[inverse] * y - sin[inverse] * x
-        along = np.stack([ahead, left, z], axis=1)
-        low, high = np.minimum.reduceat(along, first), np.maximum.reduceat(along, first)
-        ahead, left, z = ((low + high) / 2).T
-        objects["centre"] = np.stack([cos * ahead - sin * left, sin * ahead + cos * left, z], axis=1)
-        objects["size"] = high - low
+        objects["confidence"] = clusters.mean(values["confidence"]) if "confidence" in values else np.nan
+        objects["centre"], objects["size"] = clusters.boxes(
+            self._positions(points) + values["flow"], objects["heading"]
+        )
         is_fast = np.linalg.norm(objects["velocity"], axis=1) >= min_speed
         return objects[is_fast & (objects["num_points"] >= min_points)]
 
@@ -311,6 +300,41 @@ class FlowResult:
     def _given(self) -> dict[str, Tensor]:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
+
+
+class _Clusters(NamedTuple):
+    """The points of K clusters, one cluster after the other."""
+
+    id: np.ndarray  # (K,) cluster_id, ascending
+    num_points: np.ndarray  # (K,) int64
+    first: np.ndarray  # (K,) int64, where the points of each cluster start in `row`
+    row: np.ndarray  # (M,) int64, row of each point
+    number: np.ndarray  # (M,) int64, index of each point's cluster, 0 ... K - 1
+
+    @classmethod
+    def of(cls, cluster: np.ndarray) -> _Clusters:
+        """Sort points by cluster, (N,); -1 = none."""
+        row = np.argsort(cluster, kind="stable")
+        row = row[np.searchsorted(cluster[row], 0) :]
+        ids, first, number, num_points = np.unique(cluster[row], True, True, True)
+        return cls(ids, num_points, first, row, number)
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Return the mean of (N, ...) values in each cluster, (K, ...) float64."""
+        return (np.add.reduceat(values[self.row].astype(np.float64), self.first).T / self.num_points).T
+
+    def boxes(self, positions: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return centre and size, (K, 3) each, of the boxes along headings, (K,), around (N, 3) positions."""
+        x, y, z = positions[self.row].T
+        cos = np.cos(heading)
+        sin = np.sin(heading)
+        ahead = cos[self.number] * x + sin[self.number] * y
+        left = cos[self.number] * y - sin[self.number] * x
+        along = np.stack([ahead, left, z], axis=1)
+        low = np.minimum.reduceat(along, self.first)
+        high = np.maximum.reduceat(along, self.first)
+        ahead, left, z = ((low + high) / 2).T
+        return np.stack([cos * ahead - sin * left, sin * ahead + cos * left, z], axis=1), high - low
 
 
 def vector_columns(name: str) -> Sequence[str]:

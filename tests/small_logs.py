@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 from tiny_recording import TinyRecording
+from writers.aevascenes import write_aevascenes_sequence
+from writers.nuscenes import write_nuscenes
+from writers.truckscenes import write_truckscenes
+from writers.waymo import write_waymo_segment
 
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.simulator.profiles import PROFILES
-from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
 from cflow_torch.simulator.writers.av2 import write_av2_log
-from cflow_torch.simulator.writers.nuscenes import write_nuscenes
-from cflow_torch.simulator.writers.truckscenes import write_truckscenes
-from cflow_torch.simulator.writers.waymo import write_waymo_segment
 
 SMALL_LOGS = ("av2", "aevascenes", "arrays", "bags", "hdf5", "nuscenes", "truckscenes", "waymo")
 

@@ -43,10 +43,12 @@ def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> Mo
     seems to move, and the track would follow this piece. We recognise a piece by the box of the object: it holds more
     than half of the points of the group, and more static points than the group has points.
     """
-    moves, is_inside = groups.group >= 0, box >= 0
+    moves = groups.group >= 0
+    is_inside = box >= 0
     num_static = torch.bincount(box[is_inside & ~moves], minlength=num_boxes)
     group, box, _, count = unique_pairs(groups.group[is_inside & moves], box[is_inside & moves])
-    is_piece = (count > groups.count[group] / 2) & (groups.count[group] < num_static[box])
+    size = groups.count[group]
+    is_piece = (count > size / 2) & (size < num_static[box])
     return groups.divide(torch.where(torch.isin(groups.group, group[is_piece]), -1, 0))
 
 
@@ -58,13 +60,17 @@ def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGrou
     """
     moves = groups.group >= 0
     group, box, pair_of_point, count = unique_pairs(groups.group[moves], box[moves])
-    least = lookup(_MIN_CLAIM * num_points, torch.where(box < 0, len(num_points), box), torch.inf)
-    claims = count >= least
+    claims = count >= _value_of_box(_MIN_CLAIM * num_points, box, torch.inf)
     piece = torch.where(claims, box + 1, 0)
     last = torch.zeros_like(groups.count).scatter_reduce(0, group, piece, "amax")
     is_divided = torch.bincount(group[claims], minlength=len(groups.count)) > 1
     piece = torch.where(is_divided[group], torch.where(claims, piece, last[group]), 0)
     return groups.divide(torch.zeros_like(groups.group).masked_scatter(moves, piece[pair_of_point]))
+
+
+def _value_of_box(values: Tensor, box: Tensor, outside: float) -> Tensor:
+    """Return the value of each box, (N,) int64, from those of K boxes, (K,); `outside` for box -1."""
+    return lookup(values, torch.where(box < 0, len(values), box), outside)
 
 
 def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> Matches:
@@ -74,13 +80,17 @@ def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: Moving
     may_have_stopped = tracks.is_confirmed.clone()
     may_have_stopped[track] = False
     candidate = may_have_stopped.nonzero()[:, 0]
-    static = groups.point[~moves]
-    box = box_of_point(static, tracks.box[candidate], tracks.size[candidate] + _MARGIN, tracks.heading[candidate])
+    candidates = tracks.take(candidate)
+    box = box_of_point(groups.point[~moves], candidates.box, candidates.size + _MARGIN, candidates.heading)
     count = torch.bincount(box[box >= 0], minlength=len(candidate))
-    has_stopped = count >= (_MIN_STOPPED_SHARE * tracks.num_points[candidate]).clamp(min=MIN_POINTS)
-    track_of_box = torch.where(has_stopped, candidate, -1)
-    track_of_static = lookup(track_of_box, torch.where(box < 0, len(candidate), box), -1)
-    return Matches(track, group, candidate[has_stopped], count[has_stopped], track_of_static)
+    has_stopped = count >= (_MIN_STOPPED_SHARE * candidates.num_points).clamp(min=MIN_POINTS)
+    return Matches(
+        track=track,
+        group=group,
+        stopped=candidate[has_stopped],
+        num_points=count[has_stopped],
+        track_of_static=_value_of_box(torch.where(has_stopped, candidate, -1), box, -1),
+    )
 
 
 def link(points0: Tensor, group0: Tensor, points1: Tensor, group1: Tensor, min_share: float) -> tuple[Tensor, Tensor]:
@@ -112,21 +122,23 @@ def _by_overlap(
     if not (len(points0) and len(points1)):
         return []
     both = torch.cat([points0, points1])
-    voxel = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
-    voxel = torch.unique(voxel, dim=0, return_inverse=True)[1]
-    # We pack pairs into one number, such as voxel * num_groups + group, because one number sorts faster than two.
-    num_groups = 1 + int(torch.cat([group0, group1]).amax()) if len(both) else 1
-    key0 = torch.unique(voxel[: len(group0)] * num_groups + group0)
-    key1 = torch.unique(voxel[len(group0) :] * num_groups + group1)
-    voxel1, voxel0 = key1 // num_groups, key0 // num_groups
-    begin, end = (torch.searchsorted(voxel1, voxel0, right=right) for right in (False, True))
-    key0, key1 = key0 % num_groups, key1 % num_groups
-    pairs = key0.repeat_interleave(end - begin) * num_groups + key1[concat_ranges(begin, end - begin)]
-    pairs, shared = torch.unique(pairs, return_counts=True)
-    earlier, current = pairs // num_groups, pairs % num_groups
-    share = shared / (torch.bincount(key0)[earlier] + torch.bincount(key1)[current] - shared)
+    cell = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
+    voxel = torch.unique(cell, dim=0, return_inverse=True)[1]
+    voxel0, group0 = _distinct(voxel[: len(points0)], group0)
+    voxel1, group1 = _distinct(voxel[len(points0) :], group1)
+    begin = torch.searchsorted(voxel1, voxel0)
+    count = torch.searchsorted(voxel1, voxel0, right=True) - begin
+    earlier, current, _, shared = unique_pairs(group0.repeat_interleave(count), group1[concat_ranges(begin, count)])
+    share = shared / (torch.bincount(group0)[earlier] + torch.bincount(group1)[current] - shared)
     order = share.argsort(descending=True, stable=True)
-    return torch.stack([earlier, current], 1)[order[share[order] >= min_share]].tolist()  # type: ignore[no-any-return]
+    order = order[share[order] >= min_share]
+    return torch.stack([earlier[order], current[order]], 1).tolist()  # type: ignore[no-any-return]
+
+
+def _distinct(voxel: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distinct pairs of voxel and group, (K,) int64 each, in order of voxel."""
+    first, second, _, _ = unique_pairs(voxel, group)
+    return first, second
 
 
 def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) -> Tensor:
@@ -149,7 +161,8 @@ def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tenso
     """
     along, across = rotate(points[:, 0], points[:, 1], -heading[group])
     local = torch.stack([along, across, points[:, 2]], 1)
-    index, extremes = group[:, None].expand(-1, 3), local.new_zeros(len(heading), 3)
+    index = group[:, None].expand(-1, 3)
+    extremes = local.new_zeros(len(heading), 3)
     low = extremes.scatter_reduce(0, index, local, "amin", include_self=False)
     high = extremes.scatter_reduce(0, index, local, "amax", include_self=False)
     middle = (low + high) / 2
@@ -158,5 +171,6 @@ def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tenso
 
 def rotate(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     """Rotate x, y by `angle` radians, counter-clockwise."""
-    cos, sin = angle.cos(), angle.sin()
+    cos = angle.cos()
+    sin = angle.sin()
     return cos * x - sin * y, sin * x + cos * y

@@ -58,7 +58,8 @@ class CleanLog(Log):
     ) -> None:
         if standing is not None:
             raise CFlowError("standing= is now remove_stopped=")
-        self.log_id, self.timestamps = log.log_id, log.timestamps
+        self.log_id = log.log_id
+        self.timestamps = log.timestamps
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
         if flow is None and model is None:
@@ -71,14 +72,16 @@ class CleanLog(Log):
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index` without its moving points; pose and time as in the log."""
-        sweep, is_kept = self._log.sweep(index), ~self.moving(index)
+        sweep = self._log.sweep(index)
+        is_kept = ~self.moving(index)
         given = {name: getattr(sweep, name) for name in ("points", "is_ground", "point_times")}
         kept = {name: as_numpy(values)[is_kept] for name, values in given.items() if values is not None}
         return replace(sweep, **kept)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Other columns of sweep `index`, such as intensity, without the rows of moving points."""
-        is_kept, columns = ~self.moving(index), self._log.columns(index)
+        is_kept = ~self.moving(index)
+        columns = self._log.columns(index)
         for name, values in columns.items():
             what = f"column {name} of sweep {index}"
             check_array(values, what, is_kept.shape, "biuf", f"({len(is_kept)},) numbers, one per point")
@@ -114,7 +117,8 @@ class CleanLog(Log):
 
     def _reached(self, sweep: Sweep, index: int) -> np.ndarray:
         """(N,) bool, points of the last sweep in the boxes to which the clusters of the sweep before have moved."""
-        result, moves = self._flow(index - 1), self._moves(index - 1)
+        result = self._flow(index - 1)
+        moves = self._moves(index - 1)
         before = _world(self._log.sweep(index - 1))[moves]
         step = as_numpy(result.residual_flow, np.float64)[moves] @ pose_of(sweep)[:3, :3].T
         clusters, group = np.unique(as_numpy(result.cluster_id)[moves], return_inverse=True)
@@ -126,31 +130,41 @@ class CleanLog(Log):
 
     def _track(self) -> list[np.ndarray]:
         """Packed bits of `moving` for every sweep: points of objects that move, have stopped, or have yet to start."""
-        tracker, tables, bits, num_moving = Tracker(), [], [], 0
+        tracker = Tracker()
+        tables = []
+        bits = []
+        num_moving = 0
         for index in range(len(self.timestamps)):
-            moves = removed = self._moves(index)
+            removed = self._moves(index)
+            num_moving += int(removed.sum())
             if index < len(self.timestamps) - 1:
                 table, track_id = tracker.push(window(self._log, index), self._flow(index))
                 tables.append({**table, "sweep": np.full(len(table["id"]), index)})
-                stopped = table["id"][table["is_confirmed"] & ~table["is_moving"]]
-                removed = moves | np.isin(track_id, stopped)
+                has_stopped = table["is_confirmed"] & ~table["is_moving"]
+                removed = removed | np.isin(track_id, table["id"][has_stopped])
             bits.append(np.packbits(removed))
-            num_moving += int(moves.sum())
-        tracks = confirmed(join_tables(tables))
-        first = np.unique(tracks["id"], return_index=True)[1]  # the first row of each track
-        first = first[np.hypot(tracks["vx"][first], tracks["vy"][first]) < _SLOW]
-        start = {name: values[first] for name, values in tracks.items()}
+        start = _slow_starts(confirmed(join_tables(tables)))
         for index in range(int(start["sweep"].max(initial=0))):
-            sweep = self._log.sweep(index)
-            distance = np.hypot(*(start[axis] - pose_of(sweep)[k, 3] for k, axis in enumerate("xy")))
-            waits = (start["sweep"] > index) & (distance < _MAX_DISTANCE)
-            centre, size = (
-                torch.from_numpy(np.stack([start[name][waits] for name in names], 1))
-                for names in ("xyz", ("length", "width", "height"))
-            )
-            bits[index] |= np.packbits(_inside(sweep, centre, size, torch.from_numpy(start["heading"][waits])))
+            bits[index] |= np.packbits(self._waits(index, start))
         self.num_stopped = sum(int(np.unpackbits(each).sum()) for each in bits) - num_moving
         return bits
+
+    def _waits(self, index: int, start: dict[str, np.ndarray]) -> np.ndarray:
+        """(N,) bool, points of a sweep in the boxes where objects near the vehicle start later."""
+        sweep = self._log.sweep(index)
+        x, y = pose_of(sweep)[:2, 3]
+        is_near = np.hypot(start["x"] - x, start["y"] - y) < _MAX_DISTANCE
+        waiting = {name: values[is_near & (start["sweep"] > index)] for name, values in start.items()}
+        centre = np.stack([waiting[name] for name in "xyz"], 1)
+        size = np.stack([waiting[name] for name in ("length", "width", "height")], 1)
+        return _inside(sweep, *map(torch.from_numpy, (centre, size, waiting["heading"])))
+
+
+def _slow_starts(tracks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the first row of each track that is slow there."""
+    first = np.unique(tracks["id"], return_index=True)[1]
+    is_slow = np.hypot(tracks["vx"][first], tracks["vy"][first]) < _SLOW
+    return {name: values[first[is_slow]] for name, values in tracks.items()}
 
 
 def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:

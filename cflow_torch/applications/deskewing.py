@@ -35,7 +35,8 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
         >>> result = VerifiedFlow.from_preset("default")([window])[0]
         >>> points = deskew(window, result)
     """
-    before, after = window.pc0, window.pc1
+    before = window.pc0
+    after = window.pc1
     if before.point_times is None:
         raise CFlowError("the sweep has no times of points: give Sweep(points, point_times=...)")
     if result.residual_flow is None or len(result.residual_flow) != len(before.points):

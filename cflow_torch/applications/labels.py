@@ -95,7 +95,8 @@ def find_labels(
     groups: list[np.ndarray] = []
     neighbours = [*range(1, len(log)), len(log) - 2]  # index of the sweep to which the flow of each sweep leads
     for index, result in enumerate(_with_last(log, flows, model)):
-        sweep, other = log.sweep(index), log.sweep(neighbours[index])
+        sweep = log.sweep(index)
+        other = log.sweep(neighbours[index])
         if result.confidence is None or len(result.cluster_id) != len(sweep.points):
             raise CFlowError(
                 f"flow {index} of log {log.log_id} has no confidence, or rows of another sweep: labels need the flow "
@@ -150,7 +151,8 @@ def _with_last(log: Log, flows: Iterable[FlowResult], model: FlowModel) -> Itera
 
 
 def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult) -> DynamicPoints:
-    residual, group = as_numpy(result.residual_flow, np.float64), as_numpy(result.cluster_id)
+    residual = as_numpy(result.residual_flow, np.float64)
+    group = as_numpy(result.cluster_id)
     rows = np.flatnonzero((np.linalg.norm(residual, axis=1) >= MOVING) & (group >= 0))
     interval = _seconds(other) - _seconds(sweep)  # negative where the flow leads to the sweep before
     velocity = residual[rows] @ pose_of(other)[:3, :3].T / interval
@@ -198,7 +200,8 @@ def _has_moved_by_nearest(tree: Callable[..., Any], sweep: Sweep, other: Sweep, 
     """(N,) uint8 `nnd`; 0 for points that are not finite."""
     points = transform_points(as_numpy(sweep.points)[:, :3], np.linalg.inv(pose_of(other)) @ pose_of(sweep))
     others = as_numpy(other.points)[:, :3].astype(np.float64)
-    is_finite, nnd = np.isfinite(points).all(axis=1), np.zeros(len(points), np.uint8)
+    is_finite = np.isfinite(points).all(axis=1)
+    nnd = np.zeros(len(points), np.uint8)
     nearest = tree(others[np.isfinite(others).all(axis=1)])
     distance, _ = nearest.query(points[is_finite], distance_upper_bound=_NND[1], workers=workers)
     nnd[is_finite] = (distance >= _NND[0]) & (distance < _NND[1])

@@ -38,7 +38,8 @@ class MovingGroups:
             )
         row = (result.is_valid & points.isfinite().all(1)).nonzero()[:, 0]
         pose0, pose1 = (torch.tensor(pose_of(sweep), device=flow.device) for sweep in (sweeps.pc0, sweeps.pc1))
-        point, step = points[row] @ pose0[:3, :3].T + pose0[:3, 3], flow[row] @ pose1[:3, :3].T
+        point = points[row] @ pose0[:3, :3].T + pose0[:3, 3]
+        step = flow[row] @ pose1[:3, :3].T
         cluster_of_point = result.cluster_id[row]
         is_moving = (cluster_of_point >= 0) & (step.norm(dim=1) >= MOVING)
         cluster, index, count = torch.unique(cluster_of_point[is_moving], return_inverse=True, return_counts=True)

@@ -71,8 +71,10 @@ class FlowStream:
         config = (config or make_config(preset)).replace(**overrides)
         if config.num_future > 0:
             raise CFlowError(f"num_future={config.num_future}: a stream does not know later sweeps; give num_future=0")
-        self.config, self._model = config, make_model(config, device)
-        self._ground, self._max_gap = ground, max_gap
+        self.config = config
+        self._model = make_model(config, device)
+        self._ground = ground
+        self._max_gap = max_gap
         self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
         self._odometry: Odometry | None = None
         self.window: Window | None = None
@@ -126,8 +128,10 @@ class FlowStream:
             (result,) = self._model([window])
             self.window = window
         else:  # check it now, so that errors do not wait for the next sweep
-            alone, grid = replace(sweep, timestamp_ns=None), self._model.grid(self.config.pixel_sizes[-1])
-            windows, device = [Window(alone, alone)], torch.as_tensor(sweep.points).device
+            alone = replace(sweep, timestamp_ns=None)
+            grid = self._model.grid(self.config.pixel_sizes[-1])
+            windows = [Window(alone, alone)]
+            device = torch.as_tensor(sweep.points).device
             make_batch(windows, self.config, grid, device, needs_times=True)
         self._sweeps.appendleft(sweep)
         return result
@@ -156,7 +160,9 @@ class FlowStream:
                     raise CFlowError(f"some sweeps of the stream have no {name}: give it for all sweeps, or for none")
         device = choose_device([Window(sweep, sweep)], self._model.device)
         points = read_positions([sweep], device).t()
-        is_ground, pose, times = sweep.is_ground, sweep.pose, sweep.point_times
+        is_ground = sweep.is_ground
+        pose = sweep.pose
+        times = sweep.point_times
         if is_ground is not None:
             is_ground = read_ground([sweep], device)
         elif self._ground is not None:

@@ -107,7 +107,8 @@ class Tracks(NamedTuple):
         If `evidence` is high, both ends of the box must have moved at least a little: a piece of a wall may have flow,
         but its box then grows, shrinks or jumps. Otherwise, the box must have moved far, and very nearly as predicted.
         """
-        predicted, length = self.travel.norm(dim=1), self.size[:, 0]
+        predicted = self.travel.norm(dim=1)
+        length = self.size[:, 0]
         moved = self.box - self.start
         centre = (moved * self.travel).sum(1) / predicted.clamp(min=1e-9)
         slower_end = centre - (length - self.start_length).abs() / 2

@@ -84,7 +84,8 @@ def write_kitti(path: PathLike, table: Table, log: Log) -> None:
     ahead = np.einsum("nij,nj->ni", T_ego_world[:, :2, :2], direction)
     x, y, z = -centre[:, 1], table["height"] / 2 - centre[:, 2], centre[:, 0]
     rotation = _wrapped(-np.arctan2(ahead[:, 1], ahead[:, 0]) - np.pi / 2)
-    alpha, score = _wrapped(rotation - np.arctan2(x, z)), np.nan_to_num(table["confidence"], nan=1.0)
+    alpha = _wrapped(rotation - np.arctan2(x, z))
+    score = np.nan_to_num(table["confidence"], nan=1.0)
     columns = (table["sweep"], table["id"], alpha, table["height"], table["width"], table["length"])
     form = "%d %d Misc -1 -1 %.6f -1 -1 -1 -1" + 8 * " %.6f"
     _write_lines(path, form, *columns, x, y, z, rotation, score)

@@ -34,6 +34,31 @@ class Tracked(NamedTuple):
     track_id: np.ndarray
 
 
+class _Times(NamedTuple):
+    """Times of a pair of sweeps, seconds."""
+
+    now: float  # time of t
+    interval: float  # from t to t+1
+    elapsed: float  # from the last sweep to t
+    late: float  # from the end of the last flow to t; more than 0 if a sweep is missing
+
+
+class _TrackPoints(NamedTuple):
+    """Points of tracks."""
+
+    position: Tensor  # (N, 3) float64, metres in the world
+    track: Tensor  # (N,) int64, index of each point's track
+
+    def followed_by(self, other: _TrackPoints) -> _TrackPoints:
+        """Append other points of the same tracks."""
+        return _TrackPoints(torch.cat([self.position, other.position]), torch.cat([self.track, other.track]))
+
+    def renumber(self, number: Tensor) -> _TrackPoints:
+        """Give the tracks other numbers, (K,) int64, and drop the points of those with -1."""
+        track = number[self.track]
+        return _TrackPoints(self.position[track >= 0], track[track >= 0])
+
+
 class Tracker:
     """Track moving objects sweep by sweep.
 
@@ -55,10 +80,11 @@ class Tracker:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds from one sweep to the next")
         self._interval = sweep_interval
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
-        self._num_sweeps, self._num_tracks = 0, 0
+        self._num_sweeps = 0
+        self._num_tracks = 0
         self._tracks = Tracks()
-        # Points of the tracks at their predicted positions in the next sweep, and the track of each point.
-        self._points, self._track_index = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64)
+        # Points of the tracks, at their predicted positions in the next sweep.
+        self._points = _TrackPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64))
 
     def push(self, sweeps: Window | tuple[Sweep, Sweep], result: FlowResult) -> Tracked:
         """Continue the tracks by one sweep.
@@ -77,77 +103,71 @@ class Tracker:
         sweeps = sweeps if isinstance(sweeps, Window) else Window(*sweeps)
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
-        now, interval, elapsed, late = self._times(sweeps)
+        times = self._times(sweeps)
         groups = MovingGroups.of(sweeps, result)
-        device = groups.point.device
-        tracks = self._tracks.map(lambda values: values.to(device))
-        points, track_index = self._points.to(device), self._track_index.to(device)
-        # The last flow has already moved boxes and points. If the sweep is late, their velocity moves them further.
-        points = points + late * tracks.velocity[track_index]
-        tracks = tracks._replace(box=tracks.box + late * tracks.velocity).predict(elapsed, _ACCELERATION)
+        tracks, points = self._predict(times, groups.point.device)
         groups = regroup(groups, tracks)
-        matches = match(tracks, points, track_index, groups)
+        matches = match(tracks, points.position, points.track, groups)
         flow = groups.mean(groups.step)
-        tracks, track_of_group = self._update(tracks, groups, flow, matches, now, interval)
-
-        moves = groups.group >= 0
-        track_of_point = torch.full_like(groups.group, -1)
-        track_of_point[moves] = track_of_group[groups.group[moves]]
-        track_of_point[~moves] = matches.track_of_static
+        tracks, track_of_group = self._update(tracks, groups, flow, matches, times)
+        track_of_point = _track_of_point(groups, matches, track_of_group)
         has_track = track_of_point >= 0
-        track_of_point = track_of_point[has_track]
-        track_id = torch.full((len(result.residual_flow),), -1, device=device)
-        track_id[groups.row[has_track]] = tracks.id[track_of_point]
+        track_id = torch.full((len(result.residual_flow),), -1, device=track_of_point.device)
+        track_id[groups.row[has_track]] = tracks.id[track_of_point[has_track]]
+        table = self._table(tracks, times.now, sweeps.pc0.timestamp_ns)
 
-        # Move everything to the next sweep: moving points by their own flow, all others by the velocity of their track.
-        step = tracks.velocity * interval
+        step = tracks.velocity * times.interval
         step[track_of_group] = flow
-        is_missing = tracks.missed[track_index] > 0
-        missing = points[is_missing] + step[track_index[is_missing]]
-        seen = groups.point[has_track]
-        seen = seen + torch.where(moves[has_track, None], groups.step[has_track], step[track_of_point])
-        table = self._table(tracks, now, sweeps.pc0.timestamp_ns)
-        track_index = torch.cat([track_index[is_missing], track_of_point])
-        points, tracks = torch.cat([missing, seen]), tracks._replace(box=tracks.box + step)
+        points = _missing_points(points, tracks, step).followed_by(_seen_points(groups, track_of_point, step))
         is_kept = tracks.missed <= _MAX_MISSED
-        track_index = torch.where(is_kept, is_kept.cumsum(0) - 1, -1)[track_index]
-        self._tracks = tracks.take(is_kept)
-        self._points, self._track_index = points[track_index >= 0], track_index[track_index >= 0]
+        self._tracks = tracks._replace(box=tracks.box + step).take(is_kept)
+        self._points = points.renumber(torch.where(is_kept, is_kept.cumsum(0) - 1, -1))
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
 
-    def _times(self, sweeps: Window) -> tuple[float, float, float, float]:
-        """Return the time of t, and three durations: t to t+1, last sweep to t, and end of the last flow to t; seconds.
-
-        The last duration is more than 0 if a sweep is missing.
-        """
-        begin, end = sweeps.pc0.timestamp_ns, sweeps.pc1.timestamp_ns
+    def _times(self, sweeps: Window) -> _Times:
+        """Return the times of the pair t, t+1, and note them for the next one."""
+        begin = sweeps.pc0.timestamp_ns
+        end = sweeps.pc1.timestamp_ns
         last, due = self._clock or (None, 0.0)
-        now, interval = due, self._interval
+        now = due
+        interval = self._interval
         if begin is not None and end is not None:
-            now, interval = begin * 1e-9, (end - begin) * 1e-9
+            now = begin * 1e-9
+            interval = (end - begin) * 1e-9
         self._clock = now, now + interval
         if last is None:
-            return now, interval, interval, 0.0
+            return _Times(now, interval, elapsed=interval, late=0.0)
         if now <= last:
             raise CFlowError(f"this sweep is {last - now:.3f} s before the last one: push sweeps in the order of time")
-        return now, interval, now - last, now - due
+        return _Times(now, interval, elapsed=now - last, late=now - due)
+
+    def _predict(self, times: _Times, device: torch.device) -> tuple[Tracks, _TrackPoints]:
+        """Move the tracks and their points to t.
+
+        The last flow has already moved boxes and points. If the sweep is late, their velocity moves them further.
+        """
+        tracks = self._tracks.map(lambda values: values.to(device))
+        position, track = (values.to(device) for values in self._points)
+        points = _TrackPoints(position + times.late * tracks.velocity[track], track)
+        tracks = tracks._replace(box=tracks.box + times.late * tracks.velocity)
+        return tracks.predict(times.elapsed, _ACCELERATION), points
 
     def _update(
-        self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, now: float, interval: float
+        self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: _Times
     ) -> tuple[Tracks, Tensor]:
         """Begin tracks for groups without a match, and update all tracks by the mean flow (G, 3) of each group.
 
         Returns the tracks, new ones last, and the (G,) int64 track of each group.
         """
         velocity = tracks.velocity[matches.track]
-        is_fast = velocity[:, :2].norm(dim=1) >= MOVING / interval
+        is_fast = velocity[:, :2].norm(dim=1) >= MOVING / times.interval
         heading = torch.atan2(flow[:, 1], flow[:, 0])
         track_heading = torch.atan2(velocity[:, 1], velocity[:, 0])
         heading[matches.group] = torch.where(is_fast, track_heading, heading[matches.group])
         moves = groups.group >= 0
         box, size = boxes(groups.point[moves], groups.group[moves], heading)
-        noise = box.new_tensor([_BOX_NOISE, _FLOW_NOISE / interval])
+        noise = box.new_tensor([_BOX_NOISE, _FLOW_NOISE / times.interval])
 
         is_new = torch.ones_like(groups.count, dtype=torch.bool)
         is_new[matches.group] = False
@@ -156,8 +176,8 @@ class Tracker:
         track_of_group[matches.group] = matches.track
         new = track_of_group[is_new]
         tracks = tracks.extend(len(new))
-        tracks.write(new, id=self._num_tracks + number[is_new], begin=now, covariance=torch.diag(noise**2))
-        tracks.write(new, position=box[is_new], velocity=flow[is_new] / interval)
+        tracks.write(new, id=self._num_tracks + number[is_new], begin=times.now, covariance=torch.diag(noise**2))
+        tracks.write(new, position=box[is_new], velocity=flow[is_new] / times.interval)
         tracks.write(new, start=box[is_new], start_length=size[is_new, 0])
         self._num_tracks += len(new)
 
@@ -175,9 +195,10 @@ class Tracker:
         tracks.is_confirmed.logical_or_(tracks.have_shown_motion())
         tracks.travel[track_of_group] += flow  # to the next sweep
 
-        measured, step = torch.cat([matches.track, stopped]), torch.zeros_like(tracks.box)
+        measured = torch.cat([matches.track, stopped])
+        step = torch.zeros_like(tracks.box)
         step[track_of_group] = flow
-        tracks.measure(measured, tracks.box[measured], step[measured] / interval, noise)
+        tracks.measure(measured, tracks.box[measured], step[measured] / times.interval, noise)
         return tracks, track_of_group
 
     def _table(self, tracks: Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:
@@ -199,6 +220,30 @@ class Tracker:
             "num_points": rows.num_points,
             "confidence": rows.confidence,
         }
+
+
+def _track_of_point(groups: MovingGroups, matches: Matches, track_of_group: Tensor) -> Tensor:
+    """Return the track of each point that moves or lies in the box of a stopped object, (P,) int64; -1 = none."""
+    moves = groups.group >= 0
+    track = torch.full_like(groups.group, -1)
+    track[moves] = track_of_group[groups.group[moves]]
+    track[~moves] = matches.track_of_static
+    return track
+
+
+def _missing_points(points: _TrackPoints, tracks: Tracks, step: Tensor) -> _TrackPoints:
+    """Move the points of tracks that are not seen by the steps of their tracks, (K, 3) metres."""
+    is_missing = tracks.missed[points.track] > 0
+    track = points.track[is_missing]
+    return _TrackPoints(points.position[is_missing] + step[track], track)
+
+
+def _seen_points(groups: MovingGroups, track_of_point: Tensor, step: Tensor) -> _TrackPoints:
+    """Move moving points by their own flow, and all others by the steps of their tracks, (K, 3) metres."""
+    has_track = track_of_point >= 0
+    track = track_of_point[has_track]
+    moves = groups.group[has_track, None] >= 0
+    return _TrackPoints(groups.point[has_track] + torch.where(moves, groups.step[has_track], step[track]), track)
 
 
 def track(
@@ -236,7 +281,9 @@ def track(
         model = make_model(make_config("default"))
         log = CachedLog(log, model.config.num_sweeps)
         results = enumerate(model([sweeps])[0] for sweeps in windows(log, model.config.num_history))
-    recent, tracker, tables = CachedLog(log, 2), Tracker(sweep_interval), []
+    recent = CachedLog(log, 2)
+    tracker = Tracker(sweep_interval)
+    tables = []
     for index, result in results:
         table = tracker.push(window(recent, index), result).table
         where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}

@@ -24,7 +24,7 @@ _REMOVED = {"standing": "use remove_stopped", "residual_axes": "leave it out"}
 _FROM_0, _FROM_1 = bounds(int, low=0), bounds(int, low=1)
 _ABOVE_0 = bounds(float, above=0, high=1e12)
 _ALLOWED = {
-    **dict.fromkeys(("first", "seed", "first_seed", "pair", "index", "retries"), _FROM_0),
+    **dict.fromkeys(("first", "seed", "first_seed", "pair", "index"), _FROM_0),
     **dict.fromkeys(("step", "count", "num_sweeps", "num_drives", "pairs", "repeats", "batches", "width"), _FROM_1),
     **dict.fromkeys(("workers", "batch"), bounds(int, low=1, high=100_000)),  # more is a typing error
     **dict.fromkeys(("voxel_size", "voxel", "max_flow", "frames_per_second", "timeout", "memory"), _ABOVE_0),

@@ -101,10 +101,10 @@ def compute(
         redo=cfg.overwrite,
     )
     claim = (output, identity, cfg.resume, cfg.overwrite, shard.count == 1)
-    units = shard.units(sources.logs)
+    parts = shard.parts(sources.logs)
     if cfg.dry_run:
         check_folder(*claim)
-        print(forecast(job, units))
+        print(forecast(job, parts))
         return
     flow = FlowRun(sources, job, shard)
     check(cfg, flow)
@@ -113,7 +113,7 @@ def compute(
     run.write_config(cfg, output)
     if name == "local" and workers == AUTO and layout.devices[0] == "cpu":
         least, count = frames_per_worker(config), 0
-        for _, _, todo in count_frames(job, units):
+        for _, _, todo in count_frames(job, parts):
             count += todo
             if count >= least * len(layout.devices):
                 break
@@ -172,9 +172,9 @@ def _write_tracks(kind: Any, flow: FlowRun, output: Path) -> Failures:
     """Write the tracks of each log of this shard. Skip logs with incomplete frames, in this or another shard."""
     failures: Failures = []
     stored = run.stored_flow(output, ())
-    for unit in tqdm(flow.shard.units(flow.sources.logs), desc="tracks", unit="log", disable=None):
-        with run.collect_failures(failures, source_name(unit.source)):
-            log = flow.sources.open(unit.source)
+    for part in tqdm(flow.shard.parts(flow.sources.logs), desc="tracks", unit="log", disable=None):
+        with run.collect_failures(failures, source_name(part.source)):
+            log = flow.sources.open(part.source)
             folder = output / log.log_id
             stamps = [int(stamp) for stamp in log.timestamps[:-1]]
             if not complete_frames(folder) >= set(stamps):

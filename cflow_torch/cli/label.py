@@ -64,7 +64,7 @@ def _label(cfg: DictConfig, flow: FlowRun, report: dict[str, Any]) -> Failures:
     waiting: list[str] = []
     model = run.make_model(cfg)
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
-    scenes = [unit.source for unit in flow.shard.units(flow.sources.logs)]
+    scenes = [part.source for part in flow.shard.parts(flow.sources.logs)]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = as_path(flow.job.output) / scene.stem
         with run.collect_failures(failures, scene.stem):

@@ -6,17 +6,19 @@ Threads would not help: a window is thousands of small operations, and only one 
 from __future__ import annotations
 
 import os
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from queue import SimpleQueue
 from typing import Any, Callable, Iterator, Sequence, Tuple
 
 import torch
 
 from cflow_torch.cli.run import Failures, collect_failures
+from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
+from cflow_torch.fleet.executors import ProcessExecutor, describe
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
-from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
 from cflow_torch.fleet.work import run_ahead
 from cflow_torch.model import SceneFlowModel
@@ -48,67 +50,87 @@ def for_each_pair(
 def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, Answer]]:
     """Yield each pair and a function that returns its window and flow, or raises the error of that pair."""
     method: Any = model.model
-    config, recent = method.config, None
+    devices = choose_layout(method.device, AUTO, AUTO, os.environ).devices
+    count = min(len(devices), len(pairs) // frames_per_worker(method.config)) if devices[0] == "cpu" else 1
+    windows = _windows(pairs, method.config)
+    if count < 2:
+        yield from zip(Progress(pairs), (partial(_estimate, model, sweeps) for sweeps in windows))
+        return
+    # At the end, the processes are closed before we wait for the threads, which wait for the processes.
+    with ThreadPoolExecutor(count) as threads, closing(_Processes(model, count)) as processes, closing(
+        run_ahead(threads, processes.estimate, windows, _AHEAD * count)
+    ) as futures:
+        yield from zip(Progress(pairs), (future.result for future in futures))
 
-    def read(log: Log, index: int) -> Window:
-        nonlocal recent  # the log of the last pair
+
+def _windows(pairs: Sequence[Pair], config: Config) -> Iterator[Window | Exception]:
+    """Read the window of each pair. An error is yielded, so that the next windows follow."""
+    recent: CachedLog | None = None  # the log of the last pair
+    for log, index in pairs:
         if recent is None or recent.log is not log:
             recent = CachedLog(log, config.num_sweeps)
-        return window(recent, index, config.num_history, config.num_future)
-
-    devices = choose_layout(method.device, AUTO, AUTO, os.environ).devices
-    count = min(len(devices), len(pairs) // frames_per_worker(config)) if devices[0] == "cpu" else 1
-    if count < 2:
-        for pair in Progress(pairs):
-            yield pair, lambda pair=pair: _estimate(model, read(*pair))  # type: ignore[misc]
-        return
-    processes = [ChildProcess(_make_estimate, method) for _ in range(count)]
-    idle: SimpleQueue[ChildProcess] = SimpleQueue()
-    for process in processes:
-        idle.put(process)
-
-    def try_to_read(pair: Pair) -> Window | Exception:
         try:
-            return read(*pair)
+            yield window(recent, index, config.num_history, config.num_future)
         except (CFlowError, OSError) as error:
-            return error
-
-    def compute(sweeps: Window | Exception) -> tuple[Window, FlowResult]:
-        if isinstance(sweeps, Exception):
-            raise sweeps
-        process = idle.get()
-        try:
-            ((arrays, seconds),) = process.call(sweeps)
-        except WorkerDied as death:
-            raise CFlowError(f"a worker process died on it {death}") from None
-        finally:
-            idle.put(process)
-        model.pairs.append(seconds)
-        return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
-
-    with ThreadPoolExecutor(count) as threads:
-        try:
-            with closing(run_ahead(threads, compute, map(try_to_read, pairs), _AHEAD * count)) as futures:
-                for pair, future in zip(Progress(pairs), futures):
-                    yield pair, future.result
-        finally:
-            for process in processes:
-                process.close()
+            yield error
 
 
-def _estimate(model: TimedModel, sweeps: Window) -> tuple[Window, FlowResult]:
+def _estimate(model: TimedModel, sweeps: Window | Exception) -> tuple[Window, FlowResult]:
+    if isinstance(sweeps, Exception):
+        raise sweeps
     with inactive_is_an_error():
         return sweeps, model([sweeps])[0]
 
 
-def _make_estimate(method: SceneFlowModel) -> Callable[..., Iterator[tuple[dict[str, Any], Any]]]:
-    """Make the function that a worker process calls: window -> arrays and seconds."""
-    torch.set_num_threads(1)
-    show_warnings_as_lines()
-    model = TimedModel(method)
+class _Processes:
+    """Worker processes for the threads that call `estimate`: each takes one that is idle."""
 
-    def estimate(sweeps: Window, stop: Callable[[], bool]) -> Iterator[tuple[dict[str, Any], Any]]:
-        _, result = _estimate(model, sweeps)
-        yield result.numpy(), model.pairs.pop()  # tensors would take shared memory, of which containers have little
+    def __init__(self, model: TimedModel, count: int) -> None:
+        self._model, self._is_closed = model, False
+        self._executors = [ProcessExecutor(_Estimator, model.model) for _ in range(count)]
+        self._idle: SimpleQueue[ProcessExecutor] = SimpleQueue()
+        for executor in self._executors:
+            self._idle.put(executor)
 
-    return estimate
+    def estimate(self, sweeps: Window | Exception) -> tuple[Window, FlowResult]:
+        if isinstance(sweeps, Exception):
+            raise sweeps
+        executor = self._idle.get()
+        try:
+            arrays, seconds = self._call(executor, sweeps)
+        finally:
+            self._idle.put(executor)
+        self._model.pairs.append(seconds)
+        return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+    def _call(self, executor: ProcessExecutor, sweeps: Window) -> Any:
+        """Estimate in a process. If it ends, try once more in a new one."""
+        how = ""
+        for _ in range(2):
+            try:
+                return executor.submit("estimate", sweeps).result()
+            except BrokenExecutor as error:
+                how = describe(error)
+                executor.close()
+            if self._is_closed:
+                break
+        raise CFlowError(f"2 worker processes died on it, the last one: {how}")
+
+    def close(self) -> None:
+        self._is_closed = True
+        for executor in self._executors:
+            executor.close()
+
+
+class _Estimator:
+    """The model of a worker process."""
+
+    def __init__(self, method: SceneFlowModel) -> None:
+        torch.set_num_threads(1)
+        show_warnings_as_lines()
+        self._model = TimedModel(method)
+
+    def estimate(self, sweeps: Window) -> tuple[dict[str, Any], Any]:
+        """Return arrays, because tensors would take shared memory, of which containers have little; and seconds."""
+        _, result = _estimate(self._model, sweeps)
+        return result.numpy(), self._model.pairs.pop()

@@ -78,24 +78,29 @@ class AevaScenesLog(BoxLog):
         self.log_id = self.folder.resolve().name
         if clouds not in _PATHS:
             raise CFlowError(f"clouds={clouds!r}: choose one of {', '.join(_PATHS)}")
-        self._clouds, self._ground = clouds, ground
+        self._clouds = clouds
+        self._ground = ground
         self.is_compensated = clouds != "raw"
         self._clouds_of = lru_cache(1)(self._open_clouds)  # we read several arrays of the same clouds
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _HINT):
             content = read_json(self._file)
-            mounts, known = content["metadata"]["vehicle_to_lidar_extrinsics"], content["metadata"]["sensors"]["lidars"]
-            self.lidars: Sequence[str] = tuple(known if lidars is None else lidars)
-            if not self.lidars or not set(self.lidars) <= set(known):
-                wanted = shortened(list(self.lidars))
-                raise CFlowError(f"{self._file} has the LiDARs {shortened(known)}, you asked for {wanted}")
+            self.lidars: Sequence[str] = self._choose(lidars, content["metadata"]["sensors"]["lidars"])
             by_time: dict[int, dict[str, Any]] = {frame["timestamp_ns"]: frame for frame in content["frames"]}
             self.timestamps = sorted(by_time)
             self._check_count(self._file)
             self._frames = [by_time[time] for time in self.timestamps]
+            mounts = content["metadata"]["vehicle_to_lidar_extrinsics"]
             self._mounts = self._poses_of([mounts[name] for name in self.lidars], "extrinsics")
             self._poses = self._poses_of([frame["ego_pose"] for frame in self._frames], "ego poses")
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
+
+    def _choose(self, lidars: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
+        """Return the LiDARs to read; None = all that the sequence has."""
+        chosen = tuple(known if lidars is None else lidars)
+        if not chosen or not set(chosen) <= set(known):
+            raise CFlowError(f"{self._file} has the LiDARs {shortened(known)}, you asked for {shortened(list(chosen))}")
+        return chosen
 
     @property
     def poses(self) -> np.ndarray:

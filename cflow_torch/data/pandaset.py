@@ -91,23 +91,34 @@ class PandaSetLog(Log):
             if not all(file.exists() for file in files):
                 return None
         points, _, lidars = self._cloud(index)
-        cuboids = [_columns(file, ("uuid", "label", "yaw", "cuboids.sensor_id", *_POSITION, *_SIZE)) for file in files]
+        labels = FlowLabels(
+            flow=np.zeros((len(points), 3), np.float32),
+            category=np.zeros(len(points), np.uint8),
+            is_valid=np.zeros(len(points), bool),
+        )
+        names = ("uuid", "label", "yaw", "cuboids.sensor_id", *_POSITION, *_SIZE)
+        cuboids = [_columns(file, names) for file in files]
         T_ego1_ego0 = np.linalg.inv(self._poses[index + 1]) @ self._poses[index]
-        flow = np.zeros((len(points), 3), np.float32)
-        category: np.ndarray = np.zeros(len(points), np.uint8)
-        is_valid = np.zeros(len(points), bool)
         for lidar in _LIDARS:
             rows = np.flatnonzero(lidars == lidar)
             boxes0, boxes1 = (self._boxes(cuboids[k], files[k], index + k, lidar) for k in (0, 1))
-            found = flow_from_boxes(points[rows], boxes0, boxes1, T_ego1_ego0)
-            flow[rows], category[rows], is_valid[rows] = found.flow, found.category, found.is_valid
-        classes = self._classes(index, len(points))
-        if classes is not None:
-            names, class_of_point = classes
-            index_of = [CATEGORY_INDEX[CATEGORY_NAME.get(name, "NONE")] for name in names]
-            in_cuboid, category = category > 0, np.array(index_of, np.uint8)[class_of_point]
-            is_valid &= (in_cuboid == (category > 0)) & ~np.isin(names, _WITHOUT_FLOW)[class_of_point]
-        return FlowLabels(flow, category, is_valid)
+            of_lidar = flow_from_boxes(points[rows], boxes0, boxes1, T_ego1_ego0)
+            labels.flow[rows] = of_lidar.flow
+            labels.category[rows] = of_lidar.category
+            labels.is_valid[rows] = of_lidar.is_valid
+        return self._with_classes(index, labels)
+
+    def _with_classes(self, index: int, labels: FlowLabels) -> FlowLabels:
+        """Take the categories from the classes of points, if there are any; see the class for which are valid."""
+        classes = self._classes(index, len(labels.flow))
+        if classes is None:
+            return labels
+        names, class_of_point = classes
+        index_of_class = np.array([CATEGORY_INDEX[CATEGORY_NAME.get(name, "NONE")] for name in names], np.uint8)
+        category = index_of_class[class_of_point]
+        agrees = (labels.category > 0) == (category > 0)
+        is_valid = labels.is_valid & agrees & ~np.isin(names, _WITHOUT_FLOW)[class_of_point]
+        return FlowLabels(labels.flow, category, is_valid)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read i (intensity), t (unix time in seconds) and d (index of the LiDAR) of the points of sweep `index`."""

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import DenseConfig
-from cflow_torch.dense.clustering import Clusters, Pixels
+from cflow_torch.dense.clustering import Clusters, Pixels, bounding_boxes
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.errors import import_optional
-from cflow_torch.ops.indices import draw, flat_nonzero, renumber, split_index
-from cflow_torch.ops.segments import bounding_boxes, segment_amin
+from cflow_torch.ops.groups import FAR, Groups
+from cflow_torch.ops.indices import flat_nonzero, split_index
+from cflow_torch.windows.bev_grid import LONGEST_SIDE
 
 
 def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[Clusters, Tensor, Tensor]:
@@ -27,58 +28,70 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
 
     Cost: N log N in points, on the CPU, window by window; seconds for a full pair of sweeps.
     """
-    num_steps = sweeps.batch.num_steps
-    label, num_labels = _label_points(sweeps, config.min_cluster_size)
-    pixels = _occupied_pixels(sweeps, label)
-    # Labels ascend with the window.
-    area = sweeps.grid.height * sweeps.grid.width
-    window_and_pixel = pixels.image // num_steps * area + pixels.raster
-    first = segment_amin(window_and_pixel, pixels.label, num_labels, sweeps.occupancy.numel())
-    step = pixels.image % num_steps
-    kept = flat_nonzero(draw(pixels.label[step == 0], num_labels) & draw(pixels.label[step > 0], num_labels))
-    kept = kept[first[kept].argsort(stable=True)]
-    cluster_of_label = renumber(kept, num_labels)
+    labels = _label_points(sweeps, config.min_cluster_size)
+    pixels = _occupied_pixels(sweeps, labels)
+    kept = _linked(pixels)
+    clusters = pixels.labels.select(kept)
+    top_left, size = bounding_boxes(clusters, pixels.row, pixels.col)
+    is_kept = clusters.is_member
+    result = Clusters(
+        window=pixels.window[clusters.first()],
+        first=top_left,
+        size=size,
+        pixels=Pixels(
+            cluster=clusters.of_item[is_kept],
+            step=pixels.step[is_kept],
+            row=pixels.row[is_kept],
+            col=pixels.col[is_kept],
+        ),
+    )
+    return result, labels.select(kept).of_item, torch.arange(len(sweeps.pixel), device=sweeps.pixel.device)
 
-    cluster = cluster_of_label[pixels.label]
-    is_kept = cluster < len(kept)
-    row, col = split_index(pixels.raster[is_kept], sweeps.grid.width)
-    members = Pixels(cluster=cluster[is_kept], step=step[is_kept], row=row, col=col)
-    top_left, size = bounding_boxes(row, col, members.cluster, len(kept))
-    clusters = Clusters(window=first[kept] // area, first=top_left, size=size, pixels=members)
-    return clusters, cluster_of_label[label], torch.arange(len(label), device=label.device)
 
-
-def _label_points(sweeps: ProjectedSweeps, min_cluster_size: int) -> tuple[Tensor, int]:
-    """Cluster the points window by window: label of each point, (P,) int64, -1 = noise, and the number of labels."""
-    batch = sweeps.batch
+def _label_points(sweeps: ProjectedSweeps, min_cluster_size: int) -> Groups:
+    """Cluster the points window by window: P points, noise in no group. Labels ascend with the window."""
     positions = sweeps.positions()
-    window = batch.image // batch.num_steps
+    window = sweeps.batch.image // sweeps.batch.num_steps
     is_inside = sweeps.pixel < sweeps.occupancy.numel()
     label = torch.full_like(sweeps.pixel, -1)
     num_labels = 0
-    for index in range(batch.num_windows):
+    for index in range(sweeps.batch.num_windows):
         points = flat_nonzero(is_inside & (window == index))
-        found = torch.from_numpy(_labels(positions[:, points].t().cpu().numpy(), min_cluster_size))
-        label[points] = torch.where(found >= 0, found + num_labels, found).to(label.device)
-        num_labels += int(found.max()) + 1 if len(found) else 0
-    return label, num_labels
+        of_window = torch.from_numpy(_labels(positions[:, points].t().cpu().numpy(), min_cluster_size))
+        label[points] = torch.where(of_window >= 0, of_window + num_labels, -1).to(label.device)
+        num_labels += int(of_window.max()) + 1 if len(of_window) else 0
+    return Groups(label, num_labels).where(label >= 0)
 
 
 class _LabelledPixels(NamedTuple):
-    """Occupied pixels, each once per label and sweep, in order of label, image and raster; (Q,) int64 each."""
+    """Occupied pixels, each once per label and sweep, in order of label, sweep and raster."""
 
-    label: Tensor
-    image: Tensor  # window * num_steps + step
-    raster: Tensor  # row * W + column
+    labels: Groups  # of Q pixels
+    window: Tensor  # (Q,) int64
+    step: Tensor  # (Q,) int64
+    row: Tensor  # (Q,) int64
+    col: Tensor  # (Q,) int64
 
 
-def _occupied_pixels(sweeps: ProjectedSweeps, label: Tensor) -> _LabelledPixels:
-    """Return the pixels of the labelled points; `label` is (P,) int64, -1 = none."""
-    member = flat_nonzero(label >= 0)
+def _occupied_pixels(sweeps: ProjectedSweeps, labels: Groups) -> _LabelledPixels:
+    """Return the pixels of the labelled points."""
+    members = flat_nonzero(labels.is_member)
     num_cells = sweeps.occupancy.numel()
-    label_and_cell = torch.unique(label[member] * num_cells + sweeps.pixel[member])
-    label_of_pixel, cell = split_index(label_and_cell, num_cells)
-    return _LabelledPixels(label_of_pixel, *split_index(cell, sweeps.grid.height * sweeps.grid.width))
+    label_and_cell = torch.unique(labels.of_item[members] * num_cells + sweeps.pixel[members])
+    label, cell = split_index(label_and_cell, num_cells)
+    image_row, col = split_index(cell, sweeps.grid.width)
+    image, row = split_index(image_row, sweeps.grid.height)
+    window, step = split_index(image, sweeps.batch.num_steps)
+    return _LabelledPixels(Groups(label, labels.count), window, step, row, col)
+
+
+def _linked(pixels: _LabelledPixels) -> Tensor:
+    """Return the labels with pixels at t+1 and before, (M,) int64, in order of window, then of first pixel."""
+    is_newest = pixels.step == 0
+    linked = flat_nonzero(pixels.labels.any(is_newest) & pixels.labels.any(~is_newest))
+    raster = (pixels.window * LONGEST_SIDE + pixels.row) * LONGEST_SIDE + pixels.col
+    first = pixels.labels.min(raster, empty=FAR)[linked]
+    return linked[first.argsort(stable=True)]
 
 
 def _labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,68 +25,91 @@ def add_sectional_view(
     of (f_x, f_y), or the x axis if both are zero. All X-Z images lie on one grid through the origin, and each is cut to
     the bounding box of its pair. Ties: smallest shift, then smallest dz, then smallest dx'.
     """
-    pixel_size = sweeps.grid.pixel_size
-    slots = flat_nonzero(estimates.available)  # [J], one pair per cluster and sweep
-    flow = estimates.displacement.view(-1, 3)[slots]
-    heading = _heading(flow)
-    pairs = _section_pairs(slots, flow, heading, estimates.available, cluster.long(), sweeps)
-    shift, _ = best_shifts(pairs, config.correlation, config.max_memory)
-    up, along = (shift.double() * pixel_size).unbind(1)
-    corrected = torch.stack((flow[:, 0] + along * heading[0], flow[:, 1] + along * heading[1], up), 1)
+    pairs = _Pairs.of(estimates)
+    members = _Members(
+        positions=sweeps.positions(), step=sweeps.batch.image % sweeps.batch.num_steps, cluster=cluster.long()
+    )
+    shift, _ = best_shifts(_draw_pairs(pairs, members, sweeps.grid.pixel_size), config.correlation, config.max_memory)
+    up, along = (shift.double() * sweeps.grid.pixel_size).unbind(1)
+    x = pairs.flow[:, 0] + along * pairs.heading[0]
+    y = pairs.flow[:, 1] + along * pairs.heading[1]
     displacement = estimates.displacement.clone()
-    displacement.view(-1, 3)[slots] = corrected
+    displacement.view(-1, 3)[pairs.slot] = torch.stack((x, y, up), 1)
     return replace(estimates, displacement=displacement)
+
+
+class _Pairs(NamedTuple):
+    """J pairs of a cluster and an earlier sweep in which it has pixels, in order of cluster, then of sweep."""
+
+    slot: Tensor  # (J,) int64, cluster * K + sweep of each pair
+    flow: Tensor  # (J, 3) float64, metres, from the sweep to t+1
+    heading: Tensor  # (2, J) float64
+    available: Tensor  # (M, K) bool, whether there is a pair
+
+    @classmethod
+    def of(cls, estimates: Estimates) -> _Pairs:
+        """Collect the pairs that have an estimate."""
+        slot = flat_nonzero(estimates.available)
+        flow = estimates.displacement.view(-1, 3)[slot]
+        return cls(slot, flow, _heading(flow), estimates.available)
+
+
+class _Members(NamedTuple):
+    """The points of the sweeps."""
+
+    positions: Tensor  # (3, P) float64, metres, frame of t+1
+    step: Tensor  # (P,) int, sweep of each point: 0 = t+1, 1 = t, ...
+    cluster: Tensor  # (P,) int64, cluster of each point, M = none
 
 
 def _heading(flow: Tensor) -> Tensor:
     """Return the unit vectors along x and y of the flow of J pairs, (2, J); the x axis where both are zero."""
-    x, y = flow[:, 0], flow[:, 1]
+    x = flow[:, 0]
+    y = flow[:, 1]
     length = torch.sqrt(x * x + y * y)
     is_moving = length > 0
-    divisor = torch.where(is_moving, length, torch.ones_like(length))
-    return torch.stack((torch.where(is_moving, x / divisor, torch.ones_like(x)), y / divisor))
+    one = torch.ones_like(length)
+    divisor = torch.where(is_moving, length, one)
+    return torch.stack((torch.where(is_moving, x / divisor, one), y / divisor))
 
 
-def _section_pairs(
-    slots: Tensor, flow: Tensor, heading: Tensor, available: Tensor, cluster: Tensor, sweeps: ProjectedSweeps
-) -> TemplatePairs:
-    """Draw the X-Z images of J pairs. Each rotates its own copy of the target by its own heading.
-
-    Args:
-        slots: (J,) int64, cluster * K + sweep of each pair, ascending.
-        flow, heading: (J, 3) and (2, J) float64.
-        available: (M, K) bool.
-        cluster: (P,) int64, cluster of each point, M = none.
-        sweeps: the points.
-    """
-    positions = sweeps.positions()
-    num_sources = available.shape[1]
-    step = sweeps.batch.image % sweeps.batch.num_steps
-    is_member = cluster < len(available)
-    older = flat_nonzero(is_member & (step > 0))
-    pair_of_slot = renumber(slots, available.numel())
-    template_pair = pair_of_slot[cluster[older] * num_sources + step[older] - 1]
-    template = positions[:, older].clone()
-    template[:2] += flow.t()[:2, template_pair]
-
-    newest = flat_nonzero(is_member & (step == 0))
-    copies = available.sum(1)[cluster[newest]]
-    target = positions[:, newest.repeat_interleave(copies)]
-    first_pair = torch.searchsorted(slots // num_sources, cluster[newest])
-    target_pair = concat_ranges(first_pair, copies)
-
-    pair = torch.cat((template_pair, target_pair))
-    row_col = _project(torch.cat((template, target), 1), heading[:, pair], sweeps.grid.pixel_size)
-    first, size = bounding_boxes(row_col[0], row_col[1], pair, len(slots))
+def _draw_pairs(pairs: _Pairs, members: _Members, pixel_size: float) -> TemplatePairs:
+    """Draw the X-Z images of J pairs. Each rotates its own copy of the target by its own heading."""
+    pair_of_template, template = _template_points(pairs, members)
+    pair_of_target, target = _target_points(pairs, members)
+    pair = torch.cat((pair_of_template, pair_of_target))
+    row_col = _project(torch.cat((template, target), 1), pairs.heading[:, pair], pixel_size)
+    first, size = bounding_boxes(row_col[0], row_col[1], pair, len(pairs.slot))
     row_col -= first[pair].t()
-    split = len(template_pair)
+    split = len(pair_of_template)
     return TemplatePairs(
-        template=_draw(template_pair, row_col[:, :split], size),
-        target=_draw(target_pair, row_col[:, split:], size),
-        cluster=torch.arange(len(slots), device=slots.device),
-        source=slots % num_sources,
+        template=_draw(pair_of_template, row_col[:, :split], size),
+        target=_draw(pair_of_target, row_col[:, split:], size),
+        cluster=torch.arange(len(pairs.slot), device=pair.device),
+        source=pairs.slot % pairs.available.shape[1],
         size=size,
     )
+
+
+def _template_points(pairs: _Pairs, members: _Members) -> tuple[Tensor, Tensor]:
+    """Return the pair, (K,) int64, and the position, (3, K), of the points of earlier sweeps, moved by their flow."""
+    num_clusters, num_sources = pairs.available.shape
+    points = flat_nonzero((members.cluster < num_clusters) & (members.step > 0))
+    slot = members.cluster[points] * num_sources + members.step[points] - 1
+    pair = renumber(pairs.slot, num_clusters * num_sources)[slot]
+    positions = members.positions[:, points].clone()
+    positions[:2] += pairs.flow.t()[:2, pair]
+    return pair, positions
+
+
+def _target_points(pairs: _Pairs, members: _Members) -> tuple[Tensor, Tensor]:
+    """Return the pair, (K,) int64, and the position, (3, K), of the points of t+1: a copy for each pair."""
+    num_clusters, num_sources = pairs.available.shape
+    points = flat_nonzero((members.cluster < num_clusters) & (members.step == 0))
+    cluster = members.cluster[points]
+    num_copies = pairs.available.sum(1)[cluster]
+    first_pair = torch.searchsorted(pairs.slot // num_sources, cluster)
+    return concat_ranges(first_pair, num_copies), members.positions[:, points.repeat_interleave(num_copies)]
 
 
 def _project(positions: Tensor, heading: Tensor, pixel_size: float) -> Tensor:

@@ -65,7 +65,8 @@ class BucketedByRange(Accumulator):
     def cells(self, scored: ScoredPoints) -> tuple[np.ndarray, Sequence[np.ndarray]]:
         """Return the cell (range, class, bucket) of each scored point, and its two quantities: error and speed."""
         ranges = interval_of(scored.reach, self.definition.region_edges, self.definition.closed)
-        meta, bucket = meta_class(scored.category), interval_of(scored.speed, self.definition.speed_edges)
+        meta = meta_class(scored.category)
+        bucket = interval_of(scored.speed, self.definition.speed_edges)
         if self.definition.background == "static":
             bucket = np.where(meta == META_NAMES.index("BACKGROUND"), 0, bucket)
         place = np.stack([ranges, meta, bucket])

@@ -73,7 +73,8 @@ class Definition:
 
     def __post_init__(self) -> None:
         for field, kind in get_type_hints(Definition).items():
-            value, choices = getattr(self, field), get_args(kind)
+            value = getattr(self, field)
+            choices = get_args(kind)
             if get_origin(kind) is Literal and value not in choices:
                 raise CFlowError(f"definition {self.name}: {field}={value!r}, give one of {choices}")
         if not set(self.metrics) <= set(METRICS):

@@ -65,7 +65,8 @@ class EvalFrame:
             )
         if self.residual_axes not in ("t", "t+1"):
             raise CFlowError(f"residual_axes={self.residual_axes!r}: give 't' or 't+1'")
-        points, labels = point_rows("points", self.points), self.labels
+        points = point_rows("points", self.points)
+        labels = self.labels
         rows = len(points)
         self._set("points", points.astype(np.float32))
         for name, dtype, shape in (
@@ -99,12 +100,14 @@ class EvalFrame:
                 prediction with OpenSceneFlow's rounding. None = motion of the window.
             **parts: further fields, for example `eval_mask`. They take precedence over those of the window.
         """
-        pose0, pose1 = window.pc0.pose, window.pc1.pose
+        pose0 = window.pc0.pose
+        pose1 = window.pc1.pose
         if pose0 is not None and pose1 is not None:
             parts.setdefault("T_ego1_ego0", np.linalg.inv(as_numpy(pose1, np.float64)) @ as_numpy(pose0, np.float64))
         parts.setdefault("is_ground", window.pc0.is_ground)
         if stored_motion is not None:
-            points, residual = torch.as_tensor(as_numpy(window.pc0.points)[:, :3]), result.residual_flow.cpu()
+            points = torch.as_tensor(as_numpy(window.pc0.points)[:, :3])
+            residual = result.residual_flow.cpu()
             if not stored_motion.of_points:
                 residual = residual_for_harness(residual, points, stored_motion.T_ego1_ego0, parts["T_ego1_ego0"])
             pose_flow = harness_pose_flow(points, stored_motion.T_ego1_ego0)

@@ -76,13 +76,12 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     evaluators, we add the pose flow to a predicted residual and subtract it again. We compute lengths in `norm_dtype`.
     Rows without a valid label have no effect.
     """
-    points, true_total = as_numpy(frame.points), frame.labels.flow
-    pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]
-    total = _predicted_total(frame)
     # Positions in the frame in which ranges are measured are float32 at t and float64 at t+1.
+    points = as_numpy(frame.points)
     position = points if definition.region_axes == "t" else transform_points(points, frame.transform())
     keep = _candidates(frame, definition, position)
-    has_nan = np.isnan(np.concatenate([total, pose_flow, points, true_total], axis=1)).any(axis=1)
+    flows = _Flows.of(frame)
+    has_nan = flows.has_nan()
     num_nan = int((keep & has_nan).sum())
     if num_nan and definition.nan_rows == "error":
         raise CFlowError(
@@ -90,38 +89,78 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
             f"does not allow: predict 0 for points without an estimate, or use nan_rows='drop'"
         )
     keep &= ~has_nan
-    points, pose_flow, total, true_total = (values[keep] for values in (points, pose_flow, total, true_total))
-    residual, true_residual = total - pose_flow, true_total - pose_flow
-    threshold = np.float32(definition.dynamic_threshold)
-    predicted_dynamic = np.linalg.norm(residual, axis=1) >= threshold
-    if definition.residual_axes == "t":
-        T = frame.transform()
-        residual, true_residual = _residual_at_t(points, total, T), _residual_at_t(points, true_total, T)
-        if frame.residual_flow is not None:  # a residual that the frame already has needs only a rotation
-            given = as_numpy(frame.residual_flow)[keep]
-            residual = given if frame.residual_axes == "t" else (given @ T[:3, :3]).astype(np.float32)
-    is_total = definition.three_way_flow == "total"
-    predicted_flow, true_flow = (total, true_total) if is_total else (residual, true_residual)
+    flows = flows.at(keep)
+    residual, true_residual = _residuals(frame, flows, keep, definition)
+    predicted_flow = residual
+    true_flow = true_residual
+    if definition.three_way_flow == "total":
+        predicted_flow = flows.total
+        true_flow = flows.true_total
     if definition.half_precision:
-        predicted_flow, true_flow = predicted_flow.astype(np.float16), true_flow.astype(np.float16)
-    is_box = definition.region == "box"
-    reach = np.abs(position[:, :2]).max(axis=1) if is_box else np.linalg.norm(position[:, :2], axis=1)
-    in_region = interval_of(reach, (0.0, definition.max_range), definition.closed) == 0
+        predicted_flow = predicted_flow.astype(np.float16)
+        true_flow = true_flow.astype(np.float16)
+    reach = _reach(position, definition)
+    threshold = np.float32(definition.dynamic_threshold)
     difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
     return ScoredPoints(
         error=np.linalg.norm(difference, axis=1).astype(np.float64),
         speed=np.linalg.norm(true_residual.astype(definition.norm_dtype), axis=1).astype(np.float64),
         category=frame.labels.category[keep],
-        in_region=in_region[keep],
+        in_region=(interval_of(reach, (0.0, definition.max_range), definition.closed) == 0)[keep],
         reach=reach[keep].astype(np.float64),
-        is_close=(np.abs(points[:, :2]) <= CLOSE_RANGE).all(axis=1),
-        distance=np.linalg.norm(points, axis=1).astype(np.float64),
+        is_close=(np.abs(flows.points[:, :2]) <= CLOSE_RANGE).all(axis=1),
+        distance=np.linalg.norm(flows.points, axis=1).astype(np.float64),
         true_flow=true_flow.astype(np.float64),
         predicted_flow=predicted_flow.astype(np.float64),
         is_dynamic=np.linalg.norm(true_residual, axis=1) >= threshold,
-        predicted_dynamic=predicted_dynamic,
+        predicted_dynamic=np.linalg.norm(flows.total - flows.pose_flow, axis=1) >= threshold,
         num_nan=num_nan,
     )
+
+
+class _Flows(NamedTuple):
+    """Positions and flow of the points of a frame, (N, 3) each; the flow has the axes of t+1."""
+
+    points: np.ndarray  # of t
+    pose_flow: np.ndarray
+    total: np.ndarray  # predicted
+    true_total: np.ndarray
+
+    @classmethod
+    def of(cls, frame: EvalFrame) -> _Flows:
+        """Read all rows of a frame."""
+        pose_flow = as_numpy(frame.pose_flow)  # type: ignore[arg-type]
+        return cls(as_numpy(frame.points), pose_flow, _predicted_total(frame), frame.labels.flow)
+
+    def has_nan(self) -> np.ndarray:
+        """(N,) bool, whether each row has NaN."""
+        return np.isnan(np.concatenate(self, axis=1)).any(axis=1)
+
+    def at(self, keep: np.ndarray) -> _Flows:
+        """Select rows, (N,) bool."""
+        return _Flows(*(values[keep] for values in self))
+
+
+def _residuals(
+    frame: EvalFrame, flows: _Flows, keep: np.ndarray, definition: Definition
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the predicted and the true residual flow of the scored points, (M, 3) float32 each."""
+    if definition.residual_axes != "t":
+        return flows.total - flows.pose_flow, flows.true_total - flows.pose_flow
+    T = frame.transform()
+    true_residual = _residual_at_t(flows.points, flows.true_total, T)
+    if frame.residual_flow is None:
+        return _residual_at_t(flows.points, flows.total, T), true_residual
+    # A residual that the frame already has needs only a rotation.
+    stored = as_numpy(frame.residual_flow)[keep]
+    return stored if frame.residual_axes == "t" else (stored @ T[:3, :3]).astype(np.float32), true_residual
+
+
+def _reach(position: np.ndarray, definition: Definition) -> np.ndarray:
+    """Return the distance by which regions are measured, (N,) metres, of (N, 3) positions."""
+    if definition.region == "box":
+        return np.abs(position[:, :2]).max(axis=1)
+    return np.linalg.norm(position[:, :2], axis=1)
 
 
 def _predicted_total(frame: EvalFrame) -> np.ndarray:
@@ -137,7 +176,8 @@ def _predicted_total(frame: EvalFrame) -> np.ndarray:
 def _residual_at_t(points: np.ndarray, total: np.ndarray, T_ego1_ego0: np.ndarray) -> np.ndarray:
     """Return the (M, 3) float32 residual in the axes of t: end point in coordinates of t, minus the start point."""
     start = points.astype(np.float64)
-    rotation, translation = T_ego1_ego0[:3, :3], T_ego1_ego0[:3, 3]
+    rotation = T_ego1_ego0[:3, :3]
+    translation = T_ego1_ego0[:3, 3]
     return ((start + total - translation) @ rotation - start).astype(np.float32)
 
 

@@ -60,7 +60,8 @@ class ThreeWayEPE(Accumulator):
 
         These are `QUANTITIES`, then 1 if the point is predicted as dynamic, else 0.
         """
-        keep, meta = scored.in_region, meta_class(scored.category)
+        keep = scored.in_region
+        meta = meta_class(scored.category)
         if self.definition.foreground == "meta":
             keep = keep & (meta >= 0)
         cell = 4 * scored.category[keep] + 2 * scored.is_dynamic[keep] + ~scored.is_close[keep]
@@ -92,7 +93,8 @@ class ThreeWayEPE(Accumulator):
 
     def _group(self, categories: Any) -> dict[str, dict[str, dict[str, float]]]:
         """Compute motion -> distance -> means over a group of categories."""
-        count, sums = self.count[categories].sum(axis=0), self.sums[:, categories].sum(axis=1)
+        count = self.count[categories].sum(axis=0)
+        sums = self.sums[:, categories].sum(axis=1)
         columns: dict[str, Any] = {"all": slice(None), **{name: [column] for column, name in enumerate(DISTANCES)}}
         return {
             motion: {
@@ -105,7 +107,8 @@ class ThreeWayEPE(Accumulator):
 
 def _values(count: np.ndarray, sums: np.ndarray, count_eps: float = 0.0, iou_eps: float = 0.0) -> np.ndarray:
     """Return (4,) float64: the mean error of each of `_SETS`, and the IoU of true and predicted dynamic points."""
-    predicted, true = sums[-1], count[:, 1].sum()
+    predicted = sums[-1]
+    true = count[:, 1].sum()
     with np.errstate(divide="ignore", invalid="ignore"):
         means = [sums[0][cells].sum() / (count[cells].sum() + count_eps) for cells in _SETS.values()]
         return np.array([*means, predicted[:, 1].sum() / (true + predicted[:, 0].sum() + iou_eps)])

@@ -1,10 +1,8 @@
-"""A run, the share of this process, the units of work, and the events that workers report."""
+"""A run, the share of this process, the parts of logs, and the events that workers report."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any, Mapping, NamedTuple, Sequence, Union
 
 from cflow_torch.config import Config
@@ -12,14 +10,14 @@ from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.fleet.machine import AUTO
 from cflow_torch.types import CFlowError
 
-# Units per worker, so that the last unit does not keep the other workers waiting for long. A log is divided only if
-# there are too few logs, because each piece reads num_history + 1 sweeps that its neighbour reads as well.
-_UNITS_PER_WORKER = 2
+# So that the last part does not keep the other workers waiting for long. A log is divided only if there are too few
+# logs, because each part reads num_history + 1 sweeps that its neighbour reads as well.
+_PARTS_PER_WORKER = 2
 
 
 @dataclass(frozen=True)
 class Job:
-    """The settings of a run, which every worker gets. The units of work are sent separately."""
+    """The settings of a run, which every worker gets. The parts are sent separately."""
 
     config: Config  # settings of the method
     identity: str  # hash of method, data settings and versions, see `cflow_torch.fleet.manifest`
@@ -32,25 +30,26 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Unit:
+class Part:
     """Consecutive frames of one log: the work that a worker gets at once."""
 
-    number: int  # index among the units of a run
+    number: int  # index among the parts of a run
     source: Any  # its log, one of `catalog.find_sources`
-    first: Fraction = Fraction(0)  # share of the log's pairs before the first frame, 0 ... 1
-    last: Fraction = Fraction(1)  # share of the log's pairs before the end of the unit
-    only: frozenset[int] | None = None  # time stamps of the frames to do; None = all of them
-    deaths: int = 0  # number of workers that have died on it
+    begin: int = 0  # the frames lie between begin / of and end / of of the log
+    end: int = 1
+    of: int = 1
+    only: int | None = None  # time stamp of the only frame to do; None = all of them
+    attempt: int = 1
 
     def frames(self, num_pairs: int) -> range:
         """Indices of the sweeps t, in a log of `num_pairs` pairs."""
-        return range(int(self.first * num_pairs), int(self.last * num_pairs))
+        return range(self.begin * num_pairs // self.of, self.end * num_pairs // self.of)
 
 
 class Opened(NamedTuple):
-    """A unit has begun. `frames` are the time stamps of its frames, `todo` the time stamps of incomplete frames."""
+    """A part has begun. `frames` are the time stamps of its frames, `todo` the time stamps of incomplete frames."""
 
-    unit: int
+    part: int
     log_id: str
     frames: tuple[int, ...]
     todo: tuple[int, ...]
@@ -59,15 +58,15 @@ class Opened(NamedTuple):
 class Done(NamedTuple):
     """A frame is on disk. `seconds` by stage; "compute" is the time of its batch, divided by the number of frames."""
 
-    unit: int
+    part: int
     timestamp: int
     seconds: dict[str, float]
 
 
 class Failed(NamedTuple):
-    """A frame has no result. If `timestamp` is None, the unit or the rest of it has none."""
+    """A frame has no result. If `timestamp` is None, the part or the rest of it has none."""
 
-    unit: int
+    part: int
     name: str
     message: str
     timestamp: int | None = None
@@ -76,7 +75,7 @@ class Failed(NamedTuple):
 class Noted(NamedTuple):
     """Something that a user should know about a log, or about a worker."""
 
-    unit: int
+    part: int
     name: str
     message: str
 
@@ -95,21 +94,24 @@ class Shard:
         if not 0 <= self.index < self.count:
             raise CFlowError(f"shard.index={self.index} of shard.count={self.count}: give 0 ... count - 1")
 
-    def units(self, sources: Sequence[Any], workers: int = 1) -> list[Unit]:
-        """Divide this shard's share of the logs into units, numbered from 0, enough of them for all workers.
+    def parts(self, sources: Sequence[Any], workers: int = 1) -> list[Part]:
+        """Divide this shard's share of the logs into parts, numbered from 0, enough of them for all workers.
 
-        The sequence of all logs is divided into `count` parts of equal length. So a shard opens only its own logs, and
+        The sequence of all logs is divided into `count` shares of equal length. So a shard opens only its own logs, and
         shares at most the first and the last of them with a neighbour.
         """
-        begin, end = (Fraction(edge * len(sources), self.count) for edge in (self.index, self.index + 1))
-        logs = range(math.floor(begin), math.ceil(end))
-        pieces = -(-_UNITS_PER_WORKER * workers // len(logs)) if logs and workers > 1 else 1
-        units: list[Unit] = []
+        begin = self.index * len(sources)  # both edges count in 1 / count of a log
+        end = begin + len(sources)
+        logs = range(begin // self.count, -(-end // self.count))
+        pieces = -(-_PARTS_PER_WORKER * workers // len(logs)) if logs and workers > 1 else 1
+        parts: list[Part] = []
         for log in logs:
-            first, last = max(begin - log, Fraction(0)), min(end - log, Fraction(1))
-            edges = [first + (last - first) * k / pieces for k in range(pieces + 1)]
-            units += [Unit(len(units) + k, sources[log], edges[k], edges[k + 1]) for k in range(pieces)]
-        return units
+            first = max(begin - log * self.count, 0)
+            last = min(end - log * self.count, self.count)
+            edges = [first * pieces + (last - first) * k for k in range(pieces + 1)]
+            for left, right in zip(edges, edges[1:]):
+                parts.append(Part(len(parts), sources[log], left, right, self.count * pieces))
+        return parts
 
 
 def find_shard(index: Any, count: Any, environ: Mapping[str, str]) -> Shard:

@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import signal
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import suppress
 from dataclasses import replace
 from types import ModuleType
@@ -13,30 +14,29 @@ from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.errors import CFlowError, import_optional
-from cflow_torch.fleet.dispatch import dispatch
-from cflow_torch.fleet.job import Event, Job, Unit
+from cflow_torch.fleet.executors import Executor, describe, make_object
+from cflow_torch.fleet.job import Event, Job, Part
 from cflow_torch.fleet.machine import AUTO, Layout
 from cflow_torch.fleet.manifest import MANIFEST, make_identity
-from cflow_torch.fleet.processes import ChildProcess, WorkerDied
-from cflow_torch.fleet.work import describe, make_worker
+from cflow_torch.fleet.parallel import run_parallel
+from cflow_torch.fleet.work import Worker, make_worker
 
 _OBJECT_STORE_BYTES = 200 * 2**20  # it holds names and events only; Ray's default is 30 % of the memory
 
 
 def run_ray(
     job: Job,
-    units: Sequence[Unit],
+    parts: Sequence[Part],
     layout: Layout,
     stop: Callable[[], bool],
     *,
     address: str | None = None,
     num_cpus: Any = AUTO,
     num_gpus: Any = AUTO,
-    retries: int = 1,
 ) -> Iterator[Event]:
-    """Do all units with Ray actors, see `run_local`.
+    """Do all parts with Ray actors, see `run_local`.
 
-    The driver and the workers exchange units and events, a few kB each; workers read and write files themselves. On a
+    The driver and the workers exchange parts and events, a few kB each; workers read and write files themselves. On a
     cluster, all machines must reach data and output under the same names (a shared file system, an object store) and
     have the same versions of cflow_torch, torch and numpy. A node that differs is refused. Workers that do not fit into
     the cluster start when there is room. Ray chooses the GPUs. configs/engine/ray.yaml explains the settings.
@@ -66,73 +66,68 @@ def run_ray(
     _connect(ray, settings)
     try:
         _check_room(ray, needs)
-        options = {"num_cpus": needs["CPU"], "num_gpus": needs["GPU"], "max_concurrency": 2}  # `stop` during `run`
-        actor = ray.remote(_Actor).options(**options)
-        device = "cuda" if is_gpu else "cpu"  # a worker sees only the GPUs that Ray gives it
-        processes = [_Process(ray, actor, os.getcwd(), job, device) for _ in layout.devices]
-        yield from dispatch(processes, units, stop, retries)
+        actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
+        # A worker sees only the GPUs that Ray gives it.
+        make = (make_worker_on_node, os.getcwd(), job, "cuda" if is_gpu else "cpu")
+        yield from run_parallel([RayExecutor(ray, actor, *make) for _ in layout.devices], parts, stop)
     finally:
         ray.shutdown()  # this also ends a cluster that `ray.init` has started
 
 
+def make_worker_on_node(folder: str, job: Job, device: str) -> Worker:
+    """Make the worker of an actor, perhaps on another machine; `folder` is the driver's working folder."""
+    import ray
+
+    node = ray.util.get_node_ip_address()
+    if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
+        raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than the driver")
+    if not (as_path(job.output) / MANIFEST).exists():
+        raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
+    with suppress(OSError):  # relative paths of data must mean the same as in the driver
+        os.chdir(folder)
+    return make_worker(job, device)
+
+
 class _Actor:
-    """A worker of the job in a process of Ray, perhaps on another machine; `folder` is the driver's working folder."""
+    """An object in a process of Ray."""
 
-    _stops = False
+    _held: Any = None
 
-    def start(self, folder: str, job: Job, device: str) -> None:
-        import ray
-
-        node = ray.util.get_node_ip_address()
-        if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
-            raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than the driver")
-        if not (as_path(job.output) / MANIFEST).exists():
-            raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
-        with suppress(OSError):  # relative paths of data must mean the same as in the driver
-            os.chdir(folder)
-        self._run = make_worker(job, device)
-
-    def run(self, unit: Unit) -> Iterator[Event]:
-        yield from self._run(unit, lambda: self._stops)
-
-    def stop(self) -> None:
-        self._stops = True
+    def call(self, make: Sequence[Any], method: str, arguments: Sequence[Any]) -> Any:
+        if self._held is None:
+            self._held = make_object(*make)
+        return getattr(self._held, method)(*arguments)
 
 
-class _Process(ChildProcess):
-    """A Ray actor with the interface of a child process."""
+class RayExecutor(Executor):
+    """An actor of Ray. `make` is a function that returns the object, and its arguments."""
 
-    def __init__(self, ray: ModuleType, actor: Any, *arguments: Any) -> None:
-        super().__init__(actor.remote, *arguments)
-        self._ray = ray
+    def __init__(self, ray: ModuleType, actor: Any, *make: Any) -> None:
+        self._ray, self._class, self._make = ray, actor, make
         self._actor: Any = None
 
-    def start(self) -> None:
-        self.close()
-        self._actor = self._make()
-        self._get(self._actor.start.remote(*self._arguments))
+    def submit(self, method: str, *arguments: Any) -> Future[Any]:
+        if self._actor is None:
+            self._actor = self._class.remote()
+        future: Future[Any] = Future()
 
-    def call(self, *arguments: Any) -> Iterator[Event]:
-        for event in self._actor.run.options(num_returns="streaming").remote(*arguments):
-            yield self._get(event)
+        def pass_on(answer: Future[Any]) -> None:
+            error = answer.exception()
+            if error is None:
+                future.set_result(answer.result())
+            elif isinstance(error, self._ray.exceptions.RayTaskError):
+                future.set_exception(error.cause or error)
+            else:
+                future.set_exception(BrokenExecutor(f"Ray's {type(error).__name__}"))
 
-    def stop(self) -> None:
-        if self._actor is not None:
-            self._actor.stop.remote()
+        self._actor.call.remote(self._make, method, arguments).future().add_done_callback(pass_on)
+        return future
 
     def close(self) -> None:
         if self._actor is not None:
             with suppress(Exception):  # the actor may have ended with its cluster
                 self._ray.kill(self._actor)
-
-    def _get(self, answer: Any) -> Any:
-        try:
-            return self._ray.get(answer)
-        except self._ray.exceptions.RayTaskError as error:
-            raise (error.cause or error) from None
-        except self._ray.exceptions.RayError as error:
-            self.close()
-            raise WorkerDied(f"with Ray's {type(error).__name__}") from error
+        self._actor = None
 
 
 def _connect(ray: ModuleType, settings: dict[str, Any]) -> None:

@@ -13,14 +13,15 @@ from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.files import write_json
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.dispatch import run_local
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Shard, Unit
+from cflow_torch.fleet.executors import describe
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import complete_frames
-from cflow_torch.fleet.processes import StopSignal
+from cflow_torch.fleet.parallel import run_local
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.ray_engine import run_ray
-from cflow_torch.fleet.work import describe, source_name
+from cflow_torch.fleet.stop_signal import StopSignal
+from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError
 
 _SHOWN_NOTES = 3  # how often a message is shown; the report names every log with this message
@@ -48,12 +49,12 @@ def run_fleet(
     """
     if engine not in ENGINES:
         raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")
-    units = shard.units(sources, len(layout.devices))
-    counters = Counters(units)
+    parts = shard.parts(sources, len(layout.devices))
+    counters = Counters(parts)
     start = time.perf_counter()
-    with StopSignal() as stop, closing(ENGINES[engine](job, units, layout, stop, **engine_settings)) as events:
+    with StopSignal() as stop, closing(ENGINES[engine](job, parts, layout, stop, **engine_settings)) as events:
         try:
-            _follow(events, counters, len(units))
+            _follow(events, counters, len(parts))
         except KeyboardInterrupt:
             stop.received = stop.received or signal.SIGINT
         except CFlowError as error:  # no worker is left
@@ -78,13 +79,13 @@ def report_file(output: str, shard: Shard) -> Any:
     return as_path(output) / "reports" / f"shard-{shard.index}-of-{shard.count}.json"
 
 
-def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None:
+def _follow(events: Iterator[Event], counters: Counters, num_parts: int) -> None:
     """Count the events and show the progress. The total is an estimate until all logs are open."""
     with Progress() as progress:
         for event in events:
             counters.add(event)
             if counters.num_opened:
-                progress.total = round(counters.total * max(1, num_units / counters.num_opened))
+                progress.total = round(counters.total * max(1, num_parts / counters.num_opened))
             if isinstance(event, Failed):
                 log_line(f"failed: {event.name}: {event.message}")
             elif isinstance(event, Noted) and counters.times_noted(event.message) <= _SHOWN_NOTES:
@@ -93,25 +94,25 @@ def _follow(events: Iterator[Event], counters: Counters, num_units: int) -> None
         progress.total = progress.n
 
 
-def count_frames(job: Job, units: Iterable[Unit]) -> Iterator[tuple[str, int, int]]:
-    """Yield the name of each unit's log, the number of its frames, and how many of them are not complete.
+def count_frames(job: Job, parts: Iterable[Part]) -> Iterator[tuple[str, int, int]]:
+    """Yield the name of each part's log, the number of its frames, and how many of them are not complete.
 
     A log that cannot be opened counts as 0. Cost: opens the log and lists its files in the output. Nothing is written.
     """
-    for unit in units:
+    for part in parts:
         try:
             settings = {**job.settings, "check": False, "odometry": False, "read_as": None}
-            with open_log(job.reader, unit.source, **settings) as log:
-                stamps = {int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1) if i not in log.gaps}
+            with open_log(job.reader, part.source, **settings) as log:
+                stamps = {int(log.timestamps[i]) for i in part.frames(len(log.timestamps) - 1) if i not in log.gaps}
                 complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
                 yield log.log_id, len(stamps), len(stamps - complete)
         except Exception as error:
-            yield f"{source_name(unit.source)}: cannot be opened: {describe(error)}", 0, 0
+            yield f"{source_name(part.source)}: cannot be opened: {describe(error)}", 0, 0
 
 
-def forecast(job: Job, units: Sequence[Unit]) -> str:
+def forecast(job: Job, parts: Sequence[Part]) -> str:
     """Count the frames that a run would compute: a table with a row per log."""
-    rows = list(count_frames(job, units))
+    rows = list(count_frames(job, parts))
     total, left = sum(frames for _, frames, _ in rows), sum(todo for _, _, todo in rows)
     lines = [f"{frames:8} {todo:8}  {name}" for name, frames, todo in rows]
     end = f"{total:8} {left:8}  in total; dry run: nothing was written to {job.output}"
@@ -121,13 +122,13 @@ def forecast(job: Job, units: Sequence[Unit]) -> str:
 class Counters:
     """Counts frames and collects failures and notes, from the events of a run."""
 
-    def __init__(self, units: Sequence[Unit]) -> None:
+    def __init__(self, parts: Sequence[Part]) -> None:
         self.failures: list[tuple[str, str]] = []  # (frame or log, message)
         self.notes: Counter[tuple[str, str]] = Counter()  # (log, message)
-        self.num_opened = self.total = self.num_before = self.num_failed = 0  # num_opened: units; others: frames
-        # (unit number, time stamp) -> name of a frame that is neither on disk nor failed, of opened units
+        self.num_opened = self.total = self.num_before = self.num_failed = 0  # num_opened: parts; others: frames
+        # (part number, time stamp) -> name of a frame that is neither on disk nor failed, of opened parts
         self.waiting: dict[tuple[int, int | None], str] = {}
-        self._unopened = {unit.number for unit in units}
+        self._unopened = {part.number for part in parts}
         self._seconds: Counter[str] = Counter()  # by stage, of all workers together
 
     @property
@@ -142,14 +143,14 @@ class Counters:
         if isinstance(event, Noted):
             self.notes[event.name, event.message] += 1
             return
-        self._unopened.discard(event.unit)
+        self._unopened.discard(event.part)
         if isinstance(event, Opened):
             self.num_opened += 1
             self.total += len(event.frames)
             self.num_before += len(event.frames) - len(event.todo)
-            self.waiting.update({(event.unit, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
+            self.waiting.update({(event.part, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
             return
-        self.waiting.pop((event.unit, event.timestamp), None)
+        self.waiting.pop((event.part, event.timestamp), None)
         if isinstance(event, Done):
             self._seconds.update(event.seconds)
         else:
@@ -162,7 +163,7 @@ class Counters:
         Returns:
             "status": "complete", "incomplete" (something failed or is missing) or "interrupted".
             "frames": numbers of frames: "total", "complete_before", "computed", "failed" and "waiting" (not done, of
-            opened logs); numbers of logs or parts of logs: "failed_logs" and "unopened_units".
+            opened logs); numbers of logs or parts of logs: "failed_logs" and "unopened_parts".
             "frames_per_s": computed frames. "stages": seconds per computed frame, summed over all workers.
             "failures": frame or log, and message. "waiting": frames. "notes": log, message and how often.
         """
@@ -182,7 +183,7 @@ class Counters:
                 "failed": self.num_failed,
                 "failed_logs": len(self.failures) - self.num_failed,
                 "waiting": len(self.waiting),
-                "unopened_units": len(self._unopened),
+                "unopened_parts": len(self._unopened),
             },
             "seconds": seconds,
             "frames_per_s": computed / seconds if seconds > 0 else 0.0,
@@ -209,7 +210,7 @@ def format_report(report: dict[str, Any], verbose: bool = False) -> str:
     seldom = {
         "warnings": sum(count for *_, count in report["notes"]),
         "logs or parts of logs that failed": frames["failed_logs"],
-        "logs or parts of logs not begun": frames["unopened_units"],
+        "logs or parts of logs not begun": frames["unopened_parts"],
     }
     rows.update({name: count for name, count in seldom.items() if count})
     rows.update({"seconds": f"{report['seconds']:.1f}", "frames/s": f"{report['frames_per_s']:.2f}"})
@@ -226,6 +227,6 @@ def format_missing(report: dict[str, Any]) -> str:
     lines = [*dict.fromkeys(failures), *(f"  {name}: not done" for name in report["waiting"])]  # parts of a log repeat
     if len(lines) > _SHOWN_FAILURES:
         lines[_SHOWN_FAILURES:] = [f"  and {len(lines) - _SHOWN_FAILURES} more, all of them in the report"]
-    if report["frames"]["unopened_units"]:
-        lines.append(f"  {report['frames']['unopened_units']} logs or parts of logs: not begun")
+    if report["frames"]["unopened_parts"]:
+        lines.append(f"  {report['frames']['unopened_parts']} logs or parts of logs: not begun")
     return "\n".join(lines)

@@ -1,10 +1,10 @@
-"""A worker: it reads, computes and writes the frames of a `Unit` (part of a log), all three at the same time."""
+"""A worker: it reads, computes and writes the frames of a `Part` of a log, all three at the same time."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,9 +22,9 @@ from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.paths import as_path, safe_name
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Unit
+from cflow_torch.fleet.executors import describe
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
-from cflow_torch.fleet.processes import WorkerDied
 from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -44,7 +44,7 @@ class _Frame:
 
 
 class Worker:
-    """Computes units, and keeps the log of the last unit open. A device that cannot be used is a `CFlowError`."""
+    """Computes parts of logs, and keeps the last log open. A device that cannot be used is a `CFlowError`."""
 
     def __init__(self, job: Job, device: str) -> None:
         try:
@@ -57,9 +57,18 @@ class Worker:
         self._source: Any = None
         self._log: Any = None
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        self._events: Iterator[Event] = iter(())  # of the part that `next_event` has begun
+        self._is_stopped = False
 
-    def run(self, unit: Unit, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
-        """Do the frames of a unit that are not complete. `WorkerDied` if the GPU can no longer be used.
+    def next_event(self, part: Part | None, is_stopped: bool) -> Event | None:
+        """Begin a part, if one is given, and return the next event of the part; None after the last one."""
+        self._is_stopped = is_stopped
+        if part is not None:
+            self._events = self.run(part, lambda: self._is_stopped)
+        return next(self._events, None)
+
+    def run(self, part: Part, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
+        """Do the frames of a part that are not complete. `BrokenExecutor` if the GPU can no longer be used.
 
         We call `stop` before each frame and batch. Once it returns True, we write computed frames and begin no others.
 
@@ -68,37 +77,37 @@ class Worker:
             frame fails, `Failed` has no time stamp.
         """
         try:
-            yield from self._run(unit, stop)
-        except WorkerDied:
+            yield from self._run(part, stop)
+        except BrokenExecutor:
             raise
         except Exception as error:
-            yield Failed(unit.number, source_name(unit.source), describe(error))
+            yield Failed(part.number, source_name(part.source), describe(error))
 
-    def _run(self, unit: Unit, stop: Callable[[], bool]) -> Iterator[Event]:
-        log = self._open(unit.source)
+    def _run(self, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
+        log = self._open(part.source)
         folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
-        stamps = {i: int(log.timestamps[i]) for i in unit.frames(len(log.timestamps) - 1) if i not in log.gaps}
-        if unit.only is not None:
-            stamps = {i: stamp for i, stamp in stamps.items() if stamp in unit.only}
+        stamps = {i: int(log.timestamps[i]) for i in part.frames(len(log.timestamps) - 1) if i not in log.gaps}
+        if part.only is not None:
+            stamps = {i: stamp for i, stamp in stamps.items() if stamp == part.only}
         complete = set() if self._job.redo else complete_frames(folder)
         todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
         if todo or complete:
             claim_log(folder, log, self._job.identity)
         remove_stale(folder)
-        yield Opened(unit.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
+        yield Opened(part.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
         checks = bool(self._job.settings.get("check", True))
         if checks and 0 in todo:
             with suppress(Exception):  # if a sweep cannot be read, its frames fail below
                 for text in find_problems(log):
-                    yield Noted(unit.number, log.log_id, text)
+                    yield Noted(part.number, log.log_id, text)
         for frame in self._pass(log, folder, todo, stop):
             name = f"{log.log_id}/{frame.timestamp}"
             if checks and frame.is_repetition:
-                yield Noted(unit.number, name, "the next sweep has the same points")
+                yield Noted(part.number, name, "the next sweep has the same points")
             if isinstance(frame.content, Exception):
-                yield Failed(unit.number, name, describe(frame.content), frame.timestamp)
+                yield Failed(part.number, name, describe(frame.content), frame.timestamp)
             else:
-                yield Done(unit.number, frame.timestamp, frame.seconds)
+                yield Done(part.number, frame.timestamp, frame.seconds)
 
     def close(self) -> None:
         """Close the log. We do not wait for reads and writes that hang."""
@@ -156,11 +165,11 @@ class Worker:
         return frames
 
     def _check_device(self) -> None:
-        """Raise `WorkerDied` if CUDA refuses all further work, as it does after an error inside a kernel."""
+        """Raise `BrokenExecutor` if CUDA refuses all further work, as it does after an error inside a kernel."""
         try:
             torch.zeros(1, device=self._device).item()
         except RuntimeError as error:
-            raise WorkerDied(f"because {self._device} can no longer be used: {describe(error)}") from error
+            raise BrokenExecutor(f"{self._device} can no longer be used: {describe(error)}") from error
 
     def _write(self, folder: Path, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
@@ -171,10 +180,8 @@ class Worker:
         return frame
 
 
-def make_worker(
-    job: Job, device: str, memory: float | None = None
-) -> Callable[[Unit, Callable[[], bool]], Iterator[Event]]:
-    """Make the worker of this process, and return its `run`.
+def make_worker(job: Job, device: str, memory: float | None = None) -> Worker:
+    """Make the worker of this process.
 
     On a CPU, it uses one thread, because other workers use the other cores. `memory` limits its address space, bytes.
     """
@@ -186,7 +193,7 @@ def make_worker(
         torch.set_num_threads(1)
         pyarrow.set_cpu_count(1)
     show_warnings_as_lines()
-    return Worker(job, device).run
+    return Worker(job, device)
 
 
 def run_ahead(
@@ -215,12 +222,6 @@ def _stage(frame: _Frame, name: str) -> Iterator[None]:
     except Exception as error:
         frame.content = error
     frame.seconds[name] = time.perf_counter() - start
-
-
-def describe(error: BaseException) -> str:
-    """Describe an error in one line; its class is named unless it is a `CFlowError` or an OSError."""
-    text = " ".join(str(error).split()) or "no message"
-    return text if isinstance(error, (CFlowError, OSError)) else f"{type(error).__name__}: {text}"
 
 
 def source_name(source: Any) -> str:

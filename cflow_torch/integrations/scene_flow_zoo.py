@@ -62,7 +62,8 @@ def register(name: str = "CorrelationFlow") -> None:
 
 def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
     """Return sweeps without padding, the index of the first one to estimate, and the (K, PadN) mask (1, 0, NaN)."""
-    points, mask = sequence.full_pc, sequence.full_pc_mask
+    points = sequence.full_pc
+    mask = sequence.full_pc_mask
     check_array(points, f"{name}.full_pc", (None, None, 3), "f", "(K, PadN, 3) floats, metres")
     if len(points) < 2:
         raise CFlowError(f"{name}.full_pc has shape {tuple(points.shape)}: give a K of at least 2")

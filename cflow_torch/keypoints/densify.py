@@ -10,8 +10,7 @@ from torch import Tensor
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.dense.clustering import label_components
 from cflow_torch.keypoints.matching import Matches
-from cflow_torch.ops.indices import flat_nonzero, index_in_group
-from cflow_torch.ops.kornia_engine import connected_components_kornia
+from cflow_torch.ops.indices import draw, flat_nonzero, index_in_group
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.ops.segments import segment_median
@@ -48,25 +47,42 @@ def densify(
     Source: Sec. From sparse scene flow to dense scene flow; Table keypoint_sparse2dense.
     """
     pixel = flat_nonzero(images)
-    image_size = images.shape[1] * images.shape[2]
-    shift = matches.shift.double()
     if config.densify == "nearest":
-        seeds = torch.zeros_like(images).view(-1).index_fill_(0, matched, True).view_as(images)
-        nearest = nearest_set_pixel(seeds, pixel)
-        group = torch.where(nearest < 0, matched.numel(), torch.searchsorted(matched, nearest))
-        return DenseShift(pixel, group, shift, index_in_group(matched // image_size), matches.score)
+        return _by_nearest(images, pixel, matched, matches)
     if config.densify == "clusters":
         component = label_components(images, pixel, pixel_size, config)
     else:
-        label = connected_components_kornia if config.labeling == "kornia" else connected_components
-        component = label(images, pixel, config.connectivity)
+        component = connected_components(images, pixel, config.connectivity, engine=config.labeling)
     is_first = component == torch.arange(pixel.numel(), device=pixel.device)
     group = (is_first.cumsum(0) - 1).index_select(0, component)
-    first = flat_nonzero(is_first)
+    first_pixel = pixel.index_select(0, flat_nonzero(is_first))
     group_of_match = group.index_select(0, torch.searchsorted(pixel, matched))
-    num_groups = first.numel()
-    dy = segment_median(shift[:, 0], group_of_match, num_groups)
-    dx = segment_median(shift[:, 1], group_of_match, num_groups)
-    score = segment_median(matches.score, group_of_match, num_groups)
-    window = pixel.index_select(0, first) // image_size
-    return DenseShift(pixel, group, torch.stack((dy, dx), 1), index_in_group(window), score)
+    dy, dx, score = (
+        segment_median(values, group_of_match, first_pixel.numel())
+        for values in (*matches.shift.double().unbind(1), matches.score)
+    )
+    return DenseShift(
+        pixel=pixel,
+        group=group,
+        shift=torch.stack((dy, dx), 1),
+        id_in_window=_id_in_window(first_pixel, images),
+        score=score,
+    )
+
+
+def _by_nearest(images: Tensor, pixel: Tensor, matched: Tensor, matches: Matches) -> DenseShift:
+    """Give each pixel the shift of the nearest matched key point."""
+    seeds = draw(matched, images.numel()).view_as(images)
+    nearest = nearest_set_pixel(seeds, pixel)
+    return DenseShift(
+        pixel=pixel,
+        group=torch.where(nearest < 0, matched.numel(), torch.searchsorted(matched, nearest)),
+        shift=matches.shift.double(),
+        id_in_window=_id_in_window(matched, images),
+        score=matches.score,
+    )
+
+
+def _id_in_window(pixels: Tensor, images: Tensor) -> Tensor:
+    """Number some pixels of each image, flat indices (G,) int64, ascending."""
+    return index_in_group(pixels // images[0].numel())

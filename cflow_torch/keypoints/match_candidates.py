@@ -8,6 +8,7 @@ points of t and t+1.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -27,6 +28,57 @@ _GATE_SECONDS = 0.1
 
 
 @dataclass(frozen=True)
+class Patches:
+    """The L x L pixels around each of K key points. `patches[i]` copies some; no tensor holds all of them.
+
+    All images form one line of pixels, and a patch is L runs of L pixels of it:
+
+        image, L = 3     . . . . .          line      . . . . . . a b c . . d e f . . g h i .
+                         . a b c .          start                 ^         ^         ^
+                         . d e f .
+                         . g h i .
+    """
+
+    line: Tensor  # (A,) uint8, zeros and ones; the images have an empty border of L // 2 pixels
+    start: Tensor  # (K, L) int64, position in the line of the first pixel of each row of each patch
+
+    @classmethod
+    def around(cls, points: _Positions, images: Tensor, size: int) -> Patches:
+        """Find the patches of L = `size` around pixels of (B, H, W) bool images."""
+        half = size // 2
+        padded = F.pad(images.view(torch.uint8), (half, half, half, half))
+        _, height, width = padded.shape
+        corner = (points.window * height + points.row) * width + points.col  # [K]
+        start = corner[:, None] + torch.arange(0, size * width, width, device=images.device)
+        return cls(padded.flatten(), start)
+
+    @property
+    def num_pixels(self) -> int:
+        """Number of pixels of a patch, L^2."""
+        return self.start.shape[1] ** 2
+
+    def __getitem__(self, points: Tensor) -> Tensor:
+        """Copy the patches of key points, (S,) int64: (S, L^2) uint8."""
+        runs = self.line.unfold(0, self.start.shape[1], 1)  # a view: L pixels, from each pixel on
+        return runs.index_select(0, self.start.index_select(0, points).flatten()).view(-1, self.num_pixels)
+
+    def energy(self) -> Tensor:
+        """Count the ones of all patches, (K,) int64."""
+        size = self.start.shape[1]
+        sums = F.pad(self.line.int().cumsum(0, dtype=torch.int32), (1, 0))  # of all pixels before each one
+        of_run = sums[size:] - sums[:-size]
+        return of_run.index_select(0, self.start.flatten()).view_as(self.start).sum(1)
+
+
+class _Positions(NamedTuple):
+    """Pixels of images."""
+
+    window: Tensor  # (K,) int64, image of each pixel
+    row: Tensor  # (K,) int64
+    col: Tensor  # (K,) int64
+
+
+@dataclass(frozen=True)
 class KeyPoints:
     """Key points of one sweep of every window, in order of window, row and column."""
 
@@ -34,8 +86,8 @@ class KeyPoints:
     window: Tensor  # (K,) int64
     row: Tensor  # (K,) int64, row in the image of the window
     col: Tensor  # (K,) int64, column in the image of the window
-    patch: Tensor  # (K, L * L) uint8, zeros and ones
-    energy: Tensor  # (K,) int64, number of ones, at least 1
+    patches: Patches  # the descriptors
+    energy: Tensor  # (K,) int64, number of ones of each descriptor, at least 1
 
     def __len__(self) -> int:
         return self.row.numel()
@@ -49,32 +101,23 @@ def detect(occupancy: Tensor) -> Tensor:
 def describe(images: Tensor, patch_size: int) -> KeyPoints:
     """Find the key points of one sweep per window, and describe each by the L x L pixels around it (Sec. Descriptor).
 
-    The images are (B, H, W) bool; patches are zero outside. Cost: K L^2 bytes, written one row of a patch at a time.
+    The images are (B, H, W) bool; patches are zero outside. Cost: 8 L bytes per key point.
     """
     pixel = flat_nonzero(detect(images))
-    line, col = split_index(pixel, images.shape[2])
-    window, row = split_index(line, images.shape[1])
-    half = patch_size // 2
-    padded = F.pad(images.byte(), (half, half, half, half))
-    _, height, width = padded.shape
-    runs = padded.flatten().unfold(0, patch_size, 1)  # a view: `patch_size` pixels, starting at each pixel
-    first = (window * height + row) * width + col
-    rows = (first[:, None] + torch.arange(patch_size, device=images.device) * width).flatten()
-    patches = runs.index_select(0, rows).view(-1, patch_size * patch_size)
-    # A sum over the patches would write them again as integers, so we take differences of running sums of the images.
-    sums = F.pad(padded.flatten().cumsum(0, dtype=torch.int32), (1, 0))
-    energy = (sums[patch_size:] - sums[:-patch_size]).index_select(0, rows).view(-1, patch_size).sum(1)
-    return KeyPoints(pixel, window, row, col, patches, energy)
+    image_row, col = split_index(pixel, images.shape[2])
+    window, row = split_index(image_row, images.shape[1])
+    patches = Patches.around(_Positions(window, row, col), images, patch_size)
+    return KeyPoints(pixel, window, row, col, patches, patches.energy())
 
 
 def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Tensor:
     """(B,) float64, pixels: longest distance of a match in each window, by `gate_radius` and `max_speed`."""
     seconds = batch.seconds[:, 1]
     size = torch.full_like(seconds, pixel_size)  # a GPU would multiply by the reciprocal of a Python number
-    reach = config.gate_radius * (seconds / torch.full_like(seconds, _GATE_SECONDS)) / size
-    if config.max_speed is not None:
-        reach = torch.minimum(reach, config.max_speed * seconds / size + 1)
-    return reach
+    gate = config.gate_radius * (seconds / torch.full_like(seconds, _GATE_SECONDS)) / size
+    if config.max_speed is None:
+        return gate
+    return torch.minimum(gate, config.max_speed * seconds / size + 1)
 
 
 @dataclass(frozen=True)
@@ -101,12 +144,18 @@ def make_blocks(points: KeyPoints) -> Blocks:
     """Cut the key points of each band of rows into blocks, by column."""
     band = points.row // _BAND_ROWS
     key, order = _sorting_key(points.window, band, points.col).sort()
+    rank = order.argsort()
     slot = index_in_group(key >> _COL_BITS) % BLOCK_SIZE
     begin = flat_nonzero(slot == 0)
     end = F.pad(begin[1:], (0, 1), value=len(points))
     block = torch.repeat_interleave(torch.arange(begin.numel(), device=key.device), end - begin)
-    rank = order.argsort()
-    return Blocks(block[rank], slot[rank], key[begin], key[end - 1], int(band.max()) + 1)
+    return Blocks(
+        block=block[rank],
+        slot=slot[rank],
+        first=key[begin],
+        last=key[end - 1],
+        num_bands=int(band.max()) + 1,
+    )
 
 
 def near_blocks(points: KeyPoints, order: Tensor, blocks: Blocks, reach: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,20 +165,26 @@ def near_blocks(points: KeyPoints, order: Tensor, blocks: Blocks, reach: Tensor)
         The blocks near the first point in this order, those near the second one, and so on, int64. The number of
         blocks near each point in this order, (K,) int64.
     """
-    window = points.window[order, None]
+    window = points.window[order, None]  # [K, 1]
     row = points.row[order, None]
     col = points.col[order, None]
     radius = reach[window]
+    first_band = (row - radius.long()).clamp_(min=0) // _BAND_ROWS
     num_bands = min(int(2 * reach.max()) // _BAND_ROWS + 2, blocks.num_bands)
-    band = (row - radius.long()).clamp_(min=0) // _BAND_ROWS + torch.arange(num_bands, device=row.device)
-    top = band * _BAND_ROWS
-    gap = torch.maximum(top - row, row - (top + _BAND_ROWS - 1)).clamp_(min=0)  # rows between point and band
-    square = radius * radius - gap * gap
-    half_width = square.clamp(min=0).sqrt().ceil().clamp(max=1 << 15).long()
+    band = first_band + torch.arange(num_bands, device=row.device)  # [K, bands]
+    squared_width = radius * radius - _rows_between(row, band).square()  # negative if the band is out of reach
+    half_width = squared_width.clamp(min=0).sqrt().ceil().clamp(max=1 << 15).long()
     begin = torch.searchsorted(blocks.last, _sorting_key(window, band, (col - half_width).clamp(min=0)))
     end = torch.searchsorted(blocks.first, _sorting_key(window, band, col + half_width + 1))
-    count = (end - begin) * (square >= 0)  # [K, bands]
+    count = (end - begin) * (squared_width >= 0)
     return concat_ranges(begin.flatten(), count.flatten()), count.sum(1)
+
+
+def _rows_between(row: Tensor, band: Tensor) -> Tensor:
+    """Return how many rows lie between a row and a band, int64; 0 if the band contains the row."""
+    top = band * _BAND_ROWS
+    bottom = top + _BAND_ROWS - 1
+    return torch.maximum(top - row, row - bottom).clamp_(min=0)
 
 
 def _sorting_key(window: Tensor, band: Tensor, col: Tensor) -> Tensor:

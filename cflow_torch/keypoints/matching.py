@@ -10,14 +10,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Iterator
+from typing import Iterator, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
-from cflow_torch.keypoints.match_candidates import BLOCK_SIZE, Blocks, KeyPoints, make_blocks, near_blocks
+from cflow_torch.keypoints.match_candidates import (
+    BLOCK_SIZE,
+    Blocks,
+    KeyPoints,
+    Patches,
+    make_blocks,
+    near_blocks,
+)
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import flat_nonzero
@@ -75,16 +82,16 @@ class Bags:
     block: Tensor  # (N,) int64, block of each bag
 
 
-@dataclass(frozen=True)
-class Pairs:
+class Pairs(NamedTuple):
     """Pairs of a key point of t and one of t+1."""
 
     source: Tensor  # (P,) int64, key point of t
     target: Tensor  # (P,) int64, key point of t+1
-    count: Tensor  # (P,) int64, pixels that are set in both descriptors
+    shared: Tensor  # (P,) int64, pixels that are set in both descriptors
 
-    def __getitem__(self, index: Tensor) -> Pairs:
-        return Pairs(self.source[index], self.target[index], self.count[index])
+    def at(self, index: Tensor) -> Pairs:
+        """Select pairs, (K,) int64."""
+        return Pairs(self.source[index], self.target[index], self.shared[index])
 
 
 def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> Matches:
@@ -94,104 +101,132 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig
     count^2 / energy of the candidate. We accept the best match, of score R, if R > rho R' for the second-best score R',
     in integers, or if there is no second candidate. Ties: rejected.
 
-    Cost: time (pairs of a key point and a candidate) x (energy of the key point); memory 2 L^2 bytes per key point.
+    Cost: time (pairs of a key point and a candidate) x (energy of the key point); memory L^2 bytes per key point of
+    t+1.
     """
     ratio = round(config.ratio_threshold * _RATIO_UNIT)
-    none = torch.zeros(0, dtype=torch.int64, device=reach.device)
-    accepted = [Pairs(none, none, none)]
+    accepted = [Pairs(*torch.zeros((3, 0), dtype=torch.int64, device=reach.device))]
     if len(pc0) and len(pc1):
-        targets = arrange_targets(pc1, config.patch_size**2)
+        targets = arrange_targets(pc1)
         for bags in make_bags(pc0, targets.blocks, reach, config):
             count = shared_pixels(pc0, bags, targets)  # [N, 64]
             count *= is_within_reach(pc0, bags, targets, reach)
             contenders = find_contenders(bags, targets, count, ratio)
-            accepted.append(contenders[passes_ratio_test(contenders, pc1.energy, ratio)])
-    source = torch.cat([pairs.source for pairs in accepted])
-    source, order = source.sort()
-    target = torch.cat([pairs.target for pairs in accepted])[order]
-    count = torch.cat([pairs.count for pairs in accepted])[order]
-    shift = torch.stack((pc1.row[target] - pc0.row[source], pc1.col[target] - pc0.col[source]), 1)
+            accepted.append(contenders.at(passes_ratio_test(contenders, pc1.energy, ratio)))
+    pairs = Pairs(*(torch.cat(column) for column in zip(*accepted)))
+    return _matches(pairs.at(pairs.source.argsort()), pc0, pc1)
+
+
+def _matches(pairs: Pairs, pc0: KeyPoints, pc1: KeyPoints) -> Matches:
+    """Return the shifts and scores of accepted pairs."""
+    source, target, shared = pairs
+    dy = pc1.row[target] - pc0.row[source]
+    dx = pc1.col[target] - pc0.col[source]
     energies = pc0.energy[source] * pc1.energy[target]
-    return Matches(source, shift, count.double() / energies.double().sqrt())
+    return Matches(
+        source=source,
+        shift=torch.stack((dy, dx), 1),
+        score=shared.double() / energies.double().sqrt(),
+    )
 
 
-def arrange_targets(points: KeyPoints, num_pixels: int) -> Targets:
-    """Arrange the key points of t+1 and their descriptors, of L^2 = `num_pixels`, by blocks."""
+def arrange_targets(points: KeyPoints) -> Targets:
+    """Arrange the key points of t+1 and their descriptors by blocks."""
     blocks = make_blocks(points)
     number = blocks.arrange(torch.arange(len(points), device=points.row.device), 0)
-    # The last row of each block is zero: it fills up the lists of set pixels of the key points of t.
-    has_pixel = points.patch.new_empty((len(blocks), num_pixels + 1, _COLUMNS), dtype=torch.float32)
-    has_pixel[:, -1] = 0
-    for part in chunks(0, len(blocks), number.device, BLOCK_SIZE * num_pixels // 16):
-        digits = points.patch.index_select(0, number[part].flatten()).view(-1, 4, _COLUMNS, num_pixels)
-        packed = digits[:, 0].float()
-        for digit in range(1, 4):
-            packed.add_(digits[:, digit], alpha=1 << (digit * _DIGIT_BITS))
-        has_pixel[part, :-1] = packed.transpose(1, 2)
     return Targets(
         blocks=blocks,
         number=number,
         row=blocks.arrange(points.row.int(), 0),
         col=blocks.arrange(points.col.int(), 0),
         energy=blocks.arrange(points.energy.float(), math.inf),
-        has_pixel=has_pixel.flatten(0, 1),
+        has_pixel=_pixel_table(points.patches, number),
     )
+
+
+def _pixel_table(patches: Patches, number: Tensor) -> Tensor:
+    """Return `Targets.has_pixel` of the key points of N blocks, (N, 64) int64."""
+    # The last row of each block is zero: it fills up the lists of set pixels of the key points of t.
+    table = torch.empty((len(number), patches.num_pixels + 1, _COLUMNS), device=number.device)
+    table[:, -1] = 0
+    for part in chunks(0, len(number), number.device, BLOCK_SIZE * patches.num_pixels // 16):
+        digits = patches[number[part].flatten()].view(-1, 4, _COLUMNS, patches.num_pixels)
+        packed = digits[:, 0].float()  # [blocks, 16, L^2]
+        for digit in range(1, 4):
+            packed.add_(digits[:, digit], alpha=1 << (digit * _DIGIT_BITS))
+        table[part, :-1] = packed.transpose(1, 2)
+    return table.flatten(0, 1)
 
 
 def make_bags(points: KeyPoints, blocks: Blocks, reach: Tensor, config: KeypointsConfig) -> Iterator[Bags]:
     """Yield the bags of all key points of t: as many at a time as we compare together."""
-    num_pairs = _PAIRS_AT_ONCE_CPU if reach.device.type == "cpu" else _PAIRS_AT_ONCE_GPU
-    if config.max_memory is not None:
-        num_pairs = min(num_pairs, int(config.max_memory) // _BYTES_PER_PAIR)
     order = (points.energy // _ENERGY_STEP).argsort(stable=True)
     block, num_blocks = near_blocks(points, order, blocks, reach)
-    part = (num_blocks.cumsum(0) - num_blocks) // max(1, num_pairs // BLOCK_SIZE)
-    groups = Groups(part, int(part[-1]) + 1)
-    num_sources, num_bags = torch.stack((groups.size(), groups.sum(num_blocks))).tolist()
-    for source, number, near in zip(order.split(num_sources), num_blocks.split(num_sources), block.split(num_bags)):
-        if near.numel() == 0:
-            continue
-        position = torch.arange(source.numel(), device=source.device)
-        of_source = torch.repeat_interleave(position, number, output_size=near.numel())
-        yield Bags(source, Groups(of_source, source.numel()), near)
+    part = (num_blocks.cumsum(0) - num_blocks) // _bags_at_once(reach.device, config)
+    parts = Groups(part, int(part[-1]) + 1)
+    num_sources, num_bags = torch.stack((parts.size(), parts.sum(num_blocks))).tolist()
+    columns = (order.split(num_sources), num_blocks.split(num_sources), block.split(num_bags))
+    for source, blocks_of_source, near in zip(*columns):
+        if near.numel() > 0:
+            position = torch.arange(source.numel(), device=source.device)
+            of_source = torch.repeat_interleave(position, blocks_of_source, output_size=near.numel())
+            yield Bags(source, Groups(of_source, source.numel()), near)
+
+
+def _bags_at_once(device: torch.device, config: KeypointsConfig) -> int:
+    """Return how many bags we compare together."""
+    num_pairs = _PAIRS_AT_ONCE_CPU if device.type == "cpu" else _PAIRS_AT_ONCE_GPU
+    if config.max_memory is not None:
+        num_pairs = min(num_pairs, int(config.max_memory) // _BYTES_PER_PAIR)
+    return max(1, num_pairs // BLOCK_SIZE)
 
 
 def shared_pixels(points: KeyPoints, bags: Bags, targets: Targets) -> Tensor:
     """Count the pixels that the key point of each bag shares with those of its block: (N, 64) int32."""
-    num_pixels = points.patch.shape[1]
-    energy = points.energy[bags.source]
-    most = int(energy.max())
-    num_sums = -(-most // _MOST_ROWS)
-    length = -(-most // num_sums)
-    pixels = list_set_pixels(points.patch.index_select(0, bags.source), energy, length * num_sums)
-    rows = pixels.index_select(0, bags.of_source.of_item)  # [N, length * num_sums]
-    rows += bags.block[:, None].int() * (num_pixels + 1)
-    sums = F.embedding_bag(rows.view(-1, length), targets.has_pixel, mode="sum").int().view(-1, num_sums, _COLUMNS)
-    even = (sums & _EVEN_DIGITS).sum(1, dtype=torch.int32)  # [N, 16]
-    odd = (sums >> _DIGIT_BITS & _EVEN_DIGITS).sum(1, dtype=torch.int32)
+    pixels = list_set_pixels(points.patches[bags.source], points.energy[bags.source])
+    num_sums, num_sources, length = pixels.shape
+    # Copying rows of one flat table is faster than selecting along the second axis.
+    first = torch.arange(0, num_sums * num_sources, num_sources, device=pixels.device)[:, None]
+    rows = pixels.flatten(0, 1).index_select(0, (first + bags.of_source.of_item).flatten())
+    rows = rows.view(num_sums, -1, length)  # [sums, N, length], pixels
+    rows += bags.block[:, None].int() * (points.patches.num_pixels + 1)  # rows of `has_pixel`
+    sums = F.embedding_bag(rows.view(-1, length), targets.has_pixel, mode="sum")
+    return _total_of_digits(sums.int().view(num_sums, -1, _COLUMNS))
+
+
+def _total_of_digits(sums: Tensor) -> Tensor:
+    """Add up sums of rows of `has_pixel`, (sums, N, 16) int32, and split the digits: (N, 64) int32."""
+    even = (sums & _EVEN_DIGITS).sum(0, dtype=torch.int32)  # [N, 16]
+    odd = (sums.sum(0, dtype=torch.int32) - even) >> _DIGIT_BITS
     return torch.cat((even & 0xFFF, odd & 0xFFF, even >> 12, odd >> 12), 1)
 
 
-def list_set_pixels(patch: Tensor, energy: Tensor, length: int) -> Tensor:
-    """List the ones of each row of (S, L^2) uint8: (S, length) int32, filled up with L^2. `energy` counts them."""
+def list_set_pixels(patch: Tensor, energy: Tensor) -> Tensor:
+    """List the ones of each row of (S, L^2) uint8 in a few parts of equal length: (parts, S, length) int32.
+
+    `energy`, (S,) int64, counts them. The lists are filled up with L^2. A part has at most 63 ones.
+    """
     num_points, num_pixels = patch.shape
-    is_used = torch.arange(length, device=patch.device) < energy[:, None]
+    most = int(energy.max())
+    num_parts = -(-most // _MOST_ROWS)
+    length = -(-most // num_parts)
     start = torch.arange(0, patch.numel(), num_pixels, device=patch.device)[:, None]
-    pixels = torch.zeros((num_points, length), dtype=torch.int64, device=patch.device)
-    pixels.masked_scatter_(is_used, flat_nonzero(patch.bool())).sub_(start)
-    return pixels.masked_fill_(~is_used, num_pixels).int()
+    pixels = (start + num_pixels).repeat(1, num_parts * length)
+    is_used = torch.arange(num_parts * length, device=patch.device) < energy[:, None]
+    pixels.masked_scatter_(is_used, flat_nonzero(patch.view(torch.bool))).sub_(start)
+    return pixels.int().view(num_points, num_parts, length).transpose(0, 1).contiguous()
 
 
 def is_within_reach(points: KeyPoints, bags: Bags, targets: Targets, reach: Tensor) -> Tensor:
     """Tell which key points of the block of each bag are within reach of its key point: (N, 64) bool."""
     radius = reach[points.window[bags.source]]
-    limit = (radius * radius).floor().clamp(max=torch.iinfo(torch.int32).max).int()[:, None]
-    row = points.row[bags.source].int()[:, None]
-    col = points.col[bags.source].int()[:, None]
+    limit = (radius * radius).floor().clamp(max=torch.iinfo(torch.int32).max).int()
     of_source = bags.of_source.of_item
-    dy = targets.row.index_select(0, bags.block).sub_(row[of_source])
-    dx = targets.col.index_select(0, bags.block).sub_(col[of_source])
-    return dy.mul_(dy).addcmul_(dx, dx) <= limit[of_source]
+    row = points.row[bags.source].int()[of_source]
+    col = points.col[bags.source].int()[of_source]
+    dy = targets.row.index_select(0, bags.block).sub_(row[:, None])
+    dx = targets.col.index_select(0, bags.block).sub_(col[:, None])
+    return dy.mul_(dy).addcmul_(dx, dx) <= limit[of_source, None]
 
 
 def find_contenders(bags: Bags, targets: Targets, count: Tensor, ratio: int) -> Pairs:
@@ -203,9 +238,11 @@ def find_contenders(bags: Bags, targets: Targets, count: Tensor, ratio: int) -> 
     threshold = bags.of_source.spread(best * share).clamp_(min=2.0**-15)  # > 0
     index = flat_nonzero(value >= threshold[:, None])
     bag = index // BLOCK_SIZE
-    source = bags.source[bags.of_source.of_item[bag]]
-    target = targets.number[bags.block[bag], index % BLOCK_SIZE]
-    return Pairs(source, target, count.flatten()[index].long())
+    return Pairs(
+        source=bags.source[bags.of_source.of_item[bag]],
+        target=targets.number[bags.block[bag], index % BLOCK_SIZE],
+        shared=count.flatten()[index].long(),
+    )
 
 
 def passes_ratio_test(pairs: Pairs, energies: Tensor, ratio: int) -> Tensor:
@@ -213,17 +250,24 @@ def passes_ratio_test(pairs: Pairs, energies: Tensor, ratio: int) -> Tensor:
 
     `energies`, (K,) int64, are those of the key points of t+1.
     """
-    square = pairs.count * pairs.count
+    square = pairs.shared * pairs.shared
     energy = energies[pairs.target]
-    value = square.double() / energy  # exact enough to tell any two different fractions apart
-    number, of_source = torch.unique(pairs.source, return_inverse=True)
-    of_source = Groups(of_source, number.numel())
-    is_best = value == of_source.spread(of_source.max(value, empty=0))
-    best = flat_nonzero(is_best)
-    # If several are best, we take any of them: another one rejects it.
-    best_of_source = torch.zeros_like(number).scatter_(0, of_source.of_item[best], best)
-    best = best_of_source[of_source.of_item]
+    number, source = torch.unique(pairs.source, return_inverse=True)
+    of_source = Groups(source, number.numel())
+    best_of_source = _best_of_groups(square.double() / energy, of_source)
+    best = best_of_source[source]  # pair with which each pair competes
     # c1^2 / E1 > rho^2 c2^2 / E2
     is_beaten = square[best] * energy * _RATIO_UNIT**2 > square * energy[best] * ratio**2
     is_rival = ~is_beaten & (best != torch.arange(best.numel(), device=best.device))
     return best_of_source[flat_nonzero(~of_source.any(is_rival))]
+
+
+def _best_of_groups(value: Tensor, groups: Groups) -> Tensor:
+    """Return a pair with the largest value of each group, (G,) int64, all of which have pairs.
+
+    `value`, (P,) float64, is count^2 / energy, exact enough to tell any two different fractions apart. If several are
+    best, we take any of them, because another one rejects it.
+    """
+    best = flat_nonzero(value == groups.spread(groups.max(value, empty=0)))
+    of_group = torch.zeros(groups.count, dtype=torch.int64, device=value.device)
+    return of_group.scatter_(0, groups.of_item[best], best)

@@ -37,8 +37,9 @@ class CorrelationFlowKeypoints(CoarseToFine):
 
     @property
     def bytes_per_point(self) -> int:  # type: ignore[override]
-        """Working memory per point. At most half of the points have a descriptor, of L^2 bytes, or 2 L^2 at t+1."""
-        return int(super().bytes_per_point) + int(self.config.patch_size) ** 2
+        """Working memory per point. At most half of the points are key points: 8 L bytes, and L^2 at t+1."""
+        size = int(self.config.patch_size)
+        return int(super().bytes_per_point) + 4 * size + size**2 // 4
 
     def motion_at_scale(self, sweeps: ProjectedSweeps) -> Motion:
         """Match the key points of t and t+1 at one pixel size and spread the matches to all points of t."""

@@ -66,7 +66,8 @@ def _fft_dtype(images: Tensor, most: int | None) -> torch.dtype:
 
 def _by_conv(images: Tensor, num_templates: int, target: Tensor) -> Tensor:
     height, width = (images.amax(0).nonzero().amax(0) + 1).tolist()  # the rest is empty in all images
-    templates, targets = images[:num_templates, :height, :width], images[num_templates:, :height, :width]
+    templates = images[:num_templates, :height, :width]
+    targets = images[num_templates:, :height, :width]
     padded = F.pad(targets, (0, width - 1, 0, height - 1)).index_select(0, target)
     # One group per template. Sums of products of zeros and ones are exact in float32 up to 2^24, also with TF32.
     counts = F.conv2d(padded[None], templates[:, None], groups=num_templates)[0]

@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, split_index
+from cflow_torch.ops.kornia_engine import connected_components_kornia
 from cflow_torch.ops.segments import first_of_segment
 
 # Half of the eight neighbours of a block. Links to the other half are found from the other block.
@@ -175,7 +176,31 @@ def _block_masks(padded: Tensor, side: int) -> Tensor:
     return masks.flatten()
 
 
-def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 8, reach: int = 1) -> Tensor:
+def label_pixels(
+    padded: Tensor, pixel: Tensor, row: Tensor, col: Tensor, connectivity: int, reach: int, engine: str
+) -> tuple[Tensor, int]:
+    """Label the set pixels of padded images.
+
+    Args:
+        padded: (B, H', W') bool, from `pad`.
+        pixel, row, col: (P,) int64, flat index of each set pixel, ascending, and its row and column. Rows continue from
+            one image to the next.
+        connectivity: 4 or 8.
+        reach: 1 (plain) or 3 (as after a 3 x 3 dilation).
+        engine: "sparse" or "kornia"; the same components, whose numbers differ.
+
+    Returns:
+        The component of each pixel, (P,) int64, and a number above the largest component.
+    """
+    if engine == "kornia":
+        return connected_components_kornia(padded, pixel, connectivity, reach), pixel.numel()
+    (blocks,) = label_together([(padded, reach)], connectivity)
+    return blocks.of_pixel(row, col), blocks.num_components
+
+
+def connected_components(
+    occupancy: Tensor, pixels: Tensor, connectivity: int = 8, reach: int = 1, engine: str = "sparse"
+) -> Tensor:
     """Label every set pixel.
 
     Args:
@@ -183,6 +208,7 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
         pixels: (P,) int64, flat indices into `occupancy` of the set pixels, ascending (`flatten().nonzero()`).
         connectivity: 4 or 8.
         reach: 1 (plain) or 3 (as after a 3 x 3 dilation).
+        engine: "sparse" or "kornia"; the same result.
 
     Returns:
         (P,) int64: for each pixel, the position in `pixels` of the first pixel of its component, in raster order.
@@ -192,6 +218,8 @@ def connected_components(occupancy: Tensor, pixels: Tensor, connectivity: int = 
 
     Cost: as `label_together`.
     """
+    if engine == "kornia":
+        return connected_components_kornia(occupancy, pixels, connectivity, reach)
     (blocks,) = label_together([(pad([occupancy]), reach)], connectivity)
     row, col = split_index(pixels, occupancy.shape[2])
     height = occupancy.shape[1]

@@ -25,7 +25,8 @@ def build_crossing(rng: np.random.Generator) -> Scene:
     ground = Ground(slope, bend, half_widths=(HALF_WIDTH, HALF_WIDTH), crossing_x=0.0, corner_radius=5.0)
     right = bool(rng.uniform() < 0.5)
     if right:  # a turn to the right, then down the cross street
-        speed, radius = rng.uniform(4, 6), 7.5
+        speed = rng.uniform(4, 6)
+        radius = 7.5
         ego = Route(-1.75 - radius, -1.75, EAST, start=-4.0, speed=speed, radius=radius, angle=-math.pi / 2)
     else:  # straight across, after a rolling stop
         ego = Route(-16.0, -1.75, EAST, speed=rng.uniform(3, 5), acceleration=rng.uniform(1.0, 2.0))

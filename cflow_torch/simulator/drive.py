@@ -68,7 +68,8 @@ class Drive(Log):
         self.timestamps = tuple(_FIRST_STAMP_NS + i * profile.sweep_interval_ns for i in range(num_sweeps))
         self.scene = scene
         self.calibration: dict[str, np.ndarray] = {unit.name: unit.T_ego_sensor for unit in profile.units}
-        self._profile, self._seed = profile, seed
+        self._profile = profile
+        self._seed = seed
         self._seconds = np.arange(num_sweeps) * (profile.sweep_interval_ns * 1e-9)
         self._motion = Motion(scene, profile, self._seconds)
         self._body_poses = scene.body_poses(self._seconds)
@@ -118,7 +119,8 @@ class Drive(Log):
         points = returns.points.numpy().astype(np.float64)
         motion = motions[body]
         flow = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - points
-        now, then = np.append(self._is_annotated[index], True), np.append(self._is_annotated[index + 1], True)
+        now = np.append(self._is_annotated[index], True)
+        then = np.append(self._is_annotated[index + 1], True)
         category = np.where(now, np.append(self._category, 0), 0).astype(np.uint8)
         return FlowLabels(flow.astype(np.float32), category[body], (now & then)[body])
 
@@ -152,7 +154,8 @@ class Drive(Log):
         if self._profile.velocity_noise:
             noise = np.random.default_rng([self._seed, 3, index]).normal(size=len(velocity))
             velocity = (velocity + self._profile.velocity_noise * noise).astype(np.float32)
-        parts, begin = [], 0
+        parts = []
+        begin = 0
         counts = torch.bincount(returns.unit, minlength=len(self._profile.units)).tolist()
         for unit, count in zip(self._profile.units, counts):
             rows = slice(begin, begin + count)
@@ -210,9 +213,11 @@ class Drive(Log):
     def _scan(self, index: int) -> Returns:
         stream = np.random.SeedSequence([self._seed, 2, index]).generate_state(1, np.uint32)[0]
         generator = torch.Generator().manual_seed(int(stream))
-        seconds, ground = float(self._seconds[index]), self.scene.ground
+        seconds = float(self._seconds[index])
+        ground = self.scene.ground
         if self._profile.is_rolling:
-            ego, solids = self._motion.ego_motion(seconds), self._motion.solids(index)
+            ego = self._motion.ego_motion(seconds)
+            solids = self._motion.solids(index)
             return scan_rolling(self._profile, solids, ground, ego, generator)
         solids_now = self.scene.solids(seconds, self._body_poses[index])
         pose = torch.from_numpy(self.poses[index])
@@ -226,7 +231,8 @@ class Drive(Log):
             points = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
         body = self._body_of(returns)
         chosen = np.append(self._category > 0, False)[body]
-        points, body = points[chosen], body[chosen]
+        points = points[chosen]
+        body = body[chosen]
         T_body_ego = (np.linalg.inv(self._body_poses[index]) @ self.poses[index])[body]
         local = np.abs(np.einsum("nij,nj->ni", T_body_ego[:, :3, :3], points) + T_body_ego[:, :3, 3])
         extent = np.zeros((len(self.scene.bodies), 3))

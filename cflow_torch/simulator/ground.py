@@ -63,7 +63,8 @@ class Ground:
             (..., 4, 4) float64 `T_world_body`: x axis ahead, z axis normal to the ground, origin on the ground. At a
             kerb, the height rises over half a metre, not in one step, so that bodies do not jump.
         """
-        slope_x, slope_y = self.slope[0] + self.curvature * x, np.broadcast_to(self.slope[1], x.shape)
+        slope_x = self.slope[0] + self.curvature * x
+        slope_y = np.broadcast_to(self.slope[1], x.shape)
         depth = self.pavement_depth(torch.from_numpy(x), torch.from_numpy(y)).numpy()
         z = self.road_height(x, y) + self.kerb * np.clip(0.5 + depth / 0.5, 0, 1)
         up = np.stack([-slope_x, -slope_y, np.ones_like(x)], -1)
@@ -105,17 +106,20 @@ class Ground:
         # A ray hits a kerb if it is beside the pavement at pavement level, but under the pavement at road level.
         hits_kerb = ~hits_pavement & self._is_pavement_along(origin, directions, low)
         if bool(hits_kerb.any()):
-            rays = directions[:, hits_kerb]
             if origin.dim() > 1:
                 origin = origin.expand_as(directions)[:, hits_kerb]
-            near, far = raised[hits_kerb], low[hits_kerb]
-            for _ in range(_BISECTIONS):
-                middle = 0.5 * (near + far)
-                inside = self._is_pavement_along(origin, rays, middle)
-                near, far = torch.where(inside, near, middle), torch.where(inside, middle, far)
-            low[hits_kerb] = 0.5 * (near + far)
+            low[hits_kerb] = self._kerb_along(origin, directions[:, hits_kerb], raised[hits_kerb], low[hits_kerb])
             cosine[hits_kerb] = 0.5
         return torch.where(hits_pavement, raised, low), cosine
+
+    def _kerb_along(self, origin: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> Tensor:
+        """Return the range at which rays, (3, R), meet the face of a kerb between two ranges, (R,) each."""
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (near + far)
+            is_inside = self._is_pavement_along(origin, directions, middle)
+            near = torch.where(is_inside, near, middle)
+            far = torch.where(is_inside, middle, far)
+        return 0.5 * (near + far)
 
     def _is_pavement_along(self, origin: Tensor, directions: Tensor, t: Tensor) -> Tensor:
         x, y = origin[:2].to(directions.dtype)

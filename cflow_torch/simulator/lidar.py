@@ -87,7 +87,9 @@ def scan(
         T_solid_sensor = T_solid_ego @ torch.from_numpy(unit.T_ego_sensor)
 
         def cosine_at(ray: Tensor, image: RangeImage = image, T_solid_sensor: Tensor = T_solid_sensor) -> Tensor:
-            rays, distance, solid = image.rays.index_select(1, ray), image.distance[ray], image.solid[ray]
+            rays = image.rays.index_select(1, ray)
+            distance = image.distance[ray]
+            solid = image.solid[ray]
             return incidence(solids, T_solid_sensor, solid, rays, distance)
 
         hit, distance, reflected = _measure(image, unit, profile, solids, cosine_at, generator)
@@ -107,44 +109,68 @@ def scan_rolling(
     """Simulate a rolling sweep of all units of a vehicle: every column of shots has its own time and ego pose."""
     of_units = []
     for number, unit in enumerate(profile.units):
-        first, end = unit.active_columns or (0, unit.num_columns)
-        step = math.radians(unit.span) / unit.num_columns
         phase = torch.rand((), generator=generator, dtype=torch.float64).item() if unit.has_jitter else 0.5
-        columns = torch.arange(first, end)
-        T_world_unit = ego.T_world_unit[number].clone()
-        T_world_unit[:, :3, 3] -= solids.origin
-        shots = Shots(
-            azimuth=math.radians(unit.start) + step * (columns.double() + phase),
-            seconds=ego.seconds[number],
-            T_world_sensor=T_world_unit,
-            elevation=torch.tensor(unit.elevations, dtype=torch.float64).deg2rad().sort().values,
-            speed=(0.0, 0.0) if unit.is_virtual else ego.speed,
+        shots = _shots(unit, ego, number, phase, solids.origin)
+        image, cosine_at = cast_shots(
+            shots, solids, ground, min(unit.max_range or profile.max_range, profile.max_range)
         )
-        max_range = min(unit.max_range or profile.max_range, profile.max_range)
-        image, cosine_at = cast_shots(shots, solids, ground, max_range)
         hit, distance, reflected = _measure(image, unit, profile, solids, cosine_at, generator)
-
-        column = hit // len(unit.elevations)
-        T_ego_sensor = torch.from_numpy(unit.T_ego_sensor).float()
-        R, t = T_ego_sensor[:3, :3], T_ego_sensor[:3, 3:]
         if profile.is_deskewed and not unit.is_virtual:
-            # Transform the point that was hit from the world to the frames at the time stamp.
-            T_ego_world = torch.linalg.inv(ego.T_world_ego)
-            T_ego_world[:3, 3] += T_ego_world[:3, :3] @ solids.origin
-            origins = T_world_unit[:, :3, 3].T.float().contiguous()
-            world = origins.index_select(1, column) + image.rays.index_select(1, hit) * distance
-            points = T_ego_world[:3, :3].float() @ world + T_ego_world[:3, 3:].float()
-            local = R.T @ (points - t)
+            points, local = _deskewed_points(shots, image, hit, distance, unit, ego, solids.origin)
         else:
-            azimuth, elevation = shots.azimuth.float()[column], shots.elevation.float()[hit % len(unit.elevations)]
-            level = elevation.cos() * distance
-            local = torch.stack([azimuth.cos() * level, azimuth.sin() * level, elevation.sin() * distance])
-            points = R @ local + t
+            points, local = _points_at_shots(shots, hit, distance, unit)
+        first, _ = unit.active_columns or (0, unit.num_columns)
+        column = hit // len(unit.elevations) + first
         interval_ns = profile.sweep_interval_ns / unit.num_columns
-        offset_ns = ((column + first).double() * interval_ns - profile.reference * profile.sweep_interval_ns).round()
-        image_column = (column + first) % unit.num_columns
+        offset_ns = (column.double() * interval_ns - profile.reference * profile.sweep_interval_ns).round()
+        image_column = column % unit.num_columns
         of_units.append(_returns(points, local, image, hit, reflected, profile, number, image_column, offset_ns))
     return _concatenate(of_units)
+
+
+def _shots(unit: SpinningLidar, ego: EgoMotion, number: int, phase: float, origin: Tensor) -> Shots:
+    """Return the shots of unit `number`; `phase`, 0 ... 1, shifts its columns, and `origin` is as in `MovingSolids`."""
+    first, end = unit.active_columns or (0, unit.num_columns)
+    step = math.radians(unit.span) / unit.num_columns
+    T_world_unit = ego.T_world_unit[number].clone()
+    T_world_unit[:, :3, 3] -= origin
+    return Shots(
+        azimuth=math.radians(unit.start) + step * (torch.arange(first, end).double() + phase),
+        seconds=ego.seconds[number],
+        T_world_sensor=T_world_unit,
+        elevation=torch.tensor(unit.elevations, dtype=torch.float64).deg2rad().sort().values,
+        speed=(0.0, 0.0) if unit.is_virtual else ego.speed,
+    )
+
+
+def _deskewed_points(
+    shots: Shots,
+    image: RangeImage,
+    hit: Tensor,
+    distance: Tensor,
+    unit: SpinningLidar,
+    ego: EgoMotion,
+    origin: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the points that were hit, (3, N) float32, in the ego frame at the time stamp, and in that of the unit."""
+    T_ego_world = torch.linalg.inv(ego.T_world_ego)
+    T_ego_world[:3, 3] += T_ego_world[:3, :3] @ origin
+    column = hit // len(unit.elevations)
+    sensor = shots.T_world_sensor[:, :3, 3].T.float().contiguous().index_select(1, column)
+    world = sensor + image.rays.index_select(1, hit) * distance
+    points = T_ego_world[:3, :3].float() @ world + T_ego_world[:3, 3:].float()
+    T_ego_sensor = torch.from_numpy(unit.T_ego_sensor).float()
+    return points, T_ego_sensor[:3, :3].T @ (points - T_ego_sensor[:3, 3:])
+
+
+def _points_at_shots(shots: Shots, hit: Tensor, distance: Tensor, unit: SpinningLidar) -> tuple[Tensor, Tensor]:
+    """Return the points that were hit, (3, N) float32, in the ego frame and that of the unit when it fired."""
+    azimuth = shots.azimuth.float()[hit // len(unit.elevations)]
+    elevation = shots.elevation.float()[hit % len(unit.elevations)]
+    level = elevation.cos() * distance
+    local = torch.stack([azimuth.cos() * level, azimuth.sin() * level, elevation.sin() * distance])
+    T_ego_sensor = torch.from_numpy(unit.T_ego_sensor).float()
+    return T_ego_sensor[:3, :3] @ local + T_ego_sensor[:3, 3:], local
 
 
 def _measure(
@@ -169,7 +195,9 @@ def _measure(
     luck = torch.rand(len(hit), generator=generator)
     dropout = profile.dropout if unit.dropout is None else unit.dropout
     lucky = (luck < 1 - dropout).nonzero()[:, 0]
-    hit, noise, luck = hit.index_select(0, lucky), noise.index_select(0, lucky), luck.index_select(0, lucky)
+    hit = hit.index_select(0, lucky)
+    noise = noise.index_select(0, lucky)
+    luck = luck.index_select(0, lucky)
 
     distance, solid, cosine = (values.index_select(0, hit) for values in (image.distance, image.solid, image.cosine))
     on_solid = (solid >= 0).nonzero()[:, 0]
@@ -202,7 +230,8 @@ def _returns(
     offset_ns: Tensor,
 ) -> Returns:
     """Returns of unit `number`."""
-    unit, first_laser = profile.units[number], sum(len(before.elevations) for before in profile.units[:number])
+    unit = profile.units[number]
+    first_laser = sum(len(before.elevations) for before in profile.units[:number])
     laser = torch.tensor(unit.elevations, dtype=torch.float64).sort().indices
     beam = hit % len(unit.elevations)
     return Returns(

@@ -26,7 +26,9 @@ class Motion:
     """
 
     def __init__(self, scene: Scene, profile: LidarProfile, stamps: np.ndarray) -> None:
-        self._scene, self._profile, self._stamps = scene, profile, stamps
+        self._scene = scene
+        self._profile = profile
+        self._stamps = stamps
         self._dynamic, solids = scene.dynamic_part()
         body = scene.body_of_solid
         self._row = np.full(len(body), -1)
@@ -46,7 +48,8 @@ class Motion:
         profile = self._profile
         interval = profile.sweep_interval_ns * 1e-9
         stamped = self.ego_poses(np.array([seconds]))[0]
-        poses, times = [], []
+        poses = []
+        times = []
         for unit in profile.units:
             columns = np.arange(*(unit.active_columns or (0, unit.num_columns)))
             shots = seconds + interval * (columns / unit.num_columns - profile.reference)
@@ -68,7 +71,8 @@ class Motion:
 
     def solids(self, index: int) -> MovingSolids:
         """All solids during sweep `index`."""
-        seconds, poses = float(self._stamps[index]), self._dynamic_poses[index]
+        seconds = float(self._stamps[index])
+        poses = self._dynamic_poses[index]
         knots = self._knots(seconds)
         origin = self.ego_poses(np.array([seconds]))[0, :3, 3]
         dynamic = np.stack([_inverse(self._dynamic.solids(t, p).pose.numpy()) for t, p in zip(knots.tolist(), poses)])
@@ -93,35 +97,44 @@ class Motion:
         rows = np.flatnonzero(row_of_hit >= 0)
         if not len(rows):
             return velocity
-        knots = self._knots(seconds) if self._profile.is_rolling else np.array([seconds])
-        # The velocity of a point on a rigid solid is a linear function of the point's position in the world.
-        spread = np.add.outer(knots, (-_DERIVATIVE_STEP, 0.0, _DERIVATIVE_STEP))
-        bodies = self._dynamic.body_poses(spread.ravel())
-        poses = np.stack([self._dynamic.solids(t, p).pose.numpy() for t, p in zip(spread.ravel().tolist(), bodies)])
-        before, now, after = poses.reshape(len(knots), 3, *poses.shape[1:]).swapaxes(0, 1)
-        change = (after - before)[..., :3, :] / (2 * _DERIVATIVE_STEP) @ np.linalg.inv(now)  # (K + 1, M, 3, 4)
-
-        shot = seconds + 1e-9 * returns.offset_ns.numpy()[rows].astype(np.float64)
         row_of_hit = row_of_hit[rows]
-        if len(knots) > 1:
-            position = (shot - knots[0]) / (knots[1] - knots[0])
-            first = np.clip(np.floor(position).astype(int), 0, len(knots) - 2)
-            weight = (position - first)[:, None, None]
-            slope = (1 - weight) * change[first, row_of_hit] + weight * change[first + 1, row_of_hit]
+        shot: np.ndarray = np.full(len(rows), seconds)
+        if self._profile.is_rolling:
+            shot = seconds + 1e-9 * returns.offset_ns.numpy()[rows].astype(np.float64)
+            slope = self._slopes_at(self._knots(seconds), shot, row_of_hit)
         else:
-            slope = change[0, row_of_hit]
-            shot = np.full(len(rows), seconds)
+            slope = self._slopes(shot[:1])[0, row_of_hit]
         sensor, point = self._ray_ends(seconds, shot, returns, rows)
         ray = (point - sensor) / np.linalg.norm(point - sensor, axis=1, keepdims=True)
         at_point = np.einsum("nij,nj->ni", slope[:, :, :3], point) + slope[:, :, 3]
         velocity[rows] = (at_point * ray).sum(1)
         return velocity
 
+    def _slopes(self, seconds: np.ndarray) -> np.ndarray:
+        """Return (T, M, 3, 4) float64: linear functions from world positions to velocities of M dynamic solids.
+
+        The velocity of a point on a rigid solid is such a function of the position of the point.
+        """
+        around = np.add.outer(seconds, (-_DERIVATIVE_STEP, 0.0, _DERIVATIVE_STEP)).ravel()
+        bodies = self._dynamic.body_poses(around)
+        poses = np.stack([self._dynamic.solids(t, p).pose.numpy() for t, p in zip(around.tolist(), bodies)])
+        before, now, after = poses.reshape(len(seconds), 3, *poses.shape[1:]).swapaxes(0, 1)
+        return (after - before)[..., :3, :] / (2 * _DERIVATIVE_STEP) @ np.linalg.inv(now)
+
+    def _slopes_at(self, knots: np.ndarray, shot: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Interpolate `_slopes` between knots: (n, 3, 4) of the solids (n,) at the times of shots (n,)."""
+        slopes = self._slopes(knots)
+        position = (shot - knots[0]) / (knots[1] - knots[0])
+        first = np.clip(np.floor(position).astype(int), 0, len(knots) - 2)
+        weight = (position - first)[:, None, None]
+        return (1 - weight) * slopes[first, row] + weight * slopes[first + 1, row]
+
     def _ray_ends(
         self, seconds: float, shot: np.ndarray, returns: Returns, rows: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """(n, 3) float64 each: world positions of the LiDAR at its shots, and of the points that they hit."""
-        profile, stamped = self._profile, self.ego_poses(np.array([seconds]))[0]
+        profile = self._profile
+        stamped = self.ego_poses(np.array([seconds]))[0]
         unit = returns.unit.numpy()[rows]
         is_virtual = np.array([u.is_virtual for u in profile.units])[unit]
         ego = self.ego_poses(shot)

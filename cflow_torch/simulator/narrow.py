@@ -60,7 +60,8 @@ def _people(rng: np.random.Generator) -> Iterator[Body]:
 
 def _fixed(rng: np.random.Generator) -> Iterator[Body]:
     """Rows of houses with a few gateways, posts, dustbins and bushes."""
-    front, depth = HALF_WIDTH + PAVEMENT, 7.0
+    front = HALF_WIDTH + PAVEMENT
+    depth = 7.0
     for side in (-1, 1):
         x = -REACH
         while x < REACH:

@@ -82,8 +82,11 @@ def _wheels(xs: Sequence[float], y: float, radius: float) -> list[Solid]:
 
 def car(rng: np.random.Generator, route: Route) -> Body:
     """A hull with ground clearance, a cabin and four wheels."""
-    length, width, height = rng.uniform(3.8, 5.0), rng.uniform(1.7, 2.0), rng.uniform(1.4, 1.85)
-    paint, half = rng.uniform(0.15, 0.9), length / 2
+    length = rng.uniform(3.8, 5.0)
+    width = rng.uniform(1.7, 2.0)
+    height = rng.uniform(1.4, 1.85)
+    paint = rng.uniform(0.15, 0.9)
+    half = length / 2
     rear = -half + rng.uniform(0.05, 0.7)  # from estate to saloon
     solids = [
         box(-half, half, -width / 2, width / 2, 0.25, 0.58 * height, paint),
@@ -134,7 +137,8 @@ def own_truck(route: Route) -> list[Body]:
 
 def pedestrian(rng: np.random.Generator, route: Route) -> Body:
     """A torso, a head, and two legs that swing if the person walks."""
-    scale, cloth = rng.uniform(0.9, 1.1), rng.uniform(0.2, 0.8)
+    scale = rng.uniform(0.9, 1.1)
+    cloth = rng.uniform(0.2, 0.8)
     swing = 0.0 if route.speed == 0 else 0.45
     phase = rng.uniform(0, 2 * math.pi)
     legs = [
@@ -157,7 +161,8 @@ def pedestrian(rng: np.random.Generator, route: Route) -> Body:
 
 def cyclist(rng: np.random.Generator, route: Route) -> Body:
     """Two wheels, a frame, and a rider who leans forward and pedals."""
-    cloth, phase = rng.uniform(0.3, 0.8), rng.uniform(0, 2 * math.pi)
+    cloth = rng.uniform(0.3, 0.8)
+    phase = rng.uniform(0, 2 * math.pi)
     solids = [
         *[Solid(CYLINDER, (x, 0.0, 0.34), (0.34, 0.34, 0.025), roll=math.pi / 2, albedo=0.2) for x in (-0.52, 0.52)],
         box(-0.5, 0.45, -0.03, 0.03, 0.35, 0.8, 0.4),
@@ -193,7 +198,8 @@ def pole(x: float, y: float, height: float, radius: float, sign: float = 0.0) ->
 
 def tree(rng: np.random.Generator, x: float, y: float, num_leaves: int = 110) -> Body:
     """A trunk, and a crown of leaves (ellipsoids)."""
-    spread, bottom = rng.uniform(1.3, 2.1), rng.uniform(2.0, 2.8)
+    spread = rng.uniform(1.3, 2.1)
+    bottom = rng.uniform(2.0, 2.8)
     trunk = Solid(CYLINDER, (0, 0, bottom / 2 + 0.5), (0.14, 0.14, bottom / 2 + 0.5), albedo=0.3)
     crown = _foliage(rng, (spread, spread, 1.3 * spread), bottom + 1.2 * spread, num_leaves, (0.12, 0.35))
     return Body([trunk, *crown], Route(x, y))

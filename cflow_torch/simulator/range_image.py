@@ -48,16 +48,19 @@ def cast_unit(
         T_solid_ego: (P, 4, 4) float64, from the ego frame to the frame of each solid.
     """
     T_ego_sensor = torch.from_numpy(unit.T_ego_sensor)
-    T_world_sensor, T_solid_sensor = T_world_ego @ T_ego_sensor, T_solid_ego @ T_ego_sensor
+    T_world_sensor = T_world_ego @ T_ego_sensor
+    T_solid_sensor = T_solid_ego @ T_ego_sensor
     elevation = torch.tensor(unit.elevations, dtype=torch.float64).deg2rad().sort().values
     azimuth = phase + 2 * math.pi / unit.num_columns * torch.arange(unit.num_columns, dtype=torch.float64)
-
     rays = ray_directions(azimuth, elevation)
     distance, solid = cast_solids(solids.kind, T_solid_sensor, solids.half_size, azimuth, elevation, max_range)
-    ground_distance, cosine = ground.cast(T_world_sensor[:3, 3], T_world_sensor[:3, :3] @ rays)
-    rays, ground_distance, cosine = rays.float(), ground_distance.float(), cosine.float()
-    solid = solid.masked_fill(ground_distance < distance, -1)
-    return RangeImage(rays, torch.minimum(distance, ground_distance), solid, cosine)
+    to_ground, cosine = ground.cast(T_world_sensor[:3, 3], T_world_sensor[:3, :3] @ rays)
+    return RangeImage(
+        rays=rays.float(),
+        distance=torch.minimum(distance, to_ground.float()),
+        solid=solid.masked_fill(to_ground.float() < distance, -1),
+        cosine=cosine.float(),
+    )
 
 
 def cast_shots(

@@ -67,7 +67,8 @@ class UnitRays(NamedTuple):
 
 def ray_directions(azimuth: Tensor, elevation: Tensor) -> Tensor:
     """Unit vectors of a range image, sensor frame: (3, C * B), ray index column * B + beam."""
-    horizontal, vertical = elevation.cos(), elevation.sin()
+    horizontal = elevation.cos()
+    vertical = elevation.sin()
     x = azimuth.cos()[:, None] * horizontal
     y = azimuth.sin()[:, None] * horizontal
     return torch.stack([x, y, vertical.expand_as(x)]).flatten(1)
@@ -102,7 +103,8 @@ def cast_solids(
     # From the sensor frame to the unit coordinates of each solid.
     to_unit = T_solid_sensor[:, :3] / half_size[:, :, None]
     origin, matrix = to_unit[..., 3].T.float(), to_unit[..., :3].permute(1, 2, 0).float()  # (3, P), (3, 3, P)
-    cos_azimuth, sin_azimuth = azimuth.cos().float(), azimuth.sin().float()
+    cos_azimuth = azimuth.cos().float()
+    sin_azimuth = azimuth.sin().float()
 
     def rays_at(solid: Tensor, column: Tensor) -> UnitRays:
         level = take(matrix[:, 0], solid) * take(cos_azimuth, column)
@@ -132,34 +134,58 @@ def nearest_hits(
         (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 block of the solid that was hit, -1 = no hit. Ray
         index column * B + beam. At equal range, the first block counts.
     """
-    num_beams = len(elevation)
-    best = torch.full((num_columns * num_beams,), _NO_HIT, device=elevation.device)
-    cos_elevation, sin_elevation = elevation.cos().float(), elevation.sin().float()
-    height = blocks.end_beam - blocks.first_beam
-    size, kind_of = blocks.num_columns * height, kind[blocks.solid]
+    best = torch.full((num_columns * len(elevation),), _NO_HIT, device=elevation.device)
+    sweep = _Rays(rays_at, num_columns, elevation.cos().float(), elevation.sin().float())
+    size = blocks.num_columns * (blocks.end_beam - blocks.first_beam)
+    kind_of_block = kind[blocks.solid]
     for this_kind, intersect in ((BOX, _hit_cube), (CYLINDER, _hit_cylinder), (ELLIPSOID, _hit_ball)):
-        visible = ((kind_of == this_kind) & (size > 0)).nonzero()[:, 0]
-        chunk = (size[visible].cumsum(0) - 1) // _MAX_CANDIDATES
-        for chosen in visible.split(chunk.unique_consecutive(return_counts=True)[1].tolist()) if len(visible) else ():
-            # (block, column) pairs, then (block, column, beam) candidates.
-            pair, offset = _expand(take(blocks.num_columns, chosen))
-            block = take(chosen, pair)
-            column = (take(blocks.first_column, block) + offset) % num_columns
-            rays = rays_at(block, column)
-            ray = column * num_beams + take(blocks.first_beam, block)
-            pair, offset = _expand(take(height, block))
-            beam = take(blocks.first_beam, take(block, pair)) + offset
-            direction = take(rays.level, pair) * take(cos_elevation, beam)
-            direction += take(rays.up, pair) * take(sin_elevation, beam)
-            t = intersect(take(rays.origin, pair), direction)
-            # Range and block form one integer, so that the minimum is exact in any order: positive floats sort by bits.
-            hit = (t < torch.inf).nonzero()[:, 0]
-            pair, offset = take(pair, hit), take(offset, hit)
-            key = (take(t, hit).view(torch.int32).long() << 32) | take(block, pair)
-            best.scatter_reduce_(0, take(ray, pair) + offset, key, "amin")
+        visible = ((kind_of_block == this_kind) & (size > 0)).nonzero()[:, 0]
+        if len(visible):
+            chunk = (size[visible].cumsum(0) - 1) // _MAX_CANDIDATES
+            for chosen in visible.split(chunk.unique_consecutive(return_counts=True)[1].tolist()):
+                ray, key = _hits(blocks, chosen, sweep, intersect)
+                best.scatter_reduce_(0, ray, key, "amin")
     missed = best == _NO_HIT
     distance = (best >> 32).to(torch.int32).view(torch.float32).masked_fill(missed, torch.inf)
     return distance, (best & 0xFFFFFFFF).masked_fill(missed, -1)
+
+
+class _Rays(NamedTuple):
+    """The rays of a range image."""
+
+    rays_at: Callable[[Tensor, Tensor], UnitRays]
+    num_columns: int
+    cos_elevation: Tensor  # (B,) float32
+    sin_elevation: Tensor  # (B,) float32
+
+
+def _hits(
+    blocks: Blocks, chosen: Tensor, rays: _Rays, intersect: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Test all rays of the chosen blocks, whose solids are of one kind.
+
+    Returns:
+        (N,) int64 index of the ray of each hit, and (N,) int64 key of the hit:
+
+        bits  0 ... 31   32 ... 63
+              block      range as float32
+
+        Range and block form one integer, so the minimum is exact in any order: positive floats sort by bits.
+    """
+    # (block, column) pairs, then (block, column, beam) candidates.
+    pair, offset = _expand(take(blocks.num_columns, chosen))
+    block = take(chosen, pair)
+    column = (take(blocks.first_column, block) + offset) % rays.num_columns
+    of_pair = rays.rays_at(block, column)
+    candidate, offset = _expand(take(blocks.end_beam - blocks.first_beam, block))
+    beam = take(blocks.first_beam, take(block, candidate)) + offset
+    direction = take(of_pair.level, candidate) * take(rays.cos_elevation, beam)
+    direction += take(of_pair.up, candidate) * take(rays.sin_elevation, beam)
+    distance = intersect(take(of_pair.origin, candidate), direction)
+    hit = (distance < torch.inf).nonzero()[:, 0]
+    pair_of_hit = take(candidate, hit)
+    ray = take(column * len(rays.cos_elevation), pair_of_hit) + take(beam, hit)
+    return ray, (take(distance, hit).view(torch.int32).long() << 32) | take(block, pair_of_hit)
 
 
 def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
@@ -180,37 +206,67 @@ def _covered_blocks(
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64, device=azimuth.device)] * 3)
     corners = signs * half_size[:, None] - T_solid_sensor[:, None, :3, 3]
     x, y, z = (corners @ T_solid_sensor[:, :3, :3]).unbind(-1)  # (P, 8) each, sensor frame
-    rho = torch.hypot(x, y)
-    middle_x, middle_y = x.mean(1, keepdim=True), y.mean(1, keepdim=True)
-    nearest = torch.hypot(middle_x, middle_y) - torch.hypot(x - middle_x, y - middle_y).amax(1, keepdim=True)
-    nearest, farthest = nearest.clamp(min=1e-6)[:, 0], rho.amax(1)
+    middle_x = x.mean(1, keepdim=True)
+    middle_y = y.mean(1, keepdim=True)
+    radius = torch.hypot(x - middle_x, y - middle_y).amax(1, keepdim=True)
+    nearest = (torch.hypot(middle_x, middle_y) - radius).clamp(min=1e-6)[:, 0]
+    first_column, num_columns = _covered_columns(x, y, torch.atan2(middle_y, middle_x), azimuth)
+    first_beam, end_beam = covered_beams(
+        bottom=z.amin(1),
+        top=z.amax(1),
+        nearest=nearest,
+        farthest=torch.hypot(x, y).amax(1),
+        elevation=elevation,
+    )
+    solid = torch.arange(len(half_size), device=azimuth.device)
+    return Blocks(solid, first_column, num_columns.masked_fill(nearest > max_range, 0), first_beam, end_beam)
 
-    middle = torch.atan2(middle_y, middle_x)[:, 0]
-    cos, sin = middle.cos()[:, None], middle.sin()[:, None]
-    side = torch.atan2(y * cos - x * sin, x * cos + y * sin)
+
+def _covered_columns(x: Tensor, y: Tensor, middle: Tensor, azimuth: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the first column and the number of columns that P solids cover, (P,) int64 each.
+
+    Args:
+        x, y: (P, 8) float64, corners of the solids, sensor frame.
+        middle: (P, 1) float64 radians, azimuth of the middle of each solid.
+        azimuth: (C,) float64 radians, of the columns.
+    """
+    cos = middle.cos()
+    sin = middle.sin()
+    side = torch.atan2(y * cos - x * sin, x * cos + y * sin)  # azimuth of each corner, from the middle
     step = 2 * math.pi / len(azimuth)
-    low, high = (((middle + s - azimuth[0]) / step) for s in (side.amin(1), side.amax(1)))
-    first_column = (low - 1e-6).ceil().long()
-    num_columns = (high + 1e-6).floor().long() - first_column + 1
+    low = (middle[:, 0] + side.amin(1) - azimuth[0]) / step
+    high = (middle[:, 0] + side.amax(1) - azimuth[0]) / step
+    first = (low - 1e-6).ceil().long()
+    count = (high + 1e-6).floor().long() - first + 1
     # If the corners span half a revolution, the sensor's axis passes through the solid, and every column can meet it.
-    around = (high - low) * step > math.pi - 1e-6
-    num_columns = torch.where(around, len(azimuth), num_columns).clamp(0, len(azimuth))
-    num_columns = num_columns.masked_fill(nearest > max_range, 0)
+    is_around = (high - low) * step > math.pi - 1e-6
+    return first, torch.where(is_around, len(azimuth), count).clamp(0, len(azimuth))
 
-    bottom, top = z.amin(1), z.amax(1)
+
+def covered_beams(
+    bottom: Tensor, top: Tensor, nearest: Tensor, farthest: Tensor, elevation: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the first beam that can meet each solid, and the one after the last, (E,) int64 each.
+
+    Args:
+        bottom, top: (E,) float64, heights of the solids in the sensor frame, metres.
+        nearest, farthest: (E,) float64, bounds of the horizontal distance of their points, metres.
+        elevation: (B,) float64 radians, of the beams, ascending.
+    """
     lowest = torch.atan2(bottom, torch.where(bottom < 0, nearest, farthest)) - 1e-6
     highest = torch.atan2(top, torch.where(top > 0, nearest, farthest)) + 1e-6
-    first_beam = torch.searchsorted(elevation, lowest)
-    end_beam = torch.searchsorted(elevation, highest, right=True)
-    solid = torch.arange(len(half_size), device=azimuth.device)
-    return Blocks(solid, first_column, num_columns, first_beam, torch.maximum(first_beam, end_beam))
+    first = torch.searchsorted(elevation, lowest)
+    end = torch.searchsorted(elevation, highest, right=True)
+    return first, torch.maximum(first, end)
 
 
 def _hit_cube(origin: Tensor, direction: Tensor) -> Tensor:
     """(M,) range at which rays (3, M) enter the cube |x|, |y|, |z| <= 1, inf = no hit."""
     inverse = direction.reciprocal()
-    centre, half = -origin * inverse, inverse.abs()
-    enter, leave = (centre - half).amax(0), (centre + half).amin(0)
+    centre = -origin * inverse
+    half = inverse.abs()
+    enter = (centre - half).amax(0)
+    leave = (centre + half).amin(0)
     return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
 
 
@@ -218,8 +274,10 @@ def _hit_cylinder(origin: Tensor, direction: Tensor) -> Tensor:
     """(M,) range at which rays (3, M) enter the cylinder x^2 + y^2 <= 1, |z| <= 1, inf = no hit."""
     enter, leave = _chord(origin[:2], direction[:2])
     inverse = direction[2].reciprocal()
-    centre, half = -origin[2] * inverse, inverse.abs()
-    enter, leave = torch.maximum(enter, centre - half), torch.minimum(leave, centre + half)
+    centre = -origin[2] * inverse
+    half = inverse.abs()
+    enter = torch.maximum(enter, centre - half)
+    leave = torch.minimum(leave, centre + half)
     return torch.where((enter <= leave) & (enter > 0), enter, torch.inf)
 
 

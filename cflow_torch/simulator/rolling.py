@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from cflow_torch.simulator.raycast import ELLIPSOID, Blocks, UnitRays, cosine_of_incidence, take
+from cflow_torch.simulator.raycast import ELLIPSOID, Blocks, UnitRays, cosine_of_incidence, covered_beams, take
 
 _ROUNDS = 2  # of refining which column meets a solid and where the solid is then; each divides the error by 6 or more
 
@@ -119,6 +120,26 @@ class Shots:
     speed: tuple[float, float]
 
     @property
+    def step(self) -> float:
+        """Radians from column to column; negative if the LiDAR turns clockwise."""
+        return float(self.azimuth[1] - self.azimuth[0])
+
+    @property
+    def interval(self) -> float:
+        """Seconds from column to column."""
+        return float(self.seconds[1] - self.seconds[0])
+
+    @property
+    def revolution(self) -> float:
+        """Number of columns in a full turn."""
+        return 2 * math.pi / abs(self.step)
+
+    @property
+    def middle(self) -> int:
+        """Index of the column in the middle of the sweep."""
+        return len(self.azimuth) // 2
+
+    @property
     def directions(self) -> tuple[Tensor, Tensor]:
         """`level` and `up`, (3, C, 1) float32, world axes. Directions: level * cos(elevation) + up * sin(elevation)."""
         R = self.T_world_sensor[:, :3, :3]
@@ -131,95 +152,149 @@ def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Bloc
 
     Convention: a solid at the azimuth where the sweep begins and ends has a block at either end of the image.
     """
-    num_columns = len(shots.azimuth)
-    step = float(shots.azimuth[1] - shots.azimuth[0])
-    interval = float(shots.seconds[1] - shots.seconds[0])
-    revolution = 2 * math.pi / abs(step)
-    # `travel`: radius of a sphere around the mid-sweep centre of a solid, which holds the solid during the sweep.
-    middle = num_columns // 2
-    centre, speed = solids.centres
-    late = abs(float(shots.seconds[middle] - solids.middle)) + 0.5 * interval * num_columns
-    travel = solids.radius + late * (speed + shots.speed[0])
-    offset = centre - shots.T_world_sensor[middle, :3, 3]
+    offset, travel, late = _reach_in_sweep(solids, shots)
     distance = offset.norm(dim=1)
     near = (distance - travel < max_range).nonzero()[:, 0]
-    distance, travel = distance[near].clamp(min=1e-6), travel[near]
-    x, y, z = (offset[near] @ shots.T_world_sensor[middle, :3, :3]).T
+    distance = distance[near].clamp(min=1e-6)
+    travel = travel[near]
+    x, y, z = (offset[near] @ shots.T_world_sensor[shots.middle, :3, :3]).T
     rho = torch.hypot(x, y)
     slack = (travel / distance).clamp(max=1).asin() + late * shots.speed[1]
     height = torch.atan2(z, rho)
     is_seen = (height + slack > shots.elevation[0]) & (height - slack < shots.elevation[-1])
-    column = ((torch.atan2(y, x) - shots.azimuth[0]) / step) % revolution
     # Near the sensor's axis, the azimuth of a solid is not reliable.
-    slack = torch.where(rho < 2 * travel, math.pi, 2 * slack).clamp(max=math.pi) / abs(step)
-    solid, guess = [], []
-    for shift in (-revolution, 0, revolution):
+    slack = torch.where(rho < 2 * travel, math.pi, 2 * slack).clamp(max=math.pi) / abs(shots.step)
+    column = ((torch.atan2(y, x) - shots.azimuth[0]) / shots.step) % shots.revolution
+    solid = []
+    guess = []
+    for shift in (-shots.revolution, 0, shots.revolution):
         shifted = column + shift
-        chosen = (is_seen & (shifted + slack >= 0) & (shifted - slack < num_columns)).nonzero()[:, 0]
+        is_in_sweep = (shifted + slack >= 0) & (shifted - slack < len(shots.azimuth))
+        chosen = (is_seen & is_in_sweep).nonzero()[:, 0]
         solid.append(near[chosen])
         guess.append(shifted[chosen])
-    return _blocks_near(solids, shots, torch.cat(solid), torch.cat(guess), speed, max_range)
+    return _blocks_near(solids, shots, torch.cat(solid), torch.cat(guess), max_range)
 
 
-def _blocks_near(
-    solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor, speed: Tensor, max_range: float
-) -> Blocks:
+def _reach_in_sweep(solids: MovingSolids, shots: Shots) -> tuple[Tensor, Tensor, float]:
+    """Bound the motion of all solids during the sweep.
+
+    Returns:
+        (P, 3) float64 centre of each solid in the middle of the sweep, from the sensor, world axes; (P,) float64 radius
+        of a sphere around it that holds the solid during the sweep, metres; seconds from the middle of the sweep to
+        its ends.
+    """
+    centre, speed = solids.centres
+    late = abs(float(shots.seconds[shots.middle] - solids.middle)) + 0.5 * shots.interval * len(shots.azimuth)
+    travel = solids.radius + late * (speed + shots.speed[0])
+    return centre - shots.T_world_sensor[shots.middle, :3, 3], travel, late
+
+
+def _blocks_near(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor, max_range: float) -> Blocks:
     """One block for each `solid` (E,), which the unit meets near column `guess` (E,)."""
-    num_columns = len(shots.azimuth)
-    step = float(shots.azimuth[1] - shots.azimuth[0])
-    interval = float(shots.seconds[1] - shots.seconds[0])
-    num_around = 2 * math.pi / abs(step)
-    half = solids.half_size[solid]
+    view = _aim(solids, shots, solid, guess)
+    outline = _outline(solids, solid, view)
+    # While the unit scans its block, a solid moves by at most `drift` from its position in the middle of the block.
+    width = (outline.right - outline.left).clamp(max=2 * math.pi)
+    speed = solids.centres[1][solid] + shots.speed[0] + shots.speed[1] * view.centre.norm(dim=1)
+    drift = speed * shots.interval * (0.6 * width / abs(shots.step) + 2)
+    clearance = view.rho - outline.spread
+    margin = (drift / clearance.clamp(min=1e-6)).clamp(max=1).asin() + 1e-6
+    is_around = (clearance <= 2 * drift) | (width + 2 * margin > math.pi)
+    nearest = (clearance - drift).clamp(min=1e-6)
+    first, count = _columns(shots, view.column, outline, margin, is_around)
+    # The block of a solid around the sensor's axis has all columns, so its motion during the whole sweep counts.
+    whole = torch.where(is_around, speed * shots.interval * len(shots.azimuth), drift)
+    first_beam, end_beam = covered_beams(
+        bottom=outline.low - whole,
+        top=outline.high + whole,
+        nearest=torch.where(is_around, 1e-6, nearest),
+        farthest=view.rho + outline.spread + drift,
+        elevation=shots.elevation,
+    )
+    return Blocks(solid, first, count.masked_fill(nearest > max_range, 0), first_beam, end_beam)
+
+
+class _View(NamedTuple):
+    """E solids as the sensor meets them."""
+
+    column: Tensor  # (E,) float64, column at the azimuth of the centre
+    rotation: Tensor  # (E, 3, 3) float64, sensor axes to the solid's, at this column
+    centre: Tensor  # (E, 3) float64, metres, sensor frame
+    rho: Tensor  # (E,) float64, metres, horizontal distance of the centre
+
+
+def _aim(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor) -> _View:
+    """Find the column that meets the centre of each solid, from a guess, (E,)."""
     for _ in range(_ROUNDS):
-        column = guess.round().long().clamp(0, num_columns - 1)
+        column = guess.round().long().clamp(0, len(shots.azimuth) - 1)
         T_world_sensor = shots.T_world_sensor.index_select(0, column)
         to_solid, _ = solids.at(solid, take(shots.seconds, column))
-        rotation = to_solid[:, :, :3] @ T_world_sensor[:, :3, :3]  # sensor axes to the solid's
+        rotation = to_solid[:, :, :3] @ T_world_sensor[:, :3, :3]
         origin = rotate(to_solid[:, :, :3], T_world_sensor[:, :3, 3]) + to_solid[..., 3]  # of the sensor
         centre = rotate(rotation.transpose(1, 2), -origin)
         azimuth = torch.atan2(centre[:, 1], centre[:, 0])
-        expected = shots.azimuth[0] + step * guess
-        guess = guess + torch.remainder((azimuth - expected) / step + 0.5 * num_around, num_around) - 0.5 * num_around
+        late = (azimuth - (shots.azimuth[0] + shots.step * guess)) / shots.step  # columns
+        guess = guess + torch.remainder(late + 0.5 * shots.revolution, shots.revolution) - 0.5 * shots.revolution
+    return _View(guess, rotation, centre, torch.hypot(centre[:, 0], centre[:, 1]))
 
-    rho = torch.hypot(centre[:, 0], centre[:, 1])
-    spread = half.amax(1)  # horizontal radius of an ellipsoid's bounding sphere; corrected below for the rest
-    low, high, side = centre[:, 2] - spread, centre[:, 2] + spread, (spread / rho.clamp(min=1e-6)).clamp(max=1).asin()
-    side = torch.stack([-side, side])
+
+class _Outline(NamedTuple):
+    """Bounds of E solids in the sensor frame, (E,) float64 each."""
+
+    low: Tensor  # metres
+    high: Tensor  # metres
+    left: Tensor  # radians from the centre to the smallest azimuth
+    right: Tensor  # radians from the centre to the largest azimuth
+    spread: Tensor  # metres, horizontal radius
+
+
+def _outline(solids: MovingSolids, solid: Tensor, view: _View) -> _Outline:
+    """Bound an ellipsoid by its bounding sphere, and other solids by their corners."""
+    half = solids.half_size[solid]
+    spread = half.amax(1)
+    side = (spread / view.rho.clamp(min=1e-6)).clamp(max=1).asin()
+    outline = _Outline(view.centre[:, 2] - spread, view.centre[:, 2] + spread, -side, side, spread)
     cornered = (solids.kind[solid] != ELLIPSOID).nonzero()[:, 0]
     if len(cornered):
-        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
-        reach = (signs * half[cornered, None]) @ rotation[cornered]
-        x, y, z = (reach + centre[cornered, None]).unbind(-1)  # (E', 8) each, sensor frame
-        spread[cornered] = torch.hypot(reach[..., 0], reach[..., 1]).amax(1)
-        low[cornered], high[cornered] = z.amin(1), z.amax(1)
-        cos, sin = (centre[cornered, k, None] / rho[cornered, None].clamp(min=1e-6) for k in (0, 1))
-        corner_side = torch.atan2(y * cos - x * sin, x * cos + y * sin)
-        side[:, cornered] = torch.stack([corner_side.amin(1), corner_side.amax(1)])
+        of_corners = _outline_of_corners(half[cornered], *(values[cornered] for values in view[1:]))
+        for values, exact in zip(outline, of_corners):
+            values[cornered] = exact
+    return outline
 
-    # While the unit scans its block, a solid moves by at most `drift` from its position in the middle of the block.
-    width = (side[1] - side[0]).clamp(max=2 * math.pi)
-    relative = speed[solid] + shots.speed[0] + shots.speed[1] * centre.norm(dim=1)
-    drift = relative * interval * (0.6 * width / abs(step) + 2)
-    nearest, farthest = (rho - spread - drift).clamp(min=1e-6), rho + spread + drift
-    margin = (drift / (rho - spread).clamp(min=1e-6)).clamp(max=1).asin() + 1e-6
-    around = (rho - spread <= 2 * drift) | (width + 2 * margin > math.pi)
+
+def _outline_of_corners(half: Tensor, rotation: Tensor, centre: Tensor, rho: Tensor) -> _Outline:
+    """Bound boxes of half size (E, 3); the other arguments are as in `_View`."""
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+    arm = (signs * half[:, None]) @ rotation  # [E, 8, 3], from the centre
+    x, y, z = (arm + centre[:, None]).unbind(-1)  # [E, 8] each, sensor frame
+    cos, sin = (centre[:, axis, None] / rho[:, None].clamp(min=1e-6) for axis in (0, 1))
+    side = torch.atan2(y * cos - x * sin, x * cos + y * sin)
+    return _Outline(
+        low=z.amin(1),
+        high=z.amax(1),
+        left=side.amin(1),
+        right=side.amax(1),
+        spread=torch.hypot(arm[..., 0], arm[..., 1]).amax(1),
+    )
+
+
+def _columns(
+    shots: Shots, column: Tensor, outline: _Outline, margin: Tensor, is_around: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the first column, and the number of columns, between the two sides of each solid, (E,) int64 each."""
+    num_columns = len(shots.azimuth)
     # Columns count along `step`, which may be negative.
-    side = side if step > 0 else -side.flip(0)
-    first = (guess + (side[0] - margin) / abs(step)).ceil().long()
-    end = (guess + (side[1] + margin) / abs(step)).floor().long() + 1
-    first = torch.where(around, 0, first).clamp(0, num_columns)
-    end = torch.where(around, num_columns, end).clamp(0, num_columns)
-    count = (end - first).clamp(min=0).masked_fill(nearest > max_range, 0)
-
-    # The block of a solid around the sensor's axis has all columns, so its motion during the whole sweep counts.
-    whole = torch.where(around, relative * interval * num_columns, drift)
-    nearest = torch.where(around, 1e-6, nearest)
-    bottom, top = low - whole, high + whole
-    lowest = torch.atan2(bottom, torch.where(bottom < 0, nearest, farthest)) - 1e-6
-    highest = torch.atan2(top, torch.where(top > 0, nearest, farthest)) + 1e-6
-    first_beam = torch.searchsorted(shots.elevation, lowest)
-    end_beam = torch.searchsorted(shots.elevation, highest, right=True)
-    return Blocks(solid, first, count, first_beam, torch.maximum(first_beam, end_beam))
+    left = outline.left
+    right = outline.right
+    if shots.step < 0:
+        left = -outline.right
+        right = -outline.left
+    first = (column + (left - margin) / abs(shots.step)).ceil().long()
+    end = (column + (right + margin) / abs(shots.step)).floor().long() + 1
+    first = torch.where(is_around, 0, first).clamp(0, num_columns)
+    end = torch.where(is_around, num_columns, end).clamp(0, num_columns)
+    return first, (end - first).clamp(min=0)
 
 
 class RollingRays:
@@ -236,8 +311,10 @@ class RollingRays:
         self._moves = solids.row[blocks.solid] >= 0
         self._kind = solids.kind[blocks.solid]
         self._inverse_half = solids.half_size[blocks.solid].reciprocal().T.float().contiguous()
-        self._cos_elevation, self._sin_elevation = shots.elevation.cos().float(), shots.elevation.sin().float()
-        self._seconds, self._block_seconds = shots.seconds, seconds
+        self._cos_elevation = shots.elevation.cos().float()
+        self._sin_elevation = shots.elevation.sin().float()
+        self._seconds = shots.seconds
+        self._block_seconds = seconds
         level, up = shots.directions
         self._columns = torch.cat([shots.T_world_sensor[:, :3, 3].T.float(), level[..., 0], up[..., 0]])  # (9, C)
 
@@ -265,7 +342,8 @@ class RollingRays:
         Returns:
             (N,) float32 in [0, 1].
         """
-        rays, inverse_half = self(block, column), take(self._inverse_half, block)
+        rays = self(block, column)
+        inverse_half = take(self._inverse_half, block)
         direction = rays.level * take(self._cos_elevation, beam) + rays.up * take(self._sin_elevation, beam)
         at = rays.origin + direction * distance
         return cosine_of_incidence(take(self._kind, block), at, direction / inverse_half, inverse_half)

@@ -79,7 +79,8 @@ class Scene:
 
 def _rotation(axis: int, angle: np.ndarray) -> np.ndarray:
     """(P, 4, 4) rotations by `angle` (P,) radians about x (0), y (1) or z (2)."""
-    first, second = (axis + 1) % 3, (axis + 2) % 3
+    first = (axis + 1) % 3
+    second = (axis + 2) % 3
     rotation = np.tile(np.eye(4), (len(angle), 1, 1))
     rotation[:, first, first] = rotation[:, second, second] = np.cos(angle)
     rotation[:, second, first] = np.sin(angle)

@@ -49,9 +49,11 @@ class SpinningLidar:
     def T_ego_sensor(self) -> np.ndarray:
         """(4, 4) float64, from the sensor frame to the ego frame."""
         cos, sin = math.cos(math.radians(self.yaw)), math.sin(math.radians(self.yaw))
-        level, down = math.cos(math.radians(self.pitch)), math.sin(math.radians(self.pitch))
+        level = math.cos(math.radians(self.pitch))
+        down = math.sin(math.radians(self.pitch))
         flip = -1.0 if self.upside_down else 1.0
-        ahead, left = (cos * level, sin * level, -down, 0), (-sin * flip, cos * flip, 0, 0)
+        ahead = (cos * level, sin * level, -down, 0)
+        left = (-sin * flip, cos * flip, 0, 0)
         up = (cos * down * flip, sin * down * flip, level * flip, 0)
         return np.array([ahead, left, up, (*self.position, 1)], np.float64).T
 

@@ -100,7 +100,8 @@ def _parked(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
 def _fixed(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     """Houses, walls, poles, trees, bushes."""
     yield from houses(rng, ground)
-    main, crossing = ground.half_widths[0], ground.crossing_x
+    main = ground.half_widths[0]
+    crossing = ground.crossing_x
     # A hoarding 0.2-0.6 m from moving cars, and a garden wall that parked cars almost touch.
     yield objects.wall(-24.0, 5.95, 20.0, 0.1, 2.0, albedo=0.7)
     yield objects.wall(crossing + 36.0, -main - 0.1, 24.0, 0.15, 1.1)
@@ -131,7 +132,9 @@ def furniture(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
 def houses(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     """Rows of houses behind the pavements, with gaps and set-backs."""
     (main, cross), crossing = ground.half_widths, ground.crossing_x
-    main_front, cross_front, depth = main + PAVEMENT, cross + PAVEMENT, 8.0
+    main_front = main + PAVEMENT
+    cross_front = cross + PAVEMENT
+    depth = 8.0
 
     def row(begin: float, end: float) -> Iterator[tuple[float, float, float]]:
         """(middle, width, set-back) of each house of a row."""

@@ -48,12 +48,14 @@ def flow_figures(
     """
     if not 200 <= width <= 4000:
         raise CFlowError(f"width={width}: give 200 ... 4000 pixels")
-    corners, longest = [], []
+    corners = []
+    longest = []
     for frame in frames:
         view, position, _, drawn = split_sweep(frame.points, frame.is_ground, point_cloud_range)
         corners.append(view)
         longest.append(longest_flow(point_rows("residual flow", frame.result.residual_flow, len(position))[drawn]))
-    low, high = np.min(corners, axis=0)[0], np.max(corners, axis=0)[1]
+    low = np.min(corners, axis=0)[0]
+    high = np.max(corners, axis=0)[1]
     for frame in frames:
         figure = plot_flow(
             frame.points,

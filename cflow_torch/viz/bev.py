@@ -58,15 +58,19 @@ def plot_flow(
     Cost: linear in the points; about a second for 100,000.
     """
     view, position, is_floor, rest = split_sweep(points, is_ground, point_cloud_range)
-    given, cluster = result_or_residual, None
+    given = result_or_residual
+    cluster = None
     if isinstance(given, FlowResult):
-        cluster, given = as_numpy(given.cluster_id)[rest], given.residual_flow
+        cluster = as_numpy(given.cluster_id)[rest]
+        given = given.residual_flow
     residual = point_rows("residual flow", given, len(position))
     true_flow = None if truth is None else point_rows("truth", truth, len(position))[rest]
     if legend is not None and legend not in style.CORNERS:
         raise CFlowError(f"legend={legend!r}: give None or one of {', '.join(style.CORNERS)}")
 
-    floor, position, residual = position[is_floor], position[rest], residual[rest]
+    floor = position[is_floor]
+    position = position[rest]
+    residual = residual[rest]
     if max_flow is None:
         max_flow = longest_flow(residual if true_flow is None else np.concatenate([residual, true_flow]))
 
@@ -141,7 +145,8 @@ def view_of(position: np.ndarray, point_cloud_range: Sequence[float] | None) -> 
         raise CFlowError(
             f"point_cloud_range={point_cloud_range}: give (x0, y0, z0, x1, y1, z1), metres, low ends below high ones"
         )
-    low, high = bounds[:3], bounds[3:]
+    low = bounds[:3]
+    high = bounds[3:]
     is_inside = np.isfinite(position).all(axis=1) & ((position >= low) & (position <= high)).all(axis=1)
     if not np.isfinite(bounds[[0, 1, 3, 4]]).all():  # an open side ends where the points end
         seen = position[is_inside] if is_inside.any() else np.zeros((1, 3))

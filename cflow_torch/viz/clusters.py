@@ -47,13 +47,16 @@ def plot_clusters(
     if cluster.shape != (len(position),) or cluster.dtype.kind not in "iu":
         raise CFlowError(f"cluster_id has shape {cluster.shape}, {cluster.dtype}: give ({len(position)},) integers")
 
-    floor, position, cluster = position[is_floor], position[rest], cluster[rest]
+    floor = position[is_floor]
+    position = position[rest]
+    cluster = cluster[rest]
     has_cluster = cluster >= 0
     _, number, size = np.unique(cluster[has_cluster], return_inverse=True, return_counts=True)
 
     figure, (axes,) = new_figure(("",), view, title, _CAPTION)
     draw_ground(axes, floor)
-    alone, members = position[~has_cluster], position[has_cluster]
+    alone = position[~has_cluster]
+    members = position[has_cluster]
     axes.scatter(alone[:, 0], alone[:, 1], s=dot_area(axes), color=style.STATIC, linewidths=0, zorder=2)
     order = np.argsort(-size[number], kind="stable")  # small ones on top
     color = cluster_colors(members, number, (0, 0, 0))[order] / 255
@@ -76,11 +79,13 @@ def cluster_colors(position: np.ndarray, cluster_id: np.ndarray, no_cluster: Seq
     colors = np.tile(np.array(no_cluster, np.uint8), (len(cluster_id), 1))
     has_cluster = cluster_id >= 0
     _, group, size = np.unique(cluster_id[has_cluster], return_inverse=True, return_counts=True)
-    low, high = np.full((len(size), 2), np.inf), np.full((len(size), 2), -np.inf)
+    low = np.full((len(size), 2), np.inf)
+    high = np.full((len(size), 2), -np.inf)
     np.minimum.at(low, group, position[has_cluster, :2])
     np.maximum.at(high, group, position[has_cluster, :2])
     distance = np.full((len(size), len(PALETTE)), np.inf)  # from each cluster to the nearest cluster of each colour
-    color_of, uses = np.zeros(len(size), np.int64), np.zeros(len(PALETTE), np.int64)
+    color_of = np.zeros(len(size), np.int64)
+    uses = np.zeros(len(PALETTE), np.int64)
     for cluster in np.argsort(-size, kind="stable"):
         color = np.lexsort((uses, -distance[cluster]))[0]
         color_of[cluster] = color

@@ -40,7 +40,8 @@ class PackedDrive:
         for name, value in {"max_flow": max_flow, "voxel": voxel}.items():
             if not 0 < value < np.inf:
                 raise CFlowError(f"{name}={value}: give a positive length in metres")
-        self.max_flow, self.voxel = max_flow, voxel
+        self.max_flow = max_flow
+        self.voxel = voxel
         self.frame = ViewerFrame()
         self.frames: list[dict[str, Any]] = []
         self.points: list[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]] = []  # units, colours, cluster
@@ -49,41 +50,16 @@ class PackedDrive:
 
     def add(self, scene: Scene) -> None:
         """Thin one pair and choose its colours."""
-        position, ground = scene.position, scene.is_ground
-        speed = np.linalg.norm(scene.residual, axis=1)
-        static = np.where(ground, GROUND, STATIC)
-        moving = ~ground & (speed > MOVING)
+        ground = scene.is_ground
         cluster = np.where(ground, -1, scene.cluster)
-        entries = {
-            "flow": np.where(moving, _wheel_entry(scene.residual, self.max_flow), static),
-            "speed": np.where(moving, _ramp_entry(speed, self.max_flow), static),
-            "object": _object_entry(position, cluster, moving, static),
-        }
-        important = moving
-        if scene.confidence is not None:
-            entries["confidence"] = np.where(ground, GROUND, _ramp_entry(1 - scene.confidence, 1.0))
-        if scene.truth is not None:
-            length = np.linalg.norm(scene.truth, axis=1)
-            error = np.linalg.norm(scene.residual - scene.truth, axis=1)
-            unknown = np.where(ground, GROUND, UNKNOWN)
-            known = ~ground & np.isfinite(length)
-            moves, wrong = known & (length > MOVING), known & (error > MIN_ERROR)
-            entry = np.where(moves, _wheel_entry(scene.truth, self.max_flow), STATIC)
-            entries["truth"] = np.where(known, entry, unknown)
-            entries["error"] = np.where(known, np.where(wrong, _ramp_entry(error, MAX_ERROR), STATIC), unknown)
-            important = moving | moves | wrong
-        kept = self._thin(position, important, ground)
-        units = np.rint(position[kept] / _UNIT).astype(np.int16)
-        entries = {name: entry[kept].astype(np.uint8) for name, entry in entries.items()}
-        self.points.append((units, entries, cluster[kept]))
-        self.num_given += len(position)
-        near = np.hypot(position[:, 0], position[:, 1]) < _FLOOR_RADIUS
-        height = position[near & ground, 2] if (near & ground).any() else np.sort(position[near, 2])[: near.sum() // 10]
-        self.floor += [float(np.median(height))] if len(height) else []
-
-        number, start, flow = scene.arrows()
-        colors = _wheel_entry(flow, self.max_flow).tolist()
-        speeds = np.round(np.linalg.norm(flow, axis=1) / scene.interval, 1).tolist()
+        entries, important = self._entries(scene, cluster)
+        kept = self._thin(scene.position, important, ground)
+        units = np.rint(scene.position[kept] / _UNIT).astype(np.int16)
+        self.points.append(
+            (units, {name: entry[kept].astype(np.uint8) for name, entry in entries.items()}, cluster[kept])
+        )
+        self.num_given += len(scene.position)
+        self.floor += _floor_height(scene.position, ground)
         pose = np.eye(4) if scene.pose is None else self.frame.move(scene.pose)
         self.frames.append(
             {
@@ -92,10 +68,44 @@ class PackedDrive:
                 "interval": round(scene.interval, 4),
                 "pose": np.round(pose[:3], 5).ravel().tolist(),  # row-major (3, 4)
                 "count": len(units),
-                "arrows": list(zip(number.tolist(), _rounded(start), _rounded(ARROW_STEPS * flow), colors, speeds)),
+                "arrows": self._arrows(scene),
                 "boxes": [],
             }
         )
+
+    def _entries(self, scene: Scene, cluster: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Choose the colours of all points, and return which points must not be thinned, (N,) bool."""
+        ground = scene.is_ground
+        speed = np.linalg.norm(scene.residual, axis=1)
+        static = np.where(ground, GROUND, STATIC)
+        moving = ~ground & (speed > MOVING)
+        entries = {
+            "flow": np.where(moving, _wheel_entry(scene.residual, self.max_flow), static),
+            "speed": np.where(moving, _ramp_entry(speed, self.max_flow), static),
+            "object": _object_entry(scene.position, cluster, moving, static),
+        }
+        if scene.confidence is not None:
+            entries["confidence"] = np.where(ground, GROUND, _ramp_entry(1 - scene.confidence, 1.0))
+        if scene.truth is None:
+            return entries, moving
+
+        length = np.linalg.norm(scene.truth, axis=1)
+        error = np.linalg.norm(scene.residual - scene.truth, axis=1)
+        unknown = np.where(ground, GROUND, UNKNOWN)
+        known = ~ground & np.isfinite(length)
+        moves = known & (length > MOVING)
+        wrong = known & (error > MIN_ERROR)
+        true_entry = np.where(moves, _wheel_entry(scene.truth, self.max_flow), STATIC)
+        entries["truth"] = np.where(known, true_entry, unknown)
+        entries["error"] = np.where(known, np.where(wrong, _ramp_entry(error, MAX_ERROR), STATIC), unknown)
+        return entries, moving | moves | wrong
+
+    def _arrows(self, scene: Scene) -> list[Any]:
+        """List cluster, start, vector, colour and speed (m/s) of each arrow."""
+        number, start, flow = scene.arrows()
+        colors = _wheel_entry(flow, self.max_flow).tolist()
+        speeds = np.round(np.linalg.norm(flow, axis=1) / scene.interval, 1).tolist()
+        return list(zip(number.tolist(), _rounded(start), _rounded(ARROW_STEPS * flow), colors, speeds))
 
     def add_tracks(self, tracks: Mapping[str, np.ndarray]) -> None:
         """Add the boxes of tracks. The points of a track get the same colour in all sweeps."""
@@ -119,7 +129,8 @@ class PackedDrive:
         for frame, (units, entries, _) in zip(self.frames, self.points):
             missing = np.where(entries["flow"] == GROUND, GROUND, UNKNOWN).astype(np.uint8)
             frame["data"] = packed(_planes(units, [entries.get(c["name"], missing) for c in chosen]))
-        shown, side = sum(frame["count"] for frame in self.frames), self.voxel
+        shown = sum(frame["count"] for frame in self.frames)
+        side = self.voxel
         T = self.frame.T_world_viewer
         return {
             "frames": self.frames,
@@ -147,6 +158,15 @@ class PackedDrive:
         return kept[np.lexsort((position[kept, 2], cell[:, 1], cell[:, 0]))]
 
 
+def _floor_height(position: np.ndarray, ground: np.ndarray) -> list[float]:
+    """Return the height of the floor near the vehicle, metres; nothing if there are no points."""
+    near = np.hypot(position[:, 0], position[:, 1]) < _FLOOR_RADIUS
+    height = np.sort(position[near, 2])[: near.sum() // 10]
+    if (near & ground).any():
+        height = position[near & ground, 2]
+    return [float(np.median(height))] if len(height) else []
+
+
 def _planes(units: np.ndarray, entries: Sequence[np.ndarray]) -> bytes:
     """Return the low, then the high bytes of the steps from point to point, axis by axis; then the entries."""
     steps = np.diff(units, axis=0, prepend=np.zeros((1, 3), np.int16)).astype("<i2")
@@ -168,7 +188,9 @@ def _colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
     speed = max_flow / interval
     rim = f"right: ahead of the vehicle; rim: {max_flow:.4g} m per sweep, {speed:.3g}\u00a0m/s"
     faded = np.rint(_FADED * PALETTE + (1 - _FADED) * _GREY).astype(np.uint8)
-    wheel, ramp, objects = _wheel().tolist(), _ramp().tolist(), np.concatenate([PALETTE, faded]).tolist()
+    wheel = _wheel().tolist()
+    ramp = _ramp().tolist()
+    objects = np.concatenate([PALETTE, faded]).tolist()
     likely = "probability of an error below 0.1 m"
     rows = (
         # name, text, palette, scale, note, meaning of the greys

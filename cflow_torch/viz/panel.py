@@ -40,26 +40,22 @@ def new_figure(
     view that is too long and thin for a panel gets empty space along its long sides. The caption is one line below the
     panels. It explains the colours; we append the distance of the rings.
     """
-    gap, foot = 0.2, 0.42
+    gap = 0.2  # inches
+    foot = 0.42
     full, dpi = (10.0, 100) if len(names) == 1 else (16.0, 112)
     width = full / len(names) - gap * (1 + 1 / len(names))
-    extent = view[1, :2] - view[0, :2]
-    wanted = np.maximum(extent, (extent[1] / _HIGHEST, extent[0] * 2 * style.WHEEL_INCHES[1] / width))
-    view = view[:, :2] + np.array([[-0.5], [0.5]]) * (wanted - extent)
-    height = float(width * wanted[1] / wanted[0])
+    view, extent = _fitted(view, width)
+    height = float(width * extent[1] / extent[0])
     head = (0.5 if title else 0) + (0.42 if any(names) else 0) or gap
     figure = style.blank_figure((full, height + head + foot), dpi)
-    from matplotlib.patches import Circle
-
     farthest = float(np.abs(view).max())
     step = max(_RING, style.round_length(farthest / (0.4 * _MOST_RINGS)))  # rounding down takes off up to 3/5
-    radii = np.arange(step, farthest + 1e-9, step).tolist() if has_rings else []
     panels = []
     for i, name in enumerate(names):
         axes = style.add_panel(figure, gap + i * (width + gap), foot, width, height)
         style.set_view(axes, *view)
-        for radius in radii:
-            axes.add_patch(Circle((0, 0), radius, fill=False, color=style.FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
+        if has_rings:
+            _draw_rings(axes, step, farthest)
         if name:
             axes.set_title(name, fontsize=14, color=style.INK, pad=7)
         panels.append(axes)
@@ -67,6 +63,21 @@ def new_figure(
         style.add_heading(figure, 0.3, title)
     style.add_caption(figure, f"{caption}   rings: every {step:g} m" if has_rings else caption)
     return figure, panels
+
+
+def _fitted(view: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Enlarge a view that is too long and thin for a panel of `width` inches: the view, and its extent, (2,) metres."""
+    extent = view[1, :2] - view[0, :2]
+    wanted = np.maximum(extent, (extent[1] / _HIGHEST, extent[0] * 2 * style.WHEEL_INCHES[1] / width))
+    return view[:, :2] + np.array([[-0.5], [0.5]]) * (wanted - extent), wanted
+
+
+def _draw_rings(axes: Axes, step: float, farthest: float) -> None:
+    """Draw range rings every `step` metres."""
+    from matplotlib.patches import Circle
+
+    for radius in np.arange(step, farthest + 1e-9, step).tolist():
+        axes.add_patch(Circle((0, 0), radius, fill=False, color=style.FRAME, alpha=0.45, linewidth=0.8, zorder=0.5))
 
 
 def draw_ground(axes: Axes, position: np.ndarray) -> None:
@@ -84,7 +95,8 @@ def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.nd
     dot = dot_area(axes)
     static = position[~moves]
     axes.scatter(static[:, 0], static[:, 1], s=dot, color=style.STATIC, linewidths=0, zorder=2)
-    position, flow, cluster = position[moves], flow[moves], None if cluster is None else cluster[moves]
+    position = position[moves]
+    flow = flow[moves]
     # A dark rim makes yellow visible on white. The rim of slow, pale points is lighter, so that fast ones stand out.
     speed = np.minimum(np.hypot(flow[:, 0], flow[:, 1]) / max_flow, 1)
     rim = _SLOW_RIM + (_FAST_RIM - _SLOW_RIM) * np.sqrt(speed)[:, None]
@@ -93,7 +105,7 @@ def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.nd
     axes.scatter(x, y, s=9 * dot, c=rim[order], linewidths=0, zorder=3)
     axes.scatter(x, y, s=4 * dot, c=flow_to_rgb(flow[order], max_flow) / 255, linewidths=0, zorder=4)
 
-    group = _objects(position) if cluster is None else cluster
+    group = _objects(position) if cluster is None else cluster[moves]
     _, middle, count = group_medians(group, np.concatenate([position[:, :2], flow[:, :2]], axis=1))
     length: Any = {"angles": "xy", "scale_units": "xy", "scale": 1 / ARROW_STEPS, "minlength": 0.5}
     shape: Any = {"units": "width", "width": 0.0047, "headwidth": 3.6, "headlength": 4.5, "headaxislength": 4}
@@ -106,10 +118,12 @@ def draw_error(axes: Axes, position: np.ndarray, flow: np.ndarray, truth: np.nda
     """Draw the error of every point whose truth is known (not NaN), from black (no error) to white."""
     error = np.linalg.norm(flow - truth, axis=1)
     is_known = np.isfinite(error)
-    position, error = position[is_known], error[is_known]
+    position = position[is_known]
+    error = error[is_known]
     error[error < MIN_ERROR] = 0
     order = np.argsort(error, kind="stable")  # the largest on top
-    position, error = position[order], error[order]
+    position = position[order]
+    error = error[order]
     size = dot_area(axes) * np.where(error > 0, 4, 1)
     axes.set_facecolor(_SLATE)
     x, y = position[:, 0], position[:, 1]
@@ -125,7 +139,8 @@ def group_medians(group: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np
     `group` is the number of the group of each row, (N,), negative = in no group; `values` are (N, C). Groups are in
     ascending order. The median of an even number of values is the upper one of the middle two.
     """
-    values, group = values[group >= 0], group[group >= 0]
+    values = values[group >= 0]
+    group = group[group >= 0]
     number, start, count = np.unique(np.sort(group), return_index=True, return_counts=True)
     columns = [column[np.lexsort((column, group))][start + count // 2] for column in values.T]
     return number, np.stack(columns, axis=1), count

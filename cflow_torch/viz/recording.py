@@ -75,7 +75,8 @@ def record_log(
         try:
             drive = _Drive(rr, stream, max_flow)
             for i, result in results:
-                pc0, pc1 = log.sweep(i), log.sweep(i + 1)
+                pc0 = log.sweep(i)
+                pc1 = log.sweep(i + 1)
                 drive.add(Scene.of(i, pc0, pc1, result, log.labels(i)), pc1)
                 if tracks is not None:
                     drive.add_tracks({name: values[tracks["sweep"] == i] for name, values in tracks.items()})
@@ -95,7 +96,9 @@ class _Drive:
     """Log one drive to a `stream` of rerun, the package `rr`. Flow of `max_flow` metres per sweep has full colour."""
 
     def __init__(self, rr: Any, stream: Any, max_flow: float) -> None:
-        self.rr, self.stream, self.max_flow = rr, stream, max_flow
+        self.rr = rr
+        self.stream = stream
+        self.max_flow = max_flow
         self.log = partial(stream.log, strict=True)
         self.count = 0
         self.has_truth = False
@@ -104,7 +107,9 @@ class _Drive:
 
     def add(self, scene: Scene, pc1: Sweep) -> None:
         """Log one pair; `pc1` is its sweep t+1."""
-        rr, position, is_ground = self.rr, scene.position, scene.is_ground
+        rr = self.rr
+        position = scene.position
+        is_ground = scene.is_ground
         self.stream.set_time("sweep", sequence=scene.index)
         if scene.timestamp_ns is not None and scene.timestamp_ns >= _CALENDAR:
             self.stream.set_time("time", timestamp=np.datetime64(int(scene.timestamp_ns), "ns"))

@@ -33,14 +33,16 @@ class Scene:
     @classmethod
     def of(cls, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> Scene:
         """Make the scene of sweeps t and t+1, from the flow of all points of t and, if there are any, labels."""
-        points, rows = as_numpy(pc0.points, np.float64)[:, :3], len(result.residual_flow)
+        points = as_numpy(pc0.points, np.float64)[:, :3]
+        rows = len(result.residual_flow)
         if rows != len(points):
             raise CFlowError(f"pair {index}: the flow has {rows} rows, its sweep {len(points)} points")
         pose_flow = as_numpy(result.pose_flow, np.float64)
         position = points + pose_flow
         kept = np.isfinite(position).all(axis=1)
         ground = np.zeros(rows, bool) if pc0.is_ground is None else as_numpy(pc0.is_ground).astype(bool)
-        truth, times = None, (pc0.timestamp_ns, pc1.timestamp_ns)
+        truth = None
+        times = (pc0.timestamp_ns, pc1.timestamp_ns)
         if labels is not None:
             truth = np.where(as_numpy(labels.is_valid)[:, None], as_numpy(labels.flow) - pose_flow, np.nan)[kept]
         return cls(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -60,42 +60,66 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
     Source: the paper's multi-scale strategy and its figure.
     """
     if config is None:
-        config, window = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1)), replace(window, pch=(), pcf=())
+        config = make_config("paper", pixel_sizes=(0.4, 0.2, 0.1))
+        window = replace(window, pch=(), pcf=())
     found, result = scales(window, config)
     of_point = result.cluster_id.numpy()
     cluster_id = choose_cluster(of_point, found[-1].flow, cluster_id)
     shown = np.full(len(of_point), False) if cluster_id is None else of_point == cluster_id
     _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
     flows = [*(scale.flow for scale in found), alone.residual_flow.double().numpy()]
-    count = len(found) + 1
-    left, gap, side = 0.8, 0.22, 1.75  # inches; `side` is for the legends
-    width = (16.0 - left - gap * count - side) / count
-    lines = 1 if count <= 4 else 2  # of the panels' names
-    more = 0.2 * (lines - 1)  # inches
-    below_y, above_y = 0.5, width + 1.2 + more
-    figure = style.blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
-    above, below = (
-        [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
-        for bottom in (above_y, below_y)
-    )
+    panels = _ScalePanels.blank(len(found) + 1)
     title = "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
-    style.add_heading(figure, 0.32, title if cluster_id is None else f"{title}; cluster {cluster_id}")
+    style.add_heading(panels.figure, 0.32, title if cluster_id is None else f"{title}; cluster {cluster_id}")
     position = point_rows("points", window.pc0.points) + result.pose_flow.numpy()
-    _draw_close_up(above, position, found, shown)
-    max_flow = _draw_flows(below, config, position, flows, result.is_valid.numpy())
-    for axes in (*above, *below):
-        name = axes.get_title().replace(": ", ":\n", lines - 1)
-        axes.set_title(name, fontsize=min(12, 8 * width), color=style.INK, pad=6)
+    _draw_close_up(panels.above, position, found, shown)
+    max_flow = _draw_flows(panels.below, config, position, flows, result.is_valid.numpy())
+    panels.add_names_and_legends(max_flow)
+    return panels.figure
 
-    marks = style.add_panel(figure, 16.0 - side, above_y, side, width)
-    marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=style.INK)
-    wheel, high = style.WHEEL_INCHES
-    box = style.add_panel(figure, 16.0 - wheel, below_y + (width - high) / 2, wheel, high)
-    style.fill_wheel(box, max_flow)
-    for axes in (marks, box):
-        axes.axis("off")
-    style.add_caption(figure, FLOW_CAPTION)
-    return figure
+
+@dataclass(frozen=True)
+class _ScalePanels:
+    """Two rows of panels, with room for the legends on their right."""
+
+    figure: Figure
+    above: list[Axes]
+    below: list[Axes]
+    width: float  # inches, of a panel, which is a square
+    num_lines: int  # of the panels' names
+
+    _SIDE: ClassVar[float] = 1.75  # inches, for the legends
+    _BOTTOM: ClassVar[float] = 0.5  # inches, below the lower row
+
+    @classmethod
+    def blank(cls, count: int) -> _ScalePanels:
+        """Make a figure, 16 inches wide, with `count` panels a row."""
+        left = 0.8  # inches
+        gap = 0.22
+        width = (16.0 - left - gap * count - cls._SIDE) / count
+        num_lines = 1 if count <= 4 else 2
+        more = 0.2 * (num_lines - 1)
+        figure = style.blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
+        above, below = (
+            [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
+            for bottom in (width + 1.2 + more, cls._BOTTOM)
+        )
+        return cls(figure, above, below, width, num_lines)
+
+    def add_names_and_legends(self, max_flow: float) -> None:
+        """Set the names of the drawn panels, and add the legends; full colour is `max_flow`, metres per sweep."""
+        for axes in (*self.above, *self.below):
+            name = axes.get_title().replace(": ", ":\n", self.num_lines - 1)
+            axes.set_title(name, fontsize=min(12, 8 * self.width), color=style.INK, pad=6)
+        above_y = self.width + 1.2 + 0.2 * (self.num_lines - 1)
+        marks = style.add_panel(self.figure, 16.0 - self._SIDE, above_y, self._SIDE, self.width)
+        marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=style.INK)
+        side, high = style.WHEEL_INCHES
+        box = style.add_panel(self.figure, 16.0 - side, self._BOTTOM + (self.width - high) / 2, side, high)
+        style.fill_wheel(box, max_flow)
+        for axes in (marks, box):
+            axes.axis("off")
+        style.add_caption(self.figure, FLOW_CAPTION)
 
 
 def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale], shown: np.ndarray) -> None:
@@ -153,11 +177,13 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
     Source: the paper's figures of one car and of its NCC map; Eq. norm_correlation, displacement_in_bev.
     """
     if config is None:
-        config, window = make_config("paper"), replace(window, pch=(), pcf=())
+        config = make_config("paper")
+        window = replace(window, pch=(), pcf=())
     found = cluster_correlation(window, config, cluster_id)
     figure, panels = _lay_out(found.images.t.shape)
     style.add_heading(figure, 0.35, _title(found, config))
-    images, nothing = found.images, np.zeros_like(found.images.t)
+    images = found.images
+    nothing = np.zeros_like(found.images.t)
     height, width = nothing.shape
     # A shift is shorter than the box, so with this margin pixels that leave the box do not wrap around.
     padded = np.pad(images.t, ((0, height), (0, width)))
@@ -186,7 +212,8 @@ def _title(found: ClusterCorrelation, config: Config) -> str:
 
 def _lay_out(shape: tuple[int, int]) -> tuple[Figure, list[Any]]:
     """Create the figure and its axes: four images, colour bar, surface."""
-    left, right = 0.7, 5.25
+    left = 0.7
+    right = 5.25
     # Pixels are square, unless the box is so long and thin that nothing would be visible.
     height, width = np.maximum(3.35 * np.array(shape) / max(shape), 1.2)
     total = max(2 * height + 2.9, 6.4)
@@ -210,7 +237,8 @@ def _name(axes: Axes, title: str, x: str, y: str) -> None:
 def _draw_map(axes: Axes, colors: Axes, found: ClusterCorrelation) -> None:
     """Draw the scores as an image with its colour bar; shifts in pixels, those outside the search range in grey."""
     height, width = found.ncc.shape
-    low_y, low_x = -(height // 2) - 0.5, -(width // 2) - 0.5
+    low_y = -(height // 2) - 0.5
+    low_x = -(width // 2) - 0.5
     axes.set_facecolor("#d5d9de")
     extent = (low_x, low_x + width, low_y, low_y + height)
     options: Any = {"origin": "lower", "interpolation": "nearest", "aspect": "auto"}
@@ -275,7 +303,8 @@ def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
     """
     figure = style.blank_figure((16.0, 6.9), 100)
     if config is None:
-        config, window = make_config("keypoints"), replace(window, pch=(), pcf=())
+        config = make_config("keypoints")
+        window = replace(window, pch=(), pcf=())
     found = keypoint_matches(window, config)
     low, high = _busiest_view(found.start, found.end)
     title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; the view shows a part"
@@ -311,7 +340,8 @@ def _draw_matches(axes: Axes, found: KeyPointMatches, low: np.ndarray, high: np.
     from matplotlib.collections import LineCollection
 
     inside = ((found.start > low) & (found.start < high)).all(axis=1)
-    start, end = found.start[inside], found.end[inside]
+    start = found.start[inside]
+    end = found.end[inside]
     flow = end - start
     max_flow = longest_flow(flow)
     color = flow_to_rgb(flow, max_flow) / 255

@@ -130,22 +130,23 @@ def cluster_correlation(window: Window, config: Config, cluster_id: int | None =
     cluster_id = choose_cluster(of_point, last.flow, cluster_id)
     if cluster_id is None:
         raise CFlowError("no cluster has points in both sweeps: there is no correlation to draw")
-    sweeps, grid = last.sweeps, last.sweeps.grid
+    sweeps = last.sweeps
     clusters, _, _ = find_clusters(sweeps, config)
-    pairs = make_pairs(clusters, sweeps.batch, grid.pixel_size, config.max_speed)
+    pairs = make_pairs(clusters, sweeps.batch, sweeps.grid.pixel_size, config.max_speed)
     shifts, scores = best_shifts(pairs, config.correlation, config.max_memory)
     pair = int(flat_nonzero((pairs.source == 0) & (pairs.cluster == cluster_id)))
     template = _image(pairs.template, pair, pairs.size[cluster_id])
     target = _image(pairs.target, cluster_id, pairs.size[cluster_id])
-    ncc = _ncc_map(template, target)
-    if pairs.radius is not None:
-        dy, dx = (torch.arange(n) - n // 2 for n in ncc.shape)
-        ncc[dy[:, None] ** 2 + dx**2 > pairs.radius[pair] ** 2] = torch.nan
-    lower = np.array(grid.lower[:2]) + grid.pixel_size * clusters.first[cluster_id].flip(0).numpy()
+    first = clusters.first[cluster_id].flip(0).numpy()
     return ClusterCorrelation(
         cluster_id=cluster_id,
-        images=Occupancy(template.numpy() > 0, target.numpy() > 0, lower, grid.pixel_size),
-        ncc=ncc.numpy(),
+        images=Occupancy(
+            t=template.numpy() > 0,
+            t1=target.numpy() > 0,
+            lower=np.array(sweeps.grid.lower[:2]) + sweeps.grid.pixel_size * first,
+            pixel_size=sweeps.grid.pixel_size,
+        ),
+        ncc=_ncc_map(template, target, None if pairs.radius is None else pairs.radius[pair]).numpy(),
         shift=shifts[pair].numpy(),
         score=float(scores[pair]),
         flow=group_medians(np.where(of_point == cluster_id, 0, -1), last.flow)[1][0],
@@ -175,12 +176,13 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
         raise _not_drawable(config, "key points", "keypoints")
     (*_, last), _ = scales(window, config)
     sweeps = last.sweeps
+    pixel_size = sweeps.grid.pixel_size
     pc1, pc0 = (describe(sweeps.occupancy[:, step], config.patch_size) for step in (0, 1))
-    matches = match(pc0, pc1, match_radius(sweeps.batch, sweeps.grid.pixel_size, config), config)
-    images, size = last.seen(), sweeps.grid.pixel_size
-    key_points = images.lower + (torch.stack((pc0.col, pc0.row), 1).numpy() + 0.5) * size
+    matches = match(pc0, pc1, match_radius(sweeps.batch, pixel_size, config), config)
+    images = last.seen()
+    key_points = images.lower + (torch.stack((pc0.col, pc0.row), 1).numpy() + 0.5) * pixel_size
     start = key_points[matches.source.numpy()]
-    return KeyPointMatches(images, key_points, start, start + matches.shift.flip(1).numpy() * size)
+    return KeyPointMatches(images, key_points, start, start + matches.shift.flip(1).numpy() * pixel_size)
 
 
 def _not_drawable(config: Config, what: str, preset: str) -> CFlowError:
@@ -200,17 +202,23 @@ def _image(images: Images, number: int, size: Tensor) -> Tensor:
     return image
 
 
-def _ncc_map(template: Tensor, target: Tensor) -> Tensor:
-    """(H, W) float64, as `ClusterCorrelation.ncc`. The energy of the target is its correlation with ones."""
+def _ncc_map(template: Tensor, target: Tensor, radius: Tensor | None) -> Tensor:
+    """(H, W) float64, as `ClusterCorrelation.ncc`. The energy of the target is its correlation with ones.
+
+    `radius` is the longest shift that is searched, pixels; None = no limit.
+    """
     height, width = template.shape
     images = torch.zeros(3, 2 * height, 2 * width, dtype=torch.bool)
     images[:, :height, :width] = torch.stack((template, torch.ones_like(template), target))
     counts = cross_correlate(images, 2, torch.zeros(2, dtype=torch.int64)).round().double()
+    dy, dx = (torch.arange(size) - size // 2 for size in (height, width))
     # The correlation wraps around, and half of each image is empty, so negative shifts are at the far end.
-    dy, dx = ((torch.arange(n) - n // 2) % (2 * n) for n in (height, width))
-    overlap, in_window = counts[:, dy[:, None], dx]
+    overlap, in_window = counts[:, dy[:, None] % (2 * height), dx % (2 * width)]
     energies = in_window * template.double().sum()
-    return torch.where(energies > 0, overlap / energies.clamp(min=1).sqrt(), torch.zeros_like(overlap))
+    ncc = torch.where(energies > 0, overlap / energies.clamp(min=1).sqrt(), torch.zeros_like(overlap))
+    if radius is not None:
+        ncc[dy[:, None] ** 2 + dx**2 > radius**2] = torch.nan
+    return ncc
 
 
 def sweep_marks() -> list[Any]:

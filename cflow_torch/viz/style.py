@@ -119,7 +119,8 @@ def draw_scale(axes: Axes) -> None:
     """Draw a scale bar of a round length, at most a sixth of the panel (10 m in views of 60 to 120 m), bottom left."""
     from matplotlib.patheffects import withStroke
 
-    inches, metres = inches_of(axes), np.diff([axes.get_xlim(), axes.get_ylim()])[:, 0]
+    inches = inches_of(axes)
+    metres = np.diff([axes.get_xlim(), axes.get_ylim()])[:, 0]
     x, y = np.array([axes.get_xlim()[0], axes.get_ylim()[0]]) + 0.25 * metres / inches
     length = round_length(metres[0] / 6)
     options: Any = {"color": INK, "zorder": 8, "path_effects": [withStroke(linewidth=8, foreground="white")]}
@@ -146,7 +147,8 @@ def legend_box(
     twenty.
     """
     panel = inches_of(axes)
-    size, margin = np.minimum(np.array(inches) / panel, 0.5), 0.1 / panel
+    size = np.minimum(np.array(inches) / panel, 0.5)
+    margin = 0.1 / panel
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     fraction = (position[:, :2] - low) / (high - low)
     far = 1 - margin - size

@@ -32,9 +32,11 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
         raise CFlowError(f"{name} has shape {result.shape}: give one (4, 4) matrix (no batch dimension)")
     if not np.isfinite(result).all():
         raise CFlowError(f"{name} holds NaN or infinite values: give a finite rigid transform")
-    rotation, last_row = result[:3, :3], result[3]
+    rotation = result[:3, :3]
+    last_row = result[3]
     with np.errstate(over="ignore", invalid="ignore"):  # values that are far from a rotation may overflow
-        error, determinant = np.abs(rotation @ rotation.T - np.eye(3)).max(), np.linalg.det(rotation)
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        determinant = np.linalg.det(rotation)
     wrong_row = np.abs(last_row - (0, 0, 0, 1)).max()
     if not (error <= _ORTHOGONALITY and wrong_row <= _ORTHOGONALITY and determinant > 0):
         raise CFlowError(

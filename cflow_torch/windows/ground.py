@@ -103,7 +103,8 @@ def is_upside_down(cloud: Array) -> bool:
     plane = near_plane(points, sweep, inside, 1)
     above = points[2] - plane.at(points[0], points[1], sweep)
     is_far = inside & (above.abs() > _FAR) & (points[:2].abs() < _NEAR).all(0)
-    num_far, num_below = int(is_far.sum()), int((is_far & (above < 0)).sum())
+    num_far = int(is_far.sum())
+    num_below = int((is_far & (above < 0)).sum())
     return bool(plane.is_there) and num_below >= max(_FEWEST_BELOW, _SHARE_BELOW * num_far)
 
 

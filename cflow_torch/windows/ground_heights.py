@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -69,38 +71,63 @@ class GroundHeights:
 
         Convention: block heights are whole millimetres, rounded down, so all sums are exact.
         """
+        height, is_known = self._around(centre, window)
+        design = constant(_AROUND, torch.float64, window.device)  # [25, 3]
+        terms = torch.cat((design.t().expand(len(window), 3, -1), height[:, None]), 1)  # [G, 4, 25]
+        fits = [_fit_plane(terms, design, is_known)]
+        for _ in range(1, _NUM_FITS):
+            height_of_plane = (fits[-1].plane[:, :, None] * design.t()[:, None]).sum(0)  # [G, 25]
+            is_near = (height - height_of_plane).abs() <= _FARTHEST
+            fits.append(_fit_plane(terms, design, is_known & is_near))
+        num_blocks = torch.stack([fit.num_blocks for fit in fits])
+        determinant = torch.stack([fit.determinant for fit in fits])
+        is_flat = ((num_blocks >= _FEWEST_BLOCKS) & (4 * determinant >= num_blocks**3)).all(0)
+        slope = fits[-1].plane[1:] / (1000 * _BLOCK)
+        is_ground = is_flat & (slope.square().sum(0) <= _STEEPEST**2)
+        return torch.where(is_ground, slope, 0.0).t().contiguous()
+
+    def _around(self, centre: Tensor, window: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean heights of the 5 x 5 blocks around objects, in whole millimetres, (G, 25) float64.
+
+        Also return which of them are known, (G, 25) bool. Arguments as for `slopes`.
+        """
         num_windows, rows, cols = self._heights.shape
-        blocks = F.pad(torch.stack((self._heights, self._counts)), (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
         stride = cols + 2 * _REACH
-        around = constant(
-            tuple((dy + _REACH) * stride + dx + _REACH for _, dx, dy in _AROUND), torch.int64, window.device
-        )
+        offset = tuple((dy + _REACH) * stride + dx + _REACH for _, dx, dy in _AROUND)
         ends = constant(((0, 0), (cols - 1, rows - 1)), torch.int64, window.device)
         lower = constant(self._lower[:2], torch.float64, window.device)
         col, row = torch.floor((centre - lower) / _BLOCK).clamp_(*ends).long().unbind(1)
         line = window % num_windows * (rows + 2 * _REACH) + row
-        block = torch.add(col, line, alpha=stride)[:, None] + around
-        height, count = blocks.index_select(1, block.view(-1)).view(2, *block.shape)
-        height = torch.div(10 * height, count.clamp(min=1), rounding_mode="floor").double()
-        is_used = is_known = count >= _FEWEST_POINTS
-        design = constant(_AROUND, torch.float64, window.device)
-        terms = torch.cat((design.t().expand(len(window), 3, -1), height[:, None]), 1)
-        plane, fits = design.new_empty((3, len(window))), []
-        for fit in range(_NUM_FITS):
-            if fit > 0:
-                is_used = is_known & ((height - (plane[:, :, None] * design.t()[:, None]).sum(0)).abs() <= _FARTHEST)
-            sums = ((terms * is_used[:, None]) @ design).permute(1, 2, 0)
-            cofactors, det = adjugate(upper(sums[:3]))
-            plane = matvec(full(cofactors), sums[3]) / det  # undefined where `is_flat` is False
-            fits.append((sums[0, 0], det))
-        n, det = (torch.stack(of_fits) for of_fits in zip(*fits))
-        is_flat = ((n >= _FEWEST_BLOCKS) & (4 * det >= n**3)).all(0)
-        slope = plane[1:] / (1000 * _BLOCK)
-        is_ground = is_flat & (slope.square().sum(0) <= _STEEPEST**2)
-        return torch.where(is_ground, slope, 0.0).t().contiguous()
+        block = torch.add(col, line, alpha=stride)[:, None] + constant(offset, torch.int64, window.device)
+        sums = F.pad(torch.stack((self._heights, self._counts)), (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
+        height, count = sums.index_select(1, block.view(-1)).view(2, *block.shape)
+        mean = torch.div(10 * height, count.clamp(min=1), rounding_mode="floor").double()
+        return mean, count >= _FEWEST_POINTS
 
     def _block(self, positions: Tensor) -> Tensor:
         """Return the block of positions in the region, (N,) int32. There int() rounds down."""
         lower = constant(self._lower[:2], positions.dtype, positions.device)
         col, row = (positions[:2] - lower[:, None]).div_(_BLOCK).int()
         return col.add_(row, alpha=self._heights.shape[2])
+
+
+class _Fit(NamedTuple):
+    """Planes a + b column + c row, fitted to the blocks around G objects."""
+
+    plane: Tensor  # (3, G) float64, millimetres; undefined if the blocks lie on a line
+    num_blocks: Tensor  # (G,) float64
+    determinant: Tensor  # (G,) float64, of the normal equations
+
+
+def _fit_plane(terms: Tensor, design: Tensor, is_used: Tensor) -> _Fit:
+    """Fit planes by least squares.
+
+    Args:
+        terms: (G, 4, 25) float64: 1, column, row and height of each block.
+        design: (25, 3) float64: 1, column and row.
+        is_used: (G, 25) bool.
+    """
+    sums = ((terms * is_used[:, None]) @ design).permute(1, 2, 0)  # [4, 3, G]
+    cofactors, determinant = adjugate(upper(sums[:3]))
+    plane = matvec(full(cofactors), sums[3]) / determinant
+    return _Fit(plane, sums[0, 0], determinant)

@@ -40,11 +40,10 @@ class Plane:
 
 def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int) -> Plane:
     """Fit the plane of most flat cells near the origin to active points, (3, N) int64 mm. Ties: the lowest plane."""
-    size, num_cells = _NEAR_CELLS, num_sweeps * _NEAR_CELLS * _NEAR_CELLS
-    col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
-    is_near = (((col | row) & -size) == 0).logical_and_(is_active)  # both in 0 ... size - 1
-    cell = (sweep * size).add_(row).mul_(size).add_(col).masked_fill_(~is_near, num_cells)
-    low, middle, count = (v.view(num_sweeps, size, size) for v in order_statistics(cell, points[2], num_cells))
+    size = _NEAR_CELLS
+    num_cells = num_sweeps * size * size
+    statistics = order_statistics(_near_cell(points, sweep, is_active, num_cells), points[2], num_cells)
+    low, middle, count = (values.view(num_sweeps, size, size) for values in statistics)
     is_seen = count >= _FLAT_POINTS
     is_flat = is_seen & (middle - low <= _FLAT)
     step_x, num_x = _median_step(low[:, :, :-_STEP], low[:, :, _STEP:], is_flat[:, :, :-_STEP] & is_flat[:, :, _STEP:])
@@ -54,15 +53,32 @@ def near_plane(points: Tensor, sweep: Tensor, is_active: Tensor, num_sweeps: int
 
     centre = ((torch.arange(size, device=low.device) - size // 2) << _NEAR_BITS) + (1 << (_NEAR_BITS - 1))
     rise = (step_x[:, None, None] * centre + step_y[:, None, None] * centre[:, None]) >> _STEP_BITS
-    unknown = torch.iinfo(torch.int64).max // 2
-    heights = (low - rise).masked_fill_(~is_flat, unknown).flatten(1).sort(1).values
-    rank = torch.arange(heights.shape[1], device=low.device)
-    in_layer = torch.searchsorted(heights, heights + _LAYER, right=True) - rank  # flat cells up to `_LAYER` above each
-    in_layer.masked_fill_(heights == unknown, 0)
-    most = in_layer.amax(1)
-    first = torch.where(in_layer == most[:, None], rank, heights.shape[1]).amin(1)
-    height = heights.gather(1, (first + most // 2)[:, None].clamp_(max=heights.shape[1] - 1))[:, 0]
+    height = _largest_layer((low - rise).flatten(1), is_flat.flatten(1))
     return Plane(is_there, step_x, step_y, torch.where(is_there, height, 0))
+
+
+def _near_cell(points: Tensor, sweep: Tensor, is_active: Tensor, num_cells: int) -> Tensor:
+    """Return the cell of each point near the origin, (N,) int64; `num_cells` for other points."""
+    size = _NEAR_CELLS
+    col, row = (points[:2] >> _NEAR_BITS).add_(size // 2)
+    is_near = (((col | row) & -size) == 0).logical_and_(is_active)  # both in 0 ... size - 1
+    return (sweep * size).add_(row).mul_(size).add_(col).masked_fill_(~is_near, num_cells)
+
+
+def _largest_layer(height: Tensor, is_flat: Tensor) -> Tensor:
+    """Return the median height of the layer with most flat cells of each sweep, (B,) int64, mm.
+
+    `height` is (B, C) int64, mm above the tilted plane, and `is_flat` is (B, C) bool. Ties: the lowest layer.
+    """
+    unknown = torch.iinfo(torch.int64).max // 2
+    ordered = height.masked_fill_(~is_flat, unknown).sort(1).values
+    num_cells = ordered.shape[1]
+    rank = torch.arange(num_cells, device=height.device)
+    in_layer = torch.searchsorted(ordered, ordered + _LAYER, right=True) - rank  # flat cells up to `_LAYER` above each
+    in_layer.masked_fill_(ordered == unknown, 0)
+    most = in_layer.amax(1)
+    first = torch.where(in_layer == most[:, None], rank, num_cells).amin(1)
+    return ordered.gather(1, (first + most // 2)[:, None].clamp_(max=num_cells - 1))[:, 0]
 
 
 def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -71,7 +87,8 @@ def order_statistics(cell: Tensor, height: Tensor, num_cells: int) -> tuple[Tens
     Where the number is 0, the others are undefined. Heights are (N,) int64, mm, |height| < 2^36. Heights in the cell
     `num_cells` are ignored.
     """
-    offset, bits = 1 << 36, 37
+    offset = 1 << 36
+    bits = 37
     key = (cell << bits).add_(height).add_(offset).sort().values  # by cell, then by height
     count = torch.bincount(cell, minlength=num_cells + 1)[:-1]
     if key.numel() == 0:

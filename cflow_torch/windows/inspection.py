@@ -90,7 +90,8 @@ def _describe_inactive(points: Array, config: Config) -> str:
     finite = positions[np.isfinite(positions).all(axis=1)]
     seen = "all are NaN or infinite"
     if len(finite):
-        low, high = finite.min(axis=0), finite.max(axis=0)
+        low = finite.min(axis=0)
+        high = finite.max(axis=0)
         extent = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high))
         seen = f"they span {extent} in their own frame"
     return (

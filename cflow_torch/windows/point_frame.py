@@ -28,7 +28,8 @@ def frame_problem(points: Array) -> tuple[str, str]:
         return "", ""
     low, middle, high = np.quantile(positions, (0.05, 0.5, 0.95), axis=0)
     extent = high - low
-    widest, farthest = float(extent[:2].max()), float(np.abs(middle[:2]).max())
+    widest = float(extent[:2].max())
+    farthest = float(np.abs(middle[:2]).max())
     spans = f"nine tenths of the points span {widest:.4g} m"
     if widest >= _LARGEST:
         unit = "millimetres" if widest >= _MILLIMETRES else "centimetres"

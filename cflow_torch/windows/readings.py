@@ -241,7 +241,8 @@ def find_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     image = np.fft.rfft2(_image(target, 1))
     reach = int(_FARTHEST_SHIFT / _CELL)
     steps = np.r_[0 : reach + 1, -reach:0]
-    most, found = -1.0, np.eye(4)
+    most = -1.0
+    found = np.eye(4)
     for turn in _TURNS:
         T = as_matrix(rotation_about_z(turn))
         turned = np.fft.rfft2(_image(source @ T[:3, :3].T, 0))

@@ -66,7 +66,8 @@ class Structure:
         points = np.clip(np.asarray(points, np.float64), -_MOST, _MOST)
         keys = _keys(np.floor(points / REACH).astype(np.int64))
         order = np.argsort(keys, kind="stable")
-        self._points, self._sorted = points[order], keys[order]
+        self._points = points[order]
+        self._sorted = keys[order]
 
     def share(self, source: np.ndarray, T_target_source: np.ndarray) -> float:
         """Return the share of `source` in place, see `share_in_place`. Cost: 6 ms for 1500 source points."""
@@ -77,7 +78,8 @@ class Structure:
         in_place = np.zeros(len(moved), bool)
         cell = np.floor(moved / REACH).astype(np.int64)
         order = np.argsort(_keys(cell))  # the searches below are several times faster in this order
-        moved, cell = moved[order], cell[order]
+        moved = moved[order]
+        cell = cell[order]
         for offset in _OFFSETS:  # z varies fastest in a key: the three cells above one another are one range of keys
             lowest = _keys(cell + (*offset, -1))
             start = np.searchsorted(self._sorted, lowest, "left")

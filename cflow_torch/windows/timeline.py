@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import NamedTuple, Sequence
+from typing import Iterator, NamedTuple, Sequence
 
 import numpy as np
 
@@ -50,31 +50,49 @@ class Timeline:
     def of(windows: Sequence[Window], config: Config, grid: Grid, needs_times: bool) -> Timeline:
         """Check everything but the points, and list the sweeps. Arguments and errors as in `make_batch`."""
         windows = [keep_nearest(window, config.num_history) for window in windows]
-        given = [source_sweeps(window, config) for window in windows]
-        sides = [[source for source in sources if source.intervals > 0] for sources in given]
+        sources = [source_sweeps(window, config) for window in windows]
+        sides = [_side(of_window, is_past=True) for of_window in sources]
         if config.num_future > 0:
-            sides += [[sources[0], *(source for source in sources if source.intervals < 0)] for sources in given]
+            sides += [_side(of_window, is_past=False) for of_window in sources]
         table = np.zeros((5, len(sides), 1 + max(map(len, sides))))
         farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
         entries: list[Entry] = []
-        for index, sources in enumerate(sides):
+        for index, side in enumerate(sides):
             number = index % len(windows)
-            window, of_window = windows[number], [source.sweep for source in given[number]]
-            times = elapsed_times(window, sources, config)
-            table[:2, index, 1 : 1 + len(sources)] = np.transpose(times)
+            times = elapsed_times(windows[number], side, config)
+            table[:2, index, 1 : 1 + len(side)] = np.transpose(times)
             # If one sweep lacks times of points, de-skewing the others would shift them against it.
-            has_times = all(sweep.point_times is not None for sweep in (window.pc1, *of_window))
-            interval = times[0][1] / times[0][0] if needs_times and has_times else None
-            pose1, transform = window.pc1.pose, None
-            T_ego1_world = None if pose1 is None else np.linalg.inv(rigid_transform(pose1, "pose1", farthest))
-            entries.append(Entry(0, index, "pc1", window.pc1, None, interval))
-            for step, (name, sweep, _) in enumerate(sources, 1):
-                if T_ego1_world is not None:
-                    transform = T_ego1_world @ rigid_transform(sweep.pose, f"pose of {name}", farthest)
-                    _check_distance(transform, name)
-                    table[2:, index, step] = transform[:3, 3]
-                entries.append(Entry(step, index, name, sweep, transform, interval))
+            sweeps = [windows[number].pc1, *(source.sweep for source in sources[number])]
+            has_times = needs_times and all(sweep.point_times is not None for sweep in sweeps)
+            interval = times[0][1] / times[0][0] if has_times else None
+            for entry in _entries(windows[number], index, side, interval, farthest):
+                if entry.T_ego1_ego is not None:
+                    table[2:, index, entry.step] = entry.T_ego1_ego[:3, 3]
+                entries.append(entry)
         return Timeline(sorted(entries, key=lambda entry: entry.step), table)
+
+
+def _side(sources: Sequence[Source], is_past: bool) -> list[Source]:
+    """List the sweeps of one side of t+1. The future side has t, too, first."""
+    if is_past:
+        return [source for source in sources if source.intervals > 0]
+    return [sources[0], *(source for source in sources if source.intervals < 0)]
+
+
+def _entries(
+    window: Window, index: int, sources: Sequence[Source], interval: float | None, farthest: float
+) -> Iterator[Entry]:
+    """Yield t+1 and the other sweeps of one side of a window, with their transforms to t+1."""
+    yield Entry(0, index, "pc1", window.pc1, None, interval)
+    T_ego1_world = None
+    if window.pc1.pose is not None:
+        T_ego1_world = np.linalg.inv(rigid_transform(window.pc1.pose, "pose1", farthest))
+    for step, (name, sweep, _) in enumerate(sources, 1):
+        T_ego1_ego = None
+        if T_ego1_world is not None:
+            T_ego1_ego = T_ego1_world @ rigid_transform(sweep.pose, f"pose of {name}", farthest)
+            _check_distance(T_ego1_ego, name)
+        yield Entry(step, index, name, sweep, T_ego1_ego, interval)
 
 
 def source_sweeps(window: Window, config: Config) -> list[Source]:

@@ -60,7 +60,8 @@ def resolution(dtype: Any, distance: float) -> float:
 
 def _check_resolution(dtype: Any, name: str, config: Config) -> None:
     """Check that the type resolves half of the finest pixel at the far end of the region."""
-    bounds, pixel_size = config.point_cloud_range, config.pixel_sizes[-1]
+    bounds = config.point_cloud_range
+    pixel_size = config.pixel_sizes[-1]
     farthest = max(abs(bound) for bound in (*bounds[:2], *bounds[3:5]))
     step = resolution(dtype, farthest)
     if step > 0.5 * pixel_size:

@@ -22,12 +22,14 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5 import HDF5Log
 from cflow_torch.data.log import CachedLog, FlowLabels, window
 from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
-from cflow_torch.simulator.benchmark import benchmark_logs, format_of
+from cflow_torch.simulator.benchmark import benchmark_logs
 from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.ego_motion import relative_transform
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "figures"))
+sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 import drives  # noqa: E402
+from writers import FORMATS  # noqa: E402
 
 DATA = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
 CACHE = Path(os.environ.get("CFLOW_CACHE") or "outputs/cache")  # of simulated drives
@@ -171,9 +173,9 @@ def merged() -> list[Item]:
 
 def simulated(profile: str, seeds: Sequence[int]) -> list[Item]:
     """Windows of the simulated drives of one sensor, read with the reader of its data set."""
-    chosen = format_of(profile)
+    chosen = FORMATS[profile]
     items = []
-    for source in benchmark_logs(CACHE, profile, seeds, SIMULATED_SWEEPS, SCENES):
+    for source in benchmark_logs(CACHE, profile, seeds, SIMULATED_SWEEPS, SCENES, chosen):
         log = CachedLog(open_log(chosen.data_set, source, check=False, **chosen.settings), SIMULATED_SWEEPS)
         pairs = range(HISTORY, len(log) - 1)
         for wanted in SIMULATED_WINDOWS:  # not every sweep of every data set has labels

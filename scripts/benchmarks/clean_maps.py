@@ -23,7 +23,7 @@ from typing import Any, Sequence
 
 import numpy as np
 import torch
-from labelled import LabelledLog, SimulatedLog
+from labelled import SENSORS, LabelledLog, SimulatedLog
 from labels import RANGE, dufomap_labels
 from table import markdown
 
@@ -32,7 +32,6 @@ from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.data.catalog import GroundSegmentedLog
 from cflow_torch.data.log import CachedLog, windows
 from cflow_torch.simulator import objects
-from cflow_torch.simulator.benchmark import FORMATS
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.profiles import PROFILES
@@ -78,7 +77,7 @@ def main() -> None:
     torch.set_num_threads(1)
     model, rows = make_model(make_config("offline"), "auto"), []
     for name in given.logs:
-        if name in FORMATS or name == "light":
+        if name in SENSORS or name == "light":
             log = light(given.num_sweeps) if name == "light" else SimulatedLog(name, SEED, "crossing", given.num_sweeps)
             T_ego_lidar = next(iter(log.drive.calibration.values()))
         else:

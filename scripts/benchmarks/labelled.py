@@ -16,6 +16,7 @@ from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.types import Sweep
 
+SENSORS = ("av2", "nuscenes", "truckscenes", "waymo", "aevascenes")
 WITH_MASKS = ("av2", "aevascenes")  # sensors whose data sets have ground masks
 
 

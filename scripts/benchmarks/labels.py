@@ -33,7 +33,10 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import CachedLog, Log, window, windows
 from cflow_torch.data.rigid_motion import transform_points
-from cflow_torch.simulator.benchmark import FORMATS, benchmark_logs
+from cflow_torch.simulator.benchmark import benchmark_logs
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
+from writers import FORMATS  # noqa: E402
 
 RANGE = 50.0  # metres
 TIMED = 4  # about so many sweeps of a scene are grouped by HDBSCAN, only for its time
@@ -114,7 +117,7 @@ def simulated(sensor: str) -> list[Log]:
     """Simulated drives of a sensor, read with the reader of its data set."""
     made, logs = FORMATS[sensor], []
     for seed, scene in DRIVES:
-        (source,) = benchmark_logs("outputs/cache", sensor, [seed], NUM_SWEEPS, [scene])
+        (source,) = benchmark_logs("outputs/cache", sensor, [seed], NUM_SWEEPS, [scene], made)
         logs.append(open_log(made.data_set, source, check=False, **made.settings))
     return logs
 

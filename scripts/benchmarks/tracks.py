@@ -18,7 +18,7 @@ from typing import Any, Dict
 
 import numpy as np
 import torch
-from labelled import LabelledLog, SimulatedLog, Truth, open_scenes
+from labelled import SENSORS, LabelledLog, SimulatedLog, Truth, open_scenes
 from table import markdown
 
 from cflow_torch import Tracker, VerifiedFlow, make_config, make_model
@@ -26,7 +26,6 @@ from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.data.catalog import GroundSegmentedLog
 from cflow_torch.data.log import windows
-from cflow_torch.simulator.benchmark import FORMATS
 
 DRIVES = ((300, "street"), (301, "crossing"))
 SPEED, POINTS = 0.5, 20  # m/s and points, least of a scored object
@@ -102,7 +101,7 @@ def summary(name: str, parts: list[Row]) -> Row:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", nargs="*", type=Path)
-    parser.add_argument("--simulated", nargs="*", default=(), choices=tuple(FORMATS), metavar="SENSOR")
+    parser.add_argument("--simulated", nargs="*", default=(), choices=SENSORS, metavar="SENSOR")
     parser.add_argument("--num-sweeps", type=int, default=20, help="of a simulated drive")
     given = parser.parse_args()
     torch.set_num_threads(1)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import signal
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -185,6 +187,34 @@ def test_worker_processes_give_the_results_of_one_process(log_folder, tmp_path, 
     one, two = records
     assert two["num_pairs"] == 2 and two["seconds_per_pair"]["pairs"] == one["seconds_per_pair"]["pairs"]
     assert all(one[key] == two[key] for key in ("results", "failures", "data"))
+
+
+class DeadlyEstimator(pairs._Estimator):
+    """Kills its process at a window that has a file in the folder CFLOW_TEST_DEADLY, which says how often."""
+
+    def estimate(self, sweeps: Any) -> Any:
+        file = Path(os.environ["CFLOW_TEST_DEADLY"]) / str(sweeps.pc0.timestamp_ns)
+        count = int(file.read_text()) if file.exists() else 0
+        if count > 0:
+            file.write_text(str(count - 1))
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().estimate(sweeps)
+
+
+@pytest.mark.slow
+def test_a_pair_whose_process_dies_is_tried_once_more_then_reported(log_folder, tmp_path, evaluate, monkeypatch):
+    monkeypatch.setattr(pairs, "choose_layout", lambda *_: Layout(("cpu",) * 2, 1))
+    monkeypatch.setattr(pairs, "frames_per_worker", lambda config: 1)
+    monkeypatch.setattr(pairs, "_Estimator", DeadlyEstimator)
+    monkeypatch.setenv("CFLOW_TEST_DEADLY", str(tmp_path))
+    stamps = AV2Log(log_folder).timestamps
+    (tmp_path / str(stamps[0])).write_text("1")
+    (tmp_path / str(stamps[1])).write_text("9")
+    assert evaluate() == 1
+    record = results_of(tmp_path)
+    assert record["num_pairs"] == 2 and (tmp_path / str(stamps[1])).read_text() == "7"
+    ((name, message),) = record["failures"]
+    assert name.endswith(str(stamps[1])) and "2 worker processes died on it, the last one: signal 9" in message
 
 
 def test_bench_writes_what_it_prints(tmp_path, cflow, capsys):

@@ -64,7 +64,6 @@ CHEAP = (
     ("flow shard.index=one shard.count=3", "shard.index='one': give a whole number of at least 0"),
     ("flow engine.workers=0", "engine.workers=0: give a whole number of at least 1"),
     ("flow engine.memory=true", "engine.memory=True: give a number above 0"),
-    ("flow engine=ray engine.retries=-1", "engine.retries=-1: give a whole number of at least 0"),
     ("eval model.max_object=1", f"setting max_object was removed: {REMOVED['max_object']}"),
     ("eval +model.thorough=1", f"setting thorough was removed: {REMOVED['thorough']}"),
 )

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from command_line import cflow
 from small_logs import make_small_drive
+from writers import FORMATS
 
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import GroundSegmentedLog, find_sources, open_log, recognise
 from cflow_torch.simulator import Drive
-from cflow_torch.simulator.benchmark import FORMATS
+from cflow_torch.simulator.benchmark import benchmark_logs
 from cflow_torch.types import CFlowError, CFlowWarning
 
 
@@ -33,15 +34,29 @@ def arrays(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("profile", FORMATS)
-@pytest.mark.slow
-def test_a_simulated_drive_of_every_sensor_is_scored_from_its_own_format(profile: str, tmp_path: Path) -> None:
-    data = ("data=benchmark_sensors", f"data.profile={profile}", f"data.cache={tmp_path}", "data.num_drives=1")
-    assert cflow("eval", *data, "data.num_sweeps=4", "data.first=1", "model=paper", f"output={tmp_path / 'out'}") == 0
-    record = json.loads((tmp_path / "out" / "results.json").read_text())
+def check_scores(folder: Path, *data: str) -> None:
+    """Score the logs of the data settings."""
+    assert cflow("eval", *data, "data.first=1", "model=paper", f"output={folder}") == 0
+    record = json.loads((folder / "results.json").read_text())
     assert record["num_pairs"] >= 2 and not record["failures"]
     dynamic, static = record["results"]["three_way"]["epe_fd"], record["results"]["three_way"]["epe_bs"]
     assert dynamic < 0.9 and static < 0.2, "most moving objects are found, and static points stay"
+
+
+@pytest.mark.parametrize("profile", FORMATS)
+@pytest.mark.slow
+def test_a_simulated_drive_of_every_sensor_is_scored_from_its_own_format(profile: str, tmp_path: Path) -> None:
+    chosen = FORMATS[profile]
+    benchmark_logs(tmp_path / "cache", profile, [300], 4, chosen=chosen)
+    (root,) = (tmp_path / "cache").glob("*/*")
+    settings = [f"data.{name}={value}" for name, value in {**chosen.settings, "check": "false"}.items()]
+    check_scores(tmp_path / "out", f"data={chosen.data_set}", f"data.root={root}", *settings)
+
+
+@pytest.mark.parametrize("profile", ["av2", "waymo"])
+def test_a_simulated_drive_of_a_sensor_is_scored(profile: str, tmp_path: Path) -> None:
+    data = ("data=benchmark_sensors", f"data.profile={profile}", f"data.cache={tmp_path}", "data.num_drives=1")
+    check_scores(tmp_path / "out", *data, "data.num_sweeps=4")
 
 
 def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> None:

@@ -10,6 +10,9 @@ from typing import Any, Callable, NamedTuple
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from writers.aevascenes import CLASS_OF, write_aevascenes_sequence
+from writers.nuscenes import write_nuscenes
+from writers.waymo import BOX_TYPE, write_waymo_segment
 
 from cflow_torch.data.aevascenes import CATEGORY_NAME, AevaScenesLog
 from cflow_torch.data.av2 import AV2Log
@@ -20,10 +23,7 @@ from cflow_torch.data.nuscenes.reader import NuScenesLog, find_nuscenes_scenes
 from cflow_torch.data.waymo.reader import BOX_CATEGORY, WaymoLog
 from cflow_torch.simulator.drive import Drive, make_drive
 from cflow_torch.simulator.profiles import PROFILES
-from cflow_torch.simulator.writers.aevascenes import CLASS_OF, write_aevascenes_sequence
 from cflow_torch.simulator.writers.av2 import write_av2_log
-from cflow_torch.simulator.writers.nuscenes import write_nuscenes
-from cflow_torch.simulator.writers.waymo import BOX_TYPE, write_waymo_segment
 
 
 class Format(NamedTuple):

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from small_logs import SMALL_LOGS, write_small_log
 from tiny_recording import TinyRecording
+from writers.aevascenes import write_aevascenes_sequence
+from writers.nuscenes import write_nuscenes
 
 from cflow_torch.data.aevascenes import AevaScenesLog
 from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.files import read_json, read_npy
 from cflow_torch.data.paths import is_timestamp, path_inside, safe_name
-from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
-from cflow_torch.simulator.writers.nuscenes import write_nuscenes
 from cflow_torch.types import CFlowError
 
 # A clone without git-lfs has these instead of large files. They are as long as ten points of a `.bin`.

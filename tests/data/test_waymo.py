@@ -14,13 +14,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
+from writers.waymo import write_waymo_segment
 
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.data.waymo.range_image import LaserCalibration, range_image_points, rotations_from_angles
 from cflow_torch.data.waymo.reader import LIDAR, TIME, TRACK, VEHICLE_POSE, Component, WaymoLog, matrix_of
 from cflow_torch.simulator.drive import Drive, make_drive
 from cflow_torch.simulator.profiles import PROFILES
-from cflow_torch.simulator.writers.waymo import write_waymo_segment
 from cflow_torch.types import CFlowError
 
 

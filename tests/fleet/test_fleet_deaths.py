@@ -16,12 +16,11 @@ import pytest
 from small_fleet import COMMAND, PAIRS, TWO, command, flow_files, frames, run, tree
 
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.fleet import dispatch as running
-from cflow_torch.fleet import work
+from cflow_torch.fleet import parallel, work
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
 DEADLY = "CFLOW_TEST_DEADLY"  # folder of files <log>.<time stamp> with the name of a cause and how often it occurs
-REAL_MAKE = running.make_worker
+REAL_MAKE = parallel.make_worker
 LIMIT = 12e9  # bytes, of a worker's address space
 
 CAUSES: dict[str, Callable[[], Any]] = {
@@ -35,7 +34,7 @@ CAUSES: dict[str, Callable[[], Any]] = {
 
 def make_deadly_worker(*arguments: Any) -> Any:
     """A worker that dies when it reads a frame of `DEADLY`."""
-    run_units, read = REAL_MAKE(*arguments), work.window
+    worker, read = REAL_MAKE(*arguments), work.window
 
     def deadly_read(log: Any, index: int, *num_sweeps: int) -> Any:
         file = Path(os.environ[DEADLY]) / f"{log.log_id}.{log.timestamps[index]}"
@@ -47,14 +46,14 @@ def make_deadly_worker(*arguments: Any) -> Any:
         return read(log, index, *num_sweeps)
 
     work.window = deadly_read
-    return run_units
+    return worker
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("once, always", [(("SIGKILL", "hang"), "SIGSEGV"), (("SystemExit",), "memory")])
 def test_dying_workers_lose_only_the_frame_that_always_kills(once, always, fleet, single, tmp_path, monkeypatch):
     monkeypatch.setenv(DEADLY, str(tmp_path))
-    monkeypatch.setattr(running, "make_worker", make_deadly_worker)
+    monkeypatch.setattr(parallel, "make_worker", make_deadly_worker)
     logs = [AV2Log(folder) for folder in sorted(fleet.iterdir())]
     for log, cause in zip(logs, once):
         (tmp_path / f"{log.log_id}.{log.timestamps[2]}").write_text(f"{cause}:1")

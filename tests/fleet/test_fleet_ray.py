@@ -14,9 +14,10 @@ from small_fleet import PAIRS, TWO, make_job, run, tree
 
 from cflow_torch import CFlowError
 from cflow_torch.fleet import ray_engine
-from cflow_torch.fleet.job import Job, Unit
+from cflow_torch.fleet.job import Job, Part
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.ray_engine import run_ray
+from cflow_torch.fleet.work import Worker
 
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install ray")
 
@@ -31,33 +32,33 @@ def test_equals_the_local_engine_byte_for_byte(fleet, single, tmp_path):
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-class LethalActor(ray_engine._Actor):
-    """A worker whose process is killed at each call of a unit that still has a file next to the output."""
+class LethalWorker(Worker):
+    """A worker whose process is killed at each part that still has a file next to the output."""
 
-    def start(self, folder: str, job: Job, device: str) -> None:
-        self.folder = Path(job.output).parent
-        super().start(folder, job, device)
-
-    def run(self, unit: Unit) -> Any:
-        file = self.folder / f"kills-{unit.number}"
+    def run(self, part: Part, *stop: Any) -> Any:
+        file = Path(self._job.output).parent / f"kills-{part.number}"
         count = int(file.read_text()) if file.exists() else 0
         if count > 0:
             file.write_text(str(count - 1))
             os.kill(os.getpid(), signal.SIGKILL)
-        yield from super().run(unit)
+        yield from super().run(part, *stop)
+
+
+def make_lethal_worker(folder: str, job: Job, device: str) -> Worker:
+    return LethalWorker(job, device)
 
 
 @pytest.mark.slow
-def test_a_killed_worker_is_replaced_and_a_unit_that_always_kills_is_reported(fleet, single, tmp_path, monkeypatch):
+def test_a_killed_worker_is_replaced_and_a_part_that_always_kills_is_reported(fleet, single, tmp_path, monkeypatch):
     from ray import cloudpickle
 
-    monkeypatch.setattr(ray_engine, "_Actor", LethalActor)
+    monkeypatch.setattr(ray_engine, "make_worker_on_node", make_lethal_worker)
     this = sys.modules[__name__]
     cloudpickle.register_pickle_by_value(this)  # Ray's processes cannot import a test
     (tmp_path / "kills-0").write_text("1")
     (tmp_path / "kills-2").write_text("1000")
     try:
-        report = run(fleet, tmp_path / "out", TWO, engine="ray", retries=1)
+        report = run(fleet, tmp_path / "out", TWO, engine="ray")
     finally:
         cloudpickle.unregister_pickle_by_value(this)
     assert (tmp_path / "kills-0").read_text() == "0" and (tmp_path / "kills-2").read_text() == "998"
@@ -67,7 +68,7 @@ def test_a_killed_worker_is_replaced_and_a_unit_that_always_kills_is_reported(fl
 
 
 def start(layout: Layout, **settings: Any) -> None:
-    next(run_ray(make_job(Path("nowhere")), [Unit(0, "nothing")], layout, lambda: False, **settings))
+    next(run_ray(make_job(Path("nowhere")), [Part(0, "nothing")], layout, lambda: False, **settings))
 
 
 def test_ray_does_not_choose_a_gpu():

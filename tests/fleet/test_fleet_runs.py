@@ -205,7 +205,7 @@ def test_a_signal_lets_frames_in_hand_be_finished(fleet, single, tmp_path, monke
     monkeypatch.setattr(work, "write_flow", stop_at_the_second)
     report = run(fleet, tmp_path, Layout(("cpu",), 1))
     assert (report["status"], report["stopped_by"], report["exit_status"]) == ("interrupted", "SIGTERM", 143)
-    assert report["frames"]["computed"] == len(frames(tmp_path)) < PAIRS and report["frames"]["unopened_units"]
+    assert report["frames"]["computed"] == len(frames(tmp_path)) < PAIRS and report["frames"]["unopened_parts"]
     assert tree(tmp_path).items() <= single.items()
     assert run(fleet, tmp_path)["frames"]["complete_before"] == report["frames"]["computed"]
     assert tree(tmp_path) == single

@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import time
-from fractions import Fraction
 from typing import Any
 
 import pytest
@@ -18,8 +17,8 @@ from cflow_torch import CFlowError, make_config
 from cflow_torch.fleet import machine, progress
 from cflow_torch.fleet.job import Shard, find_shard
 from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
-from cflow_torch.fleet.processes import StopSignal
 from cflow_torch.fleet.progress import Progress, log_line
+from cflow_torch.fleet.stop_signal import StopSignal
 
 
 @settings(deadline=None)  # the first call imports
@@ -28,21 +27,21 @@ from cflow_torch.fleet.progress import Progress, log_line
     count=st.integers(1, 20),
     workers=st.integers(1, 5),
 )
-def test_shards_and_units_cover_every_frame_once(lengths: list[int], count: int, workers: int) -> None:
+def test_shards_and_parts_cover_every_frame_once(lengths: list[int], count: int, workers: int) -> None:
     seen: list[tuple[int, int]] = []
     for index in range(count):
-        units = Shard(index, count).units(list(range(len(lengths))), workers)
-        assert [unit.number for unit in units] == list(range(len(units)))
-        seen += [(unit.source, frame) for unit in units for frame in unit.frames(lengths[unit.source])]
+        parts = Shard(index, count).parts(list(range(len(lengths))), workers)
+        assert [part.number for part in parts] == list(range(len(parts)))
+        seen += [(part.source, frame) for part in parts for frame in part.frames(lengths[part.source])]
     assert sorted(seen) == [(log, frame) for log, length in enumerate(lengths) for frame in range(length)]
 
 
 def test_a_shard_opens_only_its_own_logs() -> None:
-    units = Shard(1, 3).units(list("abcdef"))
-    assert [(unit.source, unit.first, unit.last) for unit in units] == [("c", 0, 1), ("d", 0, 1)]
-    assert Shard().units([], 2) == []
-    units = Shard(1, 4).units(list("ab"))
-    assert [(unit.source, unit.first, unit.last) for unit in units] == [("a", Fraction(1, 2), 1)]
+    parts = Shard(1, 3).parts(list("abcdef"))
+    assert [(part.source, part.frames(7)) for part in parts] == [("c", range(7)), ("d", range(7))]
+    assert Shard().parts([], 2) == []
+    parts = Shard(1, 4).parts(list("ab"))
+    assert [(part.source, part.frames(8)) for part in parts] == [("a", range(4, 8))]
 
 
 STEP = {"SLURM_STEP_NUM_TASKS": "4", "SLURM_PROCID": "3"}

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Callable, Iterator, Sequence
@@ -15,11 +15,11 @@ from small_fleet import CONFIG, PAIRS, flow_files, make_job, tree
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import LogWrapper
-from cflow_torch.fleet import dispatch as dispatching
-from cflow_torch.fleet.dispatch import WorkerDied, dispatch
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Shard, Unit
+from cflow_torch.fleet import parallel
+from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, make_object
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.processes import ChildProcess
+from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.run import Counters, format_missing, format_report
 from cflow_torch.fleet.work import Worker
 from cflow_torch.simulator import make_drive
@@ -49,7 +49,7 @@ def test_a_bad_frame_does_not_spoil_its_batch(source, single, tmp_path, error):
     stamps = AV2Log(source).timestamps
     worker = Worker(make_job(tmp_path, batch=3), "cpu")
     worker._model = FailingModel([stamps[1], stamps[3]], lambda: error)
-    events = list(worker.run(Unit(0, source)))
+    events = list(worker.run(Part(0, source)))
     failed = [event for event in events if isinstance(event, Failed)]
     assert [event.timestamp for event in failed] == [stamps[1], stamps[3]]
     assert all(type(error).__name__ in event.message or "too odd" in event.message for event in failed)
@@ -73,13 +73,13 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
             return Odd(drive)
 
     job = make_job(tmp_path, config=make_config("paper"), settings={}, batch=4)
-    events = list(Opener(job, "cpu").run(Unit(0, "odd")))
+    events = list(Opener(job, "cpu").run(Part(0, "odd")))
     (failed,) = [event for event in events if isinstance(event, Failed)]
     assert failed.timestamp == drive.timestamps[1] and "none of the 26523 points of pc0 is active" in failed.message
     assert [event.timestamp for event in events if isinstance(event, Done)] == [drive.timestamps[i] for i in (0, 2, 3)]
     notes = [(event.name, event.message) for event in events if isinstance(event, Noted)]
     assert notes[-1] == (f"{drive.log_id}/{drive.timestamps[3]}", "the next sweep has the same points")
-    assert any("the sensor moves" in text for _, text in notes), "the log is checked by the unit of its first frame"
+    assert any("the sensor moves" in text for _, text in notes), "the log is checked by the part of its first frame"
 
 
 def test_a_lost_gpu_ends_its_worker(source, tmp_path, monkeypatch):
@@ -90,33 +90,34 @@ def test_a_lost_gpu_ends_its_worker(source, tmp_path, monkeypatch):
         raise RuntimeError("device-side assert")
 
     monkeypatch.setattr("cflow_torch.fleet.work.torch.zeros", refuse)
-    with pytest.raises(CFlowError, match="can no longer be used: .*device-side assert"):
-        list(worker.run(Unit(0, source)))
+    with pytest.raises(BrokenExecutor, match="can no longer be used: .*device-side assert"):
+        list(worker.run(Part(0, source)))
 
 
-# Several workers: the dispatcher, with threads in place of processes
+# Several workers, which live in the thread of their caller
 
 
 class Death(BaseException):
     """Ends a worker that lives in a thread."""
 
 
-class ThreadProcess:
-    """A worker that lives in the thread of its caller. It dies `failed_starts` times at its start, and when it reads a
-    deadly frame: `deadly` maps "log/time stamp" to how many more workers die on it."""
+class HereExecutor(Executor):
+    """A worker without a process. It breaks `failed_starts` times at its start, and when it reads a deadly frame:
+    `deadly` maps "log/time stamp" to how many more workers it breaks."""
 
     def __init__(self, job: Job, deadly: dict[str, int] | None = None, failed_starts: int = 0) -> None:
         self.job, self.deadly, self.failed_starts = job, {} if deadly is None else deadly, failed_starts
         self.num_starts = 0
-        self.is_closed = threading.Event()
+        self.worker: Any = None
 
-    def start(self) -> None:
+    def start(self) -> Worker:
         self.num_starts += 1
         if self.num_starts <= self.failed_starts:
-            raise WorkerDied("by SIGKILL")
-        self.worker, self.is_stopped = Worker(self.job, "cpu"), False
-        self.worker._ahead = 0  # without read-ahead, so that the frames before the deadly one are on disk
-        self.worker._read = self._read  # type: ignore[method-assign]
+            raise BrokenExecutor("SIGKILL")
+        worker = make_object(Worker, self.job, "cpu")
+        worker._ahead = 0  # without read-ahead, so that the frames before the deadly one are on disk
+        worker._read = self._read
+        return worker
 
     def _read(self, log: Any, index: int) -> Any:
         frame = f"{log.log_id}/{log.timestamps[index]}"
@@ -125,90 +126,101 @@ class ThreadProcess:
             raise Death
         return Worker._read(self.worker, log, index)
 
-    def call(self, unit: Unit) -> Any:
+    def submit(self, method: str, *arguments: Any) -> Any:
+        future: Future[Any] = Future()
         try:
-            yield from self.worker.run(unit, lambda: self.is_stopped)
+            self.worker = self.worker or self.start()
+            future.set_result(getattr(self.worker, method)(*arguments))
         except Death:
-            raise WorkerDied("by SIGSEGV") from None
-
-    def stop(self) -> None:
-        self.is_stopped = True
+            future.set_exception(BrokenExecutor("SIGSEGV"))
+        except Exception as error:
+            future.set_exception(error)
+        return future
 
     def close(self) -> None:
-        self.is_closed.set()
+        self.worker = None
 
 
-def units_of(sources: Sequence[Any]) -> list[Unit]:
-    return [Unit(number, source) for number, source in enumerate(sources)]
+def parts_of(sources: Sequence[Any]) -> list[Part]:
+    return [Part(number, source) for number, source in enumerate(sources)]
 
 
-def count(events: Iterator[Event], units: Sequence[Unit]) -> Counters:
-    counters = Counters(units)
+def never() -> bool:
+    return False
+
+
+def count(events: Iterator[Event], parts: Sequence[Part]) -> Counters:
+    counters = Counters(parts)
     for event in events:
         counters.add(event)
     return counters
 
 
-def test_after_a_death_the_unit_is_repeated_then_each_frame_by_itself(fleet, single, tmp_path):
+AGAIN = "a worker died (SIGSEGV): its frames are tried again, one by one"
+
+
+def test_when_a_worker_dies_each_of_its_frames_is_tried_by_itself(fleet, single, tmp_path):
     sources = sorted(fleet.iterdir())
     names = [f"{sources[1].name}/{stamp}" for stamp in AV2Log(sources[1]).timestamps]
-    units, deadly = units_of(sources), {names[3]: 1000, names[1]: 1}
-    processes = [ThreadProcess(make_job(tmp_path, batch=1, redo=True), deadly) for _ in range(2)]
-    counters = count(dispatch(processes, units, lambda: False, retries=1), units)
-    assert 1000 - deadly[names[3]] == 3, "once with the unit, then twice by itself"
-    assert counters.failures == [(names[3], "2 workers died on it, the last one by SIGSEGV")]
+    parts, deadly = parts_of(sources), {names[3]: 1000, names[1]: 1}
+    executors = [HereExecutor(make_job(tmp_path, batch=1, redo=True), deadly) for _ in range(2)]
+    counters = count(run_parallel(executors, parts, never), parts)
+    assert deadly == {names[3]: 998, names[1]: 0}, "the part dies on its frame 1, then frame 3 twice by itself"
+    assert counters.failures == [(names[3], "2 workers died on it, the last one: SIGSEGV")]
     assert (counters.total, counters.waiting) == (PAIRS, {})
-    assert counters.times_noted("a worker died by SIGSEGV; another one goes on with the frames that are missing") == 4
+    assert counters.times_noted(AGAIN) == 2
     found = {name: content for name, content in tree(tmp_path).items() if name != "manifest.json"}
     assert found == {n: c for n, c in single.items() if n not in ("manifest.json", f"{names[3]}.feather")}
-    assert all(process.is_closed.is_set() for process in processes)
+    assert all(executor.worker is None for executor in executors), "they are closed"
 
 
-def test_a_unit_that_kills_ten_workers_is_left(fleet, single, tmp_path):
+def test_frames_that_all_kill_are_all_reported(fleet, single, tmp_path):
     sources = sorted(fleet.iterdir())[:2]
-    units = units_of(sources)
-    deadly = {f"{sources[1].name}/{stamp}": 1000 for stamp in AV2Log(sources[1]).timestamps}
-    process = ThreadProcess(make_job(tmp_path), deadly)
-    counters = count(dispatch([process], units, lambda: False, retries=1), units)
-    assert process.num_starts == 11
-    message = "10 workers died on this part of the log, the last one by SIGSEGV: the rest is left"
-    assert counters.failures[-1] == (sources[1].name, message)
+    parts = parts_of(sources)
+    frames = [f"{sources[1].name}/{stamp}" for stamp in AV2Log(sources[1]).timestamps[:-1]]
+    executor = HereExecutor(make_job(tmp_path), dict.fromkeys(frames, 1000))
+    counters = count(run_parallel([executor], parts, never), parts)
+    assert executor.num_starts == 1 + 2 * len(frames), "for the part, then for each try of a frame"
+    assert sorted(name for name, _ in counters.failures) == frames
     found = flow_files(tmp_path)
     assert len(found) == 3 and not counters.is_complete and found.items() <= single.items()
 
 
 def test_a_log_that_cannot_be_opened_alive_is_left(source, tmp_path):
-    class Deadly(ThreadProcess):
-        def call(self, unit: Unit) -> Any:
-            raise WorkerDied("by SIGABRT")
+    class Deadly(HereExecutor):
+        def submit(self, method: str, *arguments: Any) -> Any:
+            future: Future[Any] = Future()
+            future.set_exception(BrokenExecutor("SIGSEGV"))
+            return future
 
-    died, again, failed = dispatch([Deadly(make_job(tmp_path))], units_of([source]), lambda: False, retries=1)
-    text = "a worker died by SIGABRT; another one goes on with the frames that are missing"
-    assert died == again == Noted(0, source.name, text)
-    assert failed == Failed(0, source.name, "2 workers died on it, the last one by SIGABRT")
+    died, failed = run_parallel([Deadly(make_job(tmp_path))], parts_of([source]), never)
+    assert died == Noted(0, source.name, AGAIN)
+    assert failed == Failed(0, source.name, "2 workers died on it, the last one: SIGSEGV")
 
 
-def test_workers_that_die_at_their_start_are_started_three_times(source, tmp_path):
-    units, job = units_of([source]), make_job(tmp_path)
-    with pytest.raises(CFlowError, match="3 workers in a row died at their start, the last one by SIGKILL"):
-        list(dispatch([ThreadProcess(job, failed_starts=3)], units, lambda: False, 1))
-    assert count(dispatch([ThreadProcess(job, failed_starts=2)], units, lambda: False, 1), units).is_complete
+def test_workers_that_die_at_their_start_are_started_three_times(fleet, tmp_path):
+    parts, job = parts_of(sorted(fleet.iterdir())), make_job(tmp_path)
+    executor = HereExecutor(job, failed_starts=1000)
+    with pytest.raises(CFlowError, match="3 workers died before they began, the last one: SIGKILL: if memory is short"):
+        list(run_parallel([executor], parts, never))
+    assert executor.num_starts == 3
+    assert count(run_parallel([HereExecutor(job, failed_starts=2)], parts, never), parts).is_complete
 
 
 def test_a_worker_that_cannot_start_leaves_its_work_to_the_others(fleet, tmp_path, capsys):
-    class Gone(ThreadProcess):
-        def start(self) -> None:
-            Worker(self.job, "nowhere")
+    class Gone(HereExecutor):
+        def start(self) -> Worker:
+            return make_object(Worker, self.job, "nowhere")
 
-    units = units_of(sorted(fleet.iterdir()))
-    processes = [Gone(make_job(tmp_path)), ThreadProcess(make_job(tmp_path))]
-    assert count(dispatch(processes, units, lambda: False, 1), units).is_complete
+    parts = parts_of(sorted(fleet.iterdir()))
+    executors = [Gone(make_job(tmp_path)), HereExecutor(make_job(tmp_path))]
+    assert count(run_parallel(executors, parts, never), parts).is_complete
     assert "nowhere" in capsys.readouterr().err
     with pytest.raises(CFlowError, match="nowhere"):
-        list(dispatch(processes[:1], units, lambda: False, 1))
+        list(run_parallel(executors[:1], parts, never))
 
 
-def test_an_error_outside_of_frames_fails_only_its_unit(fleet, single, tmp_path, monkeypatch):
+def test_an_error_outside_of_frames_fails_only_its_part(fleet, single, tmp_path, monkeypatch):
     """For example if there is no memory for another thread."""
     first, *others = sorted(fleet.iterdir())
     real = Worker._pass
@@ -219,49 +231,65 @@ def test_an_error_outside_of_frames_fails_only_its_unit(fleet, single, tmp_path,
         return real(self, log, *rest)
 
     monkeypatch.setattr(Worker, "_pass", pass_)
-    processes = [ThreadProcess(make_job(tmp_path)) for _ in range(2)]
-    events = dispatch(processes, units_of([first, *others]), lambda: False, 1)
+    executors = [HereExecutor(make_job(tmp_path)) for _ in range(2)]
+    events = run_parallel(executors, parts_of([first, *others]), never)
     failed = [(e.name, e.message) for e in events if isinstance(e, Failed)]
     assert failed == [(first.name, "RuntimeError: can't start new thread")]
     assert len(flow_files(tmp_path)) == PAIRS - 3 and flow_files(tmp_path).items() <= single.items()
 
 
-def test_a_stop_does_not_wait_for_a_worker_that_hangs(source, tmp_path, monkeypatch):
-    class Hanging(ThreadProcess):
-        def call(self, unit: Unit) -> Any:
-            self.is_closed.wait()
-            raise WorkerDied("by SIGKILL")
+class SilentExecutor(HereExecutor):
+    """Its first calls are not answered."""
 
-    monkeypatch.setattr(dispatching, "_GRACE_S", 1.0)
+    def __init__(self, job: Job, num_silent: int) -> None:
+        super().__init__(job)
+        self.num_silent = num_silent
+
+    def submit(self, method: str, *arguments: Any) -> Any:
+        self.num_silent -= 1
+        return Future() if self.num_silent >= 0 else super().submit(method, *arguments)
+
+
+def test_a_stop_does_not_wait_for_a_worker_that_hangs(source, tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel, "_GRACE_S", 1.0)
     start = time.monotonic()
     stop = lambda: time.monotonic() > start + 1  # noqa: E731
-    assert not list(dispatch([Hanging(make_job(tmp_path))], units_of([source]), stop, 1))
+    assert not list(run_parallel([SilentExecutor(make_job(tmp_path), 1)], parts_of([source]), stop))
     assert time.monotonic() - start < 20
 
 
-def test_a_child_process_passes_answers_and_errors():
-    # As a text, because a child process that imports this file imports torch, too.
-    countdown = "lambda number, stop: (number / k if k else 1 / number and stop() for k in (3, 2, 1, 0))"
-    process = ChildProcess(eval, countdown, timeout=60)
+def test_a_silent_worker_is_replaced(source, single, tmp_path):
+    parts = parts_of([source])
+    counters = count(run_parallel([SilentExecutor(make_job(tmp_path), 1)], parts, never, timeout=1.0), parts)
+    assert counters.is_complete and counters.times_noted(AGAIN.replace("SIGSEGV", "no answer for 1 s")) == 1
+    assert len(flow_files(tmp_path)) == 5 and flow_files(tmp_path).items() <= single.items()
+
+
+def test_a_process_passes_answers_and_errors():
+    # As texts, because a process that imports this file imports torch, too.
+    executor = ProcessExecutor(eval, "[3, 2, 1]")
     try:
-        assert list(process.call(6)) == [2.0, 3.0, 6.0, False]
-        with pytest.raises(RuntimeError, match="ZeroDivisionError"):
-            list(process.call(0))
-        process._process.kill()
-        with pytest.raises(WorkerDied, match="by signal 9, Killed"):
-            list(process.call(6))
-        assert next(process.call(3)) == 1.0, "another process"
-        process.stop()
+        assert executor.submit("pop").result(60) == 1
+        assert executor.submit("index", 3).result(60) == 0, "the same object"
+        with pytest.raises(RuntimeError, match="ValueError: .* not in list"):
+            executor.submit("remove", 7).result(60)
+        executor._process.kill()
+        executor._process.join()
+        for _ in range(2):
+            with pytest.raises(BrokenExecutor, match="signal 9, Killed"):
+                executor.submit("pop").result(60)
+        executor.close()
+        assert executor.submit("pop").result(60) == 1, "another process"
     finally:
-        process.close()
-    died = "__import__('cflow_torch.fleet.processes', fromlist=['']).WorkerDied('because it lost its GPU')"
-    with pytest.raises(WorkerDied, match="because it lost its GPU"):
-        list(ChildProcess(eval, f"lambda stop: (_ for _ in ()).throw({died})", timeout=60).call())
+        executor.close()
+    executor = ProcessExecutor(eval, "1 / 0")
+    with pytest.raises(CannotStart, match="ZeroDivisionError"):
+        executor.submit("pop").result(60)
+    executor.close()
 
 
 def test_the_report_lists_what_is_missing():
-    units = units_of(["a", "b", "c"])
-    counters = Counters(units)
+    counters = Counters(parts_of(["a", "b", "c"]))
     stamps = tuple(range(40))
     events = [Opened(0, "a", stamps, stamps[10:]), Done(0, 10, {"read": 2.0}), Failed(0, "a/11", "odd", 11)]
     for event in [*events, Failed(1, "b", "no log"), *(Noted(2, name, "odd") for name in "cca")]:
@@ -279,8 +307,8 @@ def test_the_report_lists_what_is_missing():
 
 
 def test_a_stop_lets_started_frames_finish(fleet, tmp_path):
-    units, job = units_of(sorted(fleet.iterdir())), make_job(tmp_path, batch=1)
-    processes = [ThreadProcess(job), ThreadProcess(job)]
-    counters = count(dispatch(processes, units, lambda: any(tmp_path.rglob("*.feather")), 1), units)
+    parts, job = parts_of(sorted(fleet.iterdir())), make_job(tmp_path, batch=1)
+    executors = [HereExecutor(job), HereExecutor(job)]
+    counters = count(run_parallel(executors, parts, lambda: any(tmp_path.rglob("*.feather"))), parts)
     assert 0 < len(flow_files(tmp_path)) < PAIRS
     assert len(counters.waiting) + len(flow_files(tmp_path)) == counters.total

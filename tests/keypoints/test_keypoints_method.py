@@ -15,7 +15,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.keypoints import matching
-from cflow_torch.keypoints.match_candidates import KeyPoints
+from cflow_torch.keypoints.match_candidates import KeyPoints, Patches
 from cflow_torch.keypoints.matching import match
 
 DENSIFIERS = ("components", "clusters", "nearest")
@@ -115,7 +115,13 @@ def hand_made(pixels: list[list[int]], ones: list[int]) -> KeyPoints:
     """Key points whose 11 x 11 descriptors have their first pixels set."""
     row, col = torch.tensor(pixels, dtype=torch.int64).reshape(-1, 2).unbind(1)
     patch = torch.tensor([[1] * n + [0] * (121 - n) for n in ones], dtype=torch.uint8).reshape(-1, 121)
-    return KeyPoints(row * 40_000 + col, torch.zeros_like(row), row, col, patch, patch.sum(1))
+    return KeyPoints(row * 40_000 + col, torch.zeros_like(row), row, col, patches_of(patch), patch.sum(1))
+
+
+def patches_of(patch: torch.Tensor) -> Patches:
+    """Descriptors from all their pixels, (K, L^2) uint8."""
+    size = math.isqrt(patch.shape[1])
+    return Patches(patch.flatten(), torch.arange(0, patch.numel(), size).view(-1, size))
 
 
 def shifts(pc0: KeyPoints, pc1: KeyPoints, reach: float = 10.0, ratio: float = 1.1) -> dict[int, tuple[int, int]]:
@@ -151,16 +157,17 @@ def test_a_match_at_the_radius_is_allowed():
 @pytest.mark.parametrize("precision", ["highest", "medium"])
 @pytest.mark.parametrize("patch_size", [1, 11, 51])
 def test_shared_pixels_are_counted_exactly(patch_size, precision):
-    generator, points = torch.Generator().manual_seed(patch_size), []
+    generator, points, patches = torch.Generator().manual_seed(patch_size), [], []
     for number, density in ((7, 0.1), (150, 0.7)):
         patch = torch.rand((number, patch_size**2), generator=generator) < density
         patch[0], patch[:, 0] = True, True  # every descriptor has a set pixel
         index = torch.arange(number)
         zero = torch.zeros_like(index)
-        points.append(KeyPoints(index, zero, zero, index, patch.byte(), patch.sum(1)))
+        patches.append(patch)
+        points.append(KeyPoints(index, zero, zero, index, patches_of(patch.byte()), patch.sum(1)))
     pc0, pc1 = points
-    expected = (pc0.patch[:, None] & pc1.patch).sum(2)
-    targets = matching.arrange_targets(pc1, patch_size**2)
+    expected = (patches[0][:, None] & patches[1]).sum(2)
+    targets = matching.arrange_targets(pc1)
     reach = torch.tensor([1000.0], dtype=torch.float64)
     before = torch.get_float32_matmul_precision()
     counted = torch.zeros(7, dtype=torch.int64)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from pyarrow import feather
 from scipy.spatial import cKDTree
+from writers import waymo_encoding
+from writers.waymo import write_waymo_segment
 
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.boxes import BoxLog
@@ -17,9 +19,7 @@ from cflow_torch.data.log import window
 from cflow_torch.data.waymo import WaymoLog
 from cflow_torch.simulator import Drive, benchmark, make_drive
 from cflow_torch.simulator.benchmark import benchmark_logs
-from cflow_torch.simulator.writers import waymo_encoding
 from cflow_torch.simulator.writers.av2 import write_av2_log
-from cflow_torch.simulator.writers.waymo import write_waymo_segment
 from cflow_torch.types import CFlowError
 
 
@@ -96,7 +96,7 @@ def test_waymo_writes_true_poses_where_a_turn_begins(tmp_path, monkeypatch):
     turning, used = make_drive(316, 8, "waymo", "crossing"), []
     true_poses = waymo_encoding.true_poses_of_shots
     monkeypatch.setattr(
-        "cflow_torch.simulator.writers.waymo.true_poses_of_shots",
+        "writers.waymo.true_poses_of_shots",
         lambda log, index, offsets: (used.append(index), true_poses(log, index, offsets))[1],
     )
     profile = replace(turning._profile, units=(replace(turning._profile.units[0], num_columns=530),))

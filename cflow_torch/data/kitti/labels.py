@@ -59,26 +59,42 @@ class FrameBoxes(NamedTuple):
 
 def read_tracklets(file: Path) -> dict[int, FrameBoxes]:
     """Read tracklet_labels.xml: number of the frame -> boxes. The file states positions of the middle of the base."""
-    rows: dict[int, list[tuple[str, str, Any, Any]]] = {}
+    rows: dict[int, list[_Row]] = {}
     content = read_bytes(file)
     with file_errors(file):
         if b"<!ENTITY" in content:
             raise CFlowError("it defines entities, which are not read; copy it again")
         root: Any = ElementTree.fromstring(content)
         for number, track in enumerate(root.find("tracklets").findall("item")):
-            kind = track.findtext("objectType")
-            length, width, height = (float(track.findtext(key)) for key in ("l", "w", "h"))
-            first = int(track.findtext("first_frame"))
+            first_frame = int(track.findtext("first_frame"))
             for step, pose in enumerate(track.find("poses").findall("item")):
-                if int(pose.findtext("truncation", "0")) == _OUT_OF_IMAGE:
-                    continue
-                heading, x, y, z = (float(pose.findtext(key)) for key in ("rz", "tx", "ty", "tz"))
-                place = (heading, x, y, z + height / 2)
-                rows.setdefault(first + step, []).append((str(number), kind, (length, width, height), place))
+                if int(pose.findtext("truncation", "0")) != _OUT_OF_IMAGE:
+                    rows.setdefault(first_frame + step, []).append(_Row.of(number, track, pose))
         return {frame: _upright(of_frame) for frame, of_frame in rows.items()}
 
 
-def _upright(rows: list[tuple[str, str, Any, Any]]) -> FrameBoxes:
+class _Row(NamedTuple):
+    """A tracklet in one frame."""
+
+    track: str
+    kind: str
+    size: tuple[float, float, float]  # length, width, height, metres
+    place: tuple[float, float, float, float]  # heading, radians; x, y, z of the middle of the box, metres
+
+    @classmethod
+    def of(cls, number: int, track: Any, pose: Any) -> _Row:
+        """Read a pose of track `number`; the file states the middle of the base of the box."""
+        length, width, height = (float(track.findtext(key)) for key in ("l", "w", "h"))
+        heading, x, y, z = (float(pose.findtext(key)) for key in ("rz", "tx", "ty", "tz"))
+        return cls(
+            track=str(number),
+            kind=track.findtext("objectType"),
+            size=(length, width, height),
+            place=(heading, x, y, z + height / 2),
+        )
+
+
+def _upright(rows: list[_Row]) -> FrameBoxes:
     tracks, kinds, sizes, places = zip(*rows)
     boxes = Boxes(list(tracks), category_indices(kinds, CATEGORY_NAME), sizes, upright_poses(places))
     return FrameBoxes(boxes, np.zeros((0, 4)))
@@ -102,19 +118,31 @@ def read_tracking_labels(file: Path, T_lidar_camera: np.ndarray) -> dict[int, Fr
 def _camera_boxes(rows: list[list[str]], T_lidar_camera: np.ndarray) -> FrameBoxes:
     numbers = np.array([words[6:17] for words in rows], np.float64)  # left top right bottom, h w l, x y z, rotation
     is_box = np.array([words[2] != "DontCare" for words in rows])
+    kept = [words for words, keep in zip(rows, is_box) if keep]
     boxes = numbers[is_box]
+    return FrameBoxes(
+        boxes=Boxes(
+            [words[1] for words in kept],
+            category_indices([words[2] for words in kept], CATEGORY_NAME),
+            boxes[:, [6, 5, 4]],
+            T_lidar_camera @ _camera_poses(boxes),
+        ),
+        ignored=numbers[~is_box, :4],
+    )
+
+
+def _camera_poses(boxes: np.ndarray) -> np.ndarray:
+    """Return T_camera_box, (K, 4, 4) float64, of boxes given by numbers of the file, (K, 11)."""
     height = boxes[:, 4]
-    cos, sin = np.cos(boxes[:, 10]), np.sin(boxes[:, 10])
+    cos = np.cos(boxes[:, 10])
+    sin = np.sin(boxes[:, 10])
     turned = np.tile(np.eye(4), (len(boxes), 1, 1))
     turned[:, 0, 0] = turned[:, 2, 2] = cos
     turned[:, 0, 2] = sin
     turned[:, 2, 0] = -sin
     turned[:, :3, 3] = boxes[:, 7:10] - height[:, None] * (0, 0.5, 0)
     turned[:, :3, :3] = turned[:, :3, :3] @ _OBJECT_FROM_BOX
-    kept = [words for words, keep in zip(rows, is_box) if keep]
-    category = category_indices([words[2] for words in kept], CATEGORY_NAME)
-    tracks = [words[1] for words in kept]
-    return FrameBoxes(Boxes(tracks, category, boxes[:, [6, 5, 4]], T_lidar_camera @ turned), numbers[~is_box, :4])
+    return turned
 
 
 def read_classes(file: Path, rows: int) -> tuple[np.ndarray, np.ndarray]:

@@ -103,7 +103,8 @@ class NuScenesLog(Log):
     ) -> None:
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: pass 1 for all sweeps, 2 for every second one")
-        self.log_id, self._root = source.name, as_path(source.root)
+        self.log_id = source.name
+        self._root = as_path(source.root)
         self._deskew = self.moves_by_times = deskew
         self._own_vehicle = self.OWN_VEHICLE if own_vehicle == "auto" else own_vehicle
         folder = self._root / source.version
@@ -115,18 +116,22 @@ class NuScenesLog(Log):
             raise CFlowError(f"scene {self.log_id} in {folder} has no LiDAR {missing or ''}; it has {list(known)}")
         self._lidars = {name: known[name] for name in lidars or known}
         reference = self._lidars[self._reference if self._reference in self._lidars else next(iter(self._lidars))]
-        # Key frames, and every `sweep_step`-th sweep counted from the last key frame.
+        self._keep_sweeps(reference, sweep_step, folder)
+        self.lidar_position = reference.mount[0, :3, 3]
+        self.turn_seconds = float(np.median(np.diff(reference.times))) * 1e-6  # of all sweeps, not only of those kept
+        self._odometry = (reference.times, reference.ego)
+        self._tracks = Tracks(sample_times, annotations)
+
+    def _keep_sweeps(self, reference: LidarChain, sweep_step: int, folder: Path) -> None:
+        """Keep key frames, and every `sweep_step`-th sweep counted from the last key frame."""
         row = np.arange(len(reference.times))
         last_key = np.maximum.accumulate(np.where(reference.is_key_frame, row, 0))
         kept = np.flatnonzero((row - last_key) % sweep_step == 0)
         self.timestamps = reference.times[kept].tolist()
         self._check_count(f"scene {self.log_id} in {folder}")
         self._check_files(reference, kept, int((row - last_key).max()) + 1)
-        self._poses, self._T_ego_world = reference.ego[kept], np.linalg.inv(reference.ego[kept])
-        self.lidar_position = reference.mount[0, :3, 3]
-        self.turn_seconds = float(np.median(np.diff(reference.times))) * 1e-6  # of all sweeps, not only of those kept
-        self._odometry = (reference.times, reference.ego)
-        self._tracks = Tracks(sample_times, annotations)
+        self._poses = reference.ego[kept]
+        self._T_ego_world = np.linalg.inv(self._poses)
 
     @property
     def poses(self) -> np.ndarray:

@@ -88,23 +88,33 @@ class WaymoLog(BoxLog):
             raise CFlowError(f"{self.file} is not in a folder lidar; pass <split>/lidar/<segment>.parquet")
         self.log_id = self.file.stem
         self._returns = (1, 2) if both_returns else (1,)
-        self._images, self._pixel_poses = Component(self.file, "lidar"), Component(self.file, "lidar_pose")
+        self._images = Component(self.file, "lidar")
+        self._pixel_poses = Component(self.file, "lidar_pose")
         times = sorted({time for time, _ in self._images.row_of})
         self.timestamps = [time * 1000 for time in times]
         self._check_count(self.file)
+        self._lasers = self._choose(lasers)
+        self._calibration = self._read_calibration()
+        self._poses = self._read_poses(times)
+        self._frame = lru_cache(_KEPT_FRAMES)(self._read_frame)
+
+    def _choose(self, lasers: Sequence[str]) -> list[int]:
+        """Return the numbers of the lasers to read, of those that the segment has."""
         present = {laser for _, laser in self._images.row_of}
         names = [name for name, laser in LASERS.items() if laser in present]
-        self._lasers = [LASERS[name] for name in names if name in lasers]
-        if not self._lasers or not set(lasers) <= set(LASERS):
+        chosen = [LASERS[name] for name in names if name in lasers]
+        if not chosen or not set(lasers) <= set(LASERS):
             raise CFlowError(f"{self.file}: lasers={list(lasers)}: choose some of {', '.join(names)}")
-        if TOP in self._lasers and not self._pixel_poses.row_of:
+        if TOP in chosen and not self._pixel_poses.row_of:
             raise CFlowError(f"{self._pixel_poses.file} is empty; copy it again")
-        self._calibration = self._read_calibration()
+        return chosen
+
+    def _read_poses(self, times: Sequence[int]) -> np.ndarray:
+        """Read the poses of frames, (K, 4, 4) float64."""
         component = Component(self.file, "vehicle_pose")
-        stored = component.rows_by(TIME, times, (VEHICLE_POSE,)).items()
-        poses = [matrix_of(values, f"{component.file}: the pose of frame {time}") for time, (values,) in stored]
-        self._poses = np.stack(poses)
-        self._frame = lru_cache(_KEPT_FRAMES)(self._read_frame)
+        rows = component.rows_by(TIME, times, (VEHICLE_POSE,))
+        poses = [matrix_of(values, f"{component.file}: the pose of frame {time}") for time, (values,) in rows.items()]
+        return np.stack(poses)
 
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
@@ -122,20 +132,28 @@ class WaymoLog(BoxLog):
         time = self.timestamps[index] // 1000
         keys = [(time, laser) for laser in self._lasers]
         images = [self._images.images(keys, f"{LIDAR}{number}", 4) for number in self._returns]
-        pixel_poses = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6) if TOP in self._lasers else {}
-        if any(poses is None for poses in pixel_poses.values()):
-            raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
-        points, zone = [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
+        pixel_poses = self._read_pixel_poses(time)
+        points = [np.zeros((0, 3))]
+        is_zone = [np.zeros(0, dtype=bool)]
         for key in keys:
             for image in (of_return[key] for of_return in images):
                 if image is None:  # a laser, or a second return, without any data
                     continue
-                calibration, poses = self._calibration[key[1]], pixel_poses.get(key)
+                poses = pixel_poses if key[1] == TOP else None
                 with file_errors(f"{self.file}, frame {time}, laser {key[1]}"):
-                    found, pixels = range_image_points(image, calibration, self._poses[index], poses)
-                points.append(found)
-                zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
-        return np.concatenate(points).astype(np.float32), np.concatenate(zone)
+                    of_image, pixels = range_image_points(image, self._calibration[key[1]], self._poses[index], poses)
+                points.append(of_image)
+                is_zone.append(image.reshape(-1, image.shape[2])[pixels, NO_LABEL_ZONE] == 1)
+        return np.concatenate(points).astype(np.float32), np.concatenate(is_zone)
+
+    def _read_pixel_poses(self, time: int) -> np.ndarray | None:
+        """Read the poses of the pixels of TOP, (H, W, 6); None if this laser is not read."""
+        if TOP not in self._lasers:
+            return None
+        poses = self._pixel_poses.images([(time, TOP)], PIXEL_POSE, 6)[time, TOP]
+        if poses is None:
+            raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
+        return poses
 
     def _read_calibration(self) -> dict[int, LaserCalibration]:
         component = Component(self.file, "lidar_calibration")
@@ -205,7 +223,8 @@ class Component:
         missing = [key for key in keys if key not in self.row_of]
         if missing:
             raise CFlowError(f"{self.file} has no row for frame {missing[0][0]}, laser {missing[0][1]}; copy it again")
-        rows, columns = [self.row_of[key] for key in keys], [TIME, LASER, f"{column}.values", f"{column}.shape"]
+        rows = [self.row_of[key] for key in keys]
+        columns = [TIME, LASER, f"{column}.values", f"{column}.shape"]
         images: dict[Key, np.ndarray | None] = {}
         with file_errors(self.file, self._hint):
             parquet = pq.ParquetFile(source_for_mmap(self.file))

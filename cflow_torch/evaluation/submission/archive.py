@@ -71,7 +71,8 @@ def encode(
     residual = as_numpy(result.residual_flow).astype(np.float32)
     if mask is not None:
         keep = np.asarray(mask, dtype=bool)
-        residual, flow = residual[keep], as_numpy(result.flow)[keep]
+        residual = residual[keep]
+        flow = as_numpy(result.flow)[keep]
     else:
         flow = residual if is_ground is None else np.where(as_numpy(is_ground)[:, None], np.float32(0), residual)
     bad = ~(np.abs(flow) <= LARGEST).all(axis=1)
@@ -105,7 +106,8 @@ def pack(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
         for name in sorted(set(names)):
             entry = zipfile.ZipInfo(name, _EARLIEST)
             entry.compress_type = zipfile.ZIP_DEFLATED
-            entry.create_system, entry.external_attr = 3, 0o100644 << 16
+            entry.create_system = 3
+            entry.external_attr = 0o100644 << 16
             archive.writestr(entry, (Path(folder) / name).read_bytes())
 
 

@@ -88,7 +88,8 @@ def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor
 def _ground_of_t(batch: Mapping[str, Any], b: int) -> Tensor:
     """Return the (K, 3) ground points of t, which the harness has removed from pc0; none if the batch lacks them."""
     if "origin_pc0" in batch and "gm0" in batch:
-        points, is_ground = _entry(batch, "origin_pc0", b), _mask(batch, "gm0", b)
+        points = _entry(batch, "origin_pc0", b)
+        is_ground = _mask(batch, "gm0", b)
         if len(points) == is_ground.numel():
             points = points[is_ground.to(points.device), :3]
             return points[points.isfinite().all(dim=1)]

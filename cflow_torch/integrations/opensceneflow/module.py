@@ -97,9 +97,11 @@ class CFlow(nn.Module):
 
     def _output(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> dict[str, Tensor]:
         num_points = len(sample.rows0)  # the rows after these are ground points
-        residual, is_valid = result.residual_flow[:num_points], result.is_valid[:num_points]
+        residual = result.residual_flow[:num_points]
+        is_valid = result.is_valid[:num_points]
         device = residual.device
-        points, rows = batch["pc0"][b][:, :3].detach().to(device).float(), sample.rows0.to(device)
+        points = batch["pc0"][b][:, :3].detach().to(device).float()
+        rows = sample.rows0.to(device)
         if sample.T_lidar1_lidar0 is not None:
             residual = residual_for_harness(residual, points[rows], sample.T_ego1_ego0, sample.T_lidar1_lidar0)
         flow = torch.zeros_like(points).index_copy_(0, rows, residual)
@@ -112,7 +114,8 @@ class CFlow(nn.Module):
 
     def _check_history(self, samples: list[Sample]) -> None:
         """Warn once if the batches have less history than the settings."""
-        num_history, given = self.config.num_history, min(len(sample.window.pch) for sample in samples)
+        num_history = self.config.num_history
+        given = min(len(sample.window.pch) for sample in samples)
         if given < num_history and not self._has_warned:
             self._has_warned = True
             warn(

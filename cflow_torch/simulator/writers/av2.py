@@ -11,8 +11,10 @@ import pyarrow as pa
 from pyarrow import feather
 
 from cflow_torch.data.atomic import new_folder
+from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Boxes, GroundRaster, Recording
+from cflow_torch.types import Sweep
 
 CITY = "SYN"  # code of the city in file names; real logs have PIT, MIA, ...
 _DYNAMIC = 0.05  # Argoverse 2 calls a point dynamic if its residual flow is at least this, metres per sweep
@@ -44,24 +46,19 @@ def write_av2_log(log: Recording, root: str | Path) -> Path:
 
 
 def _write_log(log: Recording, folder: Path) -> None:
-    poses, annotations = np.asarray(log.poses, np.float64), []
+    poses = np.asarray(log.poses, np.float64)
+    annotations = []
     for index, stamp in enumerate(log.timestamps):
-        sweep, labels = log.sweep(index), log.labels(index)
+        sweep = log.sweep(index)
+        points = np.asarray(sweep.points)
         annotations.append(_annotations(stamp, log.boxes(index)))
-        x, y, z = np.asarray(sweep.points)[:, :3].T.astype(np.float16)
-        lidar = {"x": x, "y": y, "z": z, **log.channels(index)}
+        lidar = {**dict(zip("xyz", points[:, :3].T.astype(np.float16))), **log.channels(index)}
         _write_feather(folder / "sensors" / "lidar" / f"{stamp}.feather", lidar)
+        labels = log.labels(index)
         if labels is not None:
             T_ego1_ego0 = np.linalg.inv(poses[index + 1]) @ poses[index]
-            points = np.asarray(sweep.points, np.float64)[:, :3]
-            residual = points + labels.flow - points @ T_ego1_ego0[:3, :3].T - T_ego1_ego0[:3, 3]
-            is_ground = np.zeros(len(points), bool) if sweep.is_ground is None else np.asarray(sweep.is_ground)
-            flow = {f"flow_t{axis}_m": labels.flow[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
-            flow["classes"] = labels.category
-            flow["dynamic"] = np.linalg.norm(residual, axis=1) >= _DYNAMIC
-            flow["is_ground_0"] = is_ground
-            flow["is_valid"] = labels.is_valid
-            _write_feather(folder / "flow_labels" / f"{stamp}.feather", flow)
+            columns = _label_columns(sweep, labels, T_ego1_ego0)
+            _write_feather(folder / "flow_labels" / f"{stamp}.feather", columns)
 
     _write_feather(
         folder / "city_SE3_egovehicle.feather",
@@ -71,9 +68,24 @@ def _write_log(log: Recording, folder: Path) -> None:
         folder / "calibration" / "egovehicle_SE3_sensor.feather",
         {"sensor_name": list(log.calibration), **_pose_columns(np.stack(list(log.calibration.values())))},
     )
-    columns = {name: np.concatenate([table[name] for table in annotations]) for name in annotations[0]}
-    _write_feather(folder / "annotations.feather", columns)
+    _write_feather(
+        folder / "annotations.feather",
+        {name: np.concatenate([table[name] for table in annotations]) for name in annotations[0]},
+    )
     _write_map(folder / "map", log.log_id, log.ground_raster())
+
+
+def _label_columns(sweep: Sweep, labels: FlowLabels, T_ego1_ego0: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Return the columns of the flow labels of a sweep."""
+    points = np.asarray(sweep.points, np.float64)[:, :3]
+    residual = points + labels.flow - points @ T_ego1_ego0[:3, :3].T - T_ego1_ego0[:3, 3]
+    return {
+        **{f"flow_t{axis}_m": labels.flow[:, k].astype(np.float32) for k, axis in enumerate("xyz")},
+        "classes": labels.category,
+        "dynamic": np.linalg.norm(residual, axis=1) >= _DYNAMIC,
+        "is_ground_0": np.zeros(len(points), bool) if sweep.is_ground is None else np.asarray(sweep.is_ground),
+        "is_valid": labels.is_valid,
+    }
 
 
 def _annotations(stamp: int, boxes: Boxes) -> Mapping[str, np.ndarray]:

@@ -27,8 +27,8 @@ from cflow_torch.data.waymo.reader import (
     VEHICLE_POSE,
 )
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
 from cflow_torch.types import CFlowError
+from writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
 
 BOX_TYPE: dict[str, int] = {
     **dict.fromkeys(META_CLASSES["CAR"] + META_CLASSES["OTHER_VEHICLES"] + ("MOTORCYCLE", "MOTORCYCLIST"), 1),
@@ -134,29 +134,37 @@ def _write_components(log: Recording, folder: Path) -> None:
         tables: dict[str, list[dict[str, Any]]] = {tag: [] for tag in SCHEMAS}  # written as one row group
         for index, time in enumerate(times):
             key = {_SEGMENT: log.log_id, TIME: time}
-            pose, units = np.asarray(log.poses[index], np.float64), log.units(index)
+            units = log.units(index)
             numbers = _laser_numbers([unit.name for unit in units])
-            rows: list[dict[str, Any]] = []
+            images = []
             for unit, number in sorted(zip(units, numbers), key=lambda pair: pair[1]):
                 calibration = _calibration(unit, log.elevations(unit.name))
-                shots = poses_of_shots(log, index, unit.offset_ns) if number == TOP else None
-                where = f"sweep {index} of log {log.log_id}, unit {unit.name}"
-                true_shots = None
-                if shots is not None and hasattr(log, "poses_at"):
-                    true_shots = partial(true_poses_of_shots, log, index, unit.offset_ns)
-                images = encode_images(unit, calibration, where, shots, true_shots)
-                cells = {**_cells(f"{LIDAR}1", images["first"]), **_cells(f"{LIDAR}2", images["second"])}
-                rows.append({**key, LASER: number, **cells})
-                if number == TOP:
-                    cells = _cells(PIXEL_POSE, images["poses"])
-                    _write_rows(writers["lidar_pose"], [{**key, LASER: TOP, **cells}])
+                image, pixel_poses = _image_cells(log, index, unit, calibration, number == TOP)
+                images.append({**key, LASER: number, **image})
+                if pixel_poses is not None:
+                    _write_rows(writers["lidar_pose"], [{**key, LASER: TOP, **pixel_poses}])
                 if index == 0:
                     tables["lidar_calibration"].append(_calibration_row(log.log_id, number, calibration))
-            _write_rows(writers["lidar"], rows)
+            _write_rows(writers["lidar"], images)
             tables["lidar_box"] += _box_rows(log, index, key)
+            pose = np.asarray(log.poses[index], np.float64)
             tables["vehicle_pose"].append({**key, VEHICLE_POSE: pose.reshape(-1)})
         for tag in ("lidar_calibration", "lidar_box", "vehicle_pose"):
             _write_rows(writers[tag], tables[tag])
+
+
+def _image_cells(
+    log: Recording, index: int, unit: UnitReturns, calibration: LaserCalibration, is_top: bool
+) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """Return the cells of both range images of a unit, and of its pixel poses; None = not TOP."""
+    where = f"sweep {index} of log {log.log_id}, unit {unit.name}"
+    shots = poses_of_shots(log, index, unit.offset_ns) if is_top else None
+    true_shots = None
+    if shots is not None and hasattr(log, "poses_at"):
+        true_shots = partial(true_poses_of_shots, log, index, unit.offset_ns)
+    images = encode_images(unit, calibration, where, shots, true_shots)
+    cells = {**_cells(f"{LIDAR}1", images["first"]), **_cells(f"{LIDAR}2", images["second"])}
+    return cells, _cells(PIXEL_POSE, images["poses"]) if is_top else None
 
 
 def _laser_numbers(names: Sequence[str]) -> list[int]:
@@ -172,7 +180,8 @@ def _laser_numbers(names: Sequence[str]) -> list[int]:
 
 def _calibration(unit: UnitReturns, elevations: np.ndarray) -> LaserCalibration:
     """Calibration of a unit. As for Waymo's small lasers, evenly spaced beams are given by their outer edges only."""
-    T_ego_sensor, elevations = np.asarray(unit.T_ego_sensor, np.float64), np.asarray(elevations, np.float64)
+    T_ego_sensor = np.asarray(unit.T_ego_sensor, np.float64)
+    elevations = np.asarray(elevations, np.float64)
     steps = np.diff(elevations)
     if len(steps) and np.ptp(steps) < 1e-12 and unit.name != "TOP":
         half = (elevations[-1] - elevations[0]) / len(steps) / 2
@@ -191,7 +200,8 @@ def _calibration_row(log_id: str, number: int, calibration: LaserCalibration) ->
 
 def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str, Any]]:
     """Boxes of one frame."""
-    boxes, rows = log.boxes(index), []
+    boxes = log.boxes(index)
+    rows = []
     for track, category, size, pose, count in zip(
         boxes.track_id, boxes.category, boxes.size, boxes.pose, boxes.num_points
     ):

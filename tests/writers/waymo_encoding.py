@@ -91,7 +91,8 @@ def encode_images(
 
     If `shot_poses` are too inaccurate for a pixel, we encode the unit again with `true_poses`.
     """
-    height, width = unit.num_rings, unit.num_columns
+    height = unit.num_rings
+    width = unit.num_columns
     points = np.asarray(unit.points, np.float64)  # laser frame, at the pose of the frame
     seen = points if shot_poses is None else shot_poses.to_shot(points, calibration.T_ego_sensor)
     distance = np.linalg.norm(seen, axis=1).astype(np.float32)
@@ -131,6 +132,7 @@ def encode_images(
 
 def pose_angles(pose: np.ndarray) -> np.ndarray:
     """(..., 6) roll, pitch, yaw, x, y, z of transforms (..., 4, 4)."""
-    roll, yaw = np.arctan2(pose[..., 2, 1], pose[..., 2, 2]), np.arctan2(pose[..., 1, 0], pose[..., 0, 0])
+    roll = np.arctan2(pose[..., 2, 1], pose[..., 2, 2])
+    yaw = np.arctan2(pose[..., 1, 0], pose[..., 0, 0])
     pitch = -np.arcsin(np.clip(pose[..., 2, 0], -1, 1))
     return np.concatenate([np.stack([roll, pitch, yaw], -1), pose[..., :3, 3]], -1)

@@ -75,9 +75,11 @@ def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
     frames: list[dict[str, Any]] = []
     mounts: dict[str, np.ndarray] = {}
     for index, stamp in enumerate(log.timestamps):
-        units, boxes = log.units(index), log.boxes(index)
+        units = log.units(index)
+        boxes = log.boxes(index)
         classes = _classes(log, index, boxes)
-        clouds, begin = {}, 0
+        clouds = {}
+        begin = 0
         for unit in units:
             mounts[unit.name] = np.asarray(unit.T_ego_sensor, np.float64)
             path = f"{_FOLDER}/{safe_name(unit.name, 'the LiDAR')}_{stamp}.npz"

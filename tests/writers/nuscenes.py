@@ -65,7 +65,8 @@ def write_nuscenes(recording: Recording, root: str | Path, key_frame_interval: f
     with new_folder(root, recording.log_id) as folder:
         scene = SceneWriter(recording, folder, "LIDAR_TOP", NUSCENES_NAMES)
         tables = scene.write("{name}__{channel}__{stamp}.pcd.bin", write_points, key_frame_interval)
-        log, image = scene.token("log"), f"maps/{recording.log_id}.png"
+        log = scene.token("log")
+        image = f"maps/{recording.log_id}.png"
         day = datetime.fromtimestamp(recording.timestamps[0] * 1e-9, timezone.utc).strftime("%Y-%m-%d")
         tables["log"] = [
             {"token": log, "logfile": recording.log_id, "vehicle": "", "date_captured": day, "location": ""}
@@ -91,7 +92,9 @@ class SceneWriter:
     """
 
     def __init__(self, recording: Recording, folder: Path, reference: str, names: Mapping[str, str]) -> None:
-        self.recording, self.folder, self._names = recording, folder, names
+        self.recording = recording
+        self.folder = folder
+        self._names = names
         self._units = recording.units(0)
         self._channels = [safe_name(unit.name, "the LiDAR") for unit in self._units]
         if reference not in self._channels:
@@ -163,7 +166,8 @@ class SceneWriter:
 
     def _fixed_tables(self, keys: Sequence[int]) -> dict[str, Table]:
         """The tables of the scene, its samples and sensors, and empty tables to fill."""
-        token, scene = self.token, self.token("scene")
+        token = self.token
+        scene = self.token("scene")
         samples = [token("sample", key) for key in keys]
         links = zip(samples, keys, ["", *samples[:-1]], [*samples[1:], ""])
         mounts = list(zip(self._channels, self._units))

@@ -9,7 +9,7 @@ import numpy as np
 from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.simulator.recording import Recording, UnitReturns
-from cflow_torch.simulator.writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
+from writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
 
 _VERSION, _KEY_FRAME_INTERVAL = "v1.2-mini", 0.5  # seconds
 # The devkit also requires these tables, which nuScenes does not have. A simulated truck has no data for them.
@@ -45,7 +45,8 @@ def write_truckscenes(recording: Recording, root: str | Path) -> Path:
 
     def write_points(file: Path, unit: UnitReturns, stamp_ns: int) -> None:
         times = ((int(stamp_ns) + np.asarray(unit.offset_ns, dtype=np.int64)) // 1000).astype(np.uint64)
-        points, intensity = np.asarray(unit.points, dtype=np.float32), unit.intensity.astype(np.float32)
+        points = np.asarray(unit.points, dtype=np.float32)
+        intensity = unit.intensity.astype(np.float32)
         write_cloud(file, points, {"intensity": intensity, "timestamp": times})
 
     with new_folder(root, recording.log_id) as folder:
