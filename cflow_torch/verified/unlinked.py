@@ -23,7 +23,7 @@ from cflow_torch.verified.component_tree import Components, NodeKind, Tree, _dra
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 _CELL = 0.8  # metres
-_SAME = 0.4  # metres; how far a component may be from where the velocity puts it, and further ...
+_SAME = 0.7  # metres; how far a component may be from where the velocity puts it, and further ...
 _SAME_SHARE = 0.05  # ... for each metre that the object has moved
 _LARGEST = 8.0  # metres
 _LIKE = 4.0  # ratio of numbers of pixels
@@ -159,10 +159,9 @@ def _links(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> tuple
         first = at_t[floor_divide(hyp, near.shape[1])]
         second = near.flatten()[hyp]
         dist = (parts.centre[:, second] - parts.centre[:, first]).square().sum(0).sqrt()
-        ratio = parts.size[first].double() / parts.size[second]
         limit = max_speed * apart[parts.window[first]] * per_meter + 1
         least = LEAST_SHIFT * per_meter
-        ok = flat_nonzero((dist <= limit) & (dist >= least) & (ratio <= _LIKE) & (ratio >= 1 / _LIKE))
+        ok = flat_nonzero((dist <= limit) & (dist >= least))
         firsts.append(first[ok])
         others.append(second[ok])
     first = torch.cat(firsts)
@@ -175,7 +174,7 @@ def _links(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> tuple
     centre = parts.centre[:, first][..., None] - velocity[..., None] * since  # [2, H, S]
     steps = torch.arange(s, device=first.device)
     given = (k != 0) | (steps == 0)
-    lookat = look(window[:, None].expand_as(k), steps.expand_as(k), centre, 1)  # [H, S, 9]
+    lookat = look(window[:, None].expand_as(k), steps.expand_as(k), centre, 2)  # [H, S, 25]
     off = parts.centre[:, lookat.clamp(min=0)] - centre[..., None]
     d = off.square().sum(0).sqrt().masked_fill(lookat < 0, math.inf)
     best, which = d.min(2)  # [H, S]
@@ -195,15 +194,6 @@ def _links(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> tuple
     kept = flat_nonzero(enough)
     found, cost, since, hit, num = found[kept], cost[kept], since[kept], hit[kept], num[kept]
     velocity = velocity[:, kept]
-    if s > 2:
-        of_first = Groups(found[:, 1], len(parts.size))
-        is_min = of_first.where(cost == of_first.spread(of_first.min(cost, empty=math.inf)))
-        of_min = is_min.first().clamp(max=max(len(cost) - 1, 0))  # [Q]
-        best_of = of_first.spread(of_min)
-        differs = (velocity - velocity[:, best_of]).square().sum(0).sqrt() > DIFFERENT * per_meter
-        rival = differs & (num >= num[best_of] - RIVAL)
-        ambiguous = of_first.spread(of_first.any(rival))
-        cost = cost.masked_fill(ambiguous, math.inf)
     # mutual best, then the first of equal ones
     is_best = torch.ones_like(cost, dtype=torch.bool)
     for part in (found[:, 1], found[:, 0]):
