@@ -19,45 +19,43 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import FAR, Groups
-from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, gather, lazy_zeros, split_index, take_columns
-from cflow_torch.ops.labeling import label_together, padded_size
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
 from cflow_torch.ops.segments import masked_median
-from cflow_torch.verified.changed_pixels import ChangedPixels
-from cflow_torch.verified.component_tree import Components, NodeKind, Tree, draw_level
+from cflow_torch.verified.component_tree import Components, NodeKind, Tree
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
 # We chose these values on simulated highways, seeds 820 and 821.
-_GAP = 0.4  # metres; nearer pixels of a sweep are the same part
 _LONGEST = 8.0  # metres, of a part
 _CELL = 0.8  # metres, of the map of the parts; a cell holds one part
-_NEAR = 2  # cells, around the place where the velocity puts a part
-_FARTHEST = 0.7  # metres from that place to a part that confirms the velocity, ...
-_FARTHER = 0.05  # ... and further for each metre that the object has moved
+_NEAR = 2  # cells, around the place where a velocity puts a part
+_FAR = 8  # cells; objects that move farther from sweep to sweep are not linked
+_ERROR = 0.7  # metres from that place to a part that confirms the velocity, at most, ...
+_ERROR_SHARE = 0.05  # ... and further for each metre that the object has moved
 _FASTEST = 60.0  # m/s, if the settings have no bound
-_SLOWEST = 0.3  # metres from part to part; slower objects have components of their own
+_SHORTEST = 0.3  # metres from part to part; slower objects are linked by their pixels
 _NARROWEST = 0.4  # metres; a thin line that moves along itself may be a part of a longer line
 
 
-def link_unlinked(
-    sweeps: HeightSlicedSweeps, components: Components, change: ChangedPixels, tree: Tree, max_speed: float | None
-) -> Tree:
-    """Add nodes for objects that move farther than their size.
+def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree, max_speed: float | None) -> Tree:
+    """Add nodes for objects that move farther than their size. Windows of two sweeps have too little evidence.
 
     Args:
         max_speed: m/s; None = 60.
 
     Convention:
-        Parts have the missing pixels of a sweep, and in pairs those of components that are not linked. A part of t
-        takes its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least
-        half of the older sweeps. Of velocities that share the part of t or of t+1, the one with the most
-        sweeps wins, then the one with the smallest errors; in pairs, the slowest. A part belongs to its first node.
+        Parts have the missing pixels of a sweep. A part of t takes its velocity from one part of t+1 or t-1. Other
+        parts must lie where it puts them: at t+1, and in at least half of the older sweeps. Of the velocities of a part
+        of t, or of t+1, the one with the most sweeps wins, then the one with the smallest errors. A part belongs to its
+        first node.
 
-    Cost: one labelling of the changed pixels, and 25 lookups for each sweep and pair of near parts.
+    Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
-    parts = _Parts.of(sweeps, components, change)
+    if sweeps.num_steps == 2:
+        return tree
+    parts = _Parts.of(sweeps, components)
     if len(parts) == 0:
         return tree
-    tracks = _best_tracks(_all_tracks(sweeps, parts, _FASTEST if max_speed is None else max_speed), len(parts))
+    tracks = _tracks(sweeps, parts, _FASTEST if max_speed is None else max_speed)
     objects = _pixels_of(tracks, parts)
     kept = flat_nonzero(_are_wide(sweeps, objects, tracks.velocity))
     objects = objects.select(kept)
@@ -77,7 +75,7 @@ def link_unlinked(
 
 
 class _Parts(NamedTuple):
-    """Q parts: pixels of one sweep that changed and lie together."""
+    """Q parts: missing pixels of one sweep that lie together."""
 
     pixels: Groups  # the P pixels, grouped by part
     window: Tensor  # (Q,) int64
@@ -85,57 +83,36 @@ class _Parts(NamedTuple):
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
 
     @classmethod
-    def of(cls, sweeps: HeightSlicedSweeps, components: Components, change: ChangedPixels) -> _Parts:
-        """Group the pixels. A part has at least two, and is at most `_LONGEST` long."""
+    def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
+        """Select the parts of at least two pixels that are at most `_LONGEST` long."""
         pixels = sweeps.pixels
-        scale = components.levels[max(len(components.levels) - 3, 0)]  # the finest but one
-        is_unlinked = scale.spread(~components.is_linked) & scale.is_member
-        has_history = sweeps.has_history.index_select(0, pixels.window)
-        changed = flat_nonzero(torch.where(has_history, change.is_missing, is_unlinked))
-        image = pixels.window * sweeps.num_steps + pixels.step
-        label, count = _label(sweeps, changed, image)
-        parts = Groups(torch.full_like(image, count).index_copy_(0, changed, label), count)
-        row_col = pixels.row_col
-        extent = parts.max(row_col, empty=0) - parts.min(row_col, empty=FAR)  # [2, count]
+        parts = components.parts
+        extent = parts.max(pixels.row_col, empty=0) - parts.min(pixels.row_col, empty=FAR)  # [2, count]
         is_short = extent.amax(0) * sweeps.grid.pixel_size <= _LONGEST
         parts = parts.only(is_short & (parts.size() >= 2))
-        window, step = split_index(parts.max(image, empty=0), sweeps.num_steps)
-        return cls(parts, window, step, parts.sum(row_col).double() / parts.size())
+        image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
+        window, step = split_index(image, sweeps.num_steps)
+        return cls(parts, window, step, parts.sum(pixels.row_col).double() / parts.size())
 
     def __len__(self) -> int:
         return len(self.step)
 
 
-def _label(sweeps: HeightSlicedSweeps, changed: Tensor, image: Tensor) -> tuple[Tensor, int]:
-    """Label pixels of each sweep, (K,) int64, at a scale of `_GAP`: (K,) int64, and a number above the largest label.
-
-    `image` is the sweep of each pixel of the list, counted through all windows.
-    """
-    block = max(1, round(_GAP / sweeps.grid.pixel_size))
-    height = -(-sweeps.grid.height // block)
-    width = -(-sweeps.grid.width // block)
-    row, col = floor_divide(take_columns(sweeps.pixels.row_col, changed), block)
-    row = row + image.index_select(0, changed) * padded_size(height)
-    drawn = draw_level(row, col, sweeps.batch.num_windows * sweeps.num_steps, height, width)
-    (blocks,) = label_together([(drawn, 1)])
-    return blocks.of_pixel(row, col), blocks.num_components
-
-
 class _Map:
     """A map of each sweep with a part in each cell; of several parts, any one."""
 
-    def __init__(self, sweeps: HeightSlicedSweeps, parts: _Parts, farthest: float) -> None:
+    def __init__(self, sweeps: HeightSlicedSweeps, parts: _Parts) -> None:
         grid = sweeps.grid
-        self.cell = max(1, round(_CELL / grid.pixel_size))  # finest pixels
+        self._cell = max(1, round(_CELL / grid.pixel_size))  # finest pixels
         # An empty border as wide as the farthest neighbours, so that they need no tests.
-        self.border = max(_NEAR, math.ceil(farthest / self.cell))
-        self._height = (grid.height - 1) // self.cell + 1 + 2 * self.border
-        self._width = (grid.width - 1) // self.cell + 1 + 2 * self.border
+        self._height = (grid.height - 1) // self._cell + 1 + 2 * _FAR
+        self._width = (grid.width - 1) // self._cell + 1 + 2 * _FAR
         self._num_steps = sweeps.num_steps
         num_cells = sweeps.batch.num_windows * sweeps.num_steps * self._height * self._width
         number = torch.arange(1, len(parts) + 1, dtype=torch.int32, device=parts.step.device)
         place = self._place(parts.window, parts.step, parts.centre)
-        self._part = lazy_zeros(num_cells, torch.int32, number.device).index_copy_(0, place, number)  # 0 = none
+        self._part = lazy_zeros(num_cells, torch.int32, number.device)  # 0 = none
+        self._part.scatter_reduce_(0, place, number, "amax")
 
     def around(self, window: Tensor, step: Tensor, centre: Tensor, reach: int) -> tuple[Tensor, Tensor]:
         """Return the parts in the cells around places, (..., (2 reach + 1)^2), and whether there is one.
@@ -143,108 +120,101 @@ class _Map:
         `centre` is (2, ...), finest pixels, `window` and `step` are (...).
         """
         line = torch.arange(-reach, reach + 1, device=centre.device)
-        offset = (line[:, None] * self._width + line).view(-1)  # [cells]
+        offset = (line[:, None] * self._width + line).view(-1)
         place = self._place(window, step, centre)[..., None] + offset
         part = self._part.index_select(0, place.view(-1)).view_as(place)
         return (part - 1).clamp_(min=0).long(), part > 0
 
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
-        row, col = (centre / self.cell).floor_().long() + self.border
-        row = row.clamp_(self.border, self._height - 1 - self.border)
-        col = col.clamp_(self.border, self._width - 1 - self.border)
+        row, col = (centre / self._cell).floor_().long() + _FAR
+        row = row.clamp_(_FAR, self._height - 1 - _FAR)
+        col = col.clamp_(_FAR, self._width - 1 - _FAR)
         return ((window * self._num_steps + step) * self._height + row) * self._width + col
 
 
 @dataclass(frozen=True)
 class _Tracks:
-    """H velocities, each of a part of t, with the parts that confirm it."""
+    """N velocities, each of a part of t, with the parts that confirm it."""
 
-    part: Tensor  # (H, S) int64, the nearest part of each sweep; of t, the part itself
-    is_found: Tensor  # (H, S) bool, the part is near enough
-    error: Tensor  # (H,) float64, finest pixels, sum over the sweeps; in pairs, the displacement
-    velocity: Tensor  # (H, 2) float64, (y, x), finest pixels per sweep interval, median over the parts
-
-    def __getitem__(self, some: Tensor) -> _Tracks:
-        return _Tracks(*gather(some, self.part, self.is_found, self.error, self.velocity))
+    part: Tensor  # (N, S) int64, the nearest part of each sweep; of t, the part itself
+    is_found: Tensor  # (N, S) bool, the part is near enough
+    velocity: Tensor  # (N, 2) float64, (y, x), finest pixels per sweep interval, median over the parts
 
 
-def _all_tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tracks:
+def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tracks:
     """Follow the velocity from each part of t to each near part of t+1 and of t-1 through all sweeps."""
-    seconds = (sweeps.batch.seconds - sweeps.batch.seconds[:, 1:2]).abs()  # [B, S], from t
-    farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
-    cells = _Map(sweeps, parts, float(farthest[:, :3].max()))
-    nearest = _SLOWEST / sweeps.grid.pixel_size
-    pairs = [_pairs(parts, cells, step, farthest[:, step], nearest) for step in (0, 2)[: sweeps.num_steps - 1]]
-    first = torch.cat([first for first, _ in pairs])  # [H], the part of t
-    other = torch.cat([other for _, other in pairs])  # [H]
-    window = parts.window.index_select(0, first)
+    cells = _Map(sweeps, parts)
+    of_t, other = _pairs(sweeps, parts, cells, max_speed)  # [H] each
+    window = parts.window.index_select(0, of_t)
     elapsed = sweeps.elapsed.index_select(0, window)  # [H, S]
     before_t = elapsed - elapsed[:, 1:2]
-    begin = take_columns(parts.centre, first)  # [2, H]
+    begin = take_columns(parts.centre, of_t)  # [2, H]
     interval = before_t.gather(1, parts.step.index_select(0, other)[:, None])[:, 0]
     velocity = (begin - take_columns(parts.centre, other)) / interval  # [2, H]
 
     expected = begin[..., None] - velocity[..., None] * before_t  # [2, H, S]
-    step = torch.arange(sweeps.num_steps, device=first.device).expand_as(before_t)
+    step = torch.arange(sweeps.num_steps, device=of_t.device).expand_as(before_t)
     part, is_part = cells.around(window[:, None].expand_as(before_t), step, expected, _NEAR)  # [H, S, 25]
-    centre = take_columns(parts.centre, part.view(-1)).view(2, *part.shape)
-    distance = (centre - expected[..., None]).square_().sum(0)
-    square, index = distance.masked_fill_(~is_part, math.inf).min(2)  # [H, S]
-    error = square.sqrt()
+    square = (_centres(parts, part) - expected[..., None]).square_().sum(0).masked_fill_(~is_part, math.inf)
+    nearest, index = square.min(2)  # [H, S]
     part = part.gather(2, index[..., None])[..., 0]
+    part[:, 1] = of_t
+    error = nearest.sqrt_()
+    error[:, 1] = 0.0
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
     is_given = (elapsed != 0) | (step == 0)
-    is_found = is_given & (error <= _FARTHEST / sweeps.grid.pixel_size + _FARTHER * moved)
-    is_t = step == 1
-    part = torch.where(is_t, first[:, None], part)
-    is_found |= is_t
-
+    is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
     is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_given[:, 2:].sum(1))
-    centre = take_columns(parts.centre, part.view(-1)).view(2, *part.shape)
-    others = (begin[..., None] - centre) / before_t  # [2, H, S], undefined at t
-    others = others.permute(1, 2, 0).masked_fill(~(is_found & ~is_t)[..., None], 0.0)
-    num_lacking = (is_given & ~is_found).sum(1)
-    error = error.masked_fill(~is_found | is_t, 0.0).sum(1) + num_lacking * float(1 << 20)
-    error = torch.where(sweeps.has_history.index_select(0, window), error, moved[:, 0])
-    tracks = _Tracks(part, is_found, error, masked_median(others, is_found & ~is_t))
-    return tracks[flat_nonzero(is_confirmed)]
+    lacking = (is_given & ~is_found).sum(1) * float(1 << 20)  # longer than any sum of errors
+    rank = (error.masked_fill(~is_found, 0.0).sum(1) + lacking).masked_fill(~is_confirmed, math.inf)
+    kept = flat_nonzero(_is_best(rank, part, len(parts)))
+    part, is_found, begin, before_t = gather(kept, part, is_found, begin.t(), before_t)
+    velocities = (begin.t()[..., None] - _centres(parts, part)) / before_t  # [2, N, S], undefined at t
+    counts = is_found & (step[: len(kept)] != 1)
+    return _Tracks(
+        part, is_found, masked_median(velocities.permute(1, 2, 0).masked_fill(~counts[..., None], 0.0), counts)
+    )
 
 
-def _pairs(parts: _Parts, cells: _Map, step: int, farthest: Tensor, nearest: float) -> tuple[Tensor, Tensor]:
-    """Pair each part of t with the parts of another sweep that are neither too near nor too far: (K,) int64 each.
+def _centres(parts: _Parts, part: Tensor) -> Tensor:
+    """(2, ...) float64, centres of parts, (...)."""
+    return take_columns(parts.centre, part.reshape(-1)).view(2, *part.shape)
 
-    `farthest` is (B,) float64; both distances are in finest pixels.
-    """
+
+def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: float) -> tuple[Tensor, Tensor]:
+    """Pair each part of t with the parts of t+1 and of t-1 that are neither too near nor too far: (H,) int64 each."""
     of_t = flat_nonzero(parts.step == 1)
-    window = parts.window.index_select(0, of_t)
+    step = constant(((0,), (2,)), torch.int64, of_t.device).expand(2, len(of_t))
+    window = parts.window.index_select(0, of_t).expand_as(step)
     centre = take_columns(parts.centre, of_t)
-    other, is_part = cells.around(window, torch.full_like(of_t, step), centre, cells.border)
-    pair = flat_nonzero(is_part)
-    first = of_t.index_select(0, floor_divide(pair, other.shape[1]))
-    other = other.view(-1).index_select(0, pair)
-    distance = (take_columns(parts.centre, first) - take_columns(parts.centre, other)).square().sum(0).sqrt()
-    bound = farthest.index_select(0, parts.window.index_select(0, first))
-    return gather(flat_nonzero((distance <= bound) & (distance >= nearest)), first, other)
+    other, is_part = cells.around(window, step, centre[:, None].expand(2, *step.shape), _FAR)  # [2, of t, 289]
+    distance = (_centres(parts, other) - centre[:, None, :, None]).square_().sum(0).sqrt_()
+    seconds = (sweeps.batch.seconds - sweeps.batch.seconds[:, 1:2]).abs()[window, step]
+    pixel_size = sweeps.grid.pixel_size
+    farthest = max_speed * seconds / pixel_size + 1
+    is_pair = is_part & (distance <= farthest[..., None]) & (distance >= _SHORTEST / pixel_size)
+    pair = flat_nonzero(is_pair)
+    at, _ = split_index(pair, other.shape[2])
+    return of_t.repeat(2).index_select(0, at), other.view(-1).index_select(0, pair)
 
 
-def _best_tracks(tracks: _Tracks, num_parts: int) -> _Tracks:
-    """Keep the tracks that are the best of their part of t and of their part of t+1. Ties: the first."""
-    is_best = torch.ones_like(tracks.error, dtype=torch.bool)
+def _is_best(rank: Tensor, part: Tensor, num_parts: int) -> Tensor:
+    """Tell which tracks, (H,), have the lowest rank of their part of t and of their part of t+1. Ties: the first."""
+    is_best = rank < math.inf
     for step in (1, 0):
-        same = Groups(tracks.part[:, step], num_parts)
-        is_best &= tracks.error == same.spread(same.min(tracks.error, empty=math.inf))
-    tracks = tracks[flat_nonzero(is_best)]
-    same = Groups(tracks.part[:, 1], num_parts)
-    first = same.spread(same.first())
-    return tracks[flat_nonzero(first == torch.arange(len(first), device=first.device))]
+        same = Groups(part[:, step], num_parts)
+        is_best &= rank == same.spread(same.min(rank, empty=math.inf))
+    same = Groups(part[:, 1], num_parts).where(is_best)
+    first = same.spread(same.first(), none=-1)
+    return first == torch.arange(len(first), device=first.device)
 
 
 def _pixels_of(tracks: _Tracks, parts: _Parts) -> Groups:
     """Group the P pixels by track, by way of their parts."""
-    count = len(tracks.error)
+    count = len(tracks.part)
     track = torch.arange(count, device=tracks.part.device)[:, None].expand_as(tracks.part)
-    of_track = Groups(tracks.part.reshape(-1), len(parts)).where(tracks.is_found.view(-1))
+    of_track = Groups(tracks.part.reshape(-1), len(parts)).where(tracks.is_found.reshape(-1))
     first_track = of_track.min(track.reshape(-1), empty=count)  # [Q]
     return Groups(parts.pixels.spread(first_track, none=count), count)
 
