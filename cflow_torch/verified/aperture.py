@@ -161,7 +161,7 @@ class _Ends(NamedTuple):
     """The two ends of L components along their direction, (L,) float64 each, metres."""
 
     length: Tensor  # from one end to the other at t+1
-    # Displacement of each end from the farthest sweep to t+1, outwards; infinite or NaN if there are no pixels.
+    # Displacement of each end from the farthest sweep to t+1, towards the other end; infinite or NaN without pixels.
     first: Tensor
     last: Tensor
 
