@@ -220,22 +220,40 @@ def _candidates(counts: _Counts, packing: Packing, cluster: Tensor, windows: Win
     shift 0, and the shift of the largest count, clamped to the search range. Division rounds monotonically, so no
     winner is lost.
     """
-    pair_of_template = packing.pair[counts.templates]  # [n]
-    cluster_of_template = cluster.index_select(0, pair_of_template)  # [n]
-    search = packing.search[counts.templates]
-    end = counts.ends()
-    start = F.pad(end[:-1], (1, 0))
-    least_value = _least_value(counts, search, start, cluster_of_template, windows)  # [n]
+    templates = _Templates.of(counts, packing, cluster)
+    least_value = _least_value(counts, templates, windows)  # [n]
     # We round the bound of the count down, because counts may be float32.
-    sample = counts.above((least_value * (1 - 2.0**-20)).to(counts.samples.dtype))
-
-    template = torch.searchsorted(end, sample, right=True)
-    searched = _searched(counts, search[template], template, sample, start)
-    pair, cluster, value = gather(searched.template, pair_of_template, cluster_of_template, least_value)
-    least, _ = windows.bounds(cluster, searched.shift)
+    bound = (least_value * (1 - 2.0**-20)).to(counts.samples.dtype)
+    searched = _searched(counts, templates, counts.above(bound))  # [K]
+    pair, target, value = gather(searched.template, templates.pair, templates.cluster, least_value)
+    least, _ = windows.bounds(target, searched.shift)
     count = searched.count
     may_win = flat_nonzero((count * count).double() / torch.maximum(least, count) >= value)
-    return _Candidates(take_columns(torch.stack((pair, cluster, *searched.shift, count)), may_win))
+    return _Candidates(take_columns(torch.stack((pair, target, *searched.shift, count)), may_win))
+
+
+@dataclass(frozen=True)
+class _Templates:
+    """The n packed templates of some counts."""
+
+    pair: Tensor  # (n,) int64
+    cluster: Tensor  # (n,) int64, the target
+    search: Search
+    start: Tensor  # (n,) int64, first sample of each template
+    end: Tensor  # (n,) int64, the one after its last sample
+
+    @classmethod
+    def of(cls, counts: _Counts, packing: Packing, cluster: Tensor) -> _Templates:
+        """Select the templates of some counts; `cluster` is the target of each pair, (J,) int64."""
+        pair = packing.pair[counts.templates]
+        end = counts.ends()
+        return cls(
+            pair=pair,
+            cluster=cluster.index_select(0, pair),
+            search=packing.search[counts.templates],
+            start=F.pad(end[:-1], (1, 0)),
+            end=end,
+        )
 
 
 @dataclass(frozen=True)
@@ -247,26 +265,24 @@ class _Searched:
     shift: Tensor  # (2, K) int64, dy and dx
 
 
-def _searched(counts: _Counts, search: Search, template: Tensor, sample: Tensor, start: Tensor) -> _Searched:
-    """Return the shifts of some samples that are in the search range.
-
-    `search` is the range of each sample, and `template` its template. `start`, (n,), is the first sample of each one.
-    """
-    shift = search.shift_at(sample - start.index_select(0, template))
+def _searched(counts: _Counts, templates: _Templates, sample: Tensor) -> _Searched:
+    """Return the shifts of some samples that are in the search range of their template."""
+    template = torch.searchsorted(templates.end, sample, right=True)
+    search = templates.search[template]
+    shift = search.shift_at(sample - templates.start.index_select(0, template))
     count = counts.samples.index_select(0, sample).long()
     columns = take_columns(torch.stack((template, count, *shift)), flat_nonzero(search.contains(shift)))
     return _Searched(columns[0], columns[1], columns[2:])
 
 
-def _least_value(counts: _Counts, search: Search, start: Tensor, cluster: Tensor, windows: WindowCounts) -> Tensor:
-    """Return what the best shift of each of n templates is worth at least, (n,) float64.
-
-    `start` is the first sample of each template, and `cluster` its target, (n,) int64 each.
-    """
+def _least_value(counts: _Counts, templates: _Templates, windows: WindowCounts) -> Tensor:
+    """Return what the best shift of each of n templates is worth at least, (n,) float64."""
+    search = templates.search
     peak = search.clamp(search.shift_at(counts.largest()))
-    samples = start + torch.stack((search.sample_at(torch.zeros_like(peak)), search.sample_at(peak)))  # [2, n]
-    _, most_at_peak = windows.bounds(cluster, peak)
-    most = torch.stack((windows.energy.index_select(0, cluster), most_at_peak)).clamp(min=1)
+    at_zero_and_peak = torch.stack((search.sample_at(torch.zeros_like(peak)), search.sample_at(peak)))
+    samples = templates.start + at_zero_and_peak  # [2, n]
+    _, most_at_peak = windows.bounds(templates.cluster, peak)
+    most = torch.stack((windows.energy.index_select(0, templates.cluster), most_at_peak)).clamp(min=1)
     return (counts.samples[samples].double().square() / most).amax(0)
 
 
