@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Iterator
+from typing import Iterator, NamedTuple
 
 import numpy as np
 import torch
@@ -99,12 +99,27 @@ def best_shifts(pairs: TemplatePairs, engine: str = "fft", max_memory: float | N
     packing = pack(pairs)
     target = pairs.target
     windows = WindowCounts(target.image, target.row, target.col, packing.size, packing.energy[num_pairs:])
-    found = [_candidates(counts, packing, pairs.cluster, windows) for counts in _correlate(packing, engine, max_memory)]
-    candidates = _Candidates(torch.cat([part.columns for part in found], 1))
+    limits = _Limits.of(pairs.size.device, max_memory)
+    parts = [_candidates(counts, packing, pairs.cluster, windows) for counts in _correlate(packing, engine, limits)]
+    candidates = _Candidates(torch.cat([part.columns for part in parts], 1))
     best = _best_of_each_pair(candidates, windows, num_pairs)
-    energies = (packing.energy[:num_pairs] * best.energy).clamp(min=1)  # 0 where nothing overlaps
-    score = best.count.double() / torch.sqrt(energies.double())
-    return torch.stack((best.dy, best.dx), 1), score.float()
+    return torch.stack((best.dy, best.dx), 1), best.score(packing.energy[:num_pairs])
+
+
+class _Limits(NamedTuple):
+    """How many samples we work on at once."""
+
+    per_call: int  # samples of templates in one call of the correlation
+    per_run: int  # searched samples whose counts we compare in one go
+
+    @classmethod
+    def of(cls, device: torch.device, max_memory: float | None) -> _Limits:
+        """Choose what suits the device and the memory that we may use, bytes; None = no limit."""
+        limits = cls(_PER_CALL_CPU, _PER_RUN_CPU) if device.type == "cpu" else cls(_PER_CALL_GPU, _PER_RUN_GPU)
+        if max_memory is None:
+            return limits
+        most = int(max_memory) // _BYTES_PER_SAMPLE
+        return cls(min(limits.per_call, most), min(limits.per_run, most))
 
 
 @dataclass(frozen=True)
@@ -137,21 +152,14 @@ class _Counts:
         )
 
 
-def _correlate(packing: Packing, engine: str, max_memory: float | None) -> Iterator[_Counts]:
-    """Correlate all packed templates, as many at once as suit the device and the memory, in Bytes, that we may use."""
-    device = packing.pair.device
-    per_call = _PER_CALL_CPU if device.type == "cpu" else _PER_CALL_GPU
-    per_run = _PER_RUN_CPU if device.type == "cpu" else _PER_RUN_GPU
-    if max_memory is not None:
-        most = int(max_memory) // _BYTES_PER_SAMPLE
-        per_call = min(per_call, most)
-        per_run = min(per_run, most)
+def _correlate(packing: Packing, engine: str, limits: _Limits) -> Iterator[_Counts]:
+    """Correlate all packed templates, as many at once as the limits allow."""
     max_energy = max(images.max_energy for images in packing.classes)
     dtype = torch.float32 if max_energy <= _EXACT_IN_FLOAT32 else torch.float64
     first = 0
-    for run in _runs(packing.classes, per_call, per_run):
+    for run in _runs(packing.classes, limits):
         num_samples = [call.num_samples for call in run]
-        samples = torch.empty(sum(num_samples), dtype=dtype, device=device)
+        samples = torch.empty(sum(num_samples), dtype=dtype, device=packing.pair.device)
         parts = [call.view(part) for call, part in zip(run, samples.split(num_samples))]
         for call, part in zip(run, parts):
             torch.round(call.correlate(engine).to(dtype), out=part)
@@ -160,17 +168,14 @@ def _correlate(packing: Packing, engine: str, max_memory: float | None) -> Itera
         first = stop
 
 
-def _runs(classes: list[ImageClass], per_call: int, per_run: int) -> Iterator[list[_Call]]:
-    """Yield lists of calls. A call has at most `per_call` samples of templates, or one template.
-
-    A list has at most `per_run` searched samples, or one call.
-    """
+def _runs(classes: list[ImageClass], limits: _Limits) -> Iterator[list[_Call]]:
+    """Yield lists of calls within the limits, or of one call. A call is within the limits or has one template."""
     run: list[_Call] = []
     for images in classes:
-        at_once = max(1, per_call // images.area)
+        at_once = max(1, limits.per_call // images.area)
         for first in range(0, len(images.target), at_once):
             call = _Call(images, slice(first, min(first + at_once, len(images.target))))
-            if run and sum(other.num_samples for other in run) + call.num_samples > per_run:
+            if run and sum(other.num_samples for other in run) + call.num_samples > limits.per_run:
                 yield run
                 run = []
             run.append(call)
@@ -200,9 +205,9 @@ class _Call:
         target = self.images.target
         if num_templates < len(target):
             # Templates are in order of their targets, so they need a range of targets.
-            ends = self.images.target_on_host[[self.templates.start, self.templates.stop - 1]] + len(target)
-            images = torch.cat((images[self.templates], images[ends[0] : ends[1] + 1]))
-            target = target[self.templates] - int(ends[0] - len(target))
+            first, last = self.images.target_on_host[[self.templates.start, self.templates.stop - 1]]
+            images = torch.cat((images[self.templates], images[len(target) :][first : last + 1]))
+            target = target[self.templates] - int(first)
         counts = cross_correlate(images, num_templates, target, engine, self.images.max_energy)
         return counts.flatten(1)[:, : self.images.num_searched]
 
@@ -215,38 +220,69 @@ def _candidates(counts: _Counts, packing: Packing, cluster: Tensor, windows: Win
     shift 0, and the shift of the largest count, clamped to the search range. Division rounds monotonically, so no
     winner is lost.
     """
-    pair = packing.pair[counts.templates]
-    cluster = cluster.index_select(0, pair)
-    search = packing.search[counts.templates]
-    end = counts.ends()
-    start = F.pad(end[:-1], (1, 0))
-    least_value = _least_value(counts, search, start, cluster, windows)  # [n]
+    templates = _Templates.of(counts, packing, cluster)
+    least_value = _least_value(counts, templates, windows)  # [n]
     # We round the bound of the count down, because counts may be float32.
-    sample = counts.above((least_value * (1 - 2.0**-20)).to(counts.samples.dtype))  # [K]
+    bound = (least_value * (1 - 2.0**-20)).to(counts.samples.dtype)
+    searched = _searched(counts, templates, counts.above(bound))  # [K]
+    pair, target, value = gather(searched.template, templates.pair, templates.cluster, least_value)
+    least, _ = windows.bounds(target, searched.shift)
+    count = searched.count
+    may_win = flat_nonzero((count * count).double() / torch.maximum(least, count) >= value)
+    return _Candidates(take_columns(torch.stack((pair, target, *searched.shift, count)), may_win))
 
-    template = torch.searchsorted(end, sample, right=True)
-    search = search[template]
-    shift = search.shift_at(sample - start.index_select(0, template))
+
+@dataclass(frozen=True)
+class _Templates:
+    """The n packed templates of some counts."""
+
+    pair: Tensor  # (n,) int64
+    cluster: Tensor  # (n,) int64, the target
+    search: Search
+    start: Tensor  # (n,) int64, first sample of each template
+    end: Tensor  # (n,) int64, the one after its last sample
+
+    @classmethod
+    def of(cls, counts: _Counts, packing: Packing, cluster: Tensor) -> _Templates:
+        """Select the templates of some counts; `cluster` is the target of each pair, (J,) int64."""
+        pair = packing.pair[counts.templates]
+        end = counts.ends()
+        return cls(
+            pair=pair,
+            cluster=cluster.index_select(0, pair),
+            search=packing.search[counts.templates],
+            start=F.pad(end[:-1], (1, 0)),
+            end=end,
+        )
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """K shifts in the search range of their template."""
+
+    template: Tensor  # (K,) int64
+    count: Tensor  # (K,) int64, coinciding pixels
+    shift: Tensor  # (2, K) int64, dy and dx
+
+
+def _searched(counts: _Counts, templates: _Templates, sample: Tensor) -> _Searched:
+    """Return the shifts of some samples that are in the search range of their template."""
+    template = torch.searchsorted(templates.end, sample, right=True)
+    search = templates.search[template]
+    shift = search.shift_at(sample - templates.start.index_select(0, template))
     count = counts.samples.index_select(0, sample).long()
     columns = take_columns(torch.stack((template, count, *shift)), flat_nonzero(search.contains(shift)))
-    template = columns[0]
-    count = columns[1]
-    shift = columns[2:]
-    pair, cluster, least_value = gather(template, pair, cluster, least_value)
-    least, _ = windows.bounds(cluster, shift)
-    may_win = flat_nonzero((count * count).double() / torch.maximum(least, count) >= least_value)
-    return _Candidates(take_columns(torch.stack((pair, cluster, *shift, count)), may_win))
+    return _Searched(columns[0], columns[1], columns[2:])
 
 
-def _least_value(counts: _Counts, search: Search, start: Tensor, cluster: Tensor, windows: WindowCounts) -> Tensor:
-    """Return what the best shift of each of n templates is worth at least, (n,) float64.
-
-    `start` is the first sample of each template, and `cluster` its target, (n,) int64 each.
-    """
+def _least_value(counts: _Counts, templates: _Templates, windows: WindowCounts) -> Tensor:
+    """Return what the best shift of each of n templates is worth at least, (n,) float64."""
+    search = templates.search
     peak = search.clamp(search.shift_at(counts.largest()))
-    samples = start + torch.stack((search.sample_at(torch.zeros_like(peak)), search.sample_at(peak)))  # [2, n]
-    _, most_at_peak = windows.bounds(cluster, peak)
-    most = torch.stack((windows.energy.index_select(0, cluster), most_at_peak)).clamp(min=1)
+    at_zero_and_peak = torch.stack((search.sample_at(torch.zeros_like(peak)), search.sample_at(peak)))
+    samples = templates.start + at_zero_and_peak  # [2, n]
+    _, most_at_peak = windows.bounds(templates.cluster, peak)
+    most = torch.stack((windows.energy.index_select(0, templates.cluster), most_at_peak)).clamp(min=1)
     return (counts.samples[samples].double().square() / most).amax(0)
 
 
@@ -281,6 +317,11 @@ class _Best:
     dx: Tensor
     count: Tensor  # coinciding pixels
     energy: Tensor  # target pixels under the window
+
+    def score(self, template_energy: Tensor) -> Tensor:
+        """Return the NCC, (J,) float32, 0 where nothing overlaps; `template_energy`, (J,), counts template pixels."""
+        energies = (template_energy * self.energy).clamp(min=1)
+        return (self.count.double() / torch.sqrt(energies.double())).float()
 
 
 def _best_of_each_pair(candidates: _Candidates, windows: WindowCounts, num_pairs: int) -> _Best:

@@ -75,41 +75,51 @@ def _heading(flow: Tensor) -> Tensor:
 
 def _draw_pairs(pairs: _Pairs, members: _Members, pixel_size: float) -> TemplatePairs:
     """Draw the X-Z images of J pairs. Each rotates its own copy of the target by its own heading."""
-    pair_of_template, template = _template_points(pairs, members)
-    pair_of_target, target = _target_points(pairs, members)
-    pair = torch.cat((pair_of_template, pair_of_target))
-    row_col = _project(torch.cat((template, target), 1), pairs.heading[:, pair], pixel_size)
+    template = _template_points(pairs, members)
+    target = _target_points(pairs, members)
+    pair = torch.cat((template.pair, target.pair))
+    row_col = _project(torch.cat((template.positions, target.positions), 1), pairs.heading[:, pair], pixel_size)
     first, size = bounding_boxes(row_col[0], row_col[1], pair, len(pairs.slot))
     row_col -= first[pair].t()
-    split = len(pair_of_template)
+    of_template, of_target = row_col.split((len(template.pair), len(target.pair)), 1)
     return TemplatePairs(
-        template=_draw(pair_of_template, row_col[:, :split], size),
-        target=_draw(pair_of_target, row_col[:, split:], size),
+        template=_draw(template.pair, of_template, size),
+        target=_draw(target.pair, of_target, size),
         cluster=torch.arange(len(pairs.slot), device=pair.device),
         source=pairs.slot % pairs.available.shape[1],
         size=size,
     )
 
 
-def _template_points(pairs: _Pairs, members: _Members) -> tuple[Tensor, Tensor]:
-    """Return the pair, (K,) int64, and the position, (3, K), of the points of earlier sweeps, moved by their flow."""
+class _PointsOfPairs(NamedTuple):
+    """K points to draw."""
+
+    pair: Tensor  # (K,) int64
+    positions: Tensor  # (3, K) float64, metres, frame of t+1
+
+
+def _template_points(pairs: _Pairs, members: _Members) -> _PointsOfPairs:
+    """Return the points of earlier sweeps, moved by their flow."""
     num_clusters, num_sources = pairs.available.shape
     points = flat_nonzero((members.cluster < num_clusters) & (members.step > 0))
     slot = members.cluster[points] * num_sources + members.step[points] - 1
     pair = renumber(pairs.slot, num_clusters * num_sources)[slot]
     positions = members.positions[:, points].clone()
     positions[:2] += pairs.flow.t()[:2, pair]
-    return pair, positions
+    return _PointsOfPairs(pair, positions)
 
 
-def _target_points(pairs: _Pairs, members: _Members) -> tuple[Tensor, Tensor]:
-    """Return the pair, (K,) int64, and the position, (3, K), of the points of t+1: a copy for each pair."""
+def _target_points(pairs: _Pairs, members: _Members) -> _PointsOfPairs:
+    """Return the points of t+1: a copy for each pair."""
     num_clusters, num_sources = pairs.available.shape
     points = flat_nonzero((members.cluster < num_clusters) & (members.step == 0))
     cluster = members.cluster[points]
     num_copies = pairs.available.sum(1)[cluster]
     first_pair = torch.searchsorted(pairs.slot // num_sources, cluster)
-    return concat_ranges(first_pair, num_copies), members.positions[:, points.repeat_interleave(num_copies)]
+    return _PointsOfPairs(
+        pair=concat_ranges(first_pair, num_copies),
+        positions=members.positions[:, points.repeat_interleave(num_copies)],
+    )
 
 
 def _project(positions: Tensor, heading: Tensor, pixel_size: float) -> Tensor:

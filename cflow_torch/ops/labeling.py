@@ -28,12 +28,14 @@ from cflow_torch.ops.segments import first_of_segment
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 # We pad images so that whole blocks of any side (1 ... 4) fill them and the last row and column of blocks are empty.
 # Then neighbours need no bounds checks.
-_GRAIN, _FREE = 12, 4
+_GRAIN = 12
+_FREE = 4
 # We read one row of a block as one number. Rows of three pixels get an empty fourth pixel.
 _WORD = {1: torch.int8, 2: torch.int16, 3: torch.int32, 4: torch.int32}
 # Rounds of union-find before the first test for convergence, and pointer jumps per round. LiDAR images need three to
 # five rounds. After the first test, we test after every round.
-_ROUNDS, _JUMPS = 3, 3
+_ROUNDS = 3
+_JUMPS = 3
 
 
 @dataclass(frozen=True)
@@ -96,12 +98,8 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
     lengths = [len(part) for part in parts]
     masks = torch.cat(parts) if len(parts) > 1 else parts[0]
     nodes = flat_nonzero(masks.bool())  # [V]; on the CPU ten times faster than `masks != 0`
-    node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=masks.device)
-    node_of_block.scatter_(0, nodes, torch.arange(len(nodes), device=masks.device))
     first_blocks = constant(tuple(accumulate(lengths[:-1])), torch.int64, masks.device)  # of all sets but the first
-    source, block = _links(masks, nodes, kinds, first_blocks)
-    root = union_find(len(nodes), source, node_of_block.index_select(0, block))
-    components = node_of_block.scatter_(0, nodes, root).split(lengths)
+    components = _components(masks, nodes, kinds, first_blocks).split(lengths)
     first = [nodes.new_zeros(())]
     if len(kinds) > 1:
         first += torch.searchsorted(nodes, first_blocks).unbind()
@@ -127,6 +125,15 @@ class _Kind(NamedTuple):
     def cols(self) -> int:
         """Blocks per row."""
         return self.width // self.side
+
+
+def _components(masks: Tensor, nodes: Tensor, kinds: tuple[_Kind, ...], first_blocks: Tensor) -> Tensor:
+    """Return the component of each block, (blocks,) int64; undefined for blocks without set pixels. Args: `_links`."""
+    node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=masks.device)
+    node_of_block.scatter_(0, nodes, torch.arange(len(nodes), device=masks.device))
+    node, block = _links(masks, nodes, kinds, first_blocks)
+    root = union_find(len(nodes), node, node_of_block.index_select(0, block))
+    return node_of_block.scatter_(0, nodes, root)
 
 
 def _links(masks: Tensor, nodes: Tensor, kinds: tuple[_Kind, ...], first_blocks: Tensor) -> tuple[Tensor, Tensor]:

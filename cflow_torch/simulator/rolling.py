@@ -15,6 +15,13 @@ from cflow_torch.simulator.raycast import ELLIPSOID, Blocks, UnitRays, cosine_of
 _ROUNDS = 2  # of refining which column meets a solid and where the solid is then; each divides the error by 6 or more
 
 
+class MovingTransforms(NamedTuple):
+    """The transforms from the world to E solids, each at its own time."""
+
+    to_solid: Tensor  # (E, 3, 4) float64
+    change: Tensor  # (E, 3, 4) float64, derivatives, per second
+
+
 @dataclass(frozen=True)
 class MovingSolids:
     """P solids during an interval of time. Coordinates are relative to `origin`, so that float32 resolves micrometres.
@@ -42,26 +49,18 @@ class MovingSolids:
     row: Tensor
     dynamic: Tensor
 
-    def at(self, solid: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the transforms from the world to E solids, each at its own time, and their derivatives.
-
-        Args:
-            solid: (E,) int64.
-            seconds: (E,) float64.
-
-        Returns:
-            (E, 3, 4) float64 transforms; (E, 3, 4) float64 derivatives, per second.
-        """
-        transform = self.static.index_select(0, solid)
-        change = torch.zeros_like(transform)
+    def at(self, solid: Tensor, seconds: Tensor) -> MovingTransforms:
+        """Return the transforms of E solids, (E,) int64, each at its own time, (E,) float64 seconds."""
+        to_solid = self.static.index_select(0, solid)
+        change = torch.zeros_like(to_solid)
         row = take(self.row, solid)
         chosen = (row >= 0).nonzero()[:, 0]
         if len(chosen):
-            transform[chosen], change[chosen] = self.dynamic_at(take(row, chosen), take(seconds, chosen))
-        return transform, change
+            to_solid[chosen], change[chosen] = self.dynamic_at(take(row, chosen), take(seconds, chosen))
+        return MovingTransforms(to_solid, change)
 
-    def dynamic_at(self, row: Tensor, seconds: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the transforms from the world to E moving solids, and their derivatives: (E, 3, 4) float64 each.
+    def dynamic_at(self, row: Tensor, seconds: Tensor) -> MovingTransforms:
+        """Return the transforms of E moving solids.
 
         `row` (E,) int64 has their indices in `dynamic`, `seconds` (E,) float64 their times.
         """
@@ -72,7 +71,7 @@ class MovingSolids:
         flat = self.dynamic.flatten(0, 1)
         begin = flat.index_select(0, index)
         slope = (flat.index_select(0, index + self.dynamic.shape[1]) - begin) / step
-        return begin + (after - first * step)[:, None, None] * slope, slope
+        return MovingTransforms(begin + (after - first * step)[:, None, None] * slope, slope)
 
     @cached_property
     def radius(self) -> Tensor:
@@ -85,20 +84,24 @@ class MovingSolids:
         return 0.5 * (self.knots[0] + self.knots[-1])
 
     @cached_property
-    def centres(self) -> tuple[Tensor, Tensor]:
-        """(P, 3) float64 centres of the solids at `middle`; (P,) upper bound of the speed of their points, m/s."""
+    def centre(self) -> Tensor:
+        """(P, 3) float64 centres of the solids at `middle`."""
         count = len(self.kind)
-        transform, _ = self.at(torch.arange(count), self.middle.expand(count))
-        centre = rotate(transform[:, :, :3].transpose(1, 2), -transform[:, :, 3])
-        speed = torch.zeros(count, dtype=torch.float64)
+        to_solid = self.at(torch.arange(count), self.middle.expand(count)).to_solid
+        return rotate(to_solid[:, :, :3].transpose(1, 2), -to_solid[:, :, 3])
+
+    @cached_property
+    def speed(self) -> Tensor:
+        """(P,) float64 upper bound of the speed of the points of the solids, m/s."""
+        speed = torch.zeros(len(self.kind), dtype=torch.float64)
         moving = (self.row >= 0).nonzero()[:, 0]
         arm = self.half_size[moving].norm(dim=1)
         for knot in self.knots[:-1]:  # the velocity differs between intervals, because legs swing
-            _, change = self.dynamic_at(self.row[moving], knot.expand(len(moving)))
-            at_centre = rotate(change[:, :, :3], centre[moving]) + change[:, :, 3]
+            change = self.dynamic_at(self.row[moving], knot.expand(len(moving))).change
+            at_centre = rotate(change[:, :, :3], self.centre[moving]) + change[:, :, 3]
             rotation = change[:, :, :3].flatten(1).norm(dim=1) * arm
             speed[moving] = torch.maximum(speed[moving], at_centre.norm(dim=1) + rotation)
-        return centre, 1.1 * speed
+        return 1.1 * speed
 
 
 @dataclass(frozen=True)
@@ -152,42 +155,66 @@ def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Bloc
 
     Convention: a solid at the azimuth where the sweep begins and ends has a block at either end of the image.
     """
-    offset, travel, late = _reach_in_sweep(solids, shots)
-    distance = offset.norm(dim=1)
-    near = (distance - travel < max_range).nonzero()[:, 0]
-    distance = distance[near].clamp(min=1e-6)
-    travel = travel[near]
-    x, y, z = (offset[near] @ shots.T_world_sensor[shots.middle, :3, :3]).T
-    rho = torch.hypot(x, y)
-    slack = (travel / distance).clamp(max=1).asin() + late * shots.speed[1]
-    height = torch.atan2(z, rho)
-    is_seen = (height + slack > shots.elevation[0]) & (height - slack < shots.elevation[-1])
-    # Near the sensor's axis, the azimuth of a solid is not reliable.
-    slack = torch.where(rho < 2 * travel, math.pi, 2 * slack).clamp(max=math.pi) / abs(shots.step)
-    column = ((torch.atan2(y, x) - shots.azimuth[0]) / shots.step) % shots.revolution
+    spheres = _spheres(solids, shots)
+    near = (spheres.distance - spheres.radius < max_range).nonzero()[:, 0]
+    sector = _sector(spheres.at(near), shots)
     solid = []
     guess = []
     for shift in (-shots.revolution, 0, shots.revolution):
-        shifted = column + shift
-        is_in_sweep = (shifted + slack >= 0) & (shifted - slack < len(shots.azimuth))
-        chosen = (is_seen & is_in_sweep).nonzero()[:, 0]
+        column = sector.column + shift
+        is_in_sweep = (column + sector.slack >= 0) & (column - sector.slack < len(shots.azimuth))
+        chosen = (sector.is_seen & is_in_sweep).nonzero()[:, 0]
         solid.append(near[chosen])
-        guess.append(shifted[chosen])
+        guess.append(column[chosen])
     return _blocks_near(solids, shots, torch.cat(solid), torch.cat(guess), max_range)
 
 
-def _reach_in_sweep(solids: MovingSolids, shots: Shots) -> tuple[Tensor, Tensor, float]:
-    """Bound the motion of all solids during the sweep.
+class _Spheres(NamedTuple):
+    """Spheres that hold P solids during a sweep."""
 
-    Returns:
-        (P, 3) float64 centre of each solid in the middle of the sweep, from the sensor, world axes; (P,) float64 radius
-        of a sphere around it that holds the solid during the sweep, metres; seconds from the middle of the sweep to
-        its ends.
-    """
-    centre, speed = solids.centres
+    centre: Tensor  # (P, 3) float64, metres, from the sensor in the middle of the sweep, world axes
+    distance: Tensor  # (P,) float64, metres, of the centre
+    radius: Tensor  # (P,) float64, metres
+    late: float  # seconds from the middle of the sweep to its ends
+
+    def at(self, index: Tensor) -> _Spheres:
+        """Select spheres by their positions in the list, (K,) int64."""
+        return _Spheres(self.centre[index], self.distance[index], self.radius[index], self.late)
+
+
+def _spheres(solids: MovingSolids, shots: Shots) -> _Spheres:
+    """Bound the motion of all solids during the sweep."""
     late = abs(float(shots.seconds[shots.middle] - solids.middle)) + 0.5 * shots.interval * len(shots.azimuth)
-    travel = solids.radius + late * (speed + shots.speed[0])
-    return centre - shots.T_world_sensor[shots.middle, :3, 3], travel, late
+    centre = solids.centre - shots.T_world_sensor[shots.middle, :3, 3]
+    return _Spheres(
+        centre=centre,
+        distance=centre.norm(dim=1),
+        radius=solids.radius + late * (solids.speed + shots.speed[0]),
+        late=late,
+    )
+
+
+class _Sector(NamedTuple):
+    """The columns that may meet K solids."""
+
+    column: Tensor  # (K,) float64, at the azimuth of the centre, 0 ... one revolution
+    slack: Tensor  # (K,) float64, columns, to either side
+    is_seen: Tensor  # (K,) bool, the elevations of the LiDAR may meet the solid
+
+
+def _sector(spheres: _Spheres, shots: Shots) -> _Sector:
+    """Bound the azimuths and the elevations of spheres as the sensor sees them."""
+    x, y, z = (spheres.centre @ shots.T_world_sensor[shots.middle, :3, :3]).T
+    rho = torch.hypot(x, y)
+    slack = (spheres.radius / spheres.distance.clamp(min=1e-6)).clamp(max=1).asin() + spheres.late * shots.speed[1]
+    height = torch.atan2(z, rho)
+    # Near the sensor's axis, the azimuth of a solid is not reliable.
+    of_azimuth = torch.where(rho < 2 * spheres.radius, math.pi, 2 * slack).clamp(max=math.pi)
+    return _Sector(
+        column=((torch.atan2(y, x) - shots.azimuth[0]) / shots.step) % shots.revolution,
+        slack=of_azimuth / abs(shots.step),
+        is_seen=(height + slack > shots.elevation[0]) & (height - slack < shots.elevation[-1]),
+    )
 
 
 def _blocks_near(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor, max_range: float) -> Blocks:
@@ -196,7 +223,7 @@ def _blocks_near(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tenso
     outline = _outline(solids, solid, view)
     # While the unit scans its block, a solid moves by at most `drift` from its position in the middle of the block.
     width = (outline.right - outline.left).clamp(max=2 * math.pi)
-    speed = solids.centres[1][solid] + shots.speed[0] + shots.speed[1] * view.centre.norm(dim=1)
+    speed = solids.speed[solid] + shots.speed[0] + shots.speed[1] * view.centre.norm(dim=1)
     drift = speed * shots.interval * (0.6 * width / abs(shots.step) + 2)
     clearance = view.rho - outline.spread
     margin = (drift / clearance.clamp(min=1e-6)).clamp(max=1).asin() + 1e-6
@@ -229,7 +256,7 @@ def _aim(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor) -> _V
     for _ in range(_ROUNDS):
         column = guess.round().long().clamp(0, len(shots.azimuth) - 1)
         T_world_sensor = shots.T_world_sensor.index_select(0, column)
-        to_solid, _ = solids.at(solid, take(shots.seconds, column))
+        to_solid = solids.at(solid, take(shots.seconds, column)).to_solid
         rotation = to_solid[:, :, :3] @ T_world_sensor[:, :3, :3]
         origin = rotate(to_solid[:, :, :3], T_world_sensor[:, :3, 3]) + to_solid[..., 3]  # of the sensor
         centre = rotate(rotation.transpose(1, 2), -origin)
@@ -303,11 +330,11 @@ class RollingRays:
     def __init__(self, solids: MovingSolids, shots: Shots, blocks: Blocks) -> None:
         middle = blocks.first_column + blocks.num_columns // 2
         seconds = shots.seconds[middle.clamp(0, len(shots.seconds) - 1)]
-        to_solid, change = solids.at(blocks.solid, seconds)
+        transforms = solids.at(blocks.solid, seconds)
         half = solids.half_size[blocks.solid][..., None]
         # Within a block, the velocity is constant: it takes milliseconds to scan most blocks.
-        self._to_unit = (to_solid / half).flatten(1).T.float().contiguous()  # (12, E)
-        self._change = (change / half).flatten(1).T.float().contiguous()
+        self._to_unit = (transforms.to_solid / half).flatten(1).T.float().contiguous()  # (12, E)
+        self._change = (transforms.change / half).flatten(1).T.float().contiguous()
         self._moves = solids.row[blocks.solid] >= 0
         self._kind = solids.kind[blocks.solid]
         self._inverse_half = solids.half_size[blocks.solid].reciprocal().T.float().contiguous()

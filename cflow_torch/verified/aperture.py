@@ -29,15 +29,16 @@ from cflow_torch.verified.in_place import are_covered
 if TYPE_CHECKING:
     from cflow_torch.verified.component_tree import Tree
 
-# A line: its largest standard deviation across and its smallest one along it, metres.
-_THIN, _LONG = 0.3, 1.0
+_THIN = 0.3  # metres, largest standard deviation of a line across it
+_LONG = 1.0  # metres, smallest standard deviation along it
 _ALONG = 0.04  # squared sine of the largest angle between a line and a motion along it
 _LEAST_TRAVEL = 1.2  # metres; shorter displacements over the window are ignored
 _ALIKE = 0.1  # the displacements of two ends that move together differ by at most this share of their sum
 _LONGEST = 60.0  # metres; no road vehicle is longer. The ends of a longer noise barrier are only the limits of the view
 # A guard rail has fewer than 2 height slices per pixel at t+1 on average, and a standard deviation of at least 2 m
 # along it. No vehicle is as low and as long. Where a rail crosses the border of a slice, its pixels have two slices.
-_TALL, _RAIL = 2, 2.0
+_TALL = 2
+_RAIL = 2.0
 
 
 def slides_along_itself(
@@ -96,12 +97,7 @@ class Lines(NamedTuple):
 
 def principal_axes(groups: Groups, row_col: Tensor, pixel_size: float) -> Lines:
     """Return the principal axes of A components from their pixels at t+1; `row_col` is (2, Q) int64."""
-    one_y_x = torch.cat((torch.ones_like(row_col[:1]), row_col))  # `F.pad` of torch 2.0 fails without pixels
-    moments = groups.sum((one_y_x[:, None] * one_y_x).view(9, -1)).reshape(3, 3, -1)
-    count = moments[0, 0]
-    sums = moments[0, 1:]
-    # Differences of large products are exact in integers.
-    covariance = (count * moments[1:, 1:] - sums[:, None] * sums) / (count * count).clamp(min=1).double()
+    covariance = _covariance(groups, row_col)  # [2, 2, A]
     var_y = covariance[0, 0]
     var_x = covariance[1, 1]
     cov = covariance[0, 1]
@@ -115,6 +111,16 @@ def principal_axes(groups: Groups, row_col: Tensor, pixel_size: float) -> Lines:
     wide = torch.stack((cov, largest - var_y), 1)
     high = torch.stack((largest - var_x, cov), 1)
     return Lines(is_line, largest, torch.where((var_y < var_x)[:, None], wide, high))
+
+
+def _covariance(groups: Groups, row_col: Tensor) -> Tensor:
+    """Return the covariance of row and column of the pixels of A groups, (2, 2, A) float64, square pixels."""
+    one_y_x = torch.cat((torch.ones_like(row_col[:1]), row_col))  # `F.pad` of torch 2.0 fails without pixels
+    moments = groups.sum((one_y_x[:, None] * one_y_x).view(9, -1)).reshape(3, 3, -1)
+    count = moments[0, 0]
+    sums = moments[0, 1:]
+    # Differences of large products are exact in integers.
+    return (count * moments[1:, 1:] - sums[:, None] * sums) / (count * count).clamp(min=1).double()
 
 
 def both_ends_move(sweeps: HeightSlicedSweeps, tree: Tree, is_long: Tensor) -> Tensor:
@@ -136,7 +142,7 @@ def both_ends_move(sweeps: HeightSlicedSweeps, tree: Tree, is_long: Tensor) -> T
 
     Cost: some passes over the pixels of long components.
     """
-    name = flat_nonzero(is_long)
+    name = flat_nonzero(is_long)  # [L]
     if name.numel() == 0:
         return torch.zeros_like(is_long)
     farthest = sweeps.elapsed.abs().argmax(1).index_select(0, sweeps.pixels.window)  # [P]
@@ -145,17 +151,35 @@ def both_ends_move(sweeps: HeightSlicedSweeps, tree: Tree, is_long: Tensor) -> T
     components = tree.members[member].select(name)
     pixels = sweeps.pixels[tree.pixel[member]]
     # The components at t+1, then those in the farthest sweep.
-    both = Groups(components.of_item + len(name) * (pixels.step != 0), 2 * len(name))
-    is_tall = both.sum(count_slices(pixels.slices) - _TALL)[: len(name)] >= 0
+    in_both = Groups(components.of_item + len(name) * (pixels.step != 0), 2 * len(name))
+    is_tall = in_both.sum(count_slices(pixels.slices) - _TALL)[: len(name)] >= 0
+    ends = _ends(in_both, pixels, sweeps.grid.pixel_size)
+    return torch.zeros_like(is_long).index_copy_(0, name, is_tall & (ends.length <= _LONGEST) & ends.move_alike())
 
+
+class _Ends(NamedTuple):
+    """The two ends of L components along their direction, (L,) float64 each, metres."""
+
+    length: Tensor  # from one end to the other at t+1
+    # Displacement of each end from the farthest sweep to t+1, towards the other end; infinite or NaN without pixels.
+    first: Tensor
+    last: Tensor
+
+    def move_alike(self) -> Tensor:
+        """Tell which components have two ends that move far enough in one direction, and equally far, (L,) bool."""
+        both = (self.first - self.last).abs()
+        return (both >= 2 * _LEAST_TRAVEL) & ((self.first + self.last).abs() <= _ALIKE * both)
+
+
+def _ends(in_both: Groups, pixels: Pixels, pixel_size: float) -> _Ends:
+    """Find the ends of L components, and their displacement; the pixels are in 2 L groups, those of t+1 first."""
+    device = pixels.slices.device
     # The first pixel in each direction, y, x and the diagonals, and in each opposite direction.
     directions = ((1, 0), (0, 1), (1, 1), (1, -1), (-1, 0), (0, -1), (-1, -1), (-1, 1))
-    along = constant(directions, torch.float64, name.device) @ pixels.row_col.double()
-    ends = both.min(along, math.inf).reshape(2, 4, 2, len(name))
-    metres = tuple(scale * sweeps.grid.pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))
-    unit = constant(metres, torch.float64, name.device)[:, None]
-    length, direction = (ends[:, :, 0].sum(0) * -unit).max(0)
-    first, last = ((ends[:, :, 0] - ends[:, :, 1]) * unit).gather(1, direction.expand(2, 1, -1))[:, 0]
-    both = (first - last).abs()  # infinite or NaN if the component is not visible
-    moves = is_tall & (length <= _LONGEST) & (both >= 2 * _LEAST_TRAVEL) & ((first + last).abs() <= _ALIKE * both)
-    return torch.zeros_like(is_long).index_copy_(0, name, moves)
+    along = constant(directions, torch.float64, device) @ pixels.row_col.double()
+    newest, farthest = in_both.min(along, math.inf).reshape(2, 4, 2, -1).unbind(2)  # [2, 4, L] each
+    metres = tuple(scale * pixel_size for scale in (1.0, 1.0, math.sqrt(0.5), math.sqrt(0.5)))
+    unit = constant(metres, torch.float64, device)[:, None]  # [4, 1]
+    length, direction = (newest.sum(0) * -unit).max(0)
+    first, last = ((newest - farthest) * unit).gather(1, direction.expand(2, 1, -1))[:, 0]
+    return _Ends(length, first, last)

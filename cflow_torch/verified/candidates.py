@@ -1,7 +1,6 @@
 """Motion candidates of the nodes of the component tree.
 
-The candidates of a node are its correlation peaks with each sweep, their median, and the medians of the coarser nodes
-around it.
+The candidates of a node are its correlation peaks with each sweep, their median, and the median of its parent.
 """
 
 from __future__ import annotations
@@ -63,17 +62,22 @@ def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, conf
 
 @dataclass(frozen=True)
 class _Boxes:
-    """The box of each of N nodes over all sweeps, at the scale at which the node is correlated."""
+    """The boxes of nodes over all sweeps, in pixels of the scale at which each node is correlated."""
 
     # (N, 6) int64: side of a pixel in finest pixels, where the images of the node begin, top and left of its box, and
-    # height and width of the box, in pixels of the scale.
+    # height and width of the box.
     table: Tensor
-    num_samples: int  # I, of all images
+    num_samples: int  # I, of the images of all nodes
 
     @property
     def block(self) -> Tensor:
         """(N,) int64, side of a pixel in finest pixels."""
         return self.table[:, 0]
+
+    @property
+    def start(self) -> Tensor:
+        """(N,) int64, first sample of the images of each node."""
+        return self.table[:, 1]
 
     @property
     def top_left(self) -> Tensor:
@@ -84,6 +88,16 @@ class _Boxes:
     def size(self) -> Tensor:
         """(N, 2) int64, height and width."""
         return self.table[:, 4:]
+
+    def __getitem__(self, node: Tensor) -> _Boxes:
+        """Select the boxes of K nodes, (K,) int64."""
+        return _Boxes(self.table.index_select(0, node), self.num_samples)
+
+    def sample_at(self, step: Tensor, row_col: Tensor) -> Tensor:
+        """Return a sample of each node, (N,) int64: that of a sweep, (N,), and a pixel of the scale, (2, N)."""
+        height, width = self.size.t()
+        row, col = row_col - self.top_left.t()
+        return self.start + (step * height + row) * width + col
 
 
 @dataclass(frozen=True)
@@ -104,26 +118,30 @@ class _NodeImages:
         node = nodes.members.of_item  # [A]
         members = sweeps.pixels[nodes.pixel]  # [A]
         boxes = _boxes(nodes, members, blocks, sweeps.num_steps)
-        of_member = boxes.table.index_select(0, node)
-        block, start, top, left, height, width = of_member.t()  # [A] each
-        row, col = torch.div(members.row_col, block, rounding_mode="floor")
-        index = start + (members.step * height + row - top) * width + col - left  # [A]
+        of_member = boxes[node]  # [A]
+        row_col = torch.div(members.row_col, of_member.block, rounding_mode="floor")  # [2, A]
+        sample = of_member.sample_at(members.step, row_col)  # [A]
         slices = lazy_zeros(boxes.num_samples, torch.uint8, node.device)
-        slices.scatter_(0, index, members.slices.masked_fill(block > 1, OWN))
+        slices.scatter_(0, sample, members.slices.masked_fill(of_member.block > 1, OWN))
         # Several finest pixels may fall into one pixel of the scale. They are equal there, so any of them may remain.
         member_at = lazy_empty(boxes.num_samples, torch.int32, node.device)
-        member_at.scatter_(0, index, torch.arange(len(node), dtype=torch.int32, device=node.device))
+        member_at.scatter_(0, sample, torch.arange(len(node), dtype=torch.int32, device=node.device))
         drawn = flat_nonzero(slices.bool())  # [Q]
         member = member_at.index_select(0, drawn).long()
-        pixels = ClusterPixels(*gather(member, node, members.step, row, col))
-        return cls(boxes, slices, pixels, slices.index_select(0, drawn))
+        return cls(
+            boxes=boxes,
+            slices=slices,
+            pixels=ClusterPixels(*gather(member, node, members.step, *row_col)),
+            slices_of_pixel=slices.index_select(0, drawn),
+        )
 
     def look_up_newest(self, node: Tensor, row: Tensor, col: Tensor) -> Tensor:
         """Return the slices of pixels of nodes at t+1; 0 outside of the box. Node is (K,), row and col (..., K)."""
-        _, start, _, _, height, width = self.boxes.table.index_select(0, node).t()
+        boxes = self.boxes[node]
+        height, width = boxes.size.t()
         is_inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
-        index = (start + row * width + col) * is_inside
-        return self.slices.index_select(0, index.view(-1)).view_as(index) * is_inside
+        sample = (boxes.start + row * width + col) * is_inside
+        return self.slices.index_select(0, sample.view(-1)).view_as(sample) * is_inside
 
 
 def _boxes(nodes: Tree, members: Pixels, blocks: Sequence[int], num_steps: int) -> _Boxes:
@@ -135,17 +153,18 @@ def _boxes(nodes: Tree, members: Pixels, blocks: Sequence[int], num_steps: int) 
     block = constant(tuple(blocks), torch.int64, members.step.device)[:, None]  # [scales, 1], coarse to fine
     first = nodes.members.min(members.row_col, empty=FAR)  # [2, N], finest pixels
     last = nodes.members.max(members.row_col, empty=0)
-    first = torch.div(first[:, None], block, rounding_mode="floor")  # [2, scales, N]
-    size = torch.div(last[:, None], block, rounding_mode="floor") - first + 1
+    top_left = torch.div(first[:, None], block, rounding_mode="floor")  # [2, scales, N]
+    size = torch.div(last[:, None], block, rounding_mode="floor") - top_left + 1
     num_fitting = (size.prod(0) <= _LARGEST_BOX).sum(0)  # these scales come first
     scale = torch.minimum(nodes.kind.clamp(max=len(blocks) - 1), (num_fitting - 1).clamp(min=0))
     node = torch.arange(nodes.count, device=scale.device)
-    top_left = first[:, scale, node]  # [2, N]
-    size = size[:, scale, node]
+    size = size[:, scale, node]  # [2, N]
     num_samples = size.prod(0) * num_steps
     end = num_samples.cumsum(0)
-    table = torch.stack((block[scale, 0], end - num_samples, *top_left, *size), 1)
-    return _Boxes(table, int(end[-1]) if nodes.count else 0)
+    return _Boxes(
+        table=torch.stack((block[scale, 0], end - num_samples, *top_left[:, scale, node], *size), 1),
+        num_samples=int(end[-1]) if nodes.count else 0,
+    )
 
 
 def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tensor:
@@ -156,19 +175,26 @@ def _parabola(images: _NodeImages, pairs: TemplatePairs, shift: Tensor) -> Tenso
     where a parabola is not concave.
     """
     is_moved = shift.any(1)
+    counts = _counts_around(images, pairs, shift, is_moved)  # [5, J]
+    before = counts[1:3]
+    after = counts[3:]
+    curve = (2 * counts[:1] - before - after).double()
+    vertex = ((after - before) / (2 * curve)).masked_fill(curve <= 0, 0.0).clamp(-0.5, 0.5)  # [2, J]
+    return (vertex * is_moved).t()
+
+
+def _counts_around(images: _NodeImages, pairs: TemplatePairs, shift: Tensor, is_wanted: Tensor) -> Tensor:
+    """Count the common slices of J pairs at their shift, one pixel above, left, below and right of it, (5, J) int64.
+
+    `is_wanted` is (J,) bool; the counts of other pairs are 0.
+    """
     template = pairs.template
     assert pairs.pixel is not None
-    some = flat_nonzero(is_moved.index_select(0, template.image))  # template pixels
+    some = flat_nonzero(is_wanted.index_select(0, template.image))  # [K], template pixels
     pair = template.image.index_select(0, some)
     row = template.row.index_select(0, some) + shift[:, 0].index_select(0, pair)
     col = template.col.index_select(0, some) + shift[:, 1].index_select(0, pair)
-    # At the peak, before it (above, left) and after it (below, right).
-    beside = constant(((0, -1, 0, 1, 0), (0, 0, -1, 0, 1)), torch.int64, shift.device)[..., None]  # [2, 5, 1]
-    node = pairs.cluster.index_select(0, pair)
-    target = images.look_up_newest(node, row + beside[0], col + beside[1])  # [5, K]
-    own = images.slices_of_pixel.index_select(0, pairs.pixel.index_select(0, some))
-    counts = Groups(pair, len(shift)).sum(count_slices(own & target))  # [5, J]
-    peak, before, after = counts[:1], counts[1:3], counts[3:]
-    curve = (2 * peak - before - after).double()
-    vertex = ((after - before) / (2 * curve)).masked_fill(curve <= 0, 0.0).clamp(-0.5, 0.5)  # [2, J]
-    return (vertex * is_moved).t()
+    down, right = constant(((0, -1, 0, 1, 0), (0, 0, -1, 0, 1)), torch.int64, shift.device)[..., None]  # [5, 1] each
+    target = images.look_up_newest(pairs.cluster.index_select(0, pair), row + down, col + right)  # [5, K]
+    source = images.slices_of_pixel.index_select(0, pairs.pixel.index_select(0, some))
+    return Groups(pair, len(shift)).sum(count_slices(source & target))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -212,24 +213,40 @@ class Columns:
         words = self.as_words(slices)
         half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
         self.slices.view(torch.int64)[:, half] = words | self.or_around(words) << NUM_SLICES
+        occupied = self._occupied(slices, num_windows)
+        step = occupied.step
+        slot = occupied.column * self.num_slots + (step + first)  # counted through all columns
+        rank = torch.arange(pixels_before + 1, pixels_before + 1 + len(slot), dtype=torch.int32, device=slot.device)
+        self.rank.view(-1).index_copy_(0, slot, rank)
+        start = occupied.position - occupied.row * self.stride - occupied.col + REACH * (self.stride + 1)
+        window = occupied.window + num_windows if first > 0 else occupied.window
+        place = torch.stack((slot - step, start, window, step, occupied.row - REACH, occupied.col - REACH), 1)
+        is_small = max(len(self.image), self.rank.numel()) <= torch.iinfo(torch.int32).max
+        if is_small and place.device.type == "cpu":  # on a GPU, the conversions would cost more than the bytes
+            place = place.int()
+        return Pixels(place, self.slices.view(-1).index_select(0, slot) & OWN)
+
+    def _occupied(self, slices: Tensor, num_windows: int) -> _Occupied:
+        """List the occupied pixels of B windows; `slices` is as for `draw`."""
         step, column = nonzero_pairs((slices != 0).t().contiguous())
         position = self.position.index_select(0, column)
         line, col = split_index(position, self.stride)
         window, row = split_index(line, self.height + 2 * REACH)
-        if num_windows > 1:
-            order = window.sort(stable=True).indices
-            listed = torch.stack((window, step, column, position, row, col)).index_select(1, order)
-            window, step, column, position, row, col = listed
-        index = column * self.num_slots + (step + first)
-        rank = torch.arange(pixels_before + 1, pixels_before + 1 + len(index), dtype=torch.int32, device=index.device)
-        self.rank.view(-1).index_copy_(0, index, rank)
-        start = position - row * self.stride - col + REACH * (self.stride + 1)
-        copy = window + num_windows if first > 0 else window
-        place = torch.stack((index - step, start, copy, step, row - REACH, col - REACH), 1)
-        is_small = max(len(self.image), self.rank.numel()) <= torch.iinfo(torch.int32).max
-        if is_small and place.device.type == "cpu":  # on a GPU, the conversions would cost more than the bytes
-            place = place.int()
-        return Pixels(place, self.slices.view(-1).index_select(0, index) & OWN)
+        occupied = _Occupied(window, step, column, position, row, col)
+        if num_windows == 1:
+            return occupied
+        return _Occupied(*torch.stack(occupied).index_select(1, window.sort(stable=True).indices))
+
+
+class _Occupied(NamedTuple):
+    """K occupied pixels in order of window, step and position, (K,) int64 each."""
+
+    window: Tensor
+    step: Tensor
+    column: Tensor
+    position: Tensor  # flat index into the images
+    row: Tensor  # of the image with its border
+    col: Tensor
 
 
 def position_of(grid: Grid, window: Tensor, row: Tensor, col: Tensor) -> Tensor:

@@ -45,7 +45,8 @@ from cflow_torch.verified.voxel_centroids import (
 )
 
 # We chose these values on real pairs and windows with history (docs/benchmarks.md).
-LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of the voxels: height in metres, number of layers before they repeat
+LAYER_HEIGHT = 0.1  # metres, of the voxels, which are as wide as the finest pixels
+NUM_LAYERS = 32  # number of layers of voxels before they repeat
 MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _NOISE = 0.05  # metres, standard deviation of a centroid, besides the covariance of its surface
 _FARTHEST = 0.2  # metres, between the two voxels of a correspondence
@@ -67,6 +68,8 @@ def refine(
     num_steps: int = NUM_STEPS,
 ) -> tuple[RigidMotion, RigidMotion]:
     """Return the final motion of objects, and their apparent motion, which differs from it if points have times.
+
+    The apparent motion aligns the points as they were measured, at different times within their sweeps.
 
     Args:
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
@@ -253,7 +256,7 @@ class Registration:
         moved = source.centre + velocity * source.elapsed_of_t + arm
         moved = torch.cat((moved, source.height))  # [3, K]
 
-        target = self._target.nearest(source.target_start, source.target_layers, moved)
+        target = self._target.nearest(source.target_start, source.target_layers, moved)  # [K], 0 = none, far away
         residual = take_columns(self._voxels.position, target) - moved
         is_near = residual.square().sum(0) <= _FARTHEST**2
         is_same = self._voxels.object_id.index_select(0, target) == source.objects.of_item

@@ -19,7 +19,9 @@ _FEWEST_POINTS = 5
 _FEWEST_BLOCKS = 5  # of a plane
 # We fit a plane to the blocks at most two away each way (10 m x 10 m), three times. The second and third fit leave out
 # blocks more than 100 mm from the last plane, such as a pavement (ties stay). Planes steeper than 0.3 are not ground.
-_REACH, _NUM_FITS, _FARTHEST = 2, 3, 100 + 1e-6
+_REACH = 2
+_NUM_FITS = 3
+_FARTHEST = 100 + 1e-6
 _STEEPEST = 0.3
 # Terms of the plane in each of these blocks: 1, and its column and row from the middle block.
 _AROUND = tuple((1, dx, dy) for dy in range(-_REACH, _REACH + 1) for dx in range(-_REACH, _REACH + 1))
@@ -34,21 +36,21 @@ class GroundHeights:
     def __init__(self, num_windows: int, grid: Grid, device: torch.device) -> None:
         self._lower = grid.lower
         shape = tuple(int((grid.upper[axis] - grid.lower[axis]) / _BLOCK) + 1 for axis in (1, 0))
-        self._heights = torch.zeros((num_windows, *shape), dtype=torch.int64, device=device)
-        self._counts = torch.zeros_like(self._heights)
+        # Of each block: the sum of the heights of its points, centimetres, and their number.
+        self._sums = torch.zeros((2, num_windows, *shape), dtype=torch.int64, device=device)
 
     def add(self, window: int | Tensor, positions: Tensor) -> None:
         """Add ground points in the region, (3, N) float64, metres, frame of t+1, of one window or (N,) windows."""
-        block = self._block(positions).long() + window * self._heights[0].numel()
+        block = self._block(positions).long() + window * self._sums[0, 0].numel()
         height = torch.floor(positions[2] * 100).clamp_(-_HIGHEST, _HIGHEST).long()
-        self._heights.view(-1).index_add_(0, block, height)
-        self._counts.view(-1).index_add_(0, block, torch.ones_like(height))
+        self._sums[0].view(-1).index_add_(0, block, height)
+        self._sums[1].view(-1).index_add_(0, block, torch.ones_like(height))
 
     def mean(self) -> Tensor:
         """Return the mean height over 3 x 3 blocks, (B, Y, X) int64, centimetres, rounded down. Where they hold fewer
         than five points, it is a height far below every point."""
-        _, rows, cols = self._heights.shape
-        sums = F.pad(torch.stack((self._heights, self._counts)), (1, 1, 1, 1))
+        rows, cols = self._sums.shape[2:]
+        sums = F.pad(self._sums, (1, 1, 1, 1))
         around = [sums[:, :, down : down + rows, right : right + cols] for down in range(3) for right in range(3)]
         height, count = torch.stack(around).sum(0)
         mean = torch.div(height, count.clamp(min=1), rounding_mode="floor")
@@ -91,24 +93,28 @@ class GroundHeights:
 
         Also return which of them are known, (G, 25) bool. Arguments as for `slopes`.
         """
-        num_windows, rows, cols = self._heights.shape
+        block = self._padded_blocks_around(centre, window)  # [G, 25]
+        padded = F.pad(self._sums, (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
+        height, count = padded.index_select(1, block.view(-1)).view(2, *block.shape)
+        mean = torch.div(10 * height, count.clamp(min=1), rounding_mode="floor").double()
+        return mean, count >= _FEWEST_POINTS
+
+    def _padded_blocks_around(self, centre: Tensor, window: Tensor) -> Tensor:
+        """Return the 5 x 5 blocks around objects, (G, 25) int64, as indices into sums with `_REACH` blocks around."""
+        num_windows, rows, cols = self._sums.shape[1:]
         stride = cols + 2 * _REACH
         offset = tuple((dy + _REACH) * stride + dx + _REACH for _, dx, dy in _AROUND)
         ends = constant(((0, 0), (cols - 1, rows - 1)), torch.int64, window.device)
         lower = constant(self._lower[:2], torch.float64, window.device)
         col, row = torch.floor((centre - lower) / _BLOCK).clamp_(*ends).long().unbind(1)
         line = window % num_windows * (rows + 2 * _REACH) + row
-        block = torch.add(col, line, alpha=stride)[:, None] + constant(offset, torch.int64, window.device)
-        sums = F.pad(torch.stack((self._heights, self._counts)), (_REACH, _REACH, _REACH, _REACH)).view(2, -1)
-        height, count = sums.index_select(1, block.view(-1)).view(2, *block.shape)
-        mean = torch.div(10 * height, count.clamp(min=1), rounding_mode="floor").double()
-        return mean, count >= _FEWEST_POINTS
+        return torch.add(col, line, alpha=stride)[:, None] + constant(offset, torch.int64, window.device)
 
     def _block(self, positions: Tensor) -> Tensor:
         """Return the block of positions in the region, (N,) int32. There int() rounds down."""
         lower = constant(self._lower[:2], positions.dtype, positions.device)
         col, row = (positions[:2] - lower[:, None]).div_(_BLOCK).int()
-        return col.add_(row, alpha=self._heights.shape[2])
+        return col.add_(row, alpha=self._sums.shape[3])
 
 
 class _Fit(NamedTuple):

@@ -1,4 +1,4 @@
-"""Motion candidates of nodes: peaks of the correlation with each sweep, their median, those of the nodes around."""
+"""Motion candidates of nodes: peaks of the correlation with each sweep, their median, that of the parent."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def propose(sweeps: SlicedSweeps, nodes: Sequence[Node]) -> tuple[list[list[Vect
     NCC of each with the nearest sweep that has it.
 
     The median of the peaks of all sweeps in y and in x, if there is more than one other sweep; the peak of each; and
-    the first candidates of the nodes around. (0, 0), which never wins, stands for a sweep that lacks the node.
+    the first candidate of the parent. (0, 0), which never wins, stands for a sweep that lacks the node.
     """
     candidates: list[list[Vector]] = []
     scores = []
@@ -31,10 +31,8 @@ def propose(sweeps: SlicedSweeps, nodes: Sequence[Node]) -> tuple[list[list[Vect
         own = [motion for motion, _ in peaks]
         if len(own) > 1:
             own.insert(0, (median([y for y, _ in found]), median([x for _, x in found])))
-        parent = node.parent
-        while parent >= 0:
-            own.append(candidates[parent][0])
-            parent = nodes[parent].parent
+        if node.parent >= 0:
+            own.append(candidates[node.parent][0])
         candidates.append(own)
         scores.append(next(score for _, score in peaks if score is not None))
     return candidates, scores

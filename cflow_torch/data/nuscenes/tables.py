@@ -121,7 +121,8 @@ class Tables:
     @cached_property
     def scenes(self) -> dict[str, str]:
         """Name of each scene -> its token."""
-        rows, file = read_table(self.folder, "scene"), self.folder / "scene.json"
+        rows = read_table(self.folder, "scene")
+        file = self.folder / "scene.json"
         scenes = {safe_name(row["name"], f"{file}: the scene"): row["token"] for row in rows}
         if len(scenes) < len(rows):
             raise CFlowError(f"{file} has {len(rows)} scenes but {len(scenes)} names; {_COPY}")
@@ -209,8 +210,11 @@ class Tracks:
     """
 
     def __init__(self, sample_times: np.ndarray, annotations: Annotations) -> None:
-        self._times, self._annotations = sample_times, annotations
-        self.start, self.end = (int(sample_times[0]), int(sample_times[-1])) if len(annotations.time) else (0, -1)
+        self._times = sample_times
+        self._annotations = annotations
+        has_boxes = len(annotations.time) > 0
+        self.start = int(sample_times[0]) if has_boxes else 0
+        self.end = int(sample_times[-1]) if has_boxes else -1
         self._rows: list[dict[str, int]] = [{} for _ in sample_times]  # per sample: track -> row
         for row, sample in enumerate(np.searchsorted(sample_times, annotations.time)):
             self._rows[int(sample)][annotations.track[row]] = row
@@ -230,26 +234,38 @@ class Tracks:
         left = int(np.searchsorted(times, time, side="right")) - 1
         rows = dict(enumerate(self._rows))
         if times[left] == time:
-            return self._boxes(time, [(row, row, 0.0, True) for row in rows[left].values()])
-        ends: list[tuple[int, int, float, bool]] = []  # row at one end, row at the other, fraction, whether it is known
+            return self._boxes(time, [_Between(row, row, 0.0, True) for row in rows[left].values()])
+        between = []
         for track, row in {**rows[left], **rows[left + 1], **rows[left]}.items():  # tracks of `left` come first
             both = [k for k in (left, left - 1, left + 1) if track in rows.get(k, ()) and track in rows.get(k + 1, ())]
             start = both[0] if both else None
             if start is None:
-                ends.append((row, row, 0.0, False))
+                between.append(_Between(row, row, 0.0, False))
             else:
                 fraction = float((time - times[start]) / (times[start + 1] - times[start]))
-                ends.append((rows[start][track], rows[start + 1][track], fraction, start == left))
-        return self._boxes(time, sorted(ends, key=lambda end: end[3]))
+                between.append(_Between(rows[start][track], rows[start + 1][track], fraction, start == left))
+        return self._boxes(time, sorted(between, key=lambda box: box.is_known))
 
-    def _boxes(self, time: int, ends: list[tuple[int, int, float, bool]]) -> tuple[Annotations, np.ndarray]:
-        table, rows0, rows1 = self._annotations, [end[0] for end in ends], [end[1] for end in ends]
-        fraction = np.array([end[2] for end in ends], dtype=np.float64)
+    def _boxes(self, time: int, between: list[_Between]) -> tuple[Annotations, np.ndarray]:
+        """Interpolate the boxes, and tell which of them are known, (K,) bool."""
+        table = self._annotations
+        before = [box.before for box in between]
+        after = [box.after for box in between]
+        fraction = np.array([box.fraction for box in between], dtype=np.float64)
         boxes = Annotations(
-            time=np.full(len(ends), time),
-            track=[table.track[row] for row in rows0],
-            category=[table.category[row] for row in rows0],
-            size=table.size[rows0] + np.clip(fraction, 0, 1)[:, None] * (table.size[rows1] - table.size[rows0]),
-            pose=interpolate_poses(table.pose[rows0], table.pose[rows1], fraction),
+            time=np.full(len(between), time),
+            track=[table.track[row] for row in before],
+            category=[table.category[row] for row in before],
+            size=table.size[before] + np.clip(fraction, 0, 1)[:, None] * (table.size[after] - table.size[before]),
+            pose=interpolate_poses(table.pose[before], table.pose[after], fraction),
         )
-        return boxes, np.array([end[3] for end in ends], dtype=bool)
+        return boxes, np.array([box.is_known for box in between], dtype=bool)
+
+
+class _Between(NamedTuple):
+    """A box at a time, from two rows of its track."""
+
+    before: int  # row
+    after: int  # row
+    fraction: float  # of the time from `before` to `after`; below 0 or above 1 = extrapolated
+    is_known: bool  # both samples around the time have the object
