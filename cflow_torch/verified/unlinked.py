@@ -33,6 +33,7 @@ _ERROR = 0.7  # metres from that place to a part that confirms the velocity, at 
 _ERROR_SHARE = 0.05  # ... and further for each metre that the object has moved
 _FASTEST = 60.0  # m/s, if the settings have no bound
 _SHORTEST = 0.3  # metres from part to part; slower objects are linked by their pixels
+_LACKING = float(1 << 20)  # finest pixels, for a sweep without a part; longer than any sum of errors
 _NARROWEST = 0.4  # metres; a thin line that moves along itself may be a part of a longer line
 
 
@@ -143,38 +144,58 @@ class _Tracks:
 
 
 def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tracks:
-    """Follow the velocity from each part of t to each near part of t+1 and of t-1 through all sweeps."""
+    """Follow the velocity from each part of t to each near part of t+1 and of t-1, and keep the best velocities."""
     cells = _Map(sweeps, parts)
     of_t, other = _pairs(sweeps, parts, cells, max_speed)  # [H] each
     window = parts.window.index_select(0, of_t)
     elapsed = sweeps.elapsed.index_select(0, window)  # [H, S]
     before_t = elapsed - elapsed[:, 1:2]
-    begin = take_columns(parts.centre, of_t)  # [2, H]
     interval = before_t.gather(1, parts.step.index_select(0, other)[:, None])[:, 0]
-    velocity = (begin - take_columns(parts.centre, other)) / interval  # [2, H]
+    velocity = (take_columns(parts.centre, of_t) - take_columns(parts.centre, other)) / interval  # [2, H]
+    part, error = _follow(parts, cells, of_t, velocity, before_t)  # [H, S] each
+    moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
+    is_given = (elapsed != 0) | (elapsed.cumsum(1) == 0)  # t+1 comes first, and its time is 0
+    is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
+    kept = flat_nonzero(_are_best(_ranks(error, is_found, is_given), part, len(parts)))
+    return _Tracks(*gather(kept, part, is_found, _median_velocity(parts, part, is_found, before_t)))
 
-    expected = begin[..., None] - velocity[..., None] * before_t  # [2, H, S]
-    step = torch.arange(sweeps.num_steps, device=of_t.device).expand_as(before_t)
-    part, is_part = cells.around(window[:, None].expand_as(before_t), step, expected, _NEAR)  # [H, S, 25]
+
+def _follow(parts: _Parts, cells: _Map, of_t: Tensor, velocity: Tensor, before_t: Tensor) -> tuple[Tensor, Tensor]:
+    """Find the nearest part of each sweep to where a velocity puts a part of t, and its distance, (H, S) each.
+
+    `of_t` is (H,), `velocity` (2, H), and `before_t`, sweep intervals from each sweep to t, (H, S). Of t, it is the part
+    itself, and the distance is 0. Without a part near, the distance is infinite.
+    """
+    expected = take_columns(parts.centre, of_t)[..., None] - velocity[..., None] * before_t  # [2, H, S]
+    step = torch.arange(before_t.shape[1], device=of_t.device).expand_as(before_t)
+    window = parts.window.index_select(0, of_t)[:, None].expand_as(before_t)
+    part, is_part = cells.around(window, step, expected, _NEAR)  # [H, S, 25]
     square = (_centres(parts, part) - expected[..., None]).square_().sum(0).masked_fill_(~is_part, math.inf)
     nearest, index = square.min(2)  # [H, S]
     part = part.gather(2, index[..., None])[..., 0]
     part[:, 1] = of_t
-    error = nearest.sqrt_()
-    error[:, 1] = 0.0
-    moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
-    is_given = (elapsed != 0) | (step == 0)
-    is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
+    nearest[:, 1] = 0.0
+    return part, nearest.sqrt_()
+
+
+def _ranks(error: Tensor, is_found: Tensor, is_given: Tensor) -> Tensor:
+    """Rank velocities by the sweeps that confirm them, then by their errors, (H,) float64: the lowest is the best.
+
+    The arguments are (H, S). The rank is infinite without a part at t+1, or with parts in less than half of the older
+    sweeps.
+    """
     is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_given[:, 2:].sum(1))
-    lacking = (is_given & ~is_found).sum(1) * float(1 << 20)  # longer than any sum of errors
-    rank = (error.masked_fill(~is_found, 0.0).sum(1) + lacking).masked_fill(~is_confirmed, math.inf)
-    kept = flat_nonzero(_is_best(rank, part, len(parts)))
-    part, is_found, begin, before_t = gather(kept, part, is_found, begin.t(), before_t)
-    velocities = (begin.t()[..., None] - _centres(parts, part)) / before_t  # [2, N, S], undefined at t
-    counts = is_found & (step[: len(kept)] != 1)
-    return _Tracks(
-        part, is_found, masked_median(velocities.permute(1, 2, 0).masked_fill(~counts[..., None], 0.0), counts)
-    )
+    num_lacking = (is_given & ~is_found).sum(1)
+    rank = error.masked_fill(~is_found, 0.0).sum(1) + num_lacking * _LACKING
+    return rank.masked_fill(~is_confirmed, math.inf)
+
+
+def _median_velocity(parts: _Parts, part: Tensor, is_found: Tensor, before_t: Tensor) -> Tensor:
+    """Return the median of the velocities between the part of t and the parts found in other sweeps, (H, 2) float64."""
+    centre = _centres(parts, part)  # [2, H, S]
+    velocity = ((centre[..., 1:2] - centre) / before_t).permute(1, 2, 0)  # undefined at t
+    is_counted = is_found & (before_t != 0)
+    return masked_median(velocity.masked_fill(~is_counted[..., None], 0.0), is_counted)
 
 
 def _centres(parts: _Parts, part: Tensor) -> Tensor:
@@ -199,7 +220,7 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
     return of_t.repeat(2).index_select(0, at), other.view(-1).index_select(0, pair)
 
 
-def _is_best(rank: Tensor, part: Tensor, num_parts: int) -> Tensor:
+def _are_best(rank: Tensor, part: Tensor, num_parts: int) -> Tensor:
     """Tell which tracks, (H,), have the lowest rank of their part of t and of their part of t+1. Ties: the first."""
     is_best = rank < math.inf
     for step in (1, 0):

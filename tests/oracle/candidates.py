@@ -33,6 +33,7 @@ def propose(sweeps: SlicedSweeps, nodes: Sequence[Node]) -> tuple[list[list[Vect
             own.insert(0, (median([y for y, _ in found]), median([x for _, x in found])))
         if node.parent >= 0:
             own.append(candidates[node.parent][0])
+        own.append(node.velocity)
         candidates.append(own)
         scores.append(next(score for _, score in peaks if score is not None))
     return candidates, scores

@@ -20,9 +20,10 @@ class Node(NamedTuple):
     """A component that may move."""
 
     members: np.ndarray  # its pixels, ascending
-    level: int  # 0 ... L - 1 in the tree, coarse to fine; L = changed pixels
+    level: int  # 0 ... L - 1 in the tree, coarse to fine; L = changed pixels, L + 1 = fast objects
     parent: int  # number of the next coarser node around it, -1 = there is none
     travels: bool  # it is longer than other objects, and both of its ends move
+    velocity: tuple[float, float] = (0.0, 0.0)  # (y, x) finest pixels per interval, of fast objects
 
 
 class Tree(NamedTuple):
@@ -107,19 +108,28 @@ def select_objects(sweeps: SlicedSweeps, tree: Tree, evidence: Sequence[int]) ->
     of each object; -1 = none.
 
     A pixel moves with the winner of its finest node in the tree; else with its node of changed pixels, if that has any
-    evidence; else it is static with its plain component, if that is linked.
+    evidence; but with its node of a fast object, if that has more evidence. Else it is static with its plain component,
+    if that is linked.
     """
     nodes, num_levels, plain = tree.nodes, len(tree.levels), tree.levels[-1]
-    name, moving = np.full((2, len(plain)), -1)
+    name, moving, changed = np.full((3, len(plain)), -1)
     for label in np.unique(plain):
         if is_linked(sweeps, np.flatnonzero(plain == label)):
             name[plain == label] = len(nodes) + label
     for i, (node, winner) in enumerate(zip(nodes, cut(nodes, evidence))):
         if node.level < num_levels:
             moving[node.members] = winner
-        if node.level == num_levels - 1 or (node.level == num_levels and evidence[i] > 0):
+        if node.level == num_levels - 1:
             name[node.members] = i
+        if node.level == num_levels and evidence[i] > 0:
+            changed[node.members] = i
+    moving = np.where(moving >= 0, moving, changed)
     name = np.where(moving >= 0, moving, name)
+    for i, node in enumerate(nodes):
+        if node.level == num_levels + 1:
+            rivals = [evidence[number] if number >= 0 else 0 for number in moving[node.members].tolist()]
+            gained = node.members[np.array(rivals) < evidence[i]]
+            moving[gained] = name[gained] = i
     names, first = np.unique(name[name >= 0], return_index=True)
     names = names[first.argsort()]
     position = {own: number for number, own in enumerate(names.tolist())}

@@ -23,8 +23,10 @@ from oracle.paired_test import count_wins, evidence_of
 from oracle.pixels import in_range
 from oracle.registration import register
 from oracle.sweeps import Cloud, PointMotion
+from oracle.unlinked import link_unlinked
 
-CHANGED_Z = 4.0  # standard deviations for nodes of changed pixels
+CHANGED_Z, FAST_Z = 4.0, 2.5  # standard deviations for nodes of changed pixels, and of fast objects
+LEAVES = 20  # slices that a fast object must win for each one that it loses
 
 
 def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, config: VerifiedConfig) -> PointMotion:
@@ -46,7 +48,9 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
         [cloud.seconds for cloud in every],
         config,
     )
-    tree = grow(sweeps, find_changed(sweeps, seen, [cloud.origin for cloud in every]), config)
+    change = find_changed(sweeps, seen, [cloud.origin for cloud in every])
+    tree = grow(sweeps, change, config)
+    tree.nodes.extend(link_unlinked(sweeps, change[0], tree))
     candidates, scores = propose(sweeps, tree.nodes)
     proven = [verify(sweeps, *given, len(tree.levels)) for given in zip(tree.nodes, candidates)]
     nodes = add_unchanged(sweeps, tree.nodes, [motion for motion, _ in proven], len(tree.levels))
@@ -76,13 +80,14 @@ def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_l
     """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations,
     that of the near counts. Nodes of changed pixels need more standard deviations. All must gain three slices for each
     sweep besides t and t+1, or one for eight pixels."""
-    z = CHANGED_Z if node.level == num_levels else sweeps.config.significance
+    z = {num_levels: CHANGED_Z, num_levels + 1: FAST_Z}.get(node.level, sweeps.config.significance)
     least = min(16 * 3 * (len(sweeps.elapsed) - 2), 16 * len(node.members) // 8)
     evidence = []
     for motion in candidates:
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))
         own = evidence_of(*exact, z) + evidence_of(*near, 2 * z)
-        counts = own > least and (node.travels or not slides_along_itself(sweeps, node.members, motion))
+        stays = node.level > num_levels and LEAVES * (exact[1] + near[1]) > exact[0] + near[0]
+        counts = own > least and not stays and (node.travels or not slides_along_itself(sweeps, node.members, motion))
         evidence.append(own if counts else 0)
     best = evidence.index(max(evidence))  # ties: the first
     return (candidates[best] if evidence[best] > 0 else (0.0, 0.0)), evidence[best]

@@ -99,7 +99,7 @@ def test_nodes_of_changed_pixels_need_4_standard_deviations(level, num_pixels, m
     sweeps, zero = from_images(images), torch.zeros(1, dtype=torch.int64)
     every = torch.arange(sweeps.num_pixels)
     one = Groups(torch.zeros_like(every), 1)
-    tree = Tree(every, one, Groups(zero + 1, 1), zero + level, zero, zero > 0, 2)
+    tree = Tree(every, one, Groups(zero + 1, 1), zero + level, zero, zero > 0, torch.zeros(1, 2), 2)
     motion, _ = fast.verify(sweeps, tree, torch.tensor([[[0.0, 5.0]]], dtype=torch.float64), 1.5)
     assert motion.tolist() == [[0.0, 5.0 * moves]]
 
@@ -205,7 +205,7 @@ def test_ends_equal_the_oracle():
         # Two levels: things by themselves, and all in one.
         every, none = torch.arange(len(roots)), torch.zeros(10, dtype=torch.int64)
         members = Groups(torch.cat((torch.full_like(roots, 9), roots)), 10)
-        tree = Tree(every.repeat(2), members, Groups(none + 10, 10), none, none, none > 0, 2)
+        tree = Tree(every.repeat(2), members, Groups(none + 10, 10), none, none, none > 0, torch.zeros(10, 2), 2)
         found = both_ends_move(sweeps, tree, torch.tensor([*is_long, False]))
         assert not found[9]
         for number, answer in enumerate(found[:9].tolist()):

@@ -1,0 +1,61 @@
+"""Objects that move farther than their size, by hand. The oracle covers random scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scenes import assert_same_bits
+
+from cflow_torch import Sweep, VerifiedFlow, Window
+
+REGION = (-60.0, -20.0, -3.0, 60.0, 20.0, 3.0)
+MODEL = VerifiedFlow.from_preset("default", point_cloud_range=REGION)
+NUM_SWEEPS = 6  # t+1, t, t-1, ...
+
+
+def window(shape: np.ndarray, step: float, seed: int = 0) -> Window:
+    """A shape that moves `step` metres along x per sweep, in front of a wall at rest; the wall comes first."""
+    rng = np.random.default_rng(seed)
+    wall = np.stack((rng.uniform(-50, 50, 3000), np.full(3000, 12.03), rng.uniform(-1, 1, 3000)), 1)
+    sweeps = []
+    for k in range(NUM_SWEEPS):
+        moved = shape - (k * step, 0.0, 0.0) + rng.normal(0, 0.01, shape.shape)
+        points = torch.from_numpy(np.concatenate((wall, moved)).astype(np.float32))
+        sweeps.append(Sweep(points, pose=np.eye(4)))
+    return Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))
+
+
+def front(seed: int, num_points: int) -> np.ndarray:
+    """The front of a far car: few points, 0.5 m deep and 1.7 m wide."""
+    low, high = (30.0, -0.8, -0.6), (30.5, 0.9, 0.4)
+    return np.random.default_rng(seed).uniform(low, high, (num_points, 3))
+
+
+@pytest.mark.parametrize("step", [-2.2, 2.2, 3.5])
+@pytest.mark.parametrize("num_points", [14, 30])
+def test_a_far_car_of_few_points_is_found(step, num_points):
+    (result,) = MODEL([window(front(1, num_points), step)])
+    flow = result.residual_flow[3000:]
+    assert torch.allclose(flow, torch.tensor([step, 0.0, 0.0]).expand_as(flow), atol=0.05)
+    assert len(result.cluster_id[3000:].unique()) == 1 and not result.residual_flow[:3000].any()
+
+
+def test_a_pair_has_too_little_evidence():
+    pair = window(front(1, 14), 2.2)
+    assert not MODEL([Window(pair.pc0, pair.pc1)])[0].residual_flow.any()
+
+
+def test_a_thin_line_that_moves_along_itself_stays():
+    """Beams hit a guard rail at places that move with the sensor."""
+    rail = np.stack((np.linspace(20, 20.8, 20), np.full(20, 5.93), np.linspace(-0.4, -0.3, 20)), 1)
+    assert not MODEL([window(rail, 2.5)])[0].residual_flow.any()
+    across = np.stack((np.full(20, 20.03), np.linspace(5, 5.8, 20), rail[:, 2]), 1)
+    assert MODEL([window(across, 2.5)])[0].residual_flow[3000:].any(1).all()
+
+
+def test_windows_of_a_batch_do_not_meet():
+    windows = [window(front(seed, 20), step, seed) for seed, step in ((2, 2.0), (3, -3.0), (4, 0.0))]
+    pair = Window(windows[0].pc0, windows[0].pc1)
+    for result, one in zip(MODEL([*windows, pair]), [*windows, pair]):
+        assert_same_bits(result, MODEL([one])[0])
