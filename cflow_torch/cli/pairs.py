@@ -13,7 +13,7 @@ from typing import Any, Callable, Iterator, Sequence, Tuple
 
 import torch
 
-from cflow_torch.cli.run import Failures, collect_failures
+from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
 from cflow_torch.fleet.processes import ChildProcess, WorkerDied
