@@ -30,9 +30,8 @@ def complete_data(data: dict[str, Any], choice: str, out: TextIO | None = None) 
     for path, name in formats.items():
         print(f"{path}: data={name}", file=out or sys.stdout)
     if len(set(formats.values())) > 1:
-        raise CFlowError(
-            f"the paths have several formats, {' and '.join(set(formats.values()))}: give one command each"
-        )
+        several = " and ".join(sorted(set(formats.values())))
+        raise CFlowError(f"the paths have several formats, {several}: give one command each")
     name = next(iter(formats.values()), "synthetic")
     settings = dict(read_settings(CONFIGS / "data" / f"{name}.yaml"))
     if "cache" in settings:
@@ -43,7 +42,7 @@ def complete_data(data: dict[str, Any], choice: str, out: TextIO | None = None) 
             settings[key] = value
         elif key not in settings and value not in (_MISSING, defaults.get(key, _MISSING)):
             raise CFlowError(f"data.{key}={value}: data={name} has no such setting; it has {', '.join(settings)}")
-    return {**settings, "name": name, "label": data["label"] or settings["label"]}
+    return {**settings, "name": name, "label": data["label"] or name}
 
 
 def paths_of(data: dict[str, Any]) -> list[Any]:

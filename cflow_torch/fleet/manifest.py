@@ -86,7 +86,8 @@ def claim_run(output: Path, identity: Mapping[str, Any], replaced: Iterable[str]
 
 def release_run(output: Path, run: str) -> None:
     """Remove the manifests of a run that has no frame, so that they keep no other run away."""
-    for folder in list(output.iterdir()) if output.is_dir() else []:
+    folders = [path for path in output.iterdir() if path.is_dir()] if output.is_dir() else []
+    for folder in folders:
         if (_read(folder / MANIFEST) or {}).get("run") == run and not complete_frames(folder):
             _clear(folder)
     with suppress(FileNotFoundError):
@@ -120,6 +121,8 @@ def _of_another_run(folder: Path, before: Mapping[str, Any], now: Mapping[str, A
     """Return the error for a log with results of another run; it lists the changes of settings if they are known."""
     other = _read(_run_file(folder.parent, str(before.get("run"))))
     changes = describe_changes(other, now, ["hash"]) if other is not None and now else ""
+    if other is not None and now and other["data"]["reader"] != now["data"]["reader"]:
+        changes = f"of data={other['data']['reader']}, not {now['data']['reader']}"
     return CFlowError(
         f"{folder} has results of another run{f' ({changes})' if changes else ''}: {remedy}, or give output=FOLDER"
     )
