@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from typing import Any, Callable
 
 import hydra
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -15,7 +17,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cflow_torch.cli.choices import near, own_names
-from cflow_torch.cli.commands import DATA_SETTINGS, ENGINES, PICTURES, WITH_SETTINGS, Command, Plot
+from cflow_torch.cli.commands import DATA_SETTINGS, ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
 from cflow_torch.cli.words import Call, check_exists, why_rejected
 from cflow_torch.config import CONFIGS, PRESETS, REMOVED_PRESETS, config_from, make_config, removed_preset
 from cflow_torch.errors import CFlowError
@@ -76,7 +78,7 @@ def _defaults(kind: type[Settings]) -> dict[str, Any]:
 _register()
 
 
-def run(name: str, call: Call, job: Callable[[Any], Any]) -> None:
+def run_with_hydra(name: str, call: Call, job: Callable[[Any], Any]) -> None:
     """Let Hydra compose the settings of a command and call `job` with them, or with those of each job of a sweep."""
     overrides = hydra_overrides(WITH_SETTINGS[name], call)
     # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
@@ -122,9 +124,19 @@ def _quoted(value: str) -> str:
     return '"' + value.replace('"', r"\"") + '"'
 
 
-def settings_of(name: str, cfg: Any) -> Command:
-    """Make the checked settings of a command from those that Hydra has composed."""
-    values: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+def find_own_modules() -> None:
+    """Let Python find the module of your own reader, which is next to its configuration."""
+    for source in HydraConfig.get().runtime.config_sources:
+        if source.schema == "file" and source.path not in sys.path:
+            sys.path.append(source.path)
+
+
+def settings_of(name: str, composed: Any) -> Command:
+    """Make the settings of a command from those that Hydra has composed. Values are checked before torch is imported.
+
+    data=auto is replaced by the format of the path, which is printed.
+    """
+    values: dict[str, Any] = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
     values.pop("versions", None)  # of the config.yaml of an earlier run
     command = WITH_SETTINGS[name]
     if command is Plot:
@@ -137,14 +149,18 @@ def settings_of(name: str, cfg: Any) -> Command:
         values["engine"] = _make(ENGINES[engine["name"]], engine, name)
     _check_data(values["data"])
     settings: Any = _make(command, values, name)
-    return settings  # type: ignore[no-any-return]
+    from cflow_torch.cli.logs import complete_data  # imports torch, which takes seconds
+
+    choice = str(HydraConfig.get().runtime.choices.get("data"))
+    out = sys.stderr if isinstance(settings, Check) and settings.json else sys.stdout
+    return replace(settings, data=complete_data(settings.data, choice, out))  # type: ignore[no-any-return]
 
 
 def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Settings:
     names = kind.__dataclass_fields__  # type: ignore[attr-defined]
     for name in values:
         if name not in names:
-            raise CFlowError(why_rejected(f"{kind.PREFIX}{name}", WITH_SETTINGS[command], command))
+            raise CFlowError(why_rejected(f"{kind.PREFIX}{name}", command))
     return kind(**values)
 
 
@@ -193,4 +209,4 @@ def _why_unknown(cause: OmegaConfBaseException, command: str) -> str:
         except CFlowError as error:
             if not str(error).startswith("unknown"):
                 return str(error)
-    return why_rejected(key, WITH_SETTINGS[command], command)
+    return why_rejected(key, command)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from typing import Any, NamedTuple, TextIO
 
 from cflow_torch.cli.choices import CONFIGS, read_settings
@@ -17,8 +16,8 @@ from cflow_torch.types import CFlowError
 _MISSING = "???"  # a setting of another format
 
 
-def complete_data(data: dict[str, Any], choice: str, out: TextIO | None = None) -> dict[str, Any]:
-    """Replace data=auto by the settings of the recognised format, and print it to `out` (stdout).
+def complete_data(data: dict[str, Any], choice: str, out: TextIO) -> dict[str, Any]:
+    """Replace data=auto by the settings of the recognised format, and print it to `out`.
 
     `choice` is the chosen data set, the label of your own reader.
     """
@@ -28,7 +27,7 @@ def complete_data(data: dict[str, Any], choice: str, out: TextIO | None = None) 
         return data
     formats = {path: recognise(path) for path in paths_of(data)}
     for path, name in formats.items():
-        print(f"{path}: data={name}", file=out or sys.stdout)
+        print(f"{path}: data={name}", file=out)
     if len(set(formats.values())) > 1:
         several = " and ".join(sorted(set(formats.values())))
         raise CFlowError(f"the paths have several formats, {several}: give one command each")

@@ -73,47 +73,44 @@ def _run(arguments: list[str]) -> None:
 
 
 def _run_with_settings(command: str, words: list[str]) -> None:
-    from cflow_torch.cli.words import check_names, split
+    from cflow_torch.cli.words import read_call
 
-    call = split(words)
-    check_names(call, WITH_SETTINGS[command], command)
+    call = read_call(words, command)
+    from cflow_torch.cli.compose import explain, run_with_hydra  # imports Hydra, which takes half a second
+    from cflow_torch.cli.failures import UnfinishedJob
+
     calls = [call]
     if command == "check":  # a page for each path, whatever its format is
         calls = [call._replace(paths=[path]) for path in call.paths] or calls
     statuses = [0]
     for one in calls:
         try:
-            _compose_and_run(command, one)
+            run_with_hydra(command, one, lambda composed: _run_job(command, composed))
         except SystemExit as end:
             statuses.append(int(end.code or 0))
+        except UnfinishedJob as error:
+            print(f"error: {error}", file=sys.stderr)
+            statuses.append(1)
+        except Exception as error:
+            _exit_if_refused(error)
+            _exit_wrong(explain(error, command))
     if max(statuses):
         raise SystemExit(max(statuses))
-
-
-def _compose_and_run(command: str, call: Any) -> None:
-    from cflow_torch.cli.compose import explain, run
-    from cflow_torch.cli.failures import UnfinishedJob
-
-    try:
-        run(command, call, lambda cfg: _run_job(command, cfg))
-    except UnfinishedJob as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
-    except Exception as error:
-        _exit_if_refused(error)
-        _exit_wrong(explain(error, command))
 
 
 def _run_job(command: str, composed: Any) -> Any:
     """Run a command with the settings that Hydra has composed, perhaps as a job of a sweep."""
     from omegaconf.errors import OmegaConfBaseException
 
-    from cflow_torch.cli.compose import explain, settings_of
+    from cflow_torch.cli.compose import explain, find_own_modules, settings_of
     from cflow_torch.cli.failures import UnfinishedJob
+    from cflow_torch.fleet.progress import show_warnings_as_lines
 
     try:
+        find_own_modules()
+        show_warnings_as_lines()
         settings = settings_of(command, composed)
-        return import_module(f"cflow_torch.cli.{command}").task(with_data(settings))
+        return import_module(f"cflow_torch.cli.{command}").task(settings)
     except UnfinishedJob:
         raise
     except (CFlowError, OmegaConfBaseException) as error:
@@ -123,25 +120,6 @@ def _run_job(command: str, composed: Any) -> Any:
         traceback.print_exc()
         message = "this is a bug of cflow: please report it with the lines above and the output of `cflow info`"
         raise UnfinishedJob(message) from None
-
-
-def with_data(settings: Any) -> Any:
-    """Complete the settings of the data set: its format, if a path was given, and the folder of your own reader."""
-    from dataclasses import replace
-
-    from hydra.core.hydra_config import HydraConfig
-
-    runtime = HydraConfig.get().runtime
-    for source in runtime.config_sources:
-        if source.schema == "file" and source.path not in sys.path:
-            sys.path.append(source.path)
-    from cflow_torch.cli.logs import complete_data  # imports torch, which takes seconds
-    from cflow_torch.fleet.progress import show_warnings_as_lines
-
-    show_warnings_as_lines()
-    out = sys.stderr if getattr(settings, "json", False) else sys.stdout
-    data = complete_data(settings.data, str(runtime.choices.get("data")), out)
-    return replace(settings, data=data)
 
 
 def _exit_wrong(message: object) -> None:

@@ -10,7 +10,7 @@ import os
 from typing import NamedTuple
 
 from cflow_torch.cli.choices import choices, near, setting_names
-from cflow_torch.cli.commands import Command
+from cflow_torch.cli.commands import WITH_SETTINGS
 from cflow_torch.config import REMOVED, REMOVED_PRESETS, removed_preset
 from cflow_torch.errors import CFlowError
 
@@ -31,6 +31,22 @@ class Call(NamedTuple):
     options: list[str]
 
 
+def read_call(words: list[str], command: str) -> Call:
+    """Read the words after a command. An option, a path or a name that does not exist is a `CFlowError`.
+
+    Names in your own configurations, with `--config-dir`, are not known here.
+    """
+    call = split(words)
+    given = {option.partition("=")[0] for option in call.options if option.startswith("-")}
+    for option in given - {*_FLAGS, *_WITH_VALUE}:
+        raise CFlowError(f"unknown option {option!r}: give settings as NAME=VALUE; `cflow {command} --help` lists them")
+    for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
+        check_exists(path)
+    if not given & set(_OWN_CONFIGS):
+        _check_names(call.settings, command)
+    return call
+
+
 def split(words: list[str]) -> Call:
     """Split the words of a call. Hydra accepts no option, such as `-m`, between two settings."""
     call = Call([], [], [])
@@ -49,27 +65,17 @@ def _is_path(word: str) -> bool:
     return word.startswith(("/", "./", "../", "~/")) or os.path.exists(word)
 
 
-def check_names(call: Call, command: type[Command], name: str) -> None:
-    """Reject paths, names of settings and choices that do not exist. Those of your own configurations are not known."""
-    for option in call.options:
-        if option.startswith("-") and option.partition("=")[0] not in (*_FLAGS, *_WITH_VALUE):
-            message = "give settings as NAME=VALUE; `cflow {} --help` lists them"
-            raise CFlowError(f"unknown option {option!r}: {message.format(name)}")
-    names = {option.partition("=")[0] for option in call.options}
-    for path in call.paths if not names & {"-c", "--cfg"} else ():  # these only print the settings
-        check_exists(path)
-    if names & set(_OWN_CONFIGS):
-        return
-    groups = command.groups()
-    known = setting_names(command)
-    for word in call.settings:
+def _check_names(settings: list[str], command: str) -> None:
+    groups = WITH_SETTINGS[command].groups()
+    known = setting_names(WITH_SETTINGS[command])
+    for word in settings:
         key, _, value = word.partition("=")
         if key in groups:
             if not set(value) & set(_NOT_PLAIN):
                 for choice in value.split(","):
                     _check_choice(key, choice.strip())
         elif not (_is_for_hydra(key) or key in known or any(one.startswith(f"{key}.") for one in known)):
-            raise CFlowError(_unknown(key, name, [*groups, *known]))
+            raise CFlowError(_unknown(key, command, [*groups, *known]))
 
 
 def _is_for_hydra(key: str) -> bool:
@@ -98,11 +104,11 @@ def _unknown(key: str, command: str, known: list[str]) -> str:
     return f"unknown setting {key!r}{near(key, known)}: `cflow {command} --cfg job` prints all settings"
 
 
-def why_rejected(key: str, command: type[Command], name: str) -> str:
+def why_rejected(key: str, command: str) -> str:
     """Return the message for a setting that the chosen groups do not have."""
-    known = setting_names(command)
+    known = setting_names(WITH_SETTINGS[command])
     if key not in known:
-        return _unknown(key, name, [*command.groups(), *known])
+        return _unknown(key, command, [*WITH_SETTINGS[command].groups(), *known])
     owners = known[key]
     if 0 < len(owners) <= 4:
         return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave the setting out"

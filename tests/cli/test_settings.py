@@ -16,7 +16,7 @@ from cflow_torch.cli.choices import CONFIGS, choices, read_settings
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
 from cflow_torch.cli.compose import hydra_overrides, settings_of
 from cflow_torch.cli.main import HELP
-from cflow_torch.cli.words import check_names, split
+from cflow_torch.cli.words import read_call, split
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, REMOVED, config_from
 from cflow_torch.data.catalog import DATA_SETS
@@ -52,7 +52,7 @@ def test_examples_use_existing_settings_and_choices(compose):
     for command, *words in (shlex.split(line.strip().partition("   ")[0])[1:] for line in lines):
         if command in WITH_SETTINGS:
             call = split([word for word in words if word != "..."])
-            check_names(call._replace(paths=[]), WITH_SETTINGS[command], command)
+            read_call([*call.settings, *call.options], command)
             overrides = hydra_overrides(WITH_SETTINGS[command], call)
             for override in OverridesParser.create().parse_overrides(overrides):
                 if override.is_sweep_override():  # its first value
