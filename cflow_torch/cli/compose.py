@@ -14,12 +14,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from cflow_torch.cli.choices import near, own_names
+from cflow_torch.cli.choices import own_names
 from cflow_torch.cli.commands import DATA_SETTINGS, ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
-from cflow_torch.cli.words import Call, check_exists, why_rejected
-from cflow_torch.config import CONFIGS, PRESETS, REMOVED_PRESETS, config_from, make_config, removed_preset
+from cflow_torch.cli.words import Call, check_exists
+from cflow_torch.config import CONFIGS, PRESETS, config_from, make_config
 from cflow_torch.errors import CFlowError
 from cflow_torch.setting import Settings, checked
 
@@ -160,7 +159,7 @@ def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Setting
     names = kind.__dataclass_fields__  # type: ignore[attr-defined]
     for name in values:
         if name not in names:
-            raise CFlowError(why_rejected(f"{kind.PREFIX}{name}", command))
+            raise CFlowError(f"unknown setting {kind.PREFIX}{name}: `cflow {command} --cfg job` prints all settings")
     return kind(**values)
 
 
@@ -176,37 +175,13 @@ def _check_data(data: dict[str, Any]) -> None:
             check_exists(path)
 
 
-def explain(error: Exception, name: str) -> str:
+def explain(error: Exception, command: str) -> str:
     """Return the message for a call that Hydra or a command rejects."""
     if isinstance(error, CFlowError):
         return str(error)
-    if isinstance(error, MissingConfigException) and error.options:
-        group, _, choice = str(error.missing_cfg_file).rpartition("/")
-        if group.startswith("hydra/"):
-            return f"there is no {group} {choice!r}: joblib, submitit and optuna need pip install {_PLUGINS}"
-        if group == "model" and choice in REMOVED_PRESETS:
-            return removed_preset(choice)
-        names = sorted(option for option in error.options if not option.startswith("base_"))
-        return f"{group}={choice}{near(choice, names)}: give one of {', '.join(names)}"
+    if isinstance(error, MissingConfigException) and str(error.missing_cfg_file).startswith("hydra/"):
+        return f"there is no {error.missing_cfg_file}: joblib, submitit and optuna need pip install {_PLUGINS}"
     if isinstance(error, OverrideParseException):
         return f"cannot read {error.override!r}: give NAME=VALUE, special characters in quotes: 'NAME=\"VALUE\"'"
-    cause = error.__cause__
-    if isinstance(cause, OmegaConfBaseException) and cause.full_key:
-        return _why_unknown(cause, name)
-    message = " ".join((f"{error}: {cause}" if cause else str(error)).split())
-    return f"{message}; `cflow {name} --help` has examples"
-
-
-def _why_unknown(cause: OmegaConfBaseException, command: str) -> str:
-    """Return the message for a setting that the composed configuration lacks; the method knows those of the others."""
-    key = str(cause.full_key)
-    group, _, own = key.rpartition(".")
-    parent: Any = cause.parent_node
-    method = parent.get("method") if group == "model" and parent is not None else None
-    if method in CONFIGS and own != "pixel_size":
-        try:
-            CONFIGS[method]().replace(**{own: None})
-        except CFlowError as error:
-            if not str(error).startswith("unknown"):
-                return str(error)
-    return why_rejected(key, command)
+    message = " ".join(str(error).split())
+    return f"{message}; `cflow {command} --help` has examples"

@@ -10,7 +10,7 @@ import os
 from typing import NamedTuple
 
 from cflow_torch.cli.choices import choices, near, setting_names
-from cflow_torch.cli.commands import WITH_SETTINGS
+from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
 from cflow_torch.config import REMOVED, REMOVED_PRESETS, removed_preset
 from cflow_torch.errors import CFlowError
 
@@ -34,7 +34,7 @@ class Call(NamedTuple):
 def read_call(words: list[str], command: str) -> Call:
     """Read the words after a command. An option, a path or a name that does not exist is a `CFlowError`.
 
-    Names in your own configurations, with `--config-dir`, are not known here.
+    With `--config-dir`, your own configurations may have other choices and settings of groups; Hydra knows them.
     """
     call = split(words)
     given = {option.partition("=")[0] for option in call.options if option.startswith("-")}
@@ -42,8 +42,7 @@ def read_call(words: list[str], command: str) -> Call:
         raise CFlowError(f"unknown option {option!r}: give settings as NAME=VALUE; `cflow {command} --help` lists them")
     for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
         check_exists(path)
-    if not given & set(_OWN_CONFIGS):
-        _check_names(call.settings, command)
+    _check_names(call.settings, command, bool(given & set(_OWN_CONFIGS)))
     return call
 
 
@@ -65,17 +64,44 @@ def _is_path(word: str) -> bool:
     return word.startswith(("/", "./", "../", "~/")) or os.path.exists(word)
 
 
-def _check_names(settings: list[str], command: str) -> None:
-    groups = WITH_SETTINGS[command].groups()
-    known = setting_names(WITH_SETTINGS[command])
+def _check_names(settings: list[str], command: str, has_own: bool) -> None:
+    kind = WITH_SETTINGS[command]
+    chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
+    known = setting_names(kind)
     for word in settings:
-        key, _, value = word.partition("=")
-        if key in groups:
-            if not set(value) & set(_NOT_PLAIN):
-                for choice in value.split(","):
-                    _check_choice(key, choice.strip())
-        elif not (_is_for_hydra(key) or key in known or any(one.startswith(f"{key}.") for one in known)):
-            raise CFlowError(_unknown(key, command, [*groups, *known]))
+        key = word.partition("=")[0]
+        if key in chosen or _is_for_hydra(key) or any(name.startswith(f"{key}.") for name in known):
+            continue
+        if has_own and key.partition(".")[0] in chosen:
+            continue
+        own = key.rpartition(".")[2]
+        if key not in known and own in _REMOVED:
+            raise CFlowError(f"setting {own} was removed: {_REMOVED[own]}")
+        if key not in known:
+            hint = near(key, [*chosen, *known])
+            raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
+        owners = known[key]
+        group = owners[0].partition("=")[0] if owners else ""
+        if chosen.get(group) and not {f"{group}={choice}" for choice in chosen[group]} & set(owners):
+            raise CFlowError(f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out")
+
+
+def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
+    """Return the checked choices of each group; none if they are not known, as those of an experiment."""
+    given = dict(word.split("=", 1) for word in settings if "=" in word)
+    chosen: dict[str, list[str]] = {}
+    for group, default in kind.groups().items():
+        chosen[group] = [default] if default else []
+    for group in chosen.keys() & given.keys():
+        is_plain = not set(given[group]) & set(_NOT_PLAIN)
+        chosen[group] = [choice.strip() for choice in given[group].split(",")] if is_plain else []
+        for choice in chosen[group]:
+            _check_choice(group, choice)
+    if "experiment" in given or "row" in given:
+        return {group: [] for group in chosen}
+    if "model" not in given and "picture" in given:
+        chosen["model"] = [PICTURES[name].PRESET or "default" for name in chosen["picture"]]
+    return chosen
 
 
 def _is_for_hydra(key: str) -> bool:
@@ -95,21 +121,3 @@ def _check_choice(group: str, choice: str) -> None:
     known = choices(group)
     if choice not in (*known, "null") and not choice.startswith("base_"):
         raise CFlowError(f"{group}={choice}{near(choice, known)}: give one of {', '.join(sorted(known))}")
-
-
-def _unknown(key: str, command: str, known: list[str]) -> str:
-    own = key.rpartition(".")[2]
-    if own in _REMOVED:
-        return f"setting {own} was removed: {_REMOVED[own]}"
-    return f"unknown setting {key!r}{near(key, known)}: `cflow {command} --cfg job` prints all settings"
-
-
-def why_rejected(key: str, command: str) -> str:
-    """Return the message for a setting that the chosen groups do not have."""
-    known = setting_names(WITH_SETTINGS[command])
-    if key not in known:
-        return _unknown(key, command, [*WITH_SETTINGS[command].groups(), *known])
-    owners = known[key]
-    if 0 < len(owners) <= 4:
-        return f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave the setting out"
-    return f"the chosen configuration has no setting {key!r}: give +{key}=VALUE to add it, or leave it out"

@@ -109,7 +109,9 @@ def test_your_own_reader_by_configuration_only(mine, cflow, capsys):
     for log, speed in (("mine", 0.5), ("back", -0.5)):
         assert np.allclose(read_flow(mine / "flow" / log / "0.feather").residual_flow[:, 0], speed)
     assert cflow("eval", *own, f"output={mine / 'eval'}", "data.step=2") == 2
-    assert "give +data.step=VALUE" in capsys.readouterr().err
+    assert "use +data.step=2" in capsys.readouterr().err
+    assert cflow("eval", *own, "modle=paper") == 2
+    assert "(did you mean model?)" in capsys.readouterr().err
     assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=0") == 2
     assert "data.step=0: give a whole number of at least 1" in capsys.readouterr().err
     assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=2") == 0

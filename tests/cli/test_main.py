@@ -42,7 +42,10 @@ CHEAP = (
     ("flow num_history=2", "(did you mean model.num_history?)"),
     ("eval model=papr", "model=papr (did you mean paper?): give one of default, keypoints, offline, paper"),
     ("eval model=fast", "preset 'fast' was removed in 0.4.0: use default with num_history=2"),
-    ("eval model.densify=nearest", "densify is a setting of method keypoints, not of verified"),
+    (
+        "eval model.densify=nearest",
+        "setting 'model.densify' belongs to model=keypoints: give that as well",
+    ),
     ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
     ("plot cluster=3", "setting 'cluster' belongs to picture=correlation or picture=scales: give that as well"),
     ("flow data=av2", "the data is missing: give data.root=PATH"),
