@@ -12,7 +12,7 @@ from cflow_torch.cli.logs import open_first_log
 from cflow_torch.cli.outputs import machine, output_folder, versions
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.files import write_json
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, window
 from cflow_torch.evaluation.tables import markdown
 from cflow_torch.stages import FlowModel, TimedModel

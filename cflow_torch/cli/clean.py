@@ -19,9 +19,10 @@ from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.files import describe_changes, json_ready, read_json, write_json
+from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
+from cflow_torch.fleet.changes import describe_changes
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture

@@ -19,11 +19,12 @@ from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import machine, output_folder, settings_record, versions, write_config
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.files import describe_changes, json_ready, read_json, write_json
+from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
+from cflow_torch.fleet.changes import describe_changes
 from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window

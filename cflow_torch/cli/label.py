@@ -13,9 +13,9 @@ from cflow_torch.cli.commands import Label
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow import FlowRun, compute
 from cflow_torch.cli.flows import make_model
-from cflow_torch.data.files import write_json
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.errors import import_optional
 from cflow_torch.fleet.machine import choose_layout

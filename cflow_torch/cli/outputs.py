@@ -18,8 +18,8 @@ from cflow_torch.cli.commands import Command
 from cflow_torch.cli.failures import is_sweep
 from cflow_torch.cli.info import processor
 from cflow_torch.data.atomic import ensure_writable, write_text
-from cflow_torch.data.files import describe_changes
 from cflow_torch.data.paths import as_path, is_remote
+from cflow_torch.fleet.changes import describe_changes
 from cflow_torch.types import CFlowError
 
 

@@ -23,10 +23,11 @@ import torch
 from cflow_torch import __version__
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import remove_stale, write_text
-from cflow_torch.data.files import describe_changes, json_ready, read_json
 from cflow_torch.data.flow_file import CONTENTS
+from cflow_torch.data.json_file import json_ready, read_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
+from cflow_torch.fleet.changes import describe_changes
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"

@@ -11,7 +11,7 @@ from typing import Any, Iterable, Iterator, Sequence
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
-from cflow_torch.data.files import write_json
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.dispatch import run_local
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Shard, Unit

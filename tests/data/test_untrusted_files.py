@@ -18,7 +18,8 @@ from tiny_recording import TinyRecording
 from cflow_torch.data.aevascenes import AevaScenesLog
 from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.files import read_json, read_npy
+from cflow_torch.data.json_file import read_json
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import is_timestamp, path_inside, safe_name
 from cflow_torch.simulator.writers.aevascenes import write_aevascenes_sequence
 from cflow_torch.simulator.writers.nuscenes import write_nuscenes
