@@ -54,9 +54,16 @@ def _names_of_choices() -> Iterator[tuple[str, str]]:
     for picture, kind in PICTURES.items():
         yield from ((f"picture={picture}", name) for name in own_names(kind))
     for file in files("data"):
-        lines = file.read_text(encoding="utf-8").splitlines()  # reading YAML takes longer than printing help
-        names = [line.partition(":")[0] for line in lines if line[:1].isalpha()]
-        yield from ((f"data={file.stem}", f"data.{name}") for name in names if name != "defaults")
+        yield from ((f"data={file.stem}", f"data.{name}") for name in names_in(file))
+
+
+def names_in(file: Path) -> Iterator[str]:
+    """Yield the keys of `read_settings`, by the text alone: reading YAML takes longer than printing help."""
+    for line in file.read_text(encoding="utf-8").splitlines():
+        if line.startswith("  - "):  # a file that this one extends
+            yield from names_in(file.with_name(f"{line[4:].strip()}.yaml"))
+        elif line[:1].isalpha() and not line.startswith("defaults:"):
+            yield line.partition(":")[0]
 
 
 def read_settings(file: Path) -> dict[str, Any]:

@@ -94,7 +94,8 @@ def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
         chosen[group] = [default] if default else []
     for group in chosen.keys() & given.keys():
         is_plain = not set(given[group]) & set(_NOT_PLAIN)
-        chosen[group] = [choice.strip() for choice in given[group].split(",")] if is_plain else []
+        words = [word.strip() for word in given[group].split(",")] if is_plain else []
+        chosen[group] = [word for word in words if not word.startswith("base_")]  # base_dense: no preset
         for choice in chosen[group]:
             _check_choice(group, choice)
     if "experiment" in given or "row" in given:
@@ -119,5 +120,5 @@ def _check_choice(group: str, choice: str) -> None:
     if group == "model" and choice in REMOVED_PRESETS:
         raise CFlowError(removed_preset(choice))
     known = choices(group)
-    if choice not in (*known, "null") and not choice.startswith("base_"):
+    if choice not in (*known, "null"):
         raise CFlowError(f"{group}={choice}{near(choice, known)}: give one of {', '.join(sorted(known))}")

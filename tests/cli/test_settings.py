@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch import make_config
-from cflow_torch.cli.choices import CONFIGS, choices, read_settings
+from cflow_torch.cli.choices import CONFIGS, choices, names_in, read_settings
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
 from cflow_torch.cli.compose import hydra_overrides, settings_of
 from cflow_torch.cli.main import HELP
@@ -62,6 +62,25 @@ def test_examples_use_existing_settings_and_choices(compose):
             calls.setdefault((command, *chosen), {}).update(dict.fromkeys(overrides))
     for (command, *_), merged in calls.items():
         compose(command, *merged)
+
+
+def test_names_of_data_settings_are_those_in_yaml():
+    for file in CONFIGS.glob("data/*.yaml"):
+        assert set(names_in(file)) == set(read_settings(file)), file
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "data=benchmark_sensors data.profile=waymo",
+        "model=base_keypoints model.densify=nearest",
+        "-m model=paper,default model.connectivity=4",
+        "experiment=keypoints model.densify=nearest",
+        "model=choice(paper,keypoints) model.connectivity=4",
+    ],
+)
+def test_settings_of_chosen_groups_are_known(words):
+    read_call(words.split(), "eval")
 
 
 def test_the_format_of_a_path_may_have_any_setting():
