@@ -64,10 +64,15 @@ def check_logs(
     """Raise a `CFlowError` if results of a run must not be added to the folders of logs in `output`.
 
     `resume` continues an earlier run of the same identity. `overwrite` replaces the results of other runs. It is
-    allowed only if you are `alone`, that is, if no other shard works on these logs.
+    allowed only if you are `alone`, that is, if no other shard works on these logs. A worker checks a log again when it
+    has opened it (`claim_log`).
     """
     forget_listings(output)
-    for name in names:
+    runs = output / RUNS
+    with remote_errors(runs):
+        known = {file.name for file in runs.iterdir()} if runs.is_dir() else set()
+    has_others = bool(known - {_run_file(output, str(identity["hash"])).name})
+    for name in names if has_others or not resume else ():  # an object store takes a while for each log
         before = _read(output / name / MANIFEST)
         if before is None or (overwrite and alone) or not complete_frames(output / name):
             continue
