@@ -52,9 +52,10 @@ def paths_of(data: dict[str, Any]) -> list[Any]:
     return list(root) if isinstance(root, (list, tuple)) else [root]
 
 
-def chosen_pairs(log: Log, first: int, step: int, count: int | None = None) -> range:
-    """Return the indices of at most `count` pairs of a log, every `step`-th from `first` on."""
-    return range(first, len(log.timestamps) - 1, step)[:count]
+def chosen_pairs(log: Log, first: int, step: int, count: int | None = None) -> list[int]:
+    """Return the indices of at most `count` pairs of a log, every `step`-th from `first` on, none over a gap."""
+    gaps = getattr(log, "gaps", ())
+    return [index for index in range(first, len(log.timestamps) - 1, step) if index not in gaps][:count]
 
 
 def check_pair(pair: int, log: Log) -> None:
