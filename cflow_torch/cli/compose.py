@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any, Callable
 
 import hydra
@@ -24,7 +24,6 @@ from cflow_torch.setting import Settings, checked
 
 _PARSER = OverridesParser.create()
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
-_AT_TOP = ("row", "experiment", "picture")  # groups whose settings are not below their name, and replace a command's
 _PATHS = ("data.root", "data.cache")  # settings of data sets whose values are text
 
 
@@ -35,7 +34,8 @@ def _register() -> None:
     """
     store = ConfigStore.instance().store
     for name, command in WITH_SETTINGS.items():
-        store(name, _command_node(command))
+        groups = [{group: choice} for group, choice in command.groups().items()]
+        store(name, {"defaults": ["hydra", "_self_", *groups], **_defaults(command)})
     for method, config in CONFIGS.items():
         store(f"base_{method}", config().as_dict(), "model")
     for preset in PRESETS:
@@ -44,13 +44,6 @@ def _register() -> None:
         store(name, _defaults(engine), "engine")
     for name, picture in PICTURES.items():
         store(name, _picture_node(name, picture), "picture", package="_global_")
-
-
-def _command_node(command: type[Command]) -> dict[str, Any]:
-    groups = [{group: choice} for group, choice in command.groups().items()]
-    below = [each for each in groups if not set(each) & set(_AT_TOP)]
-    above = [each for each in groups if set(each) & set(_AT_TOP)]
-    return {"defaults": ["hydra", *below, "_self_", *above], **_defaults(command)}
 
 
 def _picture_node(name: str, picture: type[Plot]) -> dict[str, Any]:
@@ -92,7 +85,7 @@ def run_with_hydra(name: str, call: Call, job: Callable[[Any], Any]) -> None:
 
 def hydra_overrides(command: type[Command], call: Call) -> list[str]:
     """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
-    texts = {name for name in own_names(command) if _is_text(command, name)} | set(_PATHS)
+    texts = {f.name for f in fields(command) if f.metadata.get("kind") is str} | set(_PATHS)
     overrides = []
     for word in call.settings:
         key, _, value = word.partition("=")
@@ -101,11 +94,6 @@ def hydra_overrides(command: type[Command], call: Call) -> list[str]:
     if paths:
         overrides.append(f"data.root={paths[0] if len(paths) == 1 else '[' + ','.join(paths) + ']'}")
     return overrides
-
-
-def _is_text(command: type[Command], name: str) -> bool:
-    field: Any = command.__dataclass_fields__.get(name)
-    return field is not None and field.metadata["kind"] is str
 
 
 def _as_text(value: str) -> str:

@@ -40,7 +40,7 @@ _Z = 1000.0  # metres, replaces infinite bounds of z, because the harness comput
 
 def task(arguments: list[str]) -> None:
     if not arguments:
-        sections = (f"## {title}\n\n" + "\n".join(lines) for _, title, lines in _sections())
+        sections = (f"## {title}\n\n" + "\n".join(lines) for title, lines, _ in _sections())
         print("\n\n".join([_PAGE, *sections]))
     elif len(arguments) == 2 and arguments[0] == "--opensceneflow":
         from cflow_torch.data.atomic import ensure_writable, write_text
@@ -73,11 +73,11 @@ def harness_models() -> dict[str, str]:
 
 
 class Section(NamedTuple):
-    """A section of the page. `names` are the words by which `cflow settings` finds it."""
+    """A section of the page. `cflow settings` finds it by its title or one of its `names`."""
 
-    names: list[str]
     title: str
     lines: list[str]
+    names: tuple[str, ...] = ()
 
 
 def _sections() -> Iterator[Section]:
@@ -86,18 +86,18 @@ def _sections() -> Iterator[Section]:
         presets = [preset for preset, (of_preset, _) in PRESETS.items() if of_preset == method]
         chosen = [f"model={preset}" for preset in presets]
         title = f"Method `{method}`: {', '.join(chosen)}"
-        yield Section([method, *presets, *chosen, "model"], title, _method_table(method, presets))
+        yield Section(title, _method_table(method, presets), (method, *presets, *chosen, "model"))
     for name, command in WITH_SETTINGS.items():
-        yield Section([name], f"cflow {name}", _block(f"cflow {name}: {command.SUMMARY}.", setting_lines(command)))
+        yield Section(f"cflow {name}", _block(f"cflow {name}: {command.SUMMARY}.", setting_lines(command)), (name,))
     for name, engine in ENGINES.items():
-        yield _choice("engine", name, _block(str(engine.__doc__), setting_lines(engine)))
+        yield Section(f"engine={name}", _block(str(engine.__doc__), setting_lines(engine)))
     for name, picture in PICTURES.items():
         about = str(picture.__doc__).partition("\n")[0]
-        yield _choice("picture", name, _block(about, setting_lines(picture, Plot)))
+        yield Section(f"picture={name}", _block(about, setting_lines(picture, Plot)))
     for group in _IN_FILES:
         for file in files(group):
             lines = file.read_text(encoding="utf-8").strip().splitlines()
-            yield _choice(group, file.stem, ["```yaml", *lines, "```"])
+            yield Section(f"{group}={file.stem}", ["```yaml", *lines, "```"])
 
 
 def _method_table(method: str, presets: list[str]) -> list[str]:
@@ -113,10 +113,6 @@ def _method_table(method: str, presets: list[str]) -> list[str]:
     return rows
 
 
-def _choice(group: str, name: str, lines: list[str]) -> Section:
-    return Section([f"{group}={name}"], f"{group}={name}", lines)
-
-
 def _block(about: str, lines: Iterator[str]) -> list[str]:
     return ["```yaml", f"# {about}", *lines, "```"]
 
@@ -127,7 +123,7 @@ def _about(name: str) -> list[str]:
     choices: list[str] = []
     titles_of: dict[str, list[str]] = {}  # line of a setting -> sections
     for section in _sections():
-        if name in section.names:
+        if name in (section.title, *section.names):
             whole.append("\n".join([f"## {section.title}", "", *section.lines]))
         elif section.title.startswith(f"{name}="):
             about = next(line[2:] for line in section.lines if re.match("# [^@]", line))
@@ -139,7 +135,7 @@ def _about(name: str) -> list[str]:
     found = [*whole, *(["\n".join(choices)] if choices else []), *single]
     if not found:
         known = [key for command in WITH_SETTINGS.values() for key in setting_names(command)]
-        known += [one for section in _sections() for one in section.names]
+        known += [one for section in _sections() for one in (section.title, *section.names)]
         raise CFlowError(f"settings {name}: nothing has this name{near(name, known)}; `cflow settings` lists all")
     return found
 
