@@ -31,8 +31,9 @@ class Settings:
 def setting(default: Any, help: str, *, kind: type | None = None, **limits: Any) -> Any:
     """Make a field of `Settings`: its default, its `help` (meaning and unit), and the `limits` of `bounds`.
 
-    If `kind` is None, the value has the type of the default.
+    If `kind` is None, the value has the type of the default. If the default is None, None is allowed.
     """
+    limits.setdefault("optional", default is None)
     return field(default=default, metadata={"help": help, **bounds(kind or type(default), **limits)})
 
 

@@ -43,8 +43,12 @@ def _number(help: str, low: int = 1, high: float = 100_000) -> Any:  # more is a
     return setting(AUTO, help, kind=int, low=low, high=high, word=AUTO)
 
 
+def _share(help: str) -> Any:
+    return setting(AUTO, help, kind=float, low=0, high=1e6, word=AUTO)
+
+
 def _path(help: str) -> Any:
-    return setting(None, help, kind=str, optional=True)
+    return setting(None, help, kind=str)
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class ShardSettings(Settings):
     PREFIX: ClassVar[str] = "shard."
 
     index: int | str = _number(
-        "index of this process, from 0; auto = from SLURM or torchrun, else the only process", 0, 2**53
+        "index of this process, from 0; auto = of SLURM or torchrun, else the only one", 0, 2**53
     )
     count: int | str = _number("number of processes that share the work; auto = as index", 1, 2**53)
 
@@ -64,15 +68,11 @@ class Local(Settings):
     PREFIX: ClassVar[str] = "engine."
 
     name: str = setting("local", "the engine; engine= chooses it", choices=("local",))
-    workers: int | str = _number(
-        "number of processes; auto = on a CPU one per core, with one thread each, on GPUs one per GPU"
-    )
+    workers: int | str = _number("processes; auto = one per core of a CPU, with one thread each, or one per GPU")
     batch: int | str = _number("number of windows that are computed together")
     timeout: float = _above_0(600, "seconds after which a silent worker is replaced (with several workers)")
     memory: float | None = _above_0(
-        None,
-        "limit of the address space of each worker on a CPU, in bytes, for example 8e9; null = no limit",
-        optional=True,
+        None, "limit of the address space of each worker on a CPU, in bytes, for example 8e9; null = no limit"
     )
 
 
@@ -83,28 +83,12 @@ class Ray(Settings):
     PREFIX: ClassVar[str] = "engine."
 
     name: str = setting("ray", "the engine; engine= chooses it", choices=("ray",))
-    address: str | None = _path(
-        "null = start a cluster in this process, and end it; auto or HOST:PORT = join an existing one"
-    )
-    workers: int | str = _number(
-        "number of actors; auto = the cores or GPUs of this machine; with an address, give a number"
-    )
+    address: str | None = _path("null = start a cluster in this process, and end it; auto or HOST:PORT = join one")
+    workers: int | str = _number("actors; auto = the cores or GPUs of this machine; with an address, give a number")
     batch: int | str = _number("number of windows that are computed together")
-    num_cpus: float | str = setting(
-        AUTO,
-        "CPUs that each worker takes from the cluster; auto = 1 without a GPU, 0 with one",
-        kind=float,
-        low=0,
-        high=1e6,
-        word=AUTO,
-    )
-    num_gpus: float | str = setting(
-        AUTO,
-        "GPUs that each worker takes, 0.5 = two workers share one; auto = 1 if device is cuda",
-        kind=float,
-        low=0,
-        high=1e6,
-        word=AUTO,
+    num_cpus: float | str = _share("CPUs that each worker takes from the cluster; auto = 1 without a GPU, 0 with one")
+    num_gpus: float | str = _share(
+        "GPUs that each worker takes, 0.5 = two workers share one; auto = 1 if device is cuda"
     )
     retries: int = setting(
         1, "how often a unit, and then each of its frames by itself, is repeated after a worker died on it", low=0
@@ -333,9 +317,7 @@ class Submit(Command):
     device: str = _device()
     version: int = setting(3, "of the leaderboard: 1 (Argoverse 2, 2023) | 3 (multi-dataset challenge, 2026)")
     archive: str | None = _path("zip or folder that is only checked against the data")
-    frames: str | None = _path(
-        "text file of the frames, one <log>/<time stamp> per line; null = see docs/evaluation.md"
-    )
+    frames: str | None = _path("text file of frames, one <log>/<time stamp> per line; null = see docs/evaluation.md")
     masks: str | None = _path(
         "zip of the official masks, for version 1; null = eval_mask of the scenes, else the official rule"
     )
@@ -371,14 +353,10 @@ class Plot(Command):
     device: str = _device()
     log: str | None = _path("id of the log; null = the first one")
     deskew: bool = setting(
-        False, "true = draw moving objects where they were at the time of the sweep; needs point times"
+        False, "true = draw moving objects where they were at the time of the sweep (by point times)"
     )
     pair: int | None = setting(
-        None,
-        "index of the pair in the log, from 0; null = 3, or the last pair of a shorter log",
-        kind=int,
-        low=0,
-        optional=True,
+        None, "index of the pair in the log, from 0; null = 3, or the last pair of a shorter log", kind=int, low=0
     )
     picture: str = group("flow")
 
@@ -390,9 +368,7 @@ class FlowPicture(Plot):
     truth: bool | str = setting(
         AUTO, "true | false | auto = if the log has labels", kind=object, choices=(True, False, AUTO)
     )
-    max_flow: float | None = _above_0(
-        None, "m per sweep at the rim of the colour wheel; null = the longest flow", optional=True
-    )
+    max_flow: float | None = _above_0(None, "m per sweep at the rim of the colour wheel; null = the longest flow")
 
 
 @dataclass(frozen=True)
@@ -422,7 +398,6 @@ class CorrelationPicture(Plot):
         None,
         "cluster_id as in flow files; null = the one whose number of points times length of flow is largest",
         kind=int,
-        optional=True,
     )
 
 
@@ -439,12 +414,12 @@ class Animation(Plot):
 
     first: int = setting(0, "index of the first pair", low=0)
     step: int = _count(1, "draw every n-th pair")
-    count: int | None = _count(None, "number of pairs; null = to the end of the log", optional=True)
+    count: int | None = _count(None, "number of pairs; null = to the end of the log")
     format: str = setting("gif", "gif | mp4 (extra video)", choices=("gif", "mp4"))
     frames_per_second: float = _above_0(5.0, "pictures per second")
     width: int = _count(800, "pixels")
     max_flow: float | None = _above_0(
-        None, "m per sweep at the rim of the colour wheel; null = the longest flow of all frames", optional=True
+        None, "m per sweep at the rim of the colour wheel; null = the longest flow of all frames"
     )
     legend: str = setting("upper right", "corner of the colour wheel: upper right | lower right | upper left")
 
@@ -482,18 +457,14 @@ class View(Command):
 
     output: str = setting("outputs/view", "local folder; each log gets <log id>.html or .rrd")
     format: str = setting(
-        "html",
-        "html = a page for any browser | rerun = a recording for the viewer rerun",
-        choices=("html", "rerun"),
+        "html", "html = a page for any browser | rerun = a recording for the viewer rerun", choices=("html", "rerun")
     )
     device: str = _device()
     flow: str | None = _path("output folder of `cflow flow` whose flow is shown; null = estimate the flow")
-    count: int | None = _count(
-        None, "number of pairs of each log, from data.first, every data.step; null = all", optional=True
-    )
+    count: int | None = _count(None, "number of pairs of each log, from data.first, every data.step; null = all")
     max_flow: float = _above_0(1.5, "motion with the full colour, in metres per sweep; the same for all logs")
     voxel: float = _above_0(
-        0.1, "a page keeps one static point per cube of this side, metres; twice as large for ground"
+        0.1, "a page keeps one static point per cube of this side, metres; for ground twice the side"
     )
     show: bool = setting(False, "true = open the files at the end")
 
@@ -519,7 +490,7 @@ class Stream(Command):
         1.0, "factor on the speed of the recording; null = as fast as possible", optional=True
     )
     max_gap: float = setting(0.5, "seconds; sweeps with a longer gap between them are not compared")
-    count: int | None = _count(None, "number of sweeps; null = all", optional=True)
+    count: int | None = _count(None, "number of sweeps; null = all")
 
 
 @dataclass(frozen=True)
@@ -547,9 +518,7 @@ class Clean(Command):
     resume: bool = setting(True, "skip logs that were written with the same settings; false = reject them")
     overwrite: bool = setting(False, "true = write these logs again and replace their older results")
     flow: str | None = _path("output folder of `cflow flow` whose flow is used; null = estimate the flow")
-    remove_stopped: bool = setting(
-        False, "also remove objects that move at another time of the log, such as a waiting car"
-    )
+    remove_stopped: bool = setting(False, "also remove objects that move at another time, such as a waiting car")
     suffix: str | None = _path(
         "format of the clouds: .npy | .ply | .pcd | .bin | ...; null = that of the log's own clouds, else .npy"
     )
