@@ -71,7 +71,7 @@ def check_logs(
     runs = output / RUNS
     with remote_errors(runs):
         known = {file.name for file in runs.iterdir()} if runs.is_dir() else set()
-    has_others = bool(known - {_run_file(output, str(identity["hash"])).name})
+    has_others = bool(known - {run_file(output, str(identity["hash"])).name})
     for name in names if has_others or not resume else ():  # an object store takes a while for each log
         before = _read(output / name / MANIFEST)
         if before is None or (overwrite and alone) or not complete_frames(output / name):
@@ -87,7 +87,7 @@ def claim_run(output: Path, identity: Mapping[str, Any], replaced: Iterable[str]
     for name in replaced:
         _clear(output / name)
     remove_stale(output)
-    write_text(_run_file(output, str(identity["hash"])), _text(identity))
+    write_text(run_file(output, str(identity["hash"])), _text(identity))
 
 
 def release_run(output: Path, run: str) -> None:
@@ -97,7 +97,7 @@ def release_run(output: Path, run: str) -> None:
         if (_read(folder / MANIFEST) or {}).get("run") == run and not complete_frames(folder):
             _clear(folder)
     with suppress(FileNotFoundError):
-        _run_file(output, run).unlink()
+        run_file(output, run).unlink()
     with suppress(OSError):  # another run is there
         (output / RUNS).rmdir()
 
@@ -113,7 +113,7 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
         write_text(folder / MANIFEST, _text(now))
     before = _read(folder / MANIFEST) or {}  # another process may have been quicker
     if before.get("run") != run:
-        raise _of_another_run(folder, before, _read(_run_file(folder.parent, run)) or {}, _OVERWRITE)
+        raise _of_another_run(folder, before, _read(run_file(folder.parent, run)) or {}, _OVERWRITE)
     is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
     both = now["sweeps"].keys() & (before.get("sweeps") or {}).keys()
     if not is_same or any(before["sweeps"][key] != now["sweeps"][key] for key in both):
@@ -125,7 +125,7 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
 
 def _of_another_run(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], remedy: str) -> CFlowError:
     """Return the error for a log with results of another run; it lists the changes of settings if they are known."""
-    other = _read(_run_file(folder.parent, str(before.get("run"))))
+    other = _read(run_file(folder.parent, str(before.get("run"))))
     changes = describe_changes(other, now, ["hash"]) if other is not None and now else ""
     if other is not None and now and other["data"]["reader"] != now["data"]["reader"]:
         changes = f"of data={other['data']['reader']}, not {now['data']['reader']}"
@@ -134,7 +134,8 @@ def _of_another_run(folder: Path, before: Mapping[str, Any], now: Mapping[str, A
     )
 
 
-def _run_file(output: Path, run: str) -> Path:
+def run_file(output: Path, run: str) -> Path:
+    """Return the file with the identity of a run, whose hash is `run`; every process of the run sees it."""
     return output / RUNS / f"{run[:16]}.json"
 
 

@@ -16,7 +16,7 @@ from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.fleet.dispatch import dispatch
 from cflow_torch.fleet.job import Event, Job, Unit
 from cflow_torch.fleet.machine import AUTO, Layout
-from cflow_torch.fleet.manifest import MANIFEST, make_identity
+from cflow_torch.fleet.manifest import make_identity, run_file
 from cflow_torch.fleet.processes import ChildProcess, WorkerDied
 from cflow_torch.fleet.work import describe, make_worker
 
@@ -86,7 +86,7 @@ class _Actor:
         node = ray.util.get_node_ip_address()
         if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
             raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than the driver")
-        if not (as_path(job.output) / MANIFEST).exists():
+        if not run_file(as_path(job.output), job.identity).exists():
             raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
         with suppress(OSError):  # relative paths of data must mean the same as in the driver
             os.chdir(folder)
