@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Optional, Tuple, TypeVar
 
 from cflow_torch.errors import CFlowError
-from cflow_torch.setting import LIMIT, checked, setting
+from cflow_torch.setting import LIMIT, Settings, setting
 
 Kind = TypeVar("Kind", bound="Config")
 
@@ -17,7 +17,7 @@ def _method(name: str) -> Any:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Settings):
     """Settings that all methods have. Each method adds its own ones (`CONFIGS`). `make_config` makes all from a preset.
 
     An invalid value raises `CFlowError`. `cflow settings` lists the meaning and the bounds of every field.
@@ -59,8 +59,7 @@ class Config:
     )
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            object.__setattr__(self, f.name, checked(f.name, getattr(self, f.name), f.metadata))
+        super().__post_init__()
         _check_space(self.pixel_sizes, self.point_cloud_range, self.ego_box)
 
     @property

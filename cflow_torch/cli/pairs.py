@@ -14,7 +14,7 @@ from typing import Any, Callable, Iterator, Sequence, Tuple
 
 import torch
 
-from cflow_torch.cli.run import Failures, collect_failures
+from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.fleet.executors import ProcessExecutor, describe

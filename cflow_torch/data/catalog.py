@@ -12,7 +12,8 @@ from typing import Any, Mapping, NamedTuple, Sequence
 
 from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
 from cflow_torch.data.deskewing import DeskewedLog
-from cflow_torch.data.files import find_folders, shortened
+from cflow_torch.data.file_errors import shortened
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name

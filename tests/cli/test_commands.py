@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from small_logs import write_small_log
 
 from cflow_torch import make_config
-from cflow_torch.cli import pairs, run
+from cflow_torch.cli import failures, pairs
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.eval import objective
 from cflow_torch.config import config_from
@@ -146,13 +146,13 @@ def test_warnings_are_one_line_without_a_source_path(tmp_path, cflow, capsys):
 
 
 def test_a_failure_ends_a_run_but_not_a_sweep(monkeypatch):
-    monkeypatch.setattr(run, "is_sweep", lambda: False)
+    monkeypatch.setattr(failures, "is_sweep", lambda: False)
     with pytest.raises(SystemExit, match="1"):
-        run.finish([("a", "bad")])
-    monkeypatch.setattr(run, "is_sweep", lambda: True)
-    run.finish([])
-    with pytest.raises(run.UnfinishedJob, match="1"):
-        run.finish([("a", "bad")])
+        failures.finish([("a", "bad")])
+    monkeypatch.setattr(failures, "is_sweep", lambda: True)
+    failures.finish([])
+    with pytest.raises(failures.UnfinishedJob, match="1"):
+        failures.finish([("a", "bad")])
 
 
 def test_the_first_line_has_the_scores_and_names_classes_with_few_points():

@@ -16,7 +16,7 @@ from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bi
 from cflow_torch.data.arrays.pcd import pcd_fields, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.files import file_errors, shortened
+from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError, check_array
 

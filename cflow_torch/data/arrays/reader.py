@@ -13,8 +13,10 @@ from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_columns, read_table
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
 from cflow_torch.data.arrays.poses_text import Trajectory
-from cflow_torch.data.files import file_errors, find_folders, read_npy
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes, read_start
 from cflow_torch.data.point_times import TIME_FIELDS, PointTimes, seconds_after
 from cflow_torch.data.returns import missing_returns

@@ -7,7 +7,7 @@ from typing import Any, Tuple
 import numpy as np
 
 from cflow_torch.data.arrays.bin_layout import are_plausible
-from cflow_torch.data.files import shortened
+from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions
 from cflow_torch.types import CFlowError

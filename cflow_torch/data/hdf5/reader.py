@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.arrays.reader import times_of_names
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access

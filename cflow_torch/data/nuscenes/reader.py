@@ -8,7 +8,7 @@ from typing import ClassVar, Literal, Mapping, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, points_in_box
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes, remote_errors
