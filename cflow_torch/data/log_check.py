@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Any, Callable, Iterable, NamedTuple
 
 import numpy as np
@@ -63,18 +62,21 @@ def examine(log: Log) -> list[Finding]:
         *(_sensor, _frame, _reading, _times, _poses, _lapses, _motion_of_all, _deskew),
         *(_repeated, _ground, _mask, _own_vehicle, _labels),
     )
-    findings = _collect(cached, checks)
+    findings = _collect(cached, checks, tells_errors=True)
     notes = getattr(log, "notes", ())  # complete only now, as readers note what they see in the sweeps
     return [*findings, *(Finding("reader", FOUND, note) for note in notes)]
 
 
-def _collect(log: Log, checks: Iterable[Callable[[Log], Finding | None]]) -> list[Finding]:
+def _collect(log: Log, checks: Iterable[Callable[[Log], Finding | None]], tells_errors: bool = False) -> list[Finding]:
+    """Return what the checks find. A check that cannot read a sweep finds its error, if it `tells_errors`."""
     found: list[Finding] = []
     for check in checks:
-        with suppress(CFlowError, OSError):
+        try:
             finding = check(log)
-            if finding is not None:
-                found.append(finding)
+        except (CFlowError, OSError) as error:
+            finding = Finding("log", WRONG, str(error)) if tells_errors else None
+        if finding is not None and finding not in found:
+            found.append(finding)
     return found
 
 
@@ -120,7 +122,7 @@ def _motion_of(log: Log, count: int) -> Finding | None:
     elif name == MOUNT:
         why, fix = "in turns,", f"pass data.ego_T_lidar with about x = {judgement.offset:g} m (data=arrays or hdf5)"
     elif name == NO_READING:
-        why, fix = "", "check that the poses belong to this log, their times and units"
+        why, fix = "", "check that the poses belong to this log, their times, units and quaternions"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(f"data.read_as={each}" for each in judgement.best)
@@ -180,13 +182,7 @@ def _deskew(log: Any) -> Finding | None:
     if sweep.point_times is not None:
         spread = np.ptp(as_numpy(sweep.point_times)) if len(sweep.point_times) else 0.0
         return Finding("de-skewing", RIGHT, f"points have times over {spread:.3f} s", True)
-    if not getattr(log, "deskew", False) or sweep.pose is None:
-        return None
-    text = (
-        "it has no times of points, so its sweeps are not de-skewed, and static objects are smeared while the vehicle "
-        "moves. If the clouds are already compensated, set data.deskew=off"
-    )
-    return Finding("de-skewing", WRONG, text, True)
+    return Finding("de-skewing", RIGHT, "no times of points, and no other reading fits clearly better than as stored")
 
 
 def _repeated(log: Log) -> Finding | None:
@@ -234,9 +230,9 @@ def _beams(points: np.ndarray) -> tuple[int, float]:
 def _times(log: Log) -> Finding:
     if log.sweep(0).timestamp_ns is None:
         return Finding("times", RIGHT, "the sweeps have no times, so motion is known per sweep, not per second")
-    stamps = np.array([int(stamp) for stamp in log.timestamps], np.float64)
+    stamps = np.array([int(stamp) for stamp in log.timestamps])
     nanoseconds = log.sweep(0).timestamp_ns or stamps[0]
-    unit = 1e-9 * (nanoseconds / stamps[0] if stamps[0] else 1.0)
+    unit = 1e-9 * (float(nanoseconds) / float(stamps[0]) if stamps[0] else 1.0)
     interval = np.diff(stamps) * unit
     usual = float(np.median(interval))
     if usual <= 0 or (interval <= 0).any():

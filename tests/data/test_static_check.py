@@ -310,6 +310,8 @@ def test_the_page_says_what_was_found(drive, tmp_path):
     assert {one.status for one in findings.values()} == {RIGHT}
     assert "32 beams" in findings["sensor"].text
     assert "10.0 Hz" in findings["times"].text and "none" in findings["labels"].text
+    (error,) = [one for one in examine(Wrong(drive, is_broken=True)) if one.status == WRONG]
+    assert error.text == "broken", "once, although several checks need the sweep"
     late = Wrong(drive)
     late.timestamps = [*drive.timestamps[:6], *(stamp + 700_000_000 for stamp in drive.timestamps[6:])]
     times = next(one for one in examine(late) if one.topic == "times")
