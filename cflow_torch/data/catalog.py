@@ -15,13 +15,14 @@ from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.files import find_folders, shortened
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
+from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
 
-_OF_ALL = ("find_ground", "odometry", "read_as", "deskew", "check")  # settings of every data set
+_OF_ALL = ("find_ground", "odometry", "read_as", "own_vehicle", "deskew", "check")  # settings of every data set
 AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
@@ -190,6 +191,7 @@ def open_log(
     check: bool = True,
     deskew: Any = "auto",
     read_as: str | None = "auto",
+    own_vehicle: str | None = "auto",
     **settings: Any,
 ) -> Log:
     """Open one log.
@@ -202,6 +204,7 @@ def open_log(
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
         read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`.
+        own_vehicle: "auto" = leave out returns that ride along with the vehicle, see `OwnVehicleLog`; None = keep them.
         deskew: how to move points to the instant of their sweep, see `cflow_torch.data.deskewing.DeskewedLog`; False
             (what `off` means in YAML) = "off", True = "auto".
         **settings: keyword arguments of the reader.
@@ -216,6 +219,8 @@ def open_log(
         deskew = "auto" if deskew else "off"
     if deskew not in DESKEW_CHOICES:
         raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
+    if own_vehicle not in ("auto", None):
+        raise CFlowError(f"own_vehicle={own_vehicle!r}: give auto, or null to keep returns of the own vehicle")
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
     if isinstance(source, UserSource):
@@ -230,6 +235,8 @@ def open_log(
 
         log = with_poses(log)
     log = read_log_as(log, read_as)
+    if own_vehicle is not None:
+        log = OwnVehicleLog(log)
     if deskew != "off":
         log = DeskewedLog(log, deskew)
     if find_ground is not None:

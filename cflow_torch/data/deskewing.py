@@ -89,7 +89,8 @@ class DeskewedLog(LogWrapper):
             return sweep
         seconds = self.seconds(sweep, reading, slice(None))
         points = self.move(as_numpy(sweep.points), seconds, index, reading)
-        return replace(sweep, points=points, point_times=seconds.astype(np.float32))
+        times = np.nan_to_num(seconds).astype(np.float32)  # points that are not finite have no azimuth
+        return replace(sweep, points=points, point_times=times)
 
     def seconds(self, sweep: Sweep, reading: str, rows: Any) -> np.ndarray:
         """Return the time from the instant of a sweep to some of its measurements, (N,) float64 seconds."""

@@ -317,15 +317,6 @@ def test_the_page_says_what_was_found(drive, tmp_path):
     times = next(one for one in examine(late) if one.topic == "times")
     assert times.status == WRONG and "0.8 s after sweep 5" in times.text
 
-    long = drive_of(num_sweeps=24)
-    hood = np.random.default_rng(0).uniform([1.5, -0.8, 0.5], [2.4, 0.8, 0.9], (120, 3))
-    ride = Wrong(
-        long, points=lambda points, _: np.concatenate([points, hood]), masks=lambda m: np.append(m, [False] * 120)
-    )
-    own = next(one for one in examine(ride) if one.topic == "own vehicle")
-    assert own.status == WRONG and "model.ego_box=[1.5,-1.0,2.5,1.0]" in own.text
-    assert next(one for one in examine(long) if one.topic == "own vehicle").status == RIGHT
-
 
 def test_the_page_lists_notes_of_the_reader_and_knows_its_gaps(drive):
     log = Wrong(drive)
