@@ -197,7 +197,9 @@ def _judge(pairs: Sequence[Pair]) -> Judgement:
     if any(len(shares) == 1 for shares in of_pairs):  # as given is certain there, so what all pairs show is refuted
         clear = [name for name in clear if name in (LATE, EARLY) or name.startswith(MOUNT)]
     if not clear:
-        return Judgement(mean, (NO_READING,) if mean[GIVEN] < _HOPELESS else ())
+        # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
+        is_hopeless = mean[GIVEN] < _HOPELESS and (len(pairs) > 1 or bool(_search(pairs[0]).best))
+        return Judgement(mean, (NO_READING,) if is_hopeless else ())
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return Judgement(mean, (WORLD,))
     best = max(clear, key=mean.__getitem__)

@@ -17,10 +17,10 @@ from cflow_torch.data.files import file_errors, find_folders, read_npy
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes, read_start
 from cflow_torch.data.point_times import TIME_FIELDS, PointTimes, seconds_after
-from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
+from cflow_torch.windows.returns import missing_returns
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
 POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")

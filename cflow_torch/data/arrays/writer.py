@@ -25,8 +25,8 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint:
         log: any log.
         root: parent folder, created if it does not exist.
         suffix: suffix of the clouds, one of `cloud_file.SUFFIXES`.
-        viewpoint: "sensor" or "world" = write poses in VIEWPOINT of `.pcd` files, not in `poses.txt`, and points in this
-            frame, as tools for dynamic maps expect; None = `poses.txt`.
+        viewpoint: "sensor" or "world" = write poses in VIEWPOINT of `.pcd` files, not in `poses.txt`, and points in
+            this frame, as tools for dynamic maps expect; None = `poses.txt`.
 
     Returns:
         The folder.
@@ -69,12 +69,12 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint:
     return Path(root) / log.log_id
 
 
-def _viewpoint(pose: Any, what: str) -> np.ndarray:
+def _viewpoint(pose: Any, what: str) -> list[float]:
     """Return x, y, z and quaternion w, x, y, z of a pose."""
     if pose is None:
         raise CFlowError(f"{what} has no pose for VIEWPOINT; pass viewpoint=None")
     matrix = np.asarray(pose, np.float64)
-    return np.concatenate([matrix[:3, 3], to_quaternions(matrix[None, :3, :3])[0]])
+    return [*matrix[:3, 3].tolist(), *to_quaternions(matrix[None, :3, :3])[0].tolist()]
 
 
 def _rounded(points: np.ndarray) -> np.ndarray:
