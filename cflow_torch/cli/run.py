@@ -108,13 +108,20 @@ def complete_data(data: DictConfig, out: TextIO | None = None) -> DictConfig:
     return OmegaConf.merge(settings, given)  # type: ignore[return-value]
 
 
-def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], range]:
+def chosen_pairs(cfg: DictConfig, group: str = "") -> Callable[[Log], list[int]]:
     """Return a function from a log to the indices of its pairs, by the settings `first`, `step` and `count`.
+
+    Pairs over a gap of the log are left out.
 
     `group`, "" or "data.", is the prefix of `first` and `step`. `count` has no prefix and may be missing.
     """
     first, step = (OmegaConf.select(cfg, f"{group}{name}") for name in ("first", "step"))
-    return lambda log: range(first, len(log.timestamps) - 1, step)[: cfg.get("count")]
+
+    def pairs(log: Log) -> list[int]:
+        gaps = getattr(log, "gaps", ())
+        return [index for index in range(first, len(log.timestamps) - 1, step) if index not in gaps][: cfg.get("count")]
+
+    return pairs
 
 
 def check_pair(pair: int, log: Log) -> None:

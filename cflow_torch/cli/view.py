@@ -20,7 +20,7 @@ import subprocess
 import sys
 import webbrowser
 from pathlib import Path
-from typing import Any, Callable, Iterator
+from typing import Any, Callable, Iterator, Sequence
 
 import numpy as np
 from omegaconf import DictConfig
@@ -105,7 +105,7 @@ def _flow(cfg: DictConfig) -> tuple[Callable[[Log, int], FlowResult], int]:
 
 
 def _results(
-    log: Log, pairs: range, flow: Callable[[Log, int], FlowResult], failures: Failures
+    log: Log, pairs: Sequence[int], flow: Callable[[Log, int], FlowResult], failures: Failures
 ) -> Iterator[tuple[int, FlowResult]]:
     """Yield the flow of each pair. A bad frame is reported and skipped."""
     for index in Progress(pairs, log.log_id):

@@ -39,7 +39,7 @@ def missing_returns(points: np.ndarray) -> np.ndarray:
 def without_missing(sweep: Sweep) -> tuple[Sweep, int]:
     """Return a sweep whose missing returns are NaN, and how many these are.
 
-    Sweeps with 1 % of them or less, or ten, stay as they are, and so do points on a GPU and more than ten million points.
+    Sweeps with at most 1 % of them, or ten, stay as they are. So do points on a GPU, and more than ten million points.
     """
     points: Array = sweep.points
     is_elsewhere = isinstance(points, torch.Tensor) and points.device.type != "cpu"

@@ -162,6 +162,29 @@ def test_opening_a_folder_finds_points_in_the_world(drive, tmp_path):
         open_log("arrays", tmp_path / "log", read_as="mirrored")
 
 
+def test_scenes_and_bags_in_the_world_are_found_when_they_are_opened(drive, tmp_path):
+    """Own data in the world's frame, in a scene, and in a bag whose headers name the LiDAR's frame."""
+    h5py = pytest.importorskip("h5py")
+    pytest.importorskip("rosbags")
+    from bag_writer import BagWriter
+
+    world = Wrong(drive, points=to_world)
+    writer = BagWriter(tmp_path, "ros1")
+    with h5py.File(tmp_path / "scene.h5", "w") as file:
+        for index, time in enumerate(drive.timestamps):
+            sweep, group = world.sweep(index), file.create_group(str(time))
+            group["lidar"], group["pose"], group["ground_mask"] = sweep.points, sweep.pose, sweep.is_ground
+            transform = writer.transform(time, "odom", "velodyne", sweep.pose)
+            writer.write("/tf", time, "tf2_msgs/msg/TFMessage", [transform])
+            cloud = writer.cloud(time, sweep.points, None)
+            writer.write("/points", time, "sensor_msgs/msg/PointCloud2", *cloud)
+    writer.bag.close()
+    for name, path in (("hdf5", tmp_path / "scene.h5"), ("bags", tmp_path / "drive.bag")):
+        with pytest.warns(CFlowWarning, match="world's frame, so we move them to that of the vehicle"):
+            log = open_log(name, path, find_ground="grid")
+        assert np.allclose(log.sweep(11).points, drive.sweep(11).points, atol=1e-3)
+
+
 def test_labels_move_with_the_points(drive):
     """Flow in the world's axes becomes flow in the axes of the vehicle at t+1."""
     truth = drive.labels(8)
