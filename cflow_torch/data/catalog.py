@@ -19,6 +19,7 @@ from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.deskewing import SCANS
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
 
@@ -203,7 +204,8 @@ def open_log(
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
-        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`.
+        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`. Or a
+            value of `deskew`: "times", "clockwise", ...
         own_vehicle: "auto" = leave out returns that ride along with the vehicle, see `OwnVehicleLog`; None = keep them.
         deskew: how to move points to the instant of their sweep, see `cflow_torch.data.deskewing.DeskewedLog`; False
             (what `off` means in YAML) = "off", True = "auto".
@@ -217,6 +219,8 @@ def open_log(
         raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")
     if isinstance(deskew, bool):
         deskew = "auto" if deskew else "off"
+    if read_as in ("times", *SCANS) and deskew == "auto":  # how sweeps are scanned is a reading of the log, too
+        deskew, read_as = read_as, "auto"
     if deskew not in DESKEW_CHOICES:
         raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
     if own_vehicle not in ("auto", None):

@@ -16,8 +16,8 @@ from cflow_torch.windows.ground import find_ground
 from cflow_torch.windows.stillness import REACH, Structure
 
 _NEAR, _CELL = 2.7, 0.25  # metres from the origin along x and y, and side of a cell
-_STEP, _MOST_SWEEPS, _FEWEST_SWEEPS = 2.0, 4, 3  # metres between the compared sweeps, and their number
-_SHARE = 0.7  # of the sweeps that have a point in a cell of the vehicle
+_LEAST_MOTION, _FEWEST_SWEEPS, _MOST_SWEEPS = 2.0, 3, 4  # metres between the compared sweeps, and their number
+_SHARE = 0.7  # of these sweeps that have a point in a cell of the vehicle
 _IN_PLACE = 0.3  # share of the points of a cell that the static world explains, as those of a wall along the road
 _FEWEST_POINTS = 12  # in a sweep
 
@@ -26,8 +26,8 @@ class OwnVehicleLog(LogWrapper):
     """A log in which the returns of the own vehicle are NaN, so rows stay as they are. Their labels are not valid.
 
     Attributes:
-        own_cells: (C, 3) int64, cells of 0.25 m that hold returns of the vehicle. It is found at first use from up to
-            five sweeps at least 2 m apart: cells near the origin that nearly all sweeps have points in, other than
+        own_cells: (C, 3) int64, cells of 0.25 m that hold returns of the vehicle. It is found at first use from
+            three or four sweeps at least 2 m apart: cells near the origin that most of them have points in, other than
             ground, and that are not in place under the ego motion. Empty if the vehicle does not drive, if poses are
             unknown before points are read, or if there are fewer than twelve such points.
     """
@@ -71,7 +71,7 @@ class OwnVehicleLog(LogWrapper):
         poses = known_poses(self.log)
         chosen = [] if poses is None else _spread(poses[:, :3, 3])
         clouds: list[np.ndarray] = []
-        for index in chosen if len(chosen) >= _FEWEST_SWEEPS else []:
+        for index in chosen:
             clouds.append(_structure(self.log.sweep(index)))
             if _are_near(clouds[-1]).sum() < _FEWEST_POINTS and index == chosen[0]:
                 return nothing  # no other sweep needs to be read
@@ -95,15 +95,12 @@ class OwnVehicleLog(LogWrapper):
 
 
 def _spread(positions: np.ndarray) -> list[int]:
-    """Choose sweeps along the path, in order, neighbours at least 2 m apart."""
+    """Choose sweeps along the path, in order, neighbours at least 2 m apart; [] if the vehicle hardly drives."""
     travelled = np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
-    step = max(_STEP, travelled[-1] / _MOST_SWEEPS)
-    chosen = [0]
-    for index in range(1, len(positions)):
-        away = np.linalg.norm(positions[index] - positions[chosen[-1]])
-        if away >= _STEP and travelled[index] - travelled[chosen[-1]] >= step:
-            chosen.append(index)
-    return chosen
+    count = int(np.clip(travelled[-1] / _LEAST_MOTION, _FEWEST_SWEEPS, _MOST_SWEEPS))
+    chosen = np.searchsorted(travelled, np.linspace(0, travelled[-1], count) - 1e-9)
+    away = np.linalg.norm(np.diff(positions[chosen], axis=0), axis=1)
+    return chosen.tolist() if (away >= _LEAST_MOTION).all() else []  # type: ignore[no-any-return]
 
 
 def _structure(sweep: Sweep) -> np.ndarray:

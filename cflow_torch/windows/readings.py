@@ -333,7 +333,8 @@ def _structure(sweep: Sweep, centre: np.ndarray) -> np.ndarray:
 
 def _num_blocks(points: np.ndarray) -> int:
     """Return how many blocks of 5 m in the plane hold points."""
-    return len(np.unique(np.floor(points[:, :2] / _BLOCK), axis=0))
+    column, row = np.floor(points[:, :2] / _BLOCK).astype(np.int64).T
+    return len(np.unique(column * (1 << 20) + row))
 
 
 def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:
