@@ -21,11 +21,13 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
+from cflow_torch.data.read_as import read_as
 from cflow_torch.errors import import_optional
 from cflow_torch.fleet.changes import describe_changes
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
+from cflow_torch.windows.readings import WORLD
 
 # Settings that do not change the points of a log.
 _FREE = ("output", "overwrite", "resume", "device", "map", "data.root", "data.label", "data.check", "model.max_memory")
@@ -101,19 +103,28 @@ def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog])
     file = output / f"{log.log_id}.ply"
     own = log.unwrapped
     suffix = cfg.suffix or (own.files[0].suffix.lower() if isinstance(own, ArraysLog) else ".npy")
+    viewpoint = _viewpoint(log, suffix)
     stopped = ""
     if not folder.exists():
         clean_log = clean(log)
-        write_array_log(clean_log, output, suffix)
+        write_array_log(clean_log, output, suffix, viewpoint)
         if clean_log.num_stopped is not None:
             stopped = f"; remove_stopped removed {clean_log.num_stopped} more points"
     bin_columns = max(3 + len(log.columns(0)), KITTI_COLUMNS) if suffix == ".bin" else KITTI_COLUMNS
     to_read = "" if bin_columns == KITTI_COLUMNS else f", read them with data.bin_columns={bin_columns}"
     print(f"{folder}: {len(log.timestamps)} sweeps{to_read}{stopped}")
     if cfg.map and not file.exists():
-        points = static_map(ArraysLog(folder, ground=None, bin_columns=bin_columns), cfg.voxel_size)
+        written = ArraysLog(folder, ground=None, bin_columns=bin_columns)
+        points = static_map(read_as(written, WORLD if viewpoint == "world" else None), cfg.voxel_size)
         write_cloud(file, points)
         print(f"{file}: {len(points)} points{_draw(points, file.with_suffix('.png'))}")
+
+
+def _viewpoint(log: Log, suffix: str) -> str | None:
+    """Return the frame of the points in `.pcd` files whose VIEWPOINT has the pose, as the log has it; None = none."""
+    if suffix != ".pcd" or not getattr(log.unwrapped, "has_viewpoints", False):
+        return None
+    return "world" if getattr(log, "read_as", None) == WORLD else "sensor"
 
 
 def _draw(points: np.ndarray, file: Path) -> str:

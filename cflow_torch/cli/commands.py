@@ -497,9 +497,10 @@ class Clean(Command):
     data=arrays reads such a folder. A point is dynamic if its residual flow is at least 0.05 m per sweep.
     remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car. map=true
     also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them, <log id>.png.
-    We keep the other columns of cloud folders, bags, Argoverse 2 and PandaSet, such as intensity. A log is written as a
-    whole or not at all. Run the command again to write the missing logs. OUTPUT/config.yaml has settings and versions,
-    and OUTPUT/<log id>.json those of the log. Results of other logs in OUTPUT stay.
+    We keep the other columns of cloud folders, bags, Argoverse 2 and PandaSet, such as intensity, and poses in
+    VIEWPOINT of .pcd files. A log is written as a whole or not at all. Run the command again to write the missing logs.
+    OUTPUT/config.yaml has settings and versions, and OUTPUT/<log id>.json those of the log. Results of other logs in
+    OUTPUT stay.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag

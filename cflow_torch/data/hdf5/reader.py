@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +143,7 @@ class HDF5Log(Log):
             raise CFlowError(f"{self.file}: sweep {self.timestamps[index]} has no {key}; it has {has}")
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
-    @property
+    @cached_property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points."""
         stored = np.stack([self._stored_pose(index) for index in range(len(self))])
