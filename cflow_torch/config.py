@@ -192,8 +192,8 @@ class VerifiedConfig(_WithHistory):
         blocks = [size / self.pixel_sizes[-1] for size in self.pixel_sizes]
         if any(math.isinf(block) or abs(block - round(block)) > 1e-6 for block in blocks):
             raise CFlowError(
-                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default and offline) takes whole "
-                "multiples of the finest size: give for example (0.4, 0.2, 0.1)"
+                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default, offline and live) takes "
+                "whole multiples of the finest size: give for example (0.4, 0.2, 0.1)"
             )
 
 
@@ -213,6 +213,7 @@ _DEFAULT = {
 PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
     "offline": ("verified", {**_DEFAULT, "num_future": 4}),
+    "live": ("verified", {**_DEFAULT, "num_history": 2, "point_cloud_range": _HARNESS_REGION}),
     "paper": ("dense", {}),
     # Chosen on the simulated seeds 200 ... 209: docs/method.md.
     "keypoints": (
@@ -240,8 +241,8 @@ def make_config(preset: str | None = None, method: str | None = None, **override
     """Make the settings of a preset, with some fields replaced.
 
     Args:
-        preset: "default", "offline", "paper" or "keypoints"; None = the preset of the method, or "default".
-        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "offline"); None = the
+        preset: "default", "offline", "live", "paper" or "keypoints"; None = the preset of the method, or "default".
+        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "offline", "live"); None = the
             method of the preset. Method "keypoints" with preset "paper" gives the paper's key-point settings.
         **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 

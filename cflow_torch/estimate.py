@@ -59,12 +59,12 @@ def estimate_flow(
         T_ego1_egoh: (4, 4) for each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`, or empty.
         dt0, dt1: times of the points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
-            `default` and `offline` use them if every sweep has them.
+            `default`, `offline` and `live` use them if every sweep has them.
         dth: times of the points of each of `pch`.
         pcf, T_ego1_egof, gmf, dtf: sweeps t+2, t+3, ..., at most `num_future`, with their transforms, masks and times;
             for the preset "offline".
         method: "dense", "keypoints" or "verified"; None = the method of the preset.
-        preset: "default", "offline", "keypoints" or "paper"; None = the preset of the method, or "default".
+        preset: "default", "offline", "live", "keypoints" or "paper"; None = the preset of the method, or "default".
         config: settings from `make_config`, instead of `method` and `preset`.
         ground: what to do with sweeps without a mask. "grid" = find their ground (`find_ground`); "auto" = the same,
             with a warning; "patchwork" = use Patchwork++ (`pip install pypatchworkpp`); None = no point is ground.

@@ -29,7 +29,7 @@ class FlowStream:
     estimates poses. A result is equal, bit for bit, to that of `make_model(config)([window])` with these sweeps.
 
     Args:
-        preset: "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
+        preset: "live", "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
         config: settings, from `make_config`, in place of a preset.
         device: "auto" = that of the given tensors, else a GPU if available, else the CPU.
         ground: None = use only the given masks; "auto" or "patchwork" = find the ground of each sweep without a mask.

@@ -476,7 +476,7 @@ class Stream(Command):
     examples:
       cflow stream drive.bag                          at the speed of the recording
       cflow stream /data/av2/val/LOG pace=null        as fast as possible
-      cflow stream drive.bag model.num_history=2 device=cuda
+      cflow stream drive.bag model=live device=cuda
     """
 
     SUMMARY: ClassVar[str] = "replay a log in real time and measure the latency"
@@ -555,7 +555,7 @@ class ListSettings(Words):
     With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
 
     --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-    cflow_paper.yaml and cflow_keypoints.yaml. The package contains the same files.
+    cflow_live.yaml, cflow_paper.yaml and cflow_keypoints.yaml. The package contains the same files.
 
     examples:
       cflow settings max_speed          default, allowed values and meaning of a setting

@@ -164,7 +164,7 @@ def _contents(cfg: Flow) -> tuple[str, ...]:
         return allowed
     given = [cfg.contents] if isinstance(cfg.contents, str) else list(cfg.contents)
     if not given or set(given) - set(allowed):
-        why = "" if has_confidence else "; only model=default and offline have a confidence"
+        why = "" if has_confidence else "; only model=default, offline and live have a confidence"
         raise CFlowError(f"contents={given}: give auto, or some of {', '.join(allowed)}{why}")
     needed = set(CONTENTS) if cfg.result_name is not None else set()
     if cfg.tracks:

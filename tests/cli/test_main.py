@@ -30,7 +30,7 @@ def test_help_explains_a_command_with_examples_and_settings(command, cflow, caps
         text.startswith(f"cflow {command}: {COMMANDS[command].SUMMARY}") and f"\nexamples:\n  cflow {command}" in text
     )
     if command in WITH_SETTINGS:
-        assert "\n  output: outputs/" in text and "\n  model=default|offline|paper|keypoints\n" in text
+        assert "\n  output: outputs/" in text and "\n  model=default|offline|live|paper|keypoints\n" in text
     assert cflow("help", command) == 0
     assert capsys.readouterr().out == text
 
@@ -40,7 +40,7 @@ CHEAP = (
     ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, check, flow,"),
     ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
     ("flow num_history=2", "(did you mean model.num_history?)"),
-    ("eval model=papr", "model=papr (did you mean paper?): give one of default, keypoints, offline, paper"),
+    ("eval model=papr", "model=papr (did you mean paper?): give one of default, keypoints, live, offline, paper"),
     ("eval model=fast", "preset 'fast' was removed in 0.4.0: use default with num_history=2"),
     (
         "eval model.densify=nearest",
@@ -76,7 +76,7 @@ OTHERS = (
     ("eval definition=mine data.num_sweeps=2", "mine"),
     ("demo pair=99 data.num_sweeps=2", "has pairs 0 to 0"),
     ("plot log=1e5 data.num_sweeps=2", "log=1e5: there is no such log"),
-    ("flow contents=[confidence] model=paper", "only model=default and offline have a confidence"),
+    ("flow contents=[confidence] model=paper", "only model=default, offline and live have a confidence"),
 )
 
 

@@ -156,7 +156,8 @@ def test_the_page_lists_every_setting(cflow, capsys):
     rows = [line[2:-2].split(" | ") for line in page.splitlines() if line.startswith("| `model.")]
     assert len(rows) == sum(len(fields(kind)) for kind in METHODS.values())
     name, *cells = next(row for row in reversed(rows) if row[0] == "`model.num_history`")
-    assert cells[:3] == ["`0`", "default `4`, offline `4`", "a whole number of at least 0"] and "sweeps" in cells[3]
+    changed = "default `4`, offline `4`, live `2`"
+    assert cells[:3] == ["`0`", changed, "a whole number of at least 0"] and "sweeps" in cells[3]
     assert "dense \\| keypoints" in page, "bars in cells are escaped"
     for file in CONFIGS.glob("data/*.yaml"):
         assert f"\n## data={file.stem}\n" in page and file.read_text().strip() in page
@@ -167,7 +168,10 @@ def test_the_page_lists_every_setting(cflow, capsys):
     [
         (
             "max_speed",
-            ["Method `dense`: model=paper, Method `keypoints`: model=keypoints:", "default `60.0`, offline `60.0`"],
+            [
+                "Method `dense`: model=paper, Method `keypoints`: model=keypoints:",
+                "default `60.0`, offline `60.0`, live `60.0`",
+            ],
         ),
         ("shard.index", ["cflow flow, cflow label:\n  index: auto  # index of this process"]),
         ("data", ["data=av2 ", "data=hdf5 "]),
