@@ -22,12 +22,12 @@ from cflow_torch.windows.memory import peak_memory
 
 def task(cfg: Bench) -> None:
     output = output_folder(cfg)
-    model = make_model(cfg.model, cfg.device)
+    model = make_model(cfg.model, cfg.device, cfg.keep_memory)
     log = open_first_log(cfg.data)
     windows = _windows(log, cfg.pairs, model.config)
     ensure_writable(output)
     report = {"log": log.log_id, **measure(model, windows, cfg.repeats, cfg.batches), "machine": machine()}
-    report.update(versions=versions(), model=model.config.as_dict())
+    report.update(versions=versions(), model=model.config.as_dict(), keep_memory=cfg.keep_memory)
     print(format_report(report))
     write_json(output / "bench.json", report)
     print(f"written to {output / 'bench.json'}")

@@ -12,10 +12,16 @@ from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.manifest import frame_file
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult
+from cflow_torch.windows.memory import keep_freed_memory
 
 
-def make_model(config: Config, device: str) -> SceneFlowModel:
-    """Make a method for the windows of logs, which are checked when they are opened, not at each call."""
+def make_model(config: Config, device: str, keep_memory: bool = True) -> SceneFlowModel:
+    """Make a method for the windows of logs, which are checked when they are opened, not at each call.
+
+    With `keep_memory`, this process keeps the memory that it frees, see `keep_freed_memory`.
+    """
+    if keep_memory:
+        keep_freed_memory()
     model = estimate.make_model(config, device)
     model.inspect = None
     return model

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from small_logs import write_small_log
 
 from cflow_torch import make_config
-from cflow_torch.cli import failures, pairs
+from cflow_torch.cli import failures, flows, pairs
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.eval import objective
 from cflow_torch.config import config_from
@@ -215,6 +215,16 @@ def test_a_pair_whose_process_dies_is_tried_once_more_then_reported(log_folder, 
     assert record["num_pairs"] == 2 and (tmp_path / str(stamps[1])).read_text() == "7"
     ((name, message),) = record["failures"]
     assert name.endswith(str(stamps[1])) and "2 worker processes died on it, the last one: signal 9" in message
+
+
+def test_bench_keeps_freed_memory_only_if_asked(tmp_path, cflow, monkeypatch):
+    calls: list[Any] = []
+    monkeypatch.setattr(flows, "keep_freed_memory", lambda: calls.append(1))
+    data = ["data.num_sweeps=2", f"data.cache={tmp_path}", "model=paper", SMALL, "repeats=1", "batches=[1]"]
+    for number, more in enumerate(([], ["keep_memory=false"])):
+        assert cflow("bench", *data, *more, f"output={tmp_path / 'out'}") == 0
+        report = json.loads((tmp_path / "out" / "bench.json").read_text())
+        assert len(calls) == 1 and report["keep_memory"] is (number == 0)
 
 
 def test_bench_writes_what_it_prints(tmp_path, cflow, capsys):

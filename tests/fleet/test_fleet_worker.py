@@ -15,7 +15,7 @@ from small_fleet import CONFIG, PAIRS, flow_files, make_job, tree
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import LogWrapper
-from cflow_torch.fleet import parallel
+from cflow_torch.fleet import parallel, work
 from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, make_object
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
 from cflow_torch.fleet.machine import Layout
@@ -157,6 +157,13 @@ def count(events: Iterator[Event], parts: Sequence[Part]) -> Counters:
 
 
 AGAIN = "a worker died (SIGSEGV): its frames are tried again, one by one"
+
+
+def test_a_worker_keeps_the_memory_that_it_frees(tmp_path, monkeypatch):
+    calls: list[Any] = []
+    monkeypatch.setattr(work, "keep_freed_memory", lambda: calls.append(1))
+    work.make_worker(make_job(tmp_path), "cpu").close()
+    assert len(calls) == 1, "once per process, not per part or window"
 
 
 def test_when_a_worker_dies_each_of_its_frames_is_tried_by_itself(fleet, single, tmp_path):
