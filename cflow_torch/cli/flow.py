@@ -16,7 +16,7 @@ from cflow_torch.applications.tracking import track
 from cflow_torch.cli.commands import Flow, FlowFiles
 from cflow_torch.cli.failures import Failures, UnfinishedJob, collect_failures, is_sweep
 from cflow_torch.cli.flows import stored_flow
-from cflow_torch.cli.logs import Sources, find_logs
+from cflow_torch.cli.logs import Sources, chosen_pairs, find_logs
 from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
@@ -191,11 +191,11 @@ def _write_tracks(kind: Any, flow: FlowRun, output: Path) -> Failures:
         with collect_failures(failures, source_name(part.source)):
             log = flow.sources.open(part.source)
             folder = output / log.log_id
-            stamps = [int(stamp) for stamp in log.timestamps[:-1]]
-            if not complete_frames(folder) >= set(stamps):
+            pairs = chosen_pairs(log, first=0, step=1)  # the pair over a gap has no flow
+            if not complete_frames(folder) >= {int(log.timestamps[index]) for index in pairs}:
                 continue
             if not (folder / TRACKS_FILE).exists():
-                results = ((index, stored(log, index)) for index in range(len(stamps)))
+                results = ((index, stored(log, index)) for index in pairs)
                 write_tracks(folder / TRACKS_FILE, track(log, results))
             if kind in _TRACK_FORMATS:
                 _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)
