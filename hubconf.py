@@ -19,7 +19,7 @@ def cflow(preset: str = "default", device: _Any = "auto", **overrides: _Any) -> 
     """A method as a module without parameters: a list of `cflow_torch.Window` in, a list of `FlowResult` out.
 
     Args:
-        preset: "default", "offline", "keypoints" or "paper".
+        preset: "default", "offline", "live", "keypoints" or "paper".
         device: "auto" = that of the tensors given, else a GPU if there is one, else the CPU.
         **overrides: any field of the preset's method, for example `num_history=2`.
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Optional, Tuple, TypeVar
 
 from cflow_torch.errors import CFlowError
-from cflow_torch.setting import LIMIT, checked, setting
+from cflow_torch.setting import LIMIT, Settings, setting
 
 Kind = TypeVar("Kind", bound="Config")
 
@@ -17,7 +17,7 @@ def _method(name: str) -> Any:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Settings):
     """Settings that all methods have. Each method adds its own ones (`CONFIGS`). `make_config` makes all from a preset.
 
     An invalid value raises `CFlowError`. `cflow settings` lists the meaning and the bounds of every field.
@@ -59,8 +59,7 @@ class Config:
     )
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            object.__setattr__(self, f.name, checked(f.name, getattr(self, f.name), f.metadata))
+        super().__post_init__()
         _check_space(self.pixel_sizes, self.point_cloud_range, self.ego_box)
 
     @property
@@ -193,8 +192,8 @@ class VerifiedConfig(_WithHistory):
         blocks = [size / self.pixel_sizes[-1] for size in self.pixel_sizes]
         if any(math.isinf(block) or abs(block - round(block)) > 1e-6 for block in blocks):
             raise CFlowError(
-                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default and offline) takes whole "
-                "multiples of the finest size: give for example (0.4, 0.2, 0.1)"
+                f"pixel_sizes={self.pixel_sizes}: the verified method (presets default, offline and live) takes "
+                "whole multiples of the finest size: give for example (0.4, 0.2, 0.1)"
             )
 
 
@@ -214,6 +213,7 @@ _DEFAULT = {
 PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
     "default": ("verified", _DEFAULT),
     "offline": ("verified", {**_DEFAULT, "num_future": 4}),
+    "live": ("verified", {**_DEFAULT, "num_history": 2, "point_cloud_range": _HARNESS_REGION}),
     "paper": ("dense", {}),
     # Chosen on the simulated seeds 200 ... 209: docs/method.md.
     "keypoints": (
@@ -241,8 +241,8 @@ def make_config(preset: str | None = None, method: str | None = None, **override
     """Make the settings of a preset, with some fields replaced.
 
     Args:
-        preset: "default", "offline", "paper" or "keypoints"; None = the preset of the method, or "default".
-        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "offline"); None = the
+        preset: "default", "offline", "live", "paper" or "keypoints"; None = the preset of the method, or "default".
+        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "offline", "live"); None = the
             method of the preset. Method "keypoints" with preset "paper" gives the paper's key-point settings.
         **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 

@@ -15,6 +15,7 @@ from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window
 from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.windows.ground import CHOICES, find_ground_batch
+from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import choose_device, keep_nearest
 
 # Arguments of `estimate_flow` that a `Sweep` contains.
@@ -58,12 +59,12 @@ def estimate_flow(
         T_ego1_egoh: (4, 4) for each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
         gmh: ground mask of each of `pch`, or empty.
         dt0, dt1: times of the points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
-            `default` and `offline` use them if every sweep has them.
+            `default`, `offline` and `live` use them if every sweep has them.
         dth: times of the points of each of `pch`.
         pcf, T_ego1_egof, gmf, dtf: sweeps t+2, t+3, ..., at most `num_future`, with their transforms, masks and times;
             for the preset "offline".
         method: "dense", "keypoints" or "verified"; None = the method of the preset.
-        preset: "default", "offline", "keypoints" or "paper"; None = the preset of the method, or "default".
+        preset: "default", "offline", "live", "keypoints" or "paper"; None = the preset of the method, or "default".
         config: settings from `make_config`, instead of `method` and `preset`.
         ground: what to do with sweeps without a mask. "grid" = find their ground (`find_ground`); "auto" = the same,
             with a warning; "patchwork" = use Patchwork++ (`pip install pypatchworkpp`); None = no point is ground.
@@ -74,12 +75,13 @@ def estimate_flow(
         Flow for every row of pc0, in the axes of the ego frame at t+1, on the device of the computation.
 
     Convention:
-        NaN and infinite points, ground and points outside `point_cloud_range` get residual flow 0, cluster -1 and
-        `is_valid` False. Empty sweeps give an empty or all-zero result.
+        NaN and infinite points, missing returns (see `missing_returns` of cflow_torch.windows.returns), ground and
+        points outside `point_cloud_range` get residual flow 0, cluster -1 and `is_valid` False. Empty sweeps give an
+        empty or all-zero result.
 
     Warns:
-        CFlowWarning: a sweep has no mask, so we found its ground (`ground="auto"`); a likely mistake in the input, see
-            `SceneFlowModel.forward`; `is_valid` is False for all points of pc0.
+        CFlowWarning: we left out missing returns; a sweep has no mask, so we found its ground (`ground="auto"`); a
+            likely mistake in the input, see `SceneFlowModel.forward`; `is_valid` is False for all points of pc0.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
@@ -116,7 +118,8 @@ def estimate_flow(
             pch=_sweeps(given, "h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth),
             pcf=_sweeps(given, "f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf),
         )
-    window = _find_ground(keep_nearest(window, config.num_history), ground, device)
+    window = _leave_out_missing(keep_nearest(window, config.num_history))
+    window = _find_ground(window, ground, device)
     return make_model(config, device)([window])[0]
 
 
@@ -129,6 +132,22 @@ def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
     if not isinstance(config, Config):
         raise CFlowError(f"config is {type(config).__name__}: give the result of make_config")
     return methods[config.method](config, device)
+
+
+def _leave_out_missing(window: Window) -> Window:
+    """Leave out points that are no returns, and say so."""
+    kept = [without_missing(sweep) for sweep in (window.pc0, window.pc1, *window.pch, *window.pcf)]
+    num_missing = max(count for _, count in kept)
+    if num_missing == 0:
+        return window
+    warn(f"up to {num_missing} {MISSING}, so we leave them out")
+    return _window([sweep for sweep, _ in kept], len(window.pch))
+
+
+def _window(sweeps: Sequence[Sweep], num_history: int) -> Window:
+    """Make a window of sweeps in the order t, t+1, t-1, ..., t+2, ..."""
+    first_future = 2 + num_history
+    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
 
 
 def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
@@ -147,8 +166,7 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
         )
     for index, mask in zip(bare, masks):
         sweeps[index] = replace(sweeps[index], is_ground=mask)
-    first_future = 2 + len(window.pch)
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
+    return _window(sweeps, len(window.pch))
 
 
 def _sweep(

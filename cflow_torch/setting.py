@@ -4,23 +4,36 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import field
+from dataclasses import field, fields
 from numbers import Integral, Real
-from typing import Any, Mapping
+from typing import Any, ClassVar, Mapping
 
 from cflow_torch.errors import CFlowError
 
 # Whole numbers stay below this, because they are compared with tensors of int64 and of float64.
 LIMIT = 2**53
 # Names of types in error messages.
-_NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers"}
+_NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers", str: "text"}
+
+
+class Settings:
+    """Base of frozen dataclasses whose fields are made by `setting`. A value that is not allowed is a `CFlowError`."""
+
+    PREFIX: ClassVar[str] = ""  # of the names in messages, such as "engine."
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            if "kind" in f.metadata:
+                value = checked(f"{self.PREFIX}{f.name}", getattr(self, f.name), f.metadata)
+                object.__setattr__(self, f.name, value)
 
 
 def setting(default: Any, help: str, *, kind: type | None = None, **limits: Any) -> Any:
-    """Make a field of a `Config`: its default, its `help` (meaning and unit), and the `limits` of `bounds`.
+    """Make a field of `Settings`: its default, its `help` (meaning and unit), and the `limits` of `bounds`.
 
-    If `kind` is None, the value has the type of the default.
+    If `kind` is None, the value has the type of the default. If the default is None, None is allowed.
     """
+    limits.setdefault("optional", default is None)
     return field(default=default, metadata={"help": help, **bounds(kind or type(default), **limits)})
 
 
@@ -32,14 +45,27 @@ def bounds(
     above: float = -math.inf,
     high: float = math.inf,
     choices: tuple[Any, ...] = (),
+    word: str | None = None,
+    several: bool = False,
 ) -> dict[str, Any]:
     """Describe the allowed values of a setting.
 
-    `kind` is int, float, bool, str, tuple (of floats) or object (any of the choices). If `optional`, the value None is
-    allowed. `low` and `high` are the smallest and the largest allowed value. `above` is a lower bound that is not
-    allowed itself. `choices` are all allowed values, or empty if they cannot be listed.
+    `kind` is int, float, bool, str, tuple (of floats), object (any of the choices, or anything) or a class of
+    `Settings`, whose values may be given as a dictionary. If `optional`, the value None is allowed. `low` and `high`
+    are the smallest and the largest allowed value. `above` is a lower bound that is not allowed itself. `choices` are
+    all allowed values, or empty if they cannot be listed. `word` is one more allowed value, such as "auto". If
+    `several`, the value is a list of such values.
     """
-    return {"kind": kind, "optional": optional, "low": low, "above": above, "high": high, "choices": choices}
+    return {
+        "kind": kind,
+        "optional": optional,
+        "low": low,
+        "above": above,
+        "high": high,
+        "choices": choices,
+        "word": word,
+        "several": several,
+    }
 
 
 def describe(limits: Mapping[str, Any]) -> str:
@@ -53,14 +79,19 @@ def describe(limits: Mapping[str, Any]) -> str:
     text += f" of at least {low:g}" if low > -math.inf else ""
     text += f" above {above:g}" if above > -math.inf else ""
     text += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
+    text += f", or {limits['word']}" if limits["word"] else ""
     return text + (", or None" if limits["optional"] else "")
 
 
 def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
-    """Return a value as int, float, bool, str, tuple or None. A value that is not allowed raises a `CFlowError`."""
+    """Return a value as int, float, bool, str, tuple, `Settings` or None. One that is not allowed is a `CFlowError`."""
     kind = limits["kind"]
-    if value is None and limits["optional"]:
-        return None
+    if limits["several"] and isinstance(value, (list, tuple)):
+        return tuple(checked(name, one, {**limits, "several": False}) for one in value)
+    if value is None and limits["optional"] or limits["word"] and value == limits["word"]:
+        return value
+    if issubclass(kind, Settings):
+        return value if isinstance(value, kind) else kind(**value)
     with suppress(TypeError, ValueError, OverflowError):
         if kind is tuple:
             return tuple(float(v) for v in value)

@@ -90,14 +90,14 @@ def test_a_setting_of_another_method_names_that_method():
         ("paper", "significance", "verified"),
         ("default", "patch_size", "keypoints"),
         ("default", "clustering", "dense"),
-        *((preset, name, "dense and keypoints") for preset in ("default", "offline") for name in CLUSTERING),
+        *((preset, name, "dense and keypoints") for preset in ("default", "offline", "live") for name in CLUSTERING),
     ):
         with pytest.raises(CFlowError, match=f"{name} is a setting of method {owners}, not of"):
             make_config(preset, **{name: 1})
 
 
 def test_presets_and_methods():
-    methods = {**dict.fromkeys(("default", "offline"), VerifiedConfig), "paper": DenseConfig}
+    methods = {**dict.fromkeys(("default", "offline", "live"), VerifiedConfig), "paper": DenseConfig}
     methods["keypoints"] = KeypointsConfig
     assert {name: type(make_config(name)) for name in PRESETS} == methods
     assert make_config() == make_config("default") == make_config(method="verified")
@@ -111,7 +111,7 @@ def test_presets_and_methods():
     for preset, method in (("offline", "dense"), ("default", "keypoints"), ("keypoints", "verified")):
         with pytest.raises(CFlowError, match=f"preset='{preset}' is of method=.*leave one of them out"):
             make_config(preset, method)
-    with pytest.raises(CFlowError, match="preset='best': give one of 'default', 'offline', 'paper'"):
+    with pytest.raises(CFlowError, match="preset='best': give one of 'default', 'offline', 'live', 'paper'"):
         make_config("best")
     with pytest.raises(CFlowError, match="method='sparse': give one of 'dense', 'keypoints', 'verified'"):
         make_config(method="sparse")
@@ -123,6 +123,8 @@ def test_presets_have_the_paper_s_base_row_and_documented_changes():
     assert paper.point_cloud_range == (-35.0, -35.0, -INF, 35.0, 35.0, INF) and paper.max_speed is None
     assert (default.pixel_sizes, default.num_history) == ((0.4, 0.2, 0.1), 4)
     assert make_config("offline") == default.replace(num_future=4) and make_config("offline").num_sweeps == 10
+    near = make_config("keypoints").point_cloud_range
+    assert make_config("live") == default.replace(num_history=2, point_cloud_range=near) and near[:2] == (-51.2, -51.2)
     assert make_config(pixel_size=0.2).pixel_sizes == (0.2,)
     with pytest.raises(CFlowError, match="give one of them"):
         make_config(pixel_size=0.2, pixel_sizes=(0.4,))

@@ -29,8 +29,9 @@ _MAX_VOXELS = 1 << 20  # voxels in x, y and z from the first sweep to a point of
 class CleanLog(Log):
     """A log without its moving points. Every command, writer and loader accepts it like any other log.
 
-    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep has no flow. There, we take the
-    boxes of the objects that move in the sweep before, shift them by the flow, and remove the points inside.
+    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep, and one before a gap of the log,
+    have no flow. There, we take the boxes of the objects that move in the sweep before, shift them by the flow, and
+    remove the points inside.
 
     Args:
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
@@ -60,6 +61,7 @@ class CleanLog(Log):
             raise CFlowError("standing= is now remove_stopped=")
         self.log_id = log.log_id
         self.timestamps = log.timestamps
+        self.gaps = getattr(log, "gaps", frozenset())
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
         if flow is None and model is None:
@@ -106,14 +108,18 @@ class CleanLog(Log):
     def _moves(self, index: int) -> np.ndarray:
         """(N,) bool, True for the points that move according to their flow."""
         sweep = self._log.sweep(index)
-        if index == len(self.timestamps) - 1:
-            return self._reached(sweep, index)
+        if not self._has_flow(index):
+            return self._reached(sweep, index) if self._has_flow(index - 1) else np.zeros(len(sweep.points), bool)
         moves = (self._flow(index).residual_flow.norm(dim=1) >= MOVING).cpu().numpy()
         if len(moves) != len(sweep.points):
             raise CFlowError(
                 f"sweep {index} has {len(sweep.points)} points, but its flow {len(moves)} rows: give both of one log"
             )
         return moves
+
+    def _has_flow(self, index: int) -> bool:
+        """Test whether a sweep has a next one. The pair over a gap has no flow."""
+        return 0 <= index < len(self.timestamps) - 1 and index not in self.gaps
 
     def _reached(self, sweep: Sweep, index: int) -> np.ndarray:
         """(N,) bool, points of the last sweep in the boxes to which the clusters of the sweep before have moved."""
@@ -137,7 +143,7 @@ class CleanLog(Log):
         for index in range(len(self.timestamps)):
             removed = self._moves(index)
             num_moving += int(removed.sum())
-            if index < len(self.timestamps) - 1:
+            if self._has_flow(index):
                 table, track_id = tracker.push(window(self._log, index), self._flow(index))
                 tables.append({**table, "sweep": np.full(len(table["id"]), index)})
                 has_stopped = table["is_confirmed"] & ~table["is_moving"]

@@ -20,7 +20,7 @@ def deskew(window: Window, result: FlowResult, sweep_interval: float = 0.1) -> T
 
     Args:
         window: the sweeps of the flow; `pc0.point_times` and the poses and time stamps of pc0 and pc1 are used.
-        result: flow of the points of pc0, by a preset that uses point times (`default`, `offline`).
+        result: flow of the points of pc0, by a preset that uses point times (`default`, `offline`, `live`).
         sweep_interval: seconds from t to t+1 where the two have no time stamps.
 
     Returns:

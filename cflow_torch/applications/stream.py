@@ -11,10 +11,12 @@ import torch
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.data.odometry import Odometry
+from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.collation import make_batch
 from cflow_torch.windows.ground import CHOICES, find_ground
+from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import check_windows, choose_device, read_ground, read_positions
 
 _log = logging.getLogger(__name__)
@@ -27,7 +29,7 @@ class FlowStream:
     estimates poses. A result is equal, bit for bit, to that of `make_model(config)([window])` with these sweeps.
 
     Args:
-        preset: "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
+        preset: "live", "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
         config: settings, from `make_config`, in place of a preset.
         device: "auto" = that of the given tensors, else a GPU if available, else the CPU.
         ground: None = use only the given masks; "auto" or "patchwork" = find the ground of each sweep without a mask.
@@ -77,6 +79,7 @@ class FlowStream:
         self._max_gap = max_gap
         self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
         self._odometry: Odometry | None = None
+        self._has_told_missing = False
         self.window: Window | None = None
 
     def reset(self) -> None:
@@ -158,6 +161,10 @@ class FlowStream:
             for name, (known, given) in {"pose": poses, "time": (newest.timestamp_ns, sweep.timestamp_ns)}.items():
                 if (known is None) != (given is None):
                     raise CFlowError(f"some sweeps of the stream have no {name}: give it for all sweeps, or for none")
+        sweep, num_missing = without_missing(sweep)
+        if num_missing and not self._has_told_missing:
+            self._has_told_missing = True
+            warn(f"{num_missing} {MISSING}, so we leave them out, also in later sweeps")
         device = choose_device([Window(sweep, sweep)], self._model.device)
         points = read_positions([sweep], device).t()
         is_ground = sweep.is_ground

@@ -11,7 +11,7 @@ from pyarrow import parquet
 
 from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.data.atomic import atomic_file, write_text
-from cflow_torch.data.files import check_columns, file_errors
+from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 

@@ -1,26 +1,18 @@
-"""Measures the run time of the method and of its stages, windows per second, and memory.
-
-It prints a table and writes OUTPUT/bench.json. The pairs are spread evenly over the first log and run one at a time and
-in batches. Times start with the points in memory and end with the flow on the device. Other work on the machine
-distorts them.
-
-examples:
-  cflow bench                                                    a simulated street
-  cflow bench data=av2 data.root=/data/av2/val/LOG repeats=50    real data, more runs
-  cflow bench model=paper 'batches=[1,8]'                        another method
-"""
+"""Measure run time and memory: `cflow bench`."""
 
 from __future__ import annotations
 
 from typing import Any, Sequence
 
 import torch
-from omegaconf import DictConfig
 
-from cflow_torch.cli import run
+from cflow_torch.cli.commands import Bench
+from cflow_torch.cli.flows import make_model
+from cflow_torch.cli.logs import open_first_log
+from cflow_torch.cli.outputs import machine, output_folder, versions
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.files import write_json
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, window
 from cflow_torch.evaluation.tables import markdown
 from cflow_torch.stages import FlowModel, TimedModel
@@ -28,15 +20,14 @@ from cflow_torch.types import Window
 from cflow_torch.windows.memory import peak_memory
 
 
-def task(cfg: DictConfig) -> None:
-    output = run.output_folder(cfg)
-    model = run.make_model(cfg)
-    sources = run.find_logs(cfg)
-    log = sources.open(sources.logs[0])
+def task(cfg: Bench) -> None:
+    output = output_folder(cfg)
+    model = make_model(cfg.model, cfg.device, cfg.keep_memory)
+    log = open_first_log(cfg.data)
     windows = _windows(log, cfg.pairs, model.config)
     ensure_writable(output)
-    report = {"log": log.log_id, **measure(model, windows, cfg.repeats, cfg.batches), "machine": run.machine()}
-    report.update(versions=run.versions(), model=model.config.as_dict())
+    report = {"log": log.log_id, **measure(model, windows, cfg.repeats, cfg.batches), "machine": machine()}
+    report.update(versions=versions(), model=model.config.as_dict(), keep_memory=cfg.keep_memory)
     print(format_report(report))
     write_json(output / "bench.json", report)
     print(f"written to {output / 'bench.json'}")

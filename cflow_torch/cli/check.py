@@ -1,33 +1,20 @@
-"""Says for each log what is right, what was found and is used, and what is wrong and how to fix it. Writes nothing.
-
-A page has a line each for sensor, frame, times, poses, ego motion, de-skewing, ground, own vehicle and labels. The ego
-motion is judged by one question: under which reading of the poses does the static world stand still? If another reading
-than yours is clearly better, the line names the setting that chooses it. The exit status is 1 if a line is wrong. The
-other commands make the quick part of this check, and print only what is not right.
-
-examples:
-  cflow check /data/my_drive                      recognises the format
-  cflow check /data/a /data/b.bag                 several paths
-  cflow check /data/my_drive json=true            the same as JSON: a list of logs for each path
-  cflow check /data/my_drive data.read_as=inverted   try what the check proposes
-"""
+"""Say for each log what is right, and what is wrong and how to fix it: `cflow check`."""
 
 from __future__ import annotations
 
 import json
 from typing import Any
 
-from omegaconf import DictConfig
-
-from cflow_torch.cli import run
+from cflow_torch.cli.commands import Check
+from cflow_torch.cli.logs import Sources, find_logs
 from cflow_torch.data.log_check import WRONG, Finding, examine
 from cflow_torch.types import CFlowError
 
 
-def task(cfg: DictConfig) -> None:
-    sources = run.find_logs(cfg)
+def task(cfg: Check) -> None:
+    sources = find_logs(cfg.data)
     sources.settings["check"] = False  # `examine` says more
-    pages = [_page(sources, source, str(cfg.data.label)) for source in sources.logs]
+    pages = [_page(sources, source, str(cfg.data["label"])) for source in sources.logs]
     if cfg.json:
         print(json.dumps(pages, indent=2, ensure_ascii=False))
     else:
@@ -36,7 +23,7 @@ def task(cfg: DictConfig) -> None:
         raise SystemExit(1)
 
 
-def _page(sources: run.Sources, source: Any, label: str) -> dict[str, Any]:
+def _page(sources: Sources, source: Any, label: str) -> dict[str, Any]:
     """Return the page of a log; one that cannot be opened has a single line, its error."""
     try:
         with sources.open(source) as log:

@@ -1,80 +1,84 @@
-"""The groups of a command with their choices, and the names of all its settings."""
+"""The names of all settings, the choices of each group, and the nearest name to a mistyped one."""
 
 from __future__ import annotations
 
-import re
+from dataclasses import fields
 from difflib import get_close_matches
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, Iterable, Iterator, Mapping
-
-import yaml  # type: ignore[import-untyped]
+from typing import Any, Iterable, Iterator
 
 import cflow_torch.configs
-from cflow_torch.config import PRESETS, make_config
+from cflow_torch.cli.commands import ENGINES, PICTURES, Command
+from cflow_torch.config import CONFIGS as METHODS
+from cflow_torch.config import PRESETS
+from cflow_torch.setting import Settings
 
-CONFIGS = Path(cflow_torch.configs.__path__[0])
-PREFIXES = {"data": "data.", "engine": "engine.", "picture": ""}  # group -> prefix of its settings
+CONFIGS = Path(cflow_torch.configs.__path__[0])  # YAML files of data sets and experiments
+_KINDS: dict[str, Iterable[str]] = {"model": PRESETS, "engine": ENGINES, "picture": PICTURES}
 
 
-def groups(command: str) -> dict[str, list[str]]:
-    """Return the groups of a command and their choices: {"model": ["default", ...], ...}."""
-    entries = _load(CONFIGS / f"{command}.yaml")["defaults"]
-    names = [name for entry in entries if isinstance(entry, dict) for name in entry]
-    return {name: list(PRESETS) if name == "model" else [file.stem for file in files(name)] for name in names}
+def choices(group: str) -> list[str]:
+    return list(_KINDS[group]) if group in _KINDS else [file.stem for file in files(group)]
 
 
 def files(group: str) -> list[Path]:
     return sorted((CONFIGS / group).glob("*.yaml"))
 
 
-def settings(command: str) -> list[str]:
-    """Return the dotted names of all settings of a command and of all choices of its groups."""
-    of_methods = [f"model.{name}" for preset in PRESETS for name in make_config(preset).as_dict()]
-    return list(dict.fromkeys([*(name for name, _, _ in defaults(command)), *of_methods]))
+def setting_names(command: type[Command]) -> dict[str, list[str]]:
+    """Return the dotted names of all settings of a command, each with the choices that have it, such as "data=av2"."""
+    names: dict[str, list[str]] = {name: [] for name in own_names(command)}
+    of_groups = command.groups()
+    for choice, name in _names_of_choices():
+        if choice.partition("=")[0] in of_groups and choice not in names.setdefault(name, []):
+            names[name].append(choice)
+    return names
 
 
-def defaults(command: str, chosen: Mapping[str, Any] | None = None) -> Iterator[tuple[str, str, Any]]:
-    """Yield the dotted name, the file and the default of each setting in configs/; `chosen` limits the choices."""
-    found = [("", CONFIGS / f"{command}.yaml")]
-    for group in groups(command):
-        if group in PREFIXES:
-            found += [(PREFIXES[group], f) for f in files(group) if chosen is None or chosen.get(group) == f.stem]
-    for prefix, file in found:
-        yield from ((prefix + name, file.stem, default) for name, default in own_settings(file).items())
+def own_names(kind: type[Settings], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted names of the settings of a class."""
+    for f in fields(kind):  # type: ignore[arg-type]
+        of_kind = f.metadata.get("kind", object)
+        if issubclass(of_kind, Settings):
+            yield from own_names(of_kind, f"{prefix}{f.name}.")
+        elif "kind" in f.metadata:
+            yield f"{prefix}{f.name}"
 
 
-def own_settings(file: Path) -> dict[str, Any]:
-    """Return {dotted name: default} of the settings in a YAML file and in the files that it extends."""
-    content, found = _load(file), {}
-    for base in content.get("defaults", ()):
-        if isinstance(base, str) and base not in ("_self_", "hydra"):
-            found.update(own_settings(file.with_name(f"{base}.yaml")))
-    for key, value in content.items():
-        if isinstance(value, dict):
-            found.update({f"{key}.{name}": own for name, own in value.items() if key != "hydra"})
-        elif key != "defaults":
-            found[key] = value
-    return found
+def _names_of_choices() -> Iterator[tuple[str, str]]:
+    """Yield (choice, dotted name of one of its settings)."""
+    for preset, (method, _) in PRESETS.items():
+        yield from ((f"model={preset}", f"model.{f.name}") for f in fields(METHODS[method]))
+    for engine, kind in ENGINES.items():
+        yield from ((f"engine={engine}", name) for name in own_names(kind, "engine."))
+    for picture, kind in PICTURES.items():
+        yield from ((f"picture={picture}", name) for name in own_names(kind))
+    for file in files("data"):
+        yield from ((f"data={file.stem}", f"data.{name}") for name in names_in(file))
 
 
-@lru_cache(maxsize=None)  # commands share files
-def _load(file: Path) -> dict[str, Any]:
-    """Read a YAML file without Hydra and OmegaConf: importing them takes longer than printing help."""
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    return yaml.load(file.read_text(encoding="utf-8"), loader) or {}  # type: ignore[no-any-return]
+def names_in(file: Path) -> Iterator[str]:
+    """Yield the keys of `read_settings`, by the text alone: reading YAML takes longer than printing help."""
+    for line in file.read_text(encoding="utf-8").splitlines():
+        if line.startswith("  - "):  # a file that this one extends
+            yield from names_in(file.with_name(f"{line[4:].strip()}.yaml"))
+        elif line[:1].isalpha() and not line.startswith("defaults:"):
+            yield line.partition(":")[0]
+
+
+def read_settings(file: Path) -> dict[str, Any]:
+    """Return the settings in the YAML file of a data set, and in the files that it extends, with their defaults."""
+    import yaml  # type: ignore[import-untyped]
+
+    content: dict[str, Any] = yaml.safe_load(file.read_text(encoding="utf-8"))
+    settings: dict[str, Any] = {}
+    for base in content.pop("defaults", ()):
+        settings.update(read_settings(file.with_name(f"{base}.yaml")))
+    return {**settings, **content}
 
 
 def near(word: str, known: Iterable[str]) -> str:
     """Return the hint " (did you mean X?)", "" if no name is similar. We compare names with and without their group."""
     names = {form: name for name in known for form in (name.rpartition(".")[2], name)}
-    found = get_close_matches(word, names, 1)
-    return f" (did you mean {names[found[0]]}?)" if found else ""
-
-
-def settings_help(command: str) -> str:
-    """List the settings of a command for its help: those of its YAML file, and the choices of its groups."""
-    text = (CONFIGS / f"{command}.yaml").read_text(encoding="utf-8")
-    own = re.sub(r"^((defaults|hydra):.*\n( .*\n)+|#.*\n)", "", text, flags=re.MULTILINE).strip()
-    lines = [*own.splitlines(), *(f"{group}={'|'.join(names)}" for group, names in groups(command).items())]
-    return "\n  ".join(["\nsettings:", *lines, "data.NAME, model.NAME, ...: `cflow settings` lists them"]) + "\n"
+    similar = get_close_matches(word, names, 1)
+    return f" (did you mean {names[similar[0]]}?)" if similar else ""

@@ -1,63 +1,130 @@
-"""Writes logs without dynamic objects: OUTPUT/<log id>, a folder of point clouds, poses, times and ground masks.
-
-data=arrays reads such a folder. A point is dynamic if its residual flow is at least 0.05 m per sweep.
-remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car. map=true
-also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them, <log id>.png.
-We keep the other columns of cloud folders, bags, Argoverse 2 and PandaSet, such as intensity. A log is written as a
-whole or not at all. Run the command again to write the missing logs. OUTPUT/config.yaml has settings and versions.
-
-examples:
-  cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag
-  cflow clean data=av2 data.root=/data/av2/val remove_stopped=true
-  cflow clean /data/drive flow=outputs/flow                  with the output of `cflow flow`
-"""
+"""Remove dynamic objects from logs, and build static maps: `cflow clean`."""
 
 from __future__ import annotations
 
+import shutil
 from functools import partial
 from pathlib import Path
-from typing import Callable
+from typing import Any, Callable
 
 import numpy as np
-from omegaconf import DictConfig
 
 from cflow_torch.applications.cleaning import CleanLog, static_map
-from cflow_torch.cli import run
+from cflow_torch.cli.commands import Clean
+from cflow_torch.cli.failures import collect_failures, finish
+from cflow_torch.cli.flows import make_model, stored_flow
+from cflow_torch.cli.logs import open_logs
+from cflow_torch.cli.outputs import local_folder, settings_record, versions, write_config
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
-from cflow_torch.types import CFlowError, FlowResult
+from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.json_file import json_ready, read_json, write_json
+from cflow_torch.data.log import Log
+from cflow_torch.data.read_as import read_as
+from cflow_torch.errors import import_optional
+from cflow_torch.fleet.changes import describe_changes
+from cflow_torch.fleet.manifest import describe_log
+from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
+from cflow_torch.windows.readings import WORLD
+
+# Settings that do not change the points of a log.
+_FREE = ("output", "overwrite", "resume", "device", "map", "data.root", "data.label", "data.check", "model.max_memory")
+_NEEDED = ("residual_flow", "cluster_id", "is_valid")  # of flow files
 
 
-def task(cfg: DictConfig) -> None:
-    output = run.local_folder(cfg)
+def task(cfg: Clean) -> None:
+    output = local_folder(cfg)
     if cfg.suffix is not None and cfg.suffix not in SUFFIXES:
         raise CFlowError(f"suffix={cfg.suffix}: give one of {', '.join(SUFFIXES)}")
-    needed = ("residual_flow", "cluster_id", "is_valid")
-    stored = None if cfg.flow is None else run.stored_flow(cfg.flow, needed)
-    model = None if stored is not None else run.make_model(cfg)
-    logs, failures = run.open_logs(cfg)
-    run.claim_output(cfg, output, ("device", "map"))
+    if cfg.suffix == ".pcd":
+        import_optional("pypcd4", "suffix=.pcd needs pypcd4 (extra clouds): pip install pypcd4")
+    clean = _cleaner(cfg)
+    logs, failures = open_logs(cfg.data)
+    is_new = {log.log_id: _is_new(cfg, log, output) for log in logs}
+    write_config(cfg, ensure_writable(output))
     for log in logs:
-        folder, file = output / log.log_id, output / f"{log.log_id}.ply"
-        flow: Callable[[int], FlowResult] | None = None if stored is None else partial(stored, log)
-        with run.collect_failures(failures, log.log_id):
-            own, more = log.unwrapped, ""
-            suffix = cfg.suffix or (own.files[0].suffix.lower() if isinstance(own, ArraysLog) else ".npy")
-            if not folder.exists():
-                clean = CleanLog(log, model, flow, cfg.remove_stopped)
-                write_array_log(clean, output, suffix)
-                if clean.num_stopped is not None:
-                    more = f"; remove_stopped removed {clean.num_stopped} more points"
-            bin_columns = max(3 + len(log.columns(0)), KITTI_COLUMNS) if suffix == ".bin" else KITTI_COLUMNS
-            to_read = "" if bin_columns == KITTI_COLUMNS else f", read them with data.bin_columns={bin_columns}"
-            print(f"{folder}: {len(log.timestamps)} sweeps{to_read}{more}")
-            if cfg.map and not file.exists():
-                points = static_map(ArraysLog(folder, ground=None, bin_columns=bin_columns), cfg.voxel_size)
-                write_cloud(file, points)
-                print(f"{file}: {len(points)} points{_draw(points, file.with_suffix('.png'))}")
-    run.finish(failures)
+        with collect_failures(failures, log.log_id):
+            _claim(cfg, log, output, is_new.pop(log.log_id, False))
+            _write(cfg, log, output, clean)
+    finish(failures)
+
+
+def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
+    """Return a function that makes the clean log, by the flow of earlier files or by the method."""
+    if cfg.flow is None:
+        model = make_model(cfg.model, cfg.device)
+        return lambda log: CleanLog(log, model, None, cfg.remove_stopped)
+    stored = stored_flow(cfg.flow, _NEEDED)
+    return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped)
+
+
+def _is_new(cfg: Clean, log: Log, output: Path) -> bool:
+    """Test whether a log is to be written. A folder with results of other settings or sweeps is a `CFlowError`."""
+    folder = output / log.log_id
+    if not folder.exists() or cfg.overwrite:
+        return True
+    file = _record_file(folder)
+    before: dict[str, Any] = read_json(file) if file.exists() else {}
+    changes = describe_changes(before, json_ready(_record(cfg, log)), _FREE)
+    if changes or not cfg.resume:
+        why = changes or "with the same settings; resume=true continues it"
+        raise CFlowError(f"{folder} has results of another run ({why}): give overwrite=true, or output=FOLDER")
+    return False
+
+
+def _claim(cfg: Clean, log: Log, output: Path, is_new: bool) -> None:
+    """Remove the older results of a log that is to be written, and record its settings."""
+    folder = output / log.log_id
+    if not is_new:
+        _is_new(cfg, log, output)  # another log of this run may have its name
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    for suffix in (".ply", ".png"):
+        folder.with_name(f"{log.log_id}{suffix}").unlink(missing_ok=True)
+    write_json(_record_file(folder), _record(cfg, log))
+
+
+def _record(cfg: Clean, log: Log) -> dict[str, Any]:
+    """Return what the clean points follow from: settings, versions and the sweeps of the log."""
+    settings = settings_record(cfg)
+    settings["data"].pop("root", None)  # several logs, which may be elsewhere tomorrow
+    return {**settings, "versions": versions(), "log": describe_log(log, "")}
+
+
+def _record_file(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.json")
+
+
+def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog]) -> None:
+    """Write the folder and the map of a log, if they do not exist, and print them."""
+    folder = output / log.log_id
+    file = output / f"{log.log_id}.ply"
+    own = log.unwrapped
+    suffix = cfg.suffix or (own.files[0].suffix.lower() if isinstance(own, ArraysLog) else ".npy")
+    viewpoint = _viewpoint(log, suffix)
+    stopped = ""
+    if not folder.exists():
+        clean_log = clean(log)
+        write_array_log(clean_log, output, suffix, viewpoint)
+        if clean_log.num_stopped is not None:
+            stopped = f"; remove_stopped removed {clean_log.num_stopped} more points"
+    bin_columns = max(3 + len(log.columns(0)), KITTI_COLUMNS) if suffix == ".bin" else KITTI_COLUMNS
+    to_read = "" if bin_columns == KITTI_COLUMNS else f", read them with data.bin_columns={bin_columns}"
+    print(f"{folder}: {len(log.timestamps)} sweeps{to_read}{stopped}")
+    if cfg.map and not file.exists():
+        written = ArraysLog(folder, ground=None, bin_columns=bin_columns)
+        points = static_map(read_as(written, WORLD if viewpoint == "world" else None), cfg.voxel_size)
+        write_cloud(file, points)
+        print(f"{file}: {len(points)} points{_draw(points, file.with_suffix('.png'))}")
+
+
+def _viewpoint(log: Log, suffix: str) -> str | None:
+    """Return the frame of the points in `.pcd` files whose VIEWPOINT has the pose, as the log has it; None = none."""
+    if suffix != ".pcd" or not getattr(log.unwrapped, "has_viewpoints", False):
+        return None
+    return "world" if getattr(log, "read_as", None) == WORLD else "sensor"
 
 
 def _draw(points: np.ndarray, file: Path) -> str:

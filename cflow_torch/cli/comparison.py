@@ -27,9 +27,11 @@ _SCORES = {
 
 
 class Comparison(Callback):
-    """After a run with `-m`, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv."""
+    """After `cflow eval -m`, print a table of all jobs in OUTPUT, and write it to OUTPUT/comparison.csv."""
 
     def on_multirun_end(self, config: Any, **kwargs: Any) -> None:
+        if "experiment_name" not in config:  # another command
+            return
         from cflow_torch.data.atomic import write_text
         from cflow_torch.data.paths import as_path
         from cflow_torch.evaluation.tables import markdown

@@ -1,24 +1,16 @@
-"""Simulates a drive, estimates its flow, scores it and draws it. You need no data.
-
-The drive is written in Argoverse 2's format to outputs/cache and read from there like a real log. OUTPUT (outputs/demo)
-contains flow.html (a 3-D page for any browser), flow.png, <log id>/ with one flow file per pair, results.json with the
-scores, and config.yaml with the settings.
-
-examples:
-  cflow demo
-  cflow demo data.seed=7 pair=2 output=outputs/another    another street, another pair in the picture
-  cflow demo model=paper                                  the method of the paper
-"""
+"""Simulate a drive, estimate its flow, score it and draw it: `cflow demo`."""
 
 from __future__ import annotations
 
 from typing import Any, Callable
 
-from omegaconf import DictConfig
-
 from cflow_torch.applications.tracking import track
-from cflow_torch.cli import run
+from cflow_torch.cli.commands import Demo
 from cflow_torch.cli.eval import Scores
+from cflow_torch.cli.failures import finish
+from cflow_torch.cli.flows import make_model
+from cflow_torch.cli.logs import check_pair, open_logs
+from cflow_torch.cli.outputs import chosen_preset, output_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
@@ -31,15 +23,15 @@ from cflow_torch.viz.page import load_k3d, save_page
 from cflow_torch.viz.style import blank_figure
 
 
-def task(cfg: DictConfig) -> None:
-    output, picture = run.output_folder(cfg), "none"
+def task(cfg: Demo) -> None:
+    output, picture = output_folder(cfg), "none"
     draws = _is_available("picture", lambda: blank_figure((1, 1), 100))  # matplotlib and k3d are extras
     shows = _is_available("page", load_k3d)
     scores = Scores(cfg)
-    model = TimedModel(run.make_model(cfg))
-    logs, failures = run.open_logs(cfg)
+    model = TimedModel(make_model(cfg.model, cfg.device))
+    logs, failures = open_logs(cfg.data)
     if logs:
-        run.check_pair(cfg.pair, max(logs, key=lambda log: len(log.timestamps)))
+        check_pair(cfg.pair, max(logs, key=lambda log: len(log.timestamps)))
     ensure_writable(output)
     results: list[tuple[int, FlowResult]] = []
 
@@ -61,10 +53,10 @@ def task(cfg: DictConfig) -> None:
     print(f"picture: {picture}")
     if shows and results:
         page, tracks = output / "flow.html", track(logs[0], results)
-        save_page(logs[0], results, page, tracks=lambda: tracks, preset=run.preset())
+        save_page(logs[0], results, page, tracks=lambda: tracks, preset=chosen_preset())
         print(f"3-D page, for any browser: {page}")
     print(f"flow files, scores, settings: {output}")
-    run.finish(failures)
+    finish(failures)
 
 
 def _is_available(name: str, load: Callable[[], Any]) -> bool:

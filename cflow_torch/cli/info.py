@@ -1,12 +1,4 @@
-"""Prints the versions of cflow_torch and of the packages that it uses, the system, the processor and the GPUs.
-
---full adds torch's report about the system, and names the optional packages that are not installed.
-
-examples:
-  cflow info            paste the output into a bug report
-  cflow info --full     for a bug of the installation or of a GPU
-  cflow --version       prints the version only
-"""
+"""Print versions and environment for a bug report: `cflow info`."""
 
 from __future__ import annotations
 

@@ -1,18 +1,4 @@
-"""Writes pseudo-labels into OpenSceneFlow's HDF5 scenes, for the training of SeFlow, SeFlow++ and TeFlow.
-
-Each sweep gets the keys dufo (dynamic), dufocluster, cluster and nnd. It gets ground_mask if it has none. Types and
-meanings are those of OpenSceneFlow's own scripts. First, the command estimates the flow like `cflow flow`, with the
-preset offline, which uses earlier and later sweeps. Then each scene is copied, labelled and replaced, so a killed run
-leaves the old scene or the new one. Run the command again to resume; labelled scenes are skipped. The report,
-cflow_label-0-of-1.json, is next to the scenes. You can delete OUTPUT when all scenes are labelled. With shards,
-the process that completes the flow of a scene labels it. The exit statuses are those of `cflow flow`.
-
-examples:
-  cflow label /data/scenes/train
-  cflow label /data/scenes/train dry_run=true                 counts the frames
-  cflow label /data/scenes/train model=default                half the time, finds fewer people
-  cflow label /data/scenes/train shard.index=2 shard.count=16
-"""
+"""Write pseudo-labels into OpenSceneFlow's scenes: `cflow label`."""
 
 from __future__ import annotations
 
@@ -20,17 +6,18 @@ import os
 from contextlib import suppress
 from typing import Any
 
-from omegaconf import DictConfig
 from tqdm import tqdm
 
 from cflow_torch.applications.labels import find_labels
-from cflow_torch.cli import run
+from cflow_torch.cli.commands import Label
+from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow import FlowRun, compute
-from cflow_torch.cli.run import Failures
-from cflow_torch.data.files import write_json
+from cflow_torch.cli.flows import make_model
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
+from cflow_torch.errors import import_optional
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.types import CFlowError
@@ -38,15 +25,16 @@ from cflow_torch.types import CFlowError
 _CONTENTS = ("residual", "cluster_id", "confidence")
 
 
-def task(cfg: DictConfig) -> None:
+def task(cfg: Label) -> None:
     if cfg.data.get("name") != "hdf5":
         raise CFlowError("labels are written into HDF5 scenes of OpenSceneFlow: give their folder, and leave data= out")
     if cfg.model.method != "verified":
         raise CFlowError("labels need the confidence of the flow: give model=offline or default")
+    import_optional("scipy.spatial", "labels need SciPy (extra label): pip install scipy")
     compute(cfg, _CONTENTS, _check, _label)
 
 
-def _check(cfg: DictConfig, flow: FlowRun) -> None:
+def _check(cfg: Label, flow: FlowRun) -> None:
     for scene in flow.sources.logs:
         check_writable(scene)
         maker = None
@@ -57,17 +45,17 @@ def _check(cfg: DictConfig, flow: FlowRun) -> None:
             raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
 
 
-def _label(cfg: DictConfig, flow: FlowRun, report: dict[str, Any]) -> Failures:
+def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
     """Label the scenes of a shard whose flow is complete. If one cannot be written, it stays as it was."""
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
-    model = run.make_model(cfg)
+    model = make_model(cfg.model, cfg.device)
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
-    scenes = [part.source for part in flow.shard.parts(flow.sources.logs)]
+    scenes = [part.source for part in flow.parts]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = as_path(flow.job.output) / scene.stem
-        with run.collect_failures(failures, scene.stem):
+        with collect_failures(failures, scene.stem):
             if labelled_by(scene) == flow.job.identity and not flow.job.redo:
                 continue
             log = flow.sources.open(scene)

@@ -14,7 +14,7 @@ from typing import Any, Callable, Iterator, Sequence, Tuple
 
 import torch
 
-from cflow_torch.cli.run import Failures, collect_failures
+from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.fleet.executors import ProcessExecutor, describe
@@ -25,6 +25,7 @@ from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.inspection import inactive_is_an_error
+from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # windows per worker that are read ahead
 
@@ -127,6 +128,7 @@ class _Estimator:
 
     def __init__(self, method: SceneFlowModel) -> None:
         torch.set_num_threads(1)
+        keep_freed_memory()
         show_warnings_as_lines()
         self._model = TimedModel(method)
 

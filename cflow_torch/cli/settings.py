@@ -1,30 +1,14 @@
-"""Prints all settings as a Markdown page: of the methods, then of the commands, data sets and other groups.
-
-With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
-
---opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-cflow_paper.yaml and cflow_keypoints.yaml. The package contains the same files.
-
-examples:
-  cflow settings max_speed          default, allowed values and meaning of a setting
-  cflow settings data.find_ground   a setting of several data sets
-  cflow settings data               the choices of a group
-  cflow settings data=hdf5 eval     all settings of a data set and of a command
-  cflow settings > settings.md
-  cflow settings --opensceneflow conf/model
-"""
+"""List all settings, or write them for OpenSceneFlow: `cflow settings`."""
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Iterator
+from typing import Iterator, NamedTuple
 
-import yaml  # type: ignore[import-untyped]
-
-from cflow_torch.cli.choices import CONFIGS, files, near, settings
+from cflow_torch.cli.choices import files, near, setting_names
+from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Plot, as_yaml, setting_lines
 from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS, WINDOW, make_config
 from cflow_torch.errors import CFlowError
@@ -50,13 +34,13 @@ target:
   device: auto  # auto = that of the batch
   voxel_size: [0.1, 0.1, 2000.0]  # the harness asks for it; without effect, pixel_sizes counts
 """
-_COMMANDS = sorted(file.stem for file in CONFIGS.glob("*.yaml") if file.stem != "hydra")
+_IN_FILES = ("data", "experiment", "row")  # groups whose choices are YAML files
 _Z = 1000.0  # metres, replaces infinite bounds of z, because the harness computes with the bounds
 
 
 def task(arguments: list[str]) -> None:
     if not arguments:
-        sections = (f"## {title}\n\n" + "\n".join(lines) for _, title, lines in _sections())
+        sections = (f"## {title}\n\n" + "\n".join(lines) for title, lines, _ in _sections())
         print("\n\n".join([_PAGE, *sections]))
     elif len(arguments) == 2 and arguments[0] == "--opensceneflow":
         from cflow_torch.data.atomic import ensure_writable, write_text
@@ -83,54 +67,82 @@ def harness_models() -> dict[str, str]:
         for f in fields(config):
             value = region if f.name == "point_cloud_range" else getattr(config, f.name)
             if f.name not in WINDOW:  # num_frames replaces it
-                text += f"  {f.name}: {_yaml(value)}  # {describe(f.metadata)}\n"
+                text += f"  {f.name}: {as_yaml(value)}  # {describe(f.metadata)}\n"
         models[name] = text
     return models
 
 
-def _sections() -> Iterator[tuple[list[str], str, list[str]]]:
-    """Yield the sections of the page: names, title and lines."""
-    for method, kind in METHODS.items():
-        presets = {preset: make_config(preset) for preset, (of, _) in PRESETS.items() if of == method}
-        rows = ["| setting | default | presets | allowed | meaning |", "|---|---|---|---|---|"]
-        for f in fields(kind):
-            values = {preset: getattr(config, f.name) for preset, config in presets.items()}
-            changed = ", ".join(f"{p} `{_yaml(v)}`" for p, v in values.items() if v != f.default)
-            cells = [f"`model.{f.name}`", f"`{_yaml(f.default)}`", changed, describe(f.metadata), f.metadata["help"]]
-            rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+class Section(NamedTuple):
+    """A section of the page. `cflow settings` finds it by its title or one of its `names`."""
+
+    title: str
+    lines: list[str]
+    names: tuple[str, ...] = ()
+
+
+def _sections() -> Iterator[Section]:
+    """Yield the sections of the page: methods, commands, engines, pictures, and the choices in YAML files."""
+    for method in METHODS:
+        presets = [preset for preset, (of_preset, _) in PRESETS.items() if of_preset == method]
         chosen = [f"model={preset}" for preset in presets]
-        yield [method, *presets, *chosen, "model"], f"Method `{method}`: {', '.join(chosen)}", rows
-    chosen_files = [file for group in sorted(CONFIGS.glob("*/")) for file in files(group.name)]
-    for file in [*(CONFIGS / f"{command}.yaml" for command in _COMMANDS), *chosen_files]:
-        name = file.stem if file.parent == CONFIGS else f"{file.parent.name}={file.stem}"
-        text = file.read_text(encoding="utf-8").strip()
-        yield [name], name if "=" in name else f"cflow {name}", ["```yaml", *text.splitlines(), "```"]
+        title = f"Method `{method}`: {', '.join(chosen)}"
+        yield Section(title, _method_table(method, presets), (method, *presets, *chosen, "model"))
+    for name, command in WITH_SETTINGS.items():
+        yield Section(f"cflow {name}", _block(f"cflow {name}: {command.SUMMARY}.", setting_lines(command)), (name,))
+    for name, engine in ENGINES.items():
+        yield Section(f"engine={name}", _block(str(engine.__doc__), setting_lines(engine)))
+    for name, picture in PICTURES.items():
+        about = str(picture.__doc__).partition("\n")[0]
+        yield Section(f"picture={name}", _block(about, setting_lines(picture, Plot)))
+    for group in _IN_FILES:
+        for file in files(group):
+            lines = file.read_text(encoding="utf-8").strip().splitlines()
+            yield Section(f"{group}={file.stem}", ["```yaml", *lines, "```"])
+
+
+def _method_table(method: str, presets: list[str]) -> list[str]:
+    """Return the rows of a table of all settings of a method."""
+    rows = ["| setting | default | presets | allowed | meaning |", "|---|---|---|---|---|"]
+    configs = {preset: make_config(preset) for preset in presets}
+    for f in fields(METHODS[method]):
+        values = {preset: getattr(config, f.name) for preset, config in configs.items()}
+        changed = [f"{preset} `{as_yaml(value)}`" for preset, value in values.items() if value != f.default]
+        default = f"`{as_yaml(f.default)}`"
+        cells = [f"`model.{f.name}`", default, ", ".join(changed), describe(f.metadata), f.metadata["help"]]
+        rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+    return rows
+
+
+def _block(about: str, lines: Iterator[str]) -> list[str]:
+    return ["```yaml", f"# {about}", *lines, "```"]
 
 
 def _about(name: str) -> list[str]:
     """Return the sections of this name, the first lines of the choices of a group, and the lines of a setting."""
-    group, _, setting = name.rpartition(".")
-    own_line = re.compile(rf"(\| `model\.| *){re.escape(setting)}(`|:)")
-    found: list[str] = []
+    whole: list[str] = []
     choices: list[str] = []
     titles_of: dict[str, list[str]] = {}  # line of a setting -> sections
-    for names, title, lines in _sections():
-        if name in names:
-            found.append("\n".join([f"## {title}", "", *lines]))
-        elif title.startswith(f"{name}="):
-            choices.append(f"{title:28} {next(line[2:] for line in lines if re.match('# [^@]', line))}")
-        elif group in ("", "model", title.partition("=")[0]) or any(line.startswith(f"{group}:") for line in lines):
-            for line in filter(own_line.match, lines):
-                titles_of.setdefault(line.strip(), []).append(title)
-    found += ["\n".join(choices)] if choices else []
-    found += [f"{', '.join(titles)}:\n  {line}" for line, titles in titles_of.items()]
+    for section in _sections():
+        if name in (section.title, *section.names):
+            whole.append("\n".join([f"## {section.title}", "", *section.lines]))
+        elif section.title.startswith(f"{name}="):
+            about = next(line[2:] for line in section.lines if re.match("# [^@]", line))
+            choices.append(f"{section.title:28} {about}")
+        else:
+            for line in _lines_of(name, section):
+                titles_of.setdefault(line.strip(), []).append(section.title)
+    single = [f"{', '.join(titles)}:\n  {line}" for line, titles in titles_of.items()]
+    found = [*whole, *(["\n".join(choices)] if choices else []), *single]
     if not found:
-        known = [key for command in _COMMANDS for key in settings(command)]
-        known += [one for names, *_ in _sections() for one in names]
+        known = [key for command in WITH_SETTINGS.values() for key in setting_names(command)]
+        known += [one for section in _sections() for one in (section.title, *section.names)]
         raise CFlowError(f"settings {name}: nothing has this name{near(name, known)}; `cflow settings` lists all")
     return found
 
 
-def _yaml(value: Any) -> str:
-    value = list(value) if isinstance(value, tuple) else value
-    return yaml.safe_dump([value], default_flow_style=True, width=math.inf).strip()[1:-1]  # type: ignore[no-any-return]
+def _lines_of(name: str, section: Section) -> Iterator[str]:
+    """Yield the lines of a section that define a setting."""
+    group, _, own = name.rpartition(".")
+    is_near = group in ("", "model", section.title.partition("=")[0])
+    if is_near or any(line.startswith(f"{group}:") for line in section.lines):
+        yield from filter(re.compile(rf"(\| `model\.| *){re.escape(own)}(`|:)").match, section.lines)

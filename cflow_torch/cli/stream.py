@@ -1,13 +1,4 @@
-"""Replays the first log of the data in real time and measures the latency: a summary and OUTPUT/stream.json.
-
-Latency is the time from the arrival of sweep t+1 to the flow of sweep t. A late result delays the next one. If sweeps
-have no poses, KISS-ICP (extra odometry) estimates them, and the latency includes this time.
-
-examples:
-  cflow stream drive.bag                          at the speed of the recording
-  cflow stream /data/av2/val/LOG pace=null        as fast as possible
-  cflow stream drive.bag model.num_history=2 device=cuda
-"""
+"""Replay a log in real time and measure the latency: `cflow stream`."""
 
 from __future__ import annotations
 
@@ -15,24 +6,26 @@ import time
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 from tqdm import tqdm
 
 from cflow_torch.applications.stream import FlowStream
-from cflow_torch.cli import run
+from cflow_torch.cli.commands import Stream
+from cflow_torch.cli.logs import open_first_log
+from cflow_torch.cli.outputs import machine, output_folder, versions
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.files import write_json
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
+from cflow_torch.windows.memory import keep_freed_memory
 
 
-def task(cfg: DictConfig) -> None:
-    output = run.output_folder(cfg)
-    stream = FlowStream(config=run.make_model(cfg).config, device=cfg.device, max_gap=cfg.max_gap)
-    sources = run.find_logs(cfg)
-    log = sources.open(sources.logs[0])
+def task(cfg: Stream) -> None:
+    output = output_folder(cfg)
+    keep_freed_memory()
+    stream = FlowStream(config=cfg.model, device=cfg.device, max_gap=cfg.max_gap)
+    log = open_first_log(cfg.data)
     ensure_writable(output)
     report = {"log": log.log_id, **play(stream, log, cfg.pace, cfg.count)}
-    report.update(machine=run.machine(), versions=run.versions())
+    report.update(machine=machine(), versions=versions())
     print(format_report(report))
     write_json(output / "stream.json", report)
     print(f"written to {output / 'stream.json'}")

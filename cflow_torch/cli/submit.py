@@ -1,16 +1,4 @@
-"""Writes the archive for a public leaderboard: OUTPUT/v<version>.zip, from the files in OUTPUT/v<version>/.
-
-The archive is checked and stays only if it passes. Run the command again to resume. OUTPUT/config.yaml contains the
-settings and versions.
-
-version=1: Argoverse 2 scene flow 2023, total flow of the points of the evaluation masks.
-version=3: the multi-dataset challenge of 2026, residual flow of all points.
-
-examples:
-  cflow submit data=hdf5 data.root=/data/challenge_public/test version=3
-  cflow submit data=av2 data.root=/data/av2/test version=1 masks=/data/av2/test-masks.zip
-  cflow submit data=hdf5 data.root=/data/challenge_public/test version=3 archive=mine.zip    only checks
-"""
+"""Write and check an archive for a public leaderboard: `cflow submit`."""
 
 from __future__ import annotations
 
@@ -18,11 +6,12 @@ import shutil
 from pathlib import Path
 from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
-from omegaconf import DictConfig
-
-from cflow_torch.cli import run
+from cflow_torch.cli.commands import Submit
+from cflow_torch.cli.failures import Failures, collect_failures, finish
+from cflow_torch.cli.flows import make_model
+from cflow_torch.cli.logs import open_logs
+from cflow_torch.cli.outputs import claim_output, output_folder
 from cflow_torch.cli.pairs import for_each_pair
-from cflow_torch.cli.run import Failures
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.submission import archive, frames
 from cflow_torch.evaluation.submission.archive import SubmissionVersion
@@ -36,29 +25,29 @@ _Masks = Optional[MaskArchive]
 _Listed = Optional[Mapping[str, Sequence[int]]]
 
 
-def task(cfg: DictConfig) -> None:
-    version, output = archive.get_version(cfg.version), run.output_folder(cfg)
+def task(cfg: Submit) -> None:
+    version, output = archive.get_version(cfg.version), output_folder(cfg)
     if cfg.masks is not None and not version.is_masked:
         raise CFlowError(f"version {version.number} contains every point: masks= is only for version 1")
     if cfg.masks is not None and cfg.frames is not None:
         raise CFlowError("masks= already lists the frames that are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = frames.read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
-    model = TimedModel(run.make_model(cfg))
-    logs, failures = run.open_logs(cfg)
+    model = TimedModel(make_model(cfg.model, cfg.device))
+    logs, failures = open_logs(cfg.data)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
     if cfg.archive is not None:
-        run.finish(failures)  # what the archive must contain is unknown if a log cannot be read
+        finish(failures)  # what the archive must contain is unknown if a log cannot be read
         _check(cfg.archive, version, plan)
         return
     folder, file = output / f"v{version.number}", output / f"v{version.number}.zip"
     if cfg.overwrite:
         shutil.rmtree(folder, ignore_errors=True)
         file.unlink(missing_ok=True)
-    run.claim_output(cfg, output, ("device", "archive"))
+    claim_output(cfg, output, ("device", "archive"))
     failures += _write(plan, model, version, masks, folder)
-    run.finish(failures)
+    finish(failures)
     _check(folder, version, plan)
     archive.pack(folder, [frame.name for frame, _ in plan], file)
     try:
@@ -80,7 +69,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
     plan: Plan = []
     failures: Failures = []
     for frame in Progress(wanted, "rows"):
-        with run.collect_failures(failures, frame.name):
+        with collect_failures(failures, frame.name):
             plan.append((frame, frame.count_rows(version, masks)))
     return plan, failures
 
@@ -107,6 +96,6 @@ def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Ma
 def _check(path: Any, version: SubmissionVersion, plan: Plan) -> None:
     """Print what was checked. If there are problems, list them all and exit with status 1."""
     problems = archive.check_submission(path, version, {frame.name: rows for frame, rows in plan})
-    run.finish([(str(path), problem) for problem in problems])
+    finish([(str(path), problem) for problem in problems])
     rows = sum(rows for _, rows in plan)
     print(f"{path}: passes as version {version.number}, frames: {len(plan)}, rows: {rows:,}")

@@ -1,18 +1,4 @@
-"""Writes a 3-D page per log, OUTPUT/<log id>.html, that any browser opens without a network. Needs the extra `html`.
-
-A page has a timeline of sweeps. It shows the points of sweep t, coloured by residual flow, speed, object, confidence
-and, if the log has labels, truth or error. It also shows an arrow per moving cluster, and the boxes, trails, ids and
-speeds of tracks. flow=FOLDER shows the output of `cflow flow`, and its tracks, instead of new estimates. format=rerun
-writes a recording OUTPUT/<log id>.rrd for the viewer rerun instead of a page, with all points and sweep t+1 (extra
-`rerun`). show=true opens the files at the end. OUTPUT/config.yaml contains the settings and versions.
-
-examples:
-  cflow view                                                   a simulated street, no data needed
-  cflow view /data/av2/val/LOG                                 one log
-  cflow view data=hdf5 data.root=/data/scenes count=20         the first 20 pairs of each scene
-  cflow view data.first=2 data.step=2 max_flow=0.5             every second pair; full colour at 0.5 m per sweep
-  cflow view flow=outputs/flow format=rerun                    the output of `cflow flow` with the same data= settings
-"""
+"""Write a 3-D page, or a recording for the viewer rerun: `cflow view`."""
 
 from __future__ import annotations
 
@@ -20,15 +6,17 @@ import subprocess
 import sys
 import webbrowser
 from pathlib import Path
-from typing import Any, Callable, Iterator
+from typing import Any, Callable, Iterator, Sequence
 
 import numpy as np
-from omegaconf import DictConfig
 
 from cflow_torch.applications.track_table import TRACKS_FILE, Table, confirmed, join_tables, read_tracks
 from cflow_torch.applications.tracking import Tracker
-from cflow_torch.cli import run
-from cflow_torch.cli.run import Failures
+from cflow_torch.cli.commands import View
+from cflow_torch.cli.failures import Failures, collect_failures, finish
+from cflow_torch.cli.flows import make_model, stored_flow
+from cflow_torch.cli.logs import chosen_pairs, open_logs
+from cflow_torch.cli.outputs import chosen_preset, local_folder, write_config
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path
@@ -38,21 +26,21 @@ from cflow_torch.viz.page import load_k3d, save_page
 from cflow_torch.viz.recording import load_rerun, record_log
 
 
-def task(cfg: DictConfig) -> None:
+def task(cfg: View) -> None:
     load_k3d() if cfg.format == "html" else load_rerun()  # fails now if it is missing, not after the work
-    output = run.local_folder(cfg)
-    chosen = run.chosen_pairs(cfg, "data.")
+    output = local_folder(cfg)
     flow, num_sweeps = _flow(cfg)
-    logs, failures = run.open_logs(cfg)
-    run.write_config(cfg, ensure_writable(output))
+    logs, failures = open_logs(cfg.data)
+    write_config(cfg, ensure_writable(output))
     files: list[Path] = []
     for log in logs:
         recent: Any = CachedLog(log, num_sweeps)
         file = output / f"{log.log_id}.{'html' if cfg.format == 'html' else 'rrd'}"
-        with run.collect_failures(failures, log.log_id):
+        with collect_failures(failures, log.log_id):
             if file in files:
                 raise CFlowError(f"{file} exists for another log of this name: give a data.root= with one of them")
-            results = _results(recent, chosen(log), flow, failures)
+            pairs = chosen_pairs(log, cfg.data["first"], cfg.data["step"], cfg.count)
+            results = _results(recent, pairs, flow, failures)
             stored = None if cfg.flow is None else as_path(cfg.flow) / log.log_id / TRACKS_FILE
             table = None if stored is None or not stored.exists() else read_tracks(stored)
             if cfg.format == "html":
@@ -69,12 +57,10 @@ def task(cfg: DictConfig) -> None:
     elif files and cfg.show:  # the viewer outlives this command; without --bind it accepts data from anywhere
         command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", *map(str, files)]
         subprocess.Popen(command, start_new_session=True)
-    run.finish(failures)
+    finish(failures)
 
 
-def _save_page(
-    cfg: DictConfig, log: Log, results: Iterator[tuple[int, FlowResult]], file: Path, table: Table | None
-) -> int:
+def _save_page(cfg: View, log: Log, results: Iterator[tuple[int, FlowResult]], file: Path, table: Table | None) -> int:
     """Save a page. Without a table of tracks, track the objects of the results as they arrive."""
     tracker, tables = Tracker(), []
 
@@ -89,28 +75,28 @@ def _save_page(
         results if table is not None else tracked(),
         file,
         tracks=lambda: confirmed(join_tables(tables)) if table is None else table,
-        preset=run.preset() if cfg.flow is None else None,
+        preset=chosen_preset() if cfg.flow is None else None,
         max_flow=cfg.max_flow,
         voxel=cfg.voxel,
     )
 
 
-def _flow(cfg: DictConfig) -> tuple[Callable[[Log, int], FlowResult], int]:
+def _flow(cfg: View) -> tuple[Callable[[Log, int], FlowResult], int]:
     """Return a function that returns the flow of a pair, and the number of sweeps that this function needs."""
     if cfg.flow is not None:
-        return run.stored_flow(cfg.flow, ("residual_flow", "pose_flow", "cluster_id", "is_valid")), 2
-    model = run.make_model(cfg)
+        return stored_flow(cfg.flow, ("residual_flow", "pose_flow", "cluster_id", "is_valid")), 2
+    model = make_model(cfg.model, cfg.device)
     num_history, num_future = model.config.num_history, model.config.num_future
     return lambda log, index: model([window(log, index, num_history, num_future)])[0], model.config.num_sweeps
 
 
 def _results(
-    log: Log, pairs: range, flow: Callable[[Log, int], FlowResult], failures: Failures
+    log: Log, pairs: Sequence[int], flow: Callable[[Log, int], FlowResult], failures: Failures
 ) -> Iterator[tuple[int, FlowResult]]:
     """Yield the flow of each pair. A bad frame is reported and skipped."""
     for index in Progress(pairs, log.log_id):
         result = None
-        with run.collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
+        with collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
             window(log, index)  # fails now if a sweep cannot be read, not while the file is written
             log.labels(index)
             result = flow(log, index)

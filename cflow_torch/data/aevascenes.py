@@ -11,12 +11,13 @@ import numpy as np
 from numpy.lib import format as npy
 
 from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
-from cflow_torch.data.files import file_errors, read_json, shortened
+from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
 from cflow_torch.data.pickles import load_array
-from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array
+from cflow_torch.windows.returns import missing_returns
 
 _HINT = "copy the sequence from the data set again"
 

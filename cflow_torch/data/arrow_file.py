@@ -7,7 +7,7 @@ from typing import Any, Sequence
 import numpy as np
 import pyarrow as pa
 
-from cflow_torch.data.files import check_columns, file_errors
+from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError, check_array
 

@@ -12,8 +12,10 @@ from cflow_torch.data.arrays.cloud_file import read_columns
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.categories import CATEGORIES
-from cflow_torch.data.files import file_errors, read_json, read_npy
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_errors
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array, vector_columns

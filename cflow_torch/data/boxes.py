@@ -8,7 +8,7 @@ from typing import Any, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.files import shortened
+from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.types import CFlowError

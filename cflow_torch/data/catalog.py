@@ -12,16 +12,19 @@ from typing import Any, Mapping, NamedTuple, Sequence
 
 from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
 from cflow_torch.data.deskewing import DeskewedLog
-from cflow_torch.data.files import find_folders, shortened
+from cflow_torch.data.file_errors import shortened
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
+from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.deskewing import SCANS
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
 
-_OF_ALL = ("find_ground", "odometry", "read_as", "deskew", "check")  # settings of every data set
+_OF_ALL = ("find_ground", "odometry", "read_as", "own_vehicle", "deskew", "check")  # settings of every data set
 AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
@@ -190,6 +193,7 @@ def open_log(
     check: bool = True,
     deskew: Any = "auto",
     read_as: str | None = "auto",
+    own_vehicle: str | None = "auto",
     **settings: Any,
 ) -> Log:
     """Open one log.
@@ -201,7 +205,9 @@ def open_log(
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
-        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`.
+        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`. Or a
+            value of `deskew`: "times", "clockwise", ...
+        own_vehicle: "auto" = leave out returns that ride along with the vehicle, see `OwnVehicleLog`; None = keep them.
         deskew: how to move points to the instant of their sweep, see `cflow_torch.data.deskewing.DeskewedLog`; False
             (what `off` means in YAML) = "off", True = "auto".
         **settings: keyword arguments of the reader.
@@ -214,8 +220,12 @@ def open_log(
         raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")
     if isinstance(deskew, bool):
         deskew = "auto" if deskew else "off"
+    if read_as in ("times", *SCANS) and deskew == "auto":  # how sweeps are scanned is a reading of the log, too
+        deskew, read_as = read_as, "auto"
     if deskew not in DESKEW_CHOICES:
         raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
+    if own_vehicle not in ("auto", None):
+        raise CFlowError(f"own_vehicle={own_vehicle!r}: give auto, or null to keep returns of the own vehicle")
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
     if isinstance(source, UserSource):
@@ -230,6 +240,8 @@ def open_log(
 
         log = with_poses(log)
     log = read_log_as(log, read_as)
+    if own_vehicle is not None:
+        log = OwnVehicleLog(log)
     if deskew != "off":
         log = DeskewedLog(log, deskew)
     if find_ground is not None:

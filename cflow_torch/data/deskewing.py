@@ -89,7 +89,8 @@ class DeskewedLog(LogWrapper):
             return sweep
         seconds = self.seconds(sweep, reading, slice(None))
         points = self.move(as_numpy(sweep.points), seconds, index, reading)
-        return replace(sweep, points=points, point_times=seconds.astype(np.float32))
+        times = np.nan_to_num(seconds).astype(np.float32)  # points that are not finite have no azimuth
+        return replace(sweep, points=points, point_times=times)
 
     def seconds(self, sweep: Sweep, reading: str, rows: Any) -> np.ndarray:
         """Return the time from the instant of a sweep to some of its measurements, (N,) float64 seconds."""
@@ -193,7 +194,8 @@ def choose_reading(log: DeskewedLog) -> Reading:
     has_times = log.read(0, "off").point_times is not None
     expected = "times" if has_times and own.has_raw_times else "off"
     others = ["off" if expected == "times" else "times"] if has_times else list(DIRECTIONS)
-    shares = _shares(log, [expected, *others])
+    pairs = _choose_pairs(log)
+    shares = _shares(log, pairs, [expected, *others])
     best = expected
     if shares:
         ranked = sorted(shares, key=lambda name: float(shares[name].mean()), reverse=True)
@@ -201,11 +203,11 @@ def choose_reading(log: DeskewedLog) -> Reading:
         found = ranked[0]
         is_ordered = found != expected and ranked[1] == expected and means[0] >= _LIKELY * means[1]
         if is_ordered and found in DIRECTIONS:
-            found, shares[ranked[0]] = _best_start(log, found, shares[found])
+            found, shares[ranked[0]] = _best_start(log, pairs, found, shares[found])
         is_ordered &= all(better >= _LIKELY * worse for better, worse in zip(means[1:], means[2:]))
         is_clear = is_ordered and shares[ranked[0]].mean() >= _CLEARLY * means[1]
         if is_clear and (shares[ranked[0]] > shares[expected]).all():
-            shifted = _shares(log, [found], _SHIFT)[found]
+            shifted = _shares(log, pairs, [found], _SHIFT)[found]
             best = found if shares[ranked[0]].mean() > _PEAK * shifted.mean() else expected
     if best == "off" and expected == "off":
         return Reading("off")
@@ -220,9 +222,9 @@ def choose_reading(log: DeskewedLog) -> Reading:
     return Reading(best, note + ", data.deskew=off leaves the points as they are")
 
 
-def _best_start(log: DeskewedLog, direction: str, behind: np.ndarray) -> tuple[str, np.ndarray]:
+def _best_start(log: DeskewedLog, pairs: Sequence[_Pair], direction: str, behind: np.ndarray) -> tuple[str, np.ndarray]:
     """Return where a turn begins, as the name of the reading, and its shares. `behind` are those of a start behind."""
-    shares = _shares(log, [direction + start for start in STARTS if start])
+    shares = _shares(log, pairs, [direction + start for start in STARTS if start])
     best = max(shares, key=lambda name: float(shares[name].mean()))
     is_better = shares[best].mean() >= _LIKELY * behind.mean()
     return (best, shares[best]) if is_better else (direction, behind)
@@ -232,49 +234,60 @@ def _described(shares: dict[str, np.ndarray]) -> str:
     return ", ".join(f"{values.mean():.1%} with {name}" for name, values in shares.items())
 
 
-def _shares(log: DeskewedLog, readings: Sequence[str], shift: float = 0.0) -> dict[str, np.ndarray]:
-    """Return the share of static structure in place in each pair, by reading; {} if the log does not allow to judge.
+class _Pair(NamedTuple):
+    """Two sweeps some metres apart, as stored, and the rows of their static structure, thinned."""
 
-    The earlier sweep of each pair is moved by `shift` metres along the path.
-    """
+    indices: tuple[int, int]  # the earlier and the later one
+    sweeps: tuple[Sweep, Sweep]
+    rows: tuple[np.ndarray, np.ndarray]
+
+
+def _choose_pairs(log: DeskewedLog) -> list[_Pair]:
+    """Read three pairs of sweeps about 6 m apart; [] if the vehicle is too slow, or too little structure is in view."""
     poses: Any = log.ego_poses
     motion = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     is_fast = motion > _LEAST_MOTION
     if not is_fast.any():
-        return {}
+        return []
     distance = int(np.clip(round(_BASELINE / float(np.median(motion[is_fast]))), 1, _MOST_SWEEPS))
     distance = min(distance, len(log) - 1)
     starts = np.flatnonzero(is_fast[: len(log) - distance])
     if not len(starts):
-        return {}
+        return []
     chosen = np.unique(starts[np.linspace(0, len(starts) - 1, _PAIRS).round().astype(int)])
-    of_pairs = [_shares_of_pair(log, int(index), int(index) + distance, readings, shift) for index in chosen]
-    kept = [shares for shares in of_pairs if shares is not None]
-    return {name: np.array([shares[k] for shares in kept]) for k, name in enumerate(readings)} if kept else {}
+    pairs = []
+    for earlier in chosen.tolist():
+        indices = earlier, earlier + distance
+        sweeps = log.read(indices[0], "off"), log.read(indices[1], "off")
+        source, target = (_thinned_structure(sweep) for sweep in sweeps)
+        if min(len(source), len(target)) >= _FEWEST_POINTS:
+            source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
+            pairs.append(_Pair(indices, sweeps, (source, target)))
+    return pairs
 
 
-def _shares_of_pair(
-    log: DeskewedLog, earlier: int, later: int, readings: Sequence[str], shift: float
-) -> list[float] | None:
-    """Return the share of static structure in place under each reading; None = too few points."""
-    sweeps = [log.read(index, "off") for index in (earlier, later)]
-    rows = []
-    for sweep in sweeps:
-        static = static_rows(sweep)
-        rows.append(static[thinned_rows(as_numpy(sweep.points)[static, :3])])
-    source = rows[0]
-    if min(len(source), len(rows[1])) < _FEWEST_POINTS:
-        return None
-    rows[0] = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
-    T_later_earlier = relative_transform(sweeps[1].pose, sweeps[0].pose)
-    T_later_earlier[:3, 3] *= 1 + shift / float(np.linalg.norm(T_later_earlier[:3, 3]))
-    found = []
-    for reading in readings:
-        clouds = []
-        for sweep, chosen, index in zip(sweeps, rows, (earlier, later)):
-            points = as_numpy(sweep.points)[chosen, :3]
-            if reading != "off":
-                points = log.move(points, log.seconds(sweep, reading, chosen), index, reading)
-            clouds.append(points)
-        found.append(share_in_place(clouds[0], clouds[1], T_later_earlier))
-    return found
+def _thinned_structure(sweep: Sweep) -> np.ndarray:
+    static = static_rows(sweep)
+    return static[thinned_rows(as_numpy(sweep.points)[static, :3])]
+
+
+def _shares(
+    log: DeskewedLog, pairs: Sequence[_Pair], readings: Sequence[str], shift: float = 0.0
+) -> dict[str, np.ndarray]:
+    """Return the share of static structure in place in each pair, by reading; {} without pairs.
+
+    The earlier sweep of each pair is moved by `shift` metres along the path.
+    """
+    shares: dict[str, list[float]] = {name: [] for name in readings if pairs}
+    for pair in pairs:
+        T_later_earlier = relative_transform(pair.sweeps[1].pose, pair.sweeps[0].pose)
+        T_later_earlier[:3, 3] *= 1 + shift / float(np.linalg.norm(T_later_earlier[:3, 3]))
+        for reading, of_pairs in shares.items():
+            clouds = []
+            for sweep, rows, index in zip(pair.sweeps, pair.rows, pair.indices):
+                points = as_numpy(sweep.points)[rows, :3]
+                if reading != "off":
+                    points = log.move(points, log.seconds(sweep, reading, rows), index, reading)
+                clouds.append(points)
+            of_pairs.append(share_in_place(clouds[0], clouds[1], T_later_earlier))
+    return {name: np.array(of_pairs) for name, of_pairs in shares.items()}

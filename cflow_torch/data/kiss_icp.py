@@ -8,7 +8,7 @@ from typing import Any, Iterator
 
 import numpy as np
 
-from cflow_torch.data.files import shortened
+from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.errors import CFlowError, import_optional

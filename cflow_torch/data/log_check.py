@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Any, Callable, Iterable, NamedTuple
 
 import numpy as np
@@ -19,9 +18,6 @@ RIGHT, FOUND, WRONG = "right", "found and used", "wrong"
 _CACHED = 12  # sweeps that several checks read
 _PAIRS, _ALL_PAIRS = 3, 6  # pairs that are compared in the quick check and in the whole one
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
-_OWN_REACH, _OWN_CELL = 2.7, 0.25  # metres: returns of the own vehicle are this near, and stay in cells of this side
-_OWN_SHARE, _OWN_DISTANCE = 0.8, 2.0  # of the compared sweeps; metres that the vehicle must have moved
-_FEWEST_OWN = 20  # points
 _GAP = 2.5  # usual intervals between sweeps; a longer one is a gap
 _LONGEST_GAP = 0.5  # seconds
 
@@ -63,18 +59,21 @@ def examine(log: Log) -> list[Finding]:
         *(_sensor, _frame, _reading, _times, _poses, _lapses, _motion_of_all, _deskew),
         *(_repeated, _ground, _mask, _own_vehicle, _labels),
     )
-    findings = _collect(cached, checks)
+    findings = _collect(cached, checks, tells_errors=True)
     notes = getattr(log, "notes", ())  # complete only now, as readers note what they see in the sweeps
     return [*findings, *(Finding("reader", FOUND, note) for note in notes)]
 
 
-def _collect(log: Log, checks: Iterable[Callable[[Log], Finding | None]]) -> list[Finding]:
+def _collect(log: Log, checks: Iterable[Callable[[Log], Finding | None]], tells_errors: bool = False) -> list[Finding]:
+    """Return what the checks find. A check that cannot read a sweep finds its error, if it `tells_errors`."""
     found: list[Finding] = []
     for check in checks:
-        with suppress(CFlowError, OSError):
+        try:
             finding = check(log)
-            if finding is not None:
-                found.append(finding)
+        except (CFlowError, OSError) as error:
+            finding = Finding("log", WRONG, str(error)) if tells_errors else None
+        if finding is not None and finding not in found:
+            found.append(finding)
     return found
 
 
@@ -120,7 +119,7 @@ def _motion_of(log: Log, count: int) -> Finding | None:
     elif name == MOUNT:
         why, fix = "in turns,", f"pass data.ego_T_lidar with about x = {judgement.offset:g} m (data=arrays or hdf5)"
     elif name == NO_READING:
-        why, fix = "", "check that the poses belong to this log, their times and units"
+        why, fix = "", "check that the poses belong to this log, their times, units and quaternions"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(f"data.read_as={each}" for each in judgement.best)
@@ -180,13 +179,7 @@ def _deskew(log: Any) -> Finding | None:
     if sweep.point_times is not None:
         spread = np.ptp(as_numpy(sweep.point_times)) if len(sweep.point_times) else 0.0
         return Finding("de-skewing", RIGHT, f"points have times over {spread:.3f} s", True)
-    if not getattr(log, "deskew", False) or sweep.pose is None:
-        return None
-    text = (
-        "it has no times of points, so its sweeps are not de-skewed, and static objects are smeared while the vehicle "
-        "moves. If the clouds are already compensated, set data.deskew=off"
-    )
-    return Finding("de-skewing", WRONG, text, True)
+    return Finding("de-skewing", RIGHT, "no times of points, and no other reading fits clearly better than as stored")
 
 
 def _repeated(log: Log) -> Finding | None:
@@ -234,9 +227,9 @@ def _beams(points: np.ndarray) -> tuple[int, float]:
 def _times(log: Log) -> Finding:
     if log.sweep(0).timestamp_ns is None:
         return Finding("times", RIGHT, "the sweeps have no times, so motion is known per sweep, not per second")
-    stamps = np.array([int(stamp) for stamp in log.timestamps], np.float64)
+    stamps = np.array([int(stamp) for stamp in log.timestamps])
     nanoseconds = log.sweep(0).timestamp_ns or stamps[0]
-    unit = 1e-9 * (nanoseconds / stamps[0] if stamps[0] else 1.0)
+    unit = 1e-9 * (float(nanoseconds) / float(stamps[0]) if stamps[0] else 1.0)
     interval = np.diff(stamps) * unit
     usual = float(np.median(interval))
     if usual <= 0 or (interval <= 0).any():
@@ -266,29 +259,12 @@ def _poses(log: Log) -> Finding:
     return Finding("poses", RIGHT, text)
 
 
-def _own_vehicle(log: Log) -> Finding | None:
-    """Look for returns that stay at the same place of the vehicle's frame while it drives."""
-    indices = np.unique(np.linspace(0, len(log.timestamps) - 1, 5).astype(int))
-    sweeps = [log.sweep(int(index)) for index in indices]
-    if any(sweep.pose is None for sweep in sweeps):
+def _own_vehicle(log: Any) -> Finding | None:
+    cells = getattr(log, "own_cells", None)
+    if cells is None:
         return None
-    positions = np.array([np.asarray(sweep.pose)[:3, 3] for sweep in sweeps])
-    if np.linalg.norm(np.diff(positions, axis=0), axis=1).min(initial=np.inf) < _OWN_DISTANCE:
-        return None
-    cells = []
-    for sweep in sweeps:
-        points = as_numpy(sweep.points)[:, :3].astype(np.float64)
-        near = np.isfinite(points).all(1) & (np.abs(points[:, :2]) < _OWN_REACH).all(1)
-        near &= ~as_numpy(sweep.is_ground) if sweep.is_ground is not None else True
-        cells.append(np.unique(np.floor(points[near] / _OWN_CELL).astype(np.int64), axis=0))
-    cell, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
-    fixed = cell[count >= _OWN_SHARE * len(sweeps)]
-    if len(fixed) < _FEWEST_OWN:
-        return Finding("own vehicle", RIGHT, "none of its returns are seen")
-    low, high = fixed[:, :2].min(0) * _OWN_CELL, (fixed[:, :2].max(0) + 1) * _OWN_CELL
-    box = ",".join(f"{value:.1f}" for value in (*low, *high))
-    text = f"some {len(fixed)} returns within {_OWN_REACH:g} m ride along: give model.ego_box=[{box}]"
-    return Finding("own vehicle", WRONG, text)
+    text = f"returns in {len(cells)} cells near the origin ride along, so we leave them out"
+    return Finding("own vehicle", FOUND, text) if len(cells) else Finding("own vehicle", RIGHT, "no returns are seen")
 
 
 def _labels(log: Log) -> Finding:

@@ -8,7 +8,17 @@ import numpy as np
 
 from cflow_torch.data.log import Log
 from cflow_torch.errors import CFlowError
-from cflow_torch.windows.readings import CERTAIN, WORLD, Judgement, difference, is_around, judge, make_pair, turn_of
+from cflow_torch.windows.readings import (
+    CERTAIN,
+    STILL,
+    WORLD,
+    Judgement,
+    difference,
+    is_around,
+    judge,
+    make_pair,
+    turn_of,
+)
 from cflow_torch.windows.stillness import Structure
 
 _LONGEST_STEP, _MOST_SWEEPS = 3.2, 5  # metres and sweeps between the two sweeps of a pair
@@ -96,15 +106,21 @@ def _judge_pairs(log: Log, poses: np.ndarray | None, count: int) -> Judgement:
 def is_in_world(log: Log) -> bool:
     """Test whether the points of a log are in the world's frame.
 
-    False for logs without `poses`, and if a sweep that we need cannot be read; `sweep` will raise its error.
+    They lie around the positions of the poses, or the poses come with the clouds (`ArraysLog.has_viewpoints`), and the
+    static world stands still without the poses. False for logs without `poses`, and if a sweep that we need cannot be
+    read; `sweep` will raise its error.
 
-    Cost: reads one sweep, and four more if its points lie around the position of its pose.
+    Cost: reads one sweep, and up to six more if one of the signs is there.
     """
     poses = known_poses(log)
+    has_viewpoints = bool(getattr(log.unwrapped, "has_viewpoints", False))
     try:
-        return poses is not None and _surrounds_poses(log, poses) and judge_log(log).best == (WORLD,)
+        if poses is None or not (has_viewpoints or _surrounds_poses(log, poses)):
+            return False
+        best = judge_log(log).best
     except (CFlowError, OSError):
         return False
+    return WORLD in best or (has_viewpoints and STILL in best)
 
 
 def _surrounds_poses(log: Log, poses: np.ndarray) -> bool:

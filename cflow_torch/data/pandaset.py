@@ -11,7 +11,8 @@ import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, upright_poses
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.files import check_columns, file_errors, read_json
+from cflow_torch.data.file_errors import check_columns, file_errors
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, remote_errors
 from cflow_torch.data.pickles import load_columns

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cflow_torch.data.arrays.pcd import pcd_fields
-from cflow_torch.data.files import check_columns, file_errors
+from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES, OWN_TRAILER, Footprint, NuScenesLog
 from cflow_torch.data.nuscenes.tables import SceneSource, find_scenes
 from cflow_torch.data.paths import PathLike, read_bytes

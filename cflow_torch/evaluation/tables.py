@@ -11,7 +11,8 @@ Table = Tuple[List[str], List[List[Any]]]
 def format_table(results: dict[str, Any]) -> str:
     """Format the result of `SceneFlowMetrics.compute` as Markdown, one table per metric.
 
-    Metrics that the definition lacks have no table. A "-" means that there are no points.
+    The result may come from a JSON file, which has null instead of NaN. Metrics that the definition lacks have no
+    table. A "-" means that there are no points.
     """
     scored = "{num_frames} frames, {num_points} points scored, {num_nan} ignored because of NaN"
     lines = [f"definition {results['definition']}: {scored.format_map(results)}"]
@@ -58,8 +59,8 @@ _TABLES: dict[str, Callable[[dict[str, Any]], Table]] = {
 }
 
 
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.4f}"
+def _number(value: float | None) -> str:
+    return "-" if value is None or math.isnan(value) else f"{value:.4f}"
 
 
 def markdown(header: Sequence[object], rows: Sequence[Sequence[object]]) -> list[str]:

@@ -1,7 +1,7 @@
 """The files in an output folder, and the manifests that keep results of different settings or inputs apart.
 
-OUTPUT/manifest.json              identity of the run (method, data settings, contents, versions) and its hash
-OUTPUT/<log id>/manifest.json     time stamps of the log, digests of its first, middle and last sweep
+OUTPUT/runs/<hash>.json           identity of a run: method, data settings, contents, versions
+OUTPUT/<log id>/manifest.json     hash of the run, time stamps of the log, digests of its first, middle and last sweep
 OUTPUT/<log id>/<ns>.feather      a frame; its file gets this name when it is complete
 OUTPUT/<log id>/tracks.parquet    moving objects of a log whose frames are all complete
 """
@@ -15,7 +15,7 @@ import re
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Mapping, Sequence
+from typing import Any, Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -23,17 +23,19 @@ import torch
 from cflow_torch import __version__
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import remove_stale, write_text
-from cflow_torch.data.files import describe_changes, json_ready, read_json
 from cflow_torch.data.flow_file import CONTENTS
+from cflow_torch.data.json_file import json_ready, read_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
+from cflow_torch.fleet.changes import describe_changes
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
+RUNS = "runs"
 _FORMAT = 1
 _ENDING = b"ARROW1"  # last bytes of a feather file
-_OURS = re.compile(r"[0-9]+\.feather|manifest\.json|tracks\.parquet|\..+\.tmp")
-_REMEDY = "give output=FOLDER, or overwrite=true"
+_OURS = re.compile(r"[0-9]+\.feather|manifest\.json|tracks\.parquet|mot\.txt|kitti\.txt|\..+\.tmp")
+_OVERWRITE = "give overwrite=true"
 
 
 def make_identity(
@@ -56,32 +58,48 @@ def make_identity(
     return {**identity, "hash": hashlib.sha256(_text(identity).encode()).hexdigest()}
 
 
-def check_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
-    """Raise a `CFlowError` if results of this identity must not be added to a folder.
+def check_logs(
+    output: Path, names: Iterable[str], identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool
+) -> None:
+    """Raise a `CFlowError` if results of a run must not be added to the folders of logs in `output`.
 
-    `resume` continues an earlier run of the same identity. `overwrite` removes the results of earlier runs. It is
-    allowed only if you are `alone`, that is, if no other shard works in this folder.
+    `resume` continues an earlier run of the same identity. `overwrite` replaces the results of other runs. It is
+    allowed only if you are `alone`, that is, if no other shard works on these logs. A worker checks a log again when it
+    has opened it (`claim_log`).
     """
     forget_listings(output)
-    before = _read(output / MANIFEST)
-    if before is None or (overwrite and alone):
-        return
-    why = describe_changes(before, identity, ["hash"])
-    if why or not (resume or overwrite):
-        why = f"({why})" if why else "with the same settings (resume=true continues it)"
-        # A shard does not know whether another one has already replaced the older results.
-        remedy = "remove the folder, or give output=FOLDER" if overwrite else _REMEDY
-        raise CFlowError(f"{output} has results of another run {why}: {remedy}")
+    runs = output / RUNS
+    with remote_errors(runs):
+        known = {file.name for file in runs.iterdir()} if runs.is_dir() else set()
+    has_others = bool(known - {run_file(output, str(identity["hash"])).name})
+    for name in names if has_others or not resume else ():  # an object store takes a while for each log
+        before = _read(output / name / MANIFEST)
+        if before is None or (overwrite and alone) or not complete_frames(output / name):
+            continue
+        if before.get("run") != identity["hash"]:
+            raise _of_another_run(output / name, before, identity, "remove that folder" if overwrite else _OVERWRITE)
+        if not (resume or overwrite):
+            raise CFlowError(f"{output / name} has results with the same settings: give resume=true or overwrite=true")
 
 
-def claim_folder(output: Path, identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool) -> None:
-    """Make sure that a folder has results of this identity only, see `check_folder`, and write its manifest."""
-    check_folder(output, identity, resume, overwrite, alone)
-    if overwrite and alone and output.is_dir():
-        _clear(output)
+def claim_run(output: Path, identity: Mapping[str, Any], replaced: Iterable[str] = ()) -> None:
+    """Write the identity of a run, and remove the older results of the logs `replaced`."""
+    for name in replaced:
+        _clear(output / name)
     remove_stale(output)
-    if not (output / MANIFEST).exists():
-        write_text(output / MANIFEST, _text(identity))
+    write_text(run_file(output, str(identity["hash"])), _text(identity))
+
+
+def release_run(output: Path, run: str) -> None:
+    """Remove the manifests of a run that has no frame, so that they keep no other run away."""
+    folders = [path for path in output.iterdir() if path.is_dir()] if output.is_dir() else []
+    for folder in folders:
+        if (_read(folder / MANIFEST) or {}).get("run") == run and not complete_frames(folder):
+            _clear(folder)
+    with suppress(FileNotFoundError):
+        run_file(output, run).unlink()
+    with suppress(OSError):  # another run is there
+        (output / RUNS).rmdir()
 
 
 def claim_log(folder: Path, log: Log, run: str) -> None:
@@ -89,12 +107,13 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
 
     A log that has changed since, or another log of its name, is a `CFlowError`. Cost: reads three sweeps.
     """
-    now = _describe_log(log, run)
-    if _read(folder / MANIFEST) is None:
+    now = describe_log(log, run)
+    before = _read(folder / MANIFEST)
+    if before is None or (before.get("run") != run and not complete_frames(folder)):
         write_text(folder / MANIFEST, _text(now))
     before = _read(folder / MANIFEST) or {}  # another process may have been quicker
     if before.get("run") != run:
-        raise CFlowError(f"{folder} has flow of another run: remove that folder, or give output=FOLDER")
+        raise _of_another_run(folder, before, _read(run_file(folder.parent, run)) or {}, _OVERWRITE)
     is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
     both = now["sweeps"].keys() & (before.get("sweeps") or {}).keys()
     if not is_same or any(before["sweeps"][key] != now["sweeps"][key] for key in both):
@@ -104,8 +123,27 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
         )
 
 
-def _describe_log(log: Log, run: str) -> dict[str, Any]:
-    """Return the manifest of a log. A sweep that cannot be read has no digest; its frames fail later."""
+def _of_another_run(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], remedy: str) -> CFlowError:
+    """Return the error for a log with results of another run; it lists the changes of settings if they are known."""
+    other = _read(run_file(folder.parent, str(before.get("run"))))
+    changes = describe_changes(other, now, ["hash"]) if other is not None and now else ""
+    if other is not None and now and other["data"]["reader"] != now["data"]["reader"]:
+        changes = f"of data={other['data']['reader']}, not {now['data']['reader']}"
+    return CFlowError(
+        f"{folder} has results of another run{f' ({changes})' if changes else ''}: {remedy}, or give output=FOLDER"
+    )
+
+
+def run_file(output: Path, run: str) -> Path:
+    """Return the file with the identity of a run, whose hash is `run`; every process of the run sees it."""
+    return output / RUNS / f"{run[:16]}.json"
+
+
+def describe_log(log: Log, run: str) -> dict[str, Any]:
+    """Return the manifest of a log: time stamps, and digests of its first, middle and last sweep.
+
+    A sweep that cannot be read has no digest; its frames fail later.
+    """
     stamps = [int(stamp) for stamp in log.timestamps]
     digests = {}
     for index in sorted({0, len(stamps) // 2, len(stamps) - 1} & set(range(len(stamps)))):
@@ -148,22 +186,18 @@ def _digest(log: Log, index: int) -> str:
     return digest.hexdigest()
 
 
-def _clear(output: Path) -> None:
-    """Remove the results of a run and no other files.
+def _clear(folder: Path) -> None:
+    """Remove the results of a log and no other files.
 
-    We remove the manifest of the run first, so that a killed process leaves an unclaimed folder. We remove the manifest
-    of a log last, because it marks the folder of the log as ours.
+    We remove the manifest last, because it marks the folder as ours.
     """
-    logs = [path for path in output.iterdir() if (path / MANIFEST).exists()]
-    for name in (MANIFEST, "config.yaml"):
-        with suppress(FileNotFoundError):
-            (output / name).unlink()
-    for folder in logs:
-        for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
-            if _OURS.fullmatch(file.name):
-                file.unlink()
-        with suppress(OSError):  # it has other files, or an object store has no folders
-            folder.rmdir()
+    if not (folder / MANIFEST).exists():
+        return
+    for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
+        if _OURS.fullmatch(file.name):
+            file.unlink()
+    with suppress(OSError):  # it has other files, or an object store has no folders
+        folder.rmdir()
 
 
 def _read(file: Path) -> dict[str, Any] | None:
@@ -172,7 +206,7 @@ def _read(file: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except CFlowError as error:
-        raise CFlowError(f"{file} is not a manifest ({error}): remove it, or {_REMEDY}") from None
+        raise CFlowError(f"{file} is not a manifest ({error}): remove it, or give output=FOLDER") from None
 
 
 def _text(content: Mapping[str, Any]) -> str:

@@ -34,7 +34,7 @@ def run_local(
 ) -> Iterator[Event]:
     """Do all parts with processes of this machine, one per device, and yield events as they happen.
 
-    configs/engine/local.yaml explains the settings. A single worker without a memory limit runs in this process.
+    `cli.commands.Local` explains the settings. A single worker without a memory limit runs in this process.
     """
     if len(layout.devices) > 1 or memory is not None:
         executors = [ProcessExecutor(make_worker, job, device, memory) for device in layout.devices]

@@ -54,5 +54,12 @@ def log_line(text: str) -> None:
 
 
 def show_warnings_as_lines() -> None:
-    """From now on, show each warning as a line without the path of a source file."""
-    warnings.showwarning = lambda message, *_, **__: log_line(f"warning: {message}")
+    """From now on, show each warning once, as a line without the path of a source file."""
+    shown: set[str] = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            log_line(f"warning: {message}")
+
+    warnings.showwarning = show

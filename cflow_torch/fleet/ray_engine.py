@@ -17,7 +17,7 @@ from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.fleet.executors import Executor, describe, make_object
 from cflow_torch.fleet.job import Event, Job, Part
 from cflow_torch.fleet.machine import AUTO, Layout
-from cflow_torch.fleet.manifest import MANIFEST, make_identity
+from cflow_torch.fleet.manifest import make_identity, run_file
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.work import Worker, make_worker
 
@@ -39,7 +39,7 @@ def run_ray(
     The driver and the workers exchange parts and events, a few kB each; workers read and write files themselves. On a
     cluster, all machines must reach data and output under the same names (a shared file system, an object store) and
     have the same versions of cflow_torch, torch and numpy. A node that differs is refused. Workers that do not fit into
-    the cluster start when there is room. Ray chooses the GPUs. configs/engine/ray.yaml explains the settings.
+    the cluster start when there is room. Ray chooses the GPUs. `cli.commands.Ray` explains the settings.
     """
     ray = import_optional("ray", "engine=ray needs Ray: pip install ray")
     is_gpu = layout.devices[0].startswith("cuda")
@@ -81,7 +81,7 @@ def make_worker_on_node(folder: str, job: Job, device: str) -> Worker:
     node = ray.util.get_node_ip_address()
     if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
         raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than the driver")
-    if not (as_path(job.output) / MANIFEST).exists():
+    if not run_file(as_path(job.output), job.identity).exists():
         raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
     with suppress(OSError):  # relative paths of data must mean the same as in the driver
         os.chdir(folder)

@@ -11,7 +11,7 @@ from typing import Any, Iterable, Iterator, Sequence
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
-from cflow_torch.data.files import write_json
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.executors import describe
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
@@ -40,7 +40,7 @@ def run_fleet(
 ) -> dict[str, Any]:
     """Compute the frames of a shard that are not complete, and write a report.
 
-    Call `manifest.claim_folder` first. `sources` are the logs of all shards.
+    Call `manifest.check_logs` and `manifest.claim_run` first. `sources` are the logs of all shards.
 
     Returns:
         The report of `Counters.report` with the entries of `about`. It is also written to OUTPUT/reports/<shard>.json.

@@ -29,6 +29,7 @@ from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.inspection import inactive_is_an_error, repeats
+from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # batches that are read ahead, and that wait to be written
 
@@ -184,6 +185,7 @@ def make_worker(job: Job, device: str, memory: float | None = None) -> Worker:
     """Make the worker of this process.
 
     On a CPU, it uses one thread, because other workers use the other cores. `memory` limits its address space, bytes.
+    The process keeps the memory that it frees, for the next window.
     """
     if memory is not None:
         import resource  # not available on Windows
@@ -192,6 +194,7 @@ def make_worker(job: Job, device: str, memory: float | None = None) -> Worker:
     if device == "cpu":
         torch.set_num_threads(1)
         pyarrow.set_cpu_count(1)
+    keep_freed_memory()
     show_warnings_as_lines()
     return Worker(job, device)
 

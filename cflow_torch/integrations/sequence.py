@@ -47,7 +47,7 @@ class SequenceFlow(nn.Module):
     """Base class of models that estimate residual flow from frames. They have no parameters and no buffers.
 
     Args:
-        preset: "default", "offline", "keypoints" or "paper" (`make_config`).
+        preset: "default", "offline", "live", "keypoints" or "paper" (`make_config`).
         device: "auto" = that of the given tensors, else a GPU if there is one, else the CPU.
         ground: None = the masks of the frames exclude the ground (`with_ground=False`). Otherwise the `method` of
             `find_ground`, by which we find the ground of every sweep and exclude it, too.

@@ -1,1 +1,1 @@
-"""Our method: presets `default` and `offline`. Begin with `method.py`."""
+"""Our method: presets `default`, `offline` and `live`. Begin with `method.py`."""

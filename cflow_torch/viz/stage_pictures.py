@@ -55,7 +55,7 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
 
     Raises:
         CFlowError: matplotlib is not installed, there is no such cluster, the method does not process one scale after
-            the other (presets default and offline), or the input is invalid.
+            the other (presets default, offline and live), or the input is invalid.
 
     Source: the paper's multi-scale strategy and its figure.
     """

@@ -3,7 +3,7 @@
 Occupancy images show sweep t in blue, t+1 in red, and pixels of both in a dark colour.
 
 We record every scale of a run. For the correlation and the key points, we compute the finest scale a second time. The
-presets default and offline weigh the motions of all scales together, so they have no such results.
+presets default, offline and live weigh the motions of all scales together, so they have no such results.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ def deskew_points(points: Array, fraction: Array, T_ego1_ego0: Any, T_ego0_befor
     A rotating LiDAR measures for a whole sweep interval. If the data set does not compensate this, each point is in the
     frame of the vehicle at its own instant. Static objects beside the road then seem to move: what was measured ahead
     in one sweep is measured half a turn later in the next one. Points of moving objects still have their own motion
-    afterwards. Pass their times as `Sweep.point_times`, so that the presets `default` and `offline` correct it.
+    afterwards. Pass their times as `Sweep.point_times`, so that the presets `default`, `offline` and `live` correct it.
 
     Args:
         points: (N, 3+) float, metres, ego frame of t at the instant of each measurement.

@@ -15,6 +15,7 @@ from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.ground import has_ground
 from cflow_torch.windows.point_frame import frame_problem
 from cflow_torch.windows.readings import INVERTED, NO_READING, STILL, UNKNOWN, WORLD, judge, make_pair
+from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import have_same_points
 
 REPEATED = "pc1 has the same points as pc0, so everything seems to move with the sensor: give two different sweeps"
@@ -39,8 +40,8 @@ class Inspection:
     """Warns of likely mistakes in the windows of a model.
 
     In every window, it checks that pc1 does not repeat pc0. It makes the other checks once each, only in the first
-    window of a call. Once such a window has points, it checks units, axes and ground. Once such a window has static
-    structure, it checks the ego motion. Cost: about 60 ms, once; 5 us for each window.
+    window of a call. Once such a window has points, it checks units, axes, ground and missing returns. Once such a
+    window has static structure, it checks the ego motion. Cost: about 60 ms, once; 5 us for each window.
     """
 
     def __init__(self) -> None:
@@ -60,6 +61,9 @@ class Inspection:
                 warn(problem)
             elif first.pc0.is_ground is None and has_ground(first.pc0.points):
                 warn(_GROUND)
+            _, num_missing = without_missing(first.pc0)
+            if num_missing:
+                warn(f"{num_missing} {MISSING}: leave them out, or make them NaN")
         if not self._has_seen_structure and not is_repeated[0]:
             judgement = judge([make_pair(first.pc0, first.pc1)])
             self._has_seen_structure = bool(judgement.shares)

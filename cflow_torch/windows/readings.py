@@ -197,7 +197,9 @@ def _judge(pairs: Sequence[Pair]) -> Judgement:
     if any(len(shares) == 1 for shares in of_pairs):  # as given is certain there, so what all pairs show is refuted
         clear = [name for name in clear if name in (LATE, EARLY) or name.startswith(MOUNT)]
     if not clear:
-        return Judgement(mean, (NO_READING,) if mean[GIVEN] < _HOPELESS else ())
+        # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
+        is_hopeless = mean[GIVEN] < _HOPELESS and (len(pairs) > 1 or bool(_search(pairs[0]).best))
+        return Judgement(mean, (NO_READING,) if is_hopeless else ())
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return Judgement(mean, (WORLD,))
     best = max(clear, key=mean.__getitem__)
@@ -332,7 +334,8 @@ def _structure(sweep: Sweep, centre: np.ndarray) -> np.ndarray:
 
 def _num_blocks(points: np.ndarray) -> int:
     """Return how many blocks of 5 m in the plane hold points."""
-    return len(np.unique(np.floor(points[:, :2] / _BLOCK), axis=0))
+    column, row = np.floor(points[:, :2] / _BLOCK).astype(np.int64).T
+    return len(np.unique(column * (1 << 20) + row))
 
 
 def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:

@@ -71,8 +71,10 @@ class Structure:
 
     def share(self, source: np.ndarray, T_target_source: np.ndarray) -> float:
         """Return the share of `source` in place, see `share_in_place`. Cost: 6 ms for 1500 source points."""
-        if len(source) == 0:
-            return float("nan")
+        return float(self.in_place(source, T_target_source).mean()) if len(source) else float("nan")
+
+    def in_place(self, source: np.ndarray, T_target_source: np.ndarray) -> np.ndarray:
+        """Test which points of `source`, (N, 3), are in place, (N,) bool."""
         moved = np.asarray(source, np.float64) @ T_target_source[:3, :3].T + T_target_source[:3, 3]
         moved = np.clip(moved, -_MOST, _MOST)
         in_place = np.zeros(len(moved), bool)
@@ -87,8 +89,8 @@ class Structure:
             row = np.repeat(np.arange(len(moved)), count)
             neighbour = np.arange(len(row)) + np.repeat(start - np.cumsum(count) + count, count)
             distance = np.linalg.norm(moved[row] - self._points[neighbour], axis=1)
-            in_place[row[distance <= REACH]] = True
-        return float(in_place.mean())
+            in_place[order[row[distance <= REACH]]] = True
+        return in_place
 
 
 def _keys(cell: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from cflow_torch import Config, FlowResult, Sweep, Window, make_config, make_model
 from cflow_torch.cli.bench import measure
-from cflow_torch.data.files import write_json
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
 from cflow_torch.stages import stage_seconds

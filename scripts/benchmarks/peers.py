@@ -36,7 +36,7 @@ from table import markdown
 
 from cflow_torch import make_config, make_model
 from cflow_torch.data.catalog import find_sources, open_log, recognise
-from cflow_torch.data.files import read_json, write_json
+from cflow_torch.data.json_file import read_json, write_json
 from cflow_torch.data.log import window
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "ablation"))

@@ -24,7 +24,7 @@ from opencv_loop import opencv_flow
 from table import markdown
 
 from cflow_torch import Config, Window, make_config, make_model
-from cflow_torch.cli.run import machine, versions
+from cflow_torch.cli.outputs import machine, versions
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.log import Log, window
 from cflow_torch.simulator import make_drive

@@ -30,6 +30,24 @@ def test_moving_cars_are_removed_from_every_sweep_and_the_wall_stays() -> None:
         assert clean[index].timestamp_ns == log.timestamps[index]
 
 
+def test_the_pair_over_a_gap_of_the_log_is_not_used() -> None:
+    """Its two sweeps are far apart, so its flow would be wrong. The sweep before it is like a last sweep."""
+    log = Staged([straight((0, 0), (0.9, 0.0)), straight((20, 5), (-1.0, 0.0))])
+    log.gaps, asked = frozenset([2]), []
+
+    def flow(index: int) -> FlowResult:
+        asked.append(index)
+        return log.result(index)
+
+    for more in ({}, {"remove_stopped": True}):
+        clean = CleanLog(log, flow=flow, **more)
+        for index in range(len(log)):
+            assert np.array_equal(clean.moving(index), log.world(index)[2] >= 0), index
+    assert 2 not in asked and 1 in asked
+    log.gaps = frozenset([1, 2])
+    assert not cleaned(log).moving(2).any(), "no pair has flow for it"
+
+
 def test_waiting_cars_are_removed_by_their_tracks_and_parked_cars_stay() -> None:
     """A car that waits for eight sweeps and starts, a car that stops, and a parked car that never moves."""
     start = np.cumsum([0.0] * 8 + [0.1, 0.2, 0.4, 0.7, 1.0, 1.0, 1.0, 1.0])

@@ -17,6 +17,7 @@ from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_con
 from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
+from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.log import windows
 from cflow_torch.simulator.writers.av2 import write_av2_log
@@ -320,6 +321,15 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     capsys.readouterr()
     assert call("flow", "small", *run, "contents=[residual,cluster_id,is_valid]") == 2
     assert "add confidence" in capsys.readouterr().err
+
+
+def test_a_log_with_a_gap_has_tracks_before_and_behind_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(AV2Log, "gaps", frozenset([2]))
+    call = calls_on_a_drive(tmp_path, num_sweeps=6)
+    assert call("flow", "flow", "model.num_history=0", "tracks=true", "engine.workers=1") == 0
+    (file,) = (tmp_path / "flow").glob("*/tracks.parquet")
+    assert len(list(file.parent.glob("*.feather"))) == 4, "the pair over the gap has no flow"
+    assert set(read_tracks(file)["sweep"]) >= {0, 1, 3, 4}
 
 
 def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

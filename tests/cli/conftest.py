@@ -11,7 +11,7 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 from small_logs import make_small_drive
 
-from cflow_torch.cli import checks  # noqa: F401 (registers the presets)
+from cflow_torch.cli import compose as _compose  # noqa: F401 (registers the settings)
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 

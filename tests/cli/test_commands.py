@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from small_logs import write_small_log
 
 from cflow_torch import make_config
-from cflow_torch.cli import pairs, run
+from cflow_torch.cli import failures, flows, pairs
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.eval import objective
 from cflow_torch.config import config_from
@@ -146,13 +146,13 @@ def test_warnings_are_one_line_without_a_source_path(tmp_path, cflow, capsys):
 
 
 def test_a_failure_ends_a_run_but_not_a_sweep(monkeypatch):
-    monkeypatch.setattr(run, "is_sweep", lambda: False)
+    monkeypatch.setattr(failures, "is_sweep", lambda: False)
     with pytest.raises(SystemExit, match="1"):
-        run.finish([("a", "bad")])
-    monkeypatch.setattr(run, "is_sweep", lambda: True)
-    run.finish([])
-    with pytest.raises(run.UnfinishedJob, match="1"):
-        run.finish([("a", "bad")])
+        failures.finish([("a", "bad")])
+    monkeypatch.setattr(failures, "is_sweep", lambda: True)
+    failures.finish([])
+    with pytest.raises(failures.UnfinishedJob, match="1"):
+        failures.finish([("a", "bad")])
 
 
 def test_the_first_line_has_the_scores_and_names_classes_with_few_points():
@@ -215,6 +215,16 @@ def test_a_pair_whose_process_dies_is_tried_once_more_then_reported(log_folder, 
     assert record["num_pairs"] == 2 and (tmp_path / str(stamps[1])).read_text() == "7"
     ((name, message),) = record["failures"]
     assert name.endswith(str(stamps[1])) and "2 worker processes died on it, the last one: signal 9" in message
+
+
+def test_bench_keeps_freed_memory_only_if_asked(tmp_path, cflow, monkeypatch):
+    calls: list[Any] = []
+    monkeypatch.setattr(flows, "keep_freed_memory", lambda: calls.append(1))
+    data = ["data.num_sweeps=2", f"data.cache={tmp_path}", "model=paper", SMALL, "repeats=1", "batches=[1]"]
+    for number, more in enumerate(([], ["keep_memory=false"])):
+        assert cflow("bench", *data, *more, f"output={tmp_path / 'out'}") == 0
+        report = json.loads((tmp_path / "out" / "bench.json").read_text())
+        assert len(calls) == 1 and report["keep_memory"] is (number == 0)
 
 
 def test_bench_writes_what_it_prints(tmp_path, cflow, capsys):

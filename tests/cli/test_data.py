@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from small_logs import SMALL_LOGS, write_small_log
 
-from cflow_torch.cli.main import split
+from cflow_torch.cli.commands import Flow
+from cflow_torch.cli.compose import hydra_overrides
+from cflow_torch.cli.words import split
 from cflow_torch.data.catalog import DATA_SETS, recognise
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.types import CFlowError
@@ -46,16 +48,20 @@ def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path):
 
 
 def test_a_path_by_itself_is_the_data_root():
-    call = ["-m", "/a b/c", "model=paper,default", "--config-dir", "conf", "-p", "model"]
-    assert split(call) == (['data.root="/a b/c"', "model=paper,default"], ["-m", "--config-dir", "conf", "-p", "model"])
-    paths = ["/a/date=2024-01-05", "./date=2024", "model=paper"]
-    assert split(paths) == (['data.root="/a/date=2024-01-05"', 'data.root="./date=2024"', "model=paper"], [])
+    words = ["-m", "/a b/c", "model=paper,default", "--config-dir", "conf", "-p", "model"]
+    call = split(words)
+    assert call == (["model=paper,default"], ["/a b/c"], ["-m", "--config-dir", "conf", "-p", "model"])
+    assert hydra_overrides(Flow, call) == ["model=paper,default", 'data.root="/a b/c"']
+    call = split(["/a/date=2024-01-05", "./date=2024", "model=paper"])
+    assert hydra_overrides(Flow, call)[1] == 'data.root=["/a/date=2024-01-05","./date=2024"]'
 
 
 def test_a_name_with_an_equals_sign_that_exists_is_a_path(tmp_path, monkeypatch):
     (tmp_path / "date=2024").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert split(["date=2024", "date=2025"])[0] == ['data.root="date=2024"', "date=2025"]
+    call = split(["date=2024", "date=2025", "date=*"])
+    assert call.paths == ["date=2024"] and call.settings == ["date=2025", "date=*"]
+    assert split(["d*"]).paths == ["date=2024"], "a pattern in quotes"
 
 
 READER = """
@@ -103,7 +109,9 @@ def test_your_own_reader_by_configuration_only(mine, cflow, capsys):
     for log, speed in (("mine", 0.5), ("back", -0.5)):
         assert np.allclose(read_flow(mine / "flow" / log / "0.feather").residual_flow[:, 0], speed)
     assert cflow("eval", *own, f"output={mine / 'eval'}", "data.step=2") == 2
-    assert "give +data.step=VALUE" in capsys.readouterr().err
+    assert "use +data.step=2" in capsys.readouterr().err
+    assert cflow("eval", *own, "modle=paper") == 2
+    assert "(did you mean model?)" in capsys.readouterr().err
     assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=0") == 2
     assert "data.step=0: give a whole number of at least 1" in capsys.readouterr().err
     assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=2") == 0

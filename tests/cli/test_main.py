@@ -15,8 +15,7 @@ import hydra
 import pytest
 
 import cflow_torch
-from cflow_torch.cli.choices import CONFIGS
-from cflow_torch.cli.main import COMMANDS
+from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS
 from cflow_torch.config import REMOVED
 
 MAIN = [sys.executable, "-m", "cflow_torch.cli.main"]
@@ -27,9 +26,11 @@ needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX 
 def test_help_explains_a_command_with_examples_and_settings(command, cflow, capsys):
     assert cflow(command, "--help") == 0
     text = capsys.readouterr().out
-    assert text.startswith(f"cflow {command}: {COMMANDS[command]}") and f"\nexamples:\n  cflow {command}" in text
-    if (CONFIGS / f"{command}.yaml").exists():
-        assert "\n  output: outputs/" in text and "\n  model=default|offline|paper|keypoints\n" in text
+    assert (
+        text.startswith(f"cflow {command}: {COMMANDS[command].SUMMARY}") and f"\nexamples:\n  cflow {command}" in text
+    )
+    if command in WITH_SETTINGS:
+        assert "\n  output: outputs/" in text and "\n  model=default|offline|live|paper|keypoints\n" in text
     assert cflow("help", command) == 0
     assert capsys.readouterr().out == text
 
@@ -39,9 +40,12 @@ CHEAP = (
     ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, check, flow,"),
     ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
     ("flow num_history=2", "(did you mean model.num_history?)"),
-    ("eval model=papr", "model=papr (did you mean paper?): give one of default, keypoints, offline, paper"),
+    ("eval model=papr", "model=papr (did you mean paper?): give one of default, keypoints, live, offline, paper"),
     ("eval model=fast", "preset 'fast' was removed in 0.4.0: use default with num_history=2"),
-    ("eval model.densify=nearest", "densify is a setting of method keypoints, not of verified"),
+    (
+        "eval model.densify=nearest",
+        "setting 'model.densify' belongs to model=keypoints: give that as well",
+    ),
     ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
     ("plot cluster=3", "setting 'cluster' belongs to picture=correlation or picture=scales: give that as well"),
     ("flow data=av2", "the data is missing: give data.root=PATH"),
@@ -50,7 +54,7 @@ CHEAP = (
     ("info --long", "info takes --short (the default) or --full, got --long"),
     ("clean standing=true", "setting standing was removed: use remove_stopped"),
     ("eval -m model=default,papr", "model=papr (did you mean paper?)"),
-    ("eval model.num_history=1.5", "num_history=1.5: Value '1.5' of type 'float' could not be converted to Integer"),
+    ("eval model.num_history=1.5", "num_history=1.5: give a whole number of at least 0"),
     ("eval --bogus", "unknown option '--bogus'"),
     ("eval -m hydra/launcher=joblib data.seed=1,2", "pip install hydra-joblib-launcher hydra-submitit-launcher"),
     ("eval model.pixel_sizes=[0.2", "cannot read 'model.pixel_sizes=[0.2'"),
@@ -72,7 +76,7 @@ OTHERS = (
     ("eval definition=mine data.num_sweeps=2", "mine"),
     ("demo pair=99 data.num_sweeps=2", "has pairs 0 to 0"),
     ("plot log=1e5 data.num_sweeps=2", "log=1e5: there is no such log"),
-    ("flow contents=[confidence] model=paper", "only model=default and offline have a confidence"),
+    ("flow contents=[confidence] model=paper", "only model=default, offline and live have a confidence"),
 )
 
 

@@ -12,54 +12,82 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch import make_config
-from cflow_torch.cli import settings
-from cflow_torch.cli.choices import CONFIGS, groups
-from cflow_torch.cli.main import COMMANDS, HELP, split, unknown_options
-from cflow_torch.cli.run import make_model
+from cflow_torch.cli.choices import CONFIGS, choices, names_in, read_settings
+from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
+from cflow_torch.cli.compose import hydra_overrides, settings_of
+from cflow_torch.cli.main import HELP
+from cflow_torch.cli.words import read_call, split
 from cflow_torch.config import CONFIGS as METHODS
-from cflow_torch.config import PRESETS, REMOVED
-
-WITH_SETTINGS = [command for command in COMMANDS if (CONFIGS / f"{command}.yaml").exists()]
+from cflow_torch.config import PRESETS, REMOVED, config_from
+from cflow_torch.data.catalog import DATA_SETS
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_preset_is_the_same_as_in_python(preset, compose):
-    assert make_model(compose("eval", f"model={preset}")).config == make_config(preset)
+    assert config_from(OmegaConf.to_container(compose("eval", f"model={preset}").model)) == make_config(preset)
 
 
 def test_every_choice_of_every_group_composes(compose):
     """All choices with the first command that has their group, and the first one with the others."""
     tested: set[str] = {"row", "experiment"}  # see test_experiments.py
-    for command in WITH_SETTINGS:
-        choices = {group: names[:1] if group in tested else names for group, names in groups(command).items()}
-        for group in ("row", "experiment"):
-            choices.pop(group, None)
-        tested.update(choices)
-        for number in range(max(map(len, choices.values()))):
-            call = {group: names[number % len(names)] for group, names in choices.items()}
+    for command, kind in WITH_SETTINGS.items():
+        of_groups = {group: choices(group) for group in kind.groups() if group not in ("row", "experiment")}
+        of_groups = {group: names[:1] if group in tested else names for group, names in of_groups.items()}
+        tested.update(of_groups)
+        for number in range(max(map(len, of_groups.values()))):
+            call = {group: names[number % len(names)] for group, names in of_groups.items()}
             cfg = compose(command, *(f"{group}={name}" for group, name in call.items()))
             assert call.items() <= dict(cfg.hydra.runtime.choices).items()
-            if "device" in cfg:  # `cflow check` makes no model
-                make_model(cfg)
+            composed = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+            if OmegaConf.is_missing(composed.data, "root"):
+                composed.data.root = "/"
+            assert isinstance(settings_of(command, composed), kind)
 
 
 def test_examples_use_existing_settings_and_choices(compose):
-    texts = [HELP, *((Path(settings.__file__).parent / f"{command}.py").read_text() for command in WITH_SETTINGS)]
-    lines = [line for text in texts for line in text.splitlines() if line.startswith("  cflow ")]
+    lines = [line for text in (HELP, *(kind.help() for kind in COMMANDS.values())) for line in text.splitlines()]
+    lines = [line for line in lines if line.startswith("  cflow ")]
     assert len(lines) > 30
     calls: dict[tuple[str, ...], dict[str, None]] = {}  # examples with the same choices are one call
     for command, *words in (shlex.split(line.strip().partition("   ")[0])[1:] for line in lines):
         if command in WITH_SETTINGS:
-            overrides, options = split([word for word in words if word != "..."])
+            call = split([word for word in words if word != "..."])
+            read_call([*call.settings, *call.options], command)
+            overrides = hydra_overrides(WITH_SETTINGS[command], call)
             for override in OverridesParser.create().parse_overrides(overrides):
                 if override.is_sweep_override():  # its first value
                     value = next(override.sweep_string_iterator())
                     overrides[overrides.index(override.input_line)] = f"{override.get_key_element()}={value}"
-            choices = [override for override in overrides if override.partition("=")[0] in groups(command)]
-            calls.setdefault((command, *choices), {}).update(dict.fromkeys(overrides))
-            assert not unknown_options(options)
+            chosen = [one for one in overrides if one.partition("=")[0] in WITH_SETTINGS[command].groups()]
+            calls.setdefault((command, *chosen), {}).update(dict.fromkeys(overrides))
     for (command, *_), merged in calls.items():
         compose(command, *merged)
+
+
+def test_names_of_data_settings_are_those_in_yaml():
+    for file in CONFIGS.glob("data/*.yaml"):
+        assert set(names_in(file)) == set(read_settings(file)), file
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "data=benchmark_sensors data.profile=waymo",
+        "model=base_keypoints model.densify=nearest",
+        "-m model=paper,default model.connectivity=4",
+        "experiment=keypoints model.densify=nearest",
+        "model=choice(paper,keypoints) model.connectivity=4",
+    ],
+)
+def test_settings_of_chosen_groups_are_known(words):
+    read_call(words.split(), "eval")
+
+
+def test_the_format_of_a_path_may_have_any_setting():
+    """data=auto lists the settings of all formats that it recognises."""
+    of_formats = {name for name in DATA_SETS if DATA_SETS[name].marks or name == "arrays"}
+    names = {name for one in (*of_formats, "synthetic") for name in read_settings(CONFIGS / "data" / f"{one}.yaml")}
+    assert set(read_settings(CONFIGS / "data" / "auto.yaml")) == names
 
 
 @pytest.fixture
@@ -88,7 +116,10 @@ def test_your_own_preset_contains_only_its_changes(mine, cflow, capsys):
         ("defaults: [base_dense, _self_]\nsignificance: 2\n", "significance is a setting of method verified"),
         ("defaults: [base_verified, _self_]\nthorough: false\n", REMOVED["thorough"]),
         ("method: verified\nmax_object: 20\n", REMOVED["max_object"]),
-        ("defaults: [base_dense, _self_]\nnum_history: many\n", "could not be converted to Integer"),
+        (
+            "defaults: [base_dense, _self_]\nnum_history: many\n",
+            "num_history='many': give a whole number of at least 0",
+        ),
         ("num_history: 3\n", "method=None: give one of"),
     ],
 )
@@ -104,15 +135,19 @@ def test_a_wrong_preset_is_one_line(text, message, mine, cflow, capsys):
     + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "50%", "a#b"],
 )
 def test_names_are_text_even_if_they_look_like_numbers(name):
-    read = OverridesParser.create().parse_overrides(split([f"log={name}", f"+data.root={name}", "pair=1"])[0])
+    overrides = hydra_overrides(Plot, split([f"log={name}", f"+data.root={name}", "pair=1"]))
+    read = OverridesParser.create().parse_overrides(overrides)
     assert [override.value() for override in read] == [name, name, 1]
 
 
 def test_hydra_syntax_in_names_keeps_its_meaning(compose):
-    cfg = compose("plot", *split(["log=null", "output=${device}"])[0])
+    def words(*given: str) -> list[str]:
+        return hydra_overrides(Plot, split(list(given)))
+
+    cfg = compose("plot", *words("log=null", "output=${device}"))
     assert cfg.log is None and cfg.output == "auto"
-    assert split(["-m", "log=1_0,b,2_0", "pair=1,2"]) == (['log="1_0",b,"2_0"', "pair=1,2"], ["-m"])
-    assert split(["log=choice(a,b)", "log='1_0'"])[0] == ["log=choice(a,b)", "log='1_0'"]
+    assert words("-m", "log=1_0,b,2_0", "pair=1,2") == ['log="1_0",b,"2_0"', "pair=1,2"]
+    assert words("log=choice(a,b)", "log='1_0'") == ["log=choice(a,b)", "log='1_0'"]
 
 
 def test_the_page_lists_every_setting(cflow, capsys):
@@ -121,7 +156,8 @@ def test_the_page_lists_every_setting(cflow, capsys):
     rows = [line[2:-2].split(" | ") for line in page.splitlines() if line.startswith("| `model.")]
     assert len(rows) == sum(len(fields(kind)) for kind in METHODS.values())
     name, *cells = next(row for row in reversed(rows) if row[0] == "`model.num_history`")
-    assert cells[:3] == ["`0`", "default `4`, offline `4`", "a whole number of at least 0"] and "sweeps" in cells[3]
+    changed = "default `4`, offline `4`, live `2`"
+    assert cells[:3] == ["`0`", changed, "a whole number of at least 0"] and "sweeps" in cells[3]
     assert "dense \\| keypoints" in page, "bars in cells are escaped"
     for file in CONFIGS.glob("data/*.yaml"):
         assert f"\n## data={file.stem}\n" in page and file.read_text().strip() in page
@@ -132,7 +168,10 @@ def test_the_page_lists_every_setting(cflow, capsys):
     [
         (
             "max_speed",
-            ["Method `dense`: model=paper, Method `keypoints`: model=keypoints:", "default `60.0`, offline `60.0`"],
+            [
+                "Method `dense`: model=paper, Method `keypoints`: model=keypoints:",
+                "default `60.0`, offline `60.0`, live `60.0`",
+            ],
         ),
         ("shard.index", ["cflow flow, cflow label:\n  index: auto  # index of this process"]),
         ("data", ["data=av2 ", "data=hdf5 "]),

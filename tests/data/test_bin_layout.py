@@ -50,6 +50,13 @@ def test_missing_returns_and_reflectances_of_zero_change_nothing() -> None:
         assert find_bin_layout(table.tobytes()).columns == columns
 
 
+def test_near_points_of_one_reflectance_do_not_look_like_float64() -> None:
+    table = street(4)
+    table[:, :3] = np.clip(np.random.default_rng(0).normal(0, 6, (len(table), 3)), -20, 20)
+    table[:, 3] = 1
+    assert find_bin_layout(table.tobytes()) == BinLayout(4, "<f4")
+
+
 def packed() -> bytes:
     kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("i", "u1"), ("t", "<u4"), ("ring", "u1")]
     table = np.zeros(2400, kinds)

@@ -150,6 +150,8 @@ def test_times_in_files_are_used(raw: Drive, truth: Drive, tmp_path: Path, suffi
         warnings.simplefilter("error")
         chosen = open_log("arrays", folder, find_ground="grid", deskew="times")
         stored = open_log("arrays", folder, find_ground="grid", deskew="off", check=False)
+        same = open_log("arrays", folder, find_ground="grid", read_as="times", check=False)
+        assert np.array_equal(same.sweep(1).points, chosen.sweep(1).points)
     assert np.array_equal(chosen.sweep(3).points, log.sweep(3).points)
     assert np.array_equal(stored.sweep(3).points, raw.sweep(3).points)
 

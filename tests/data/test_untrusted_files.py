@@ -20,7 +20,8 @@ from writers.nuscenes import write_nuscenes
 from cflow_torch.data.aevascenes import AevaScenesLog
 from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.catalog import find_sources, open_log
-from cflow_torch.data.files import read_json, read_npy
+from cflow_torch.data.json_file import read_json
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import is_timestamp, path_inside, safe_name
 from cflow_torch.types import CFlowError
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from cflow_torch import CFlowError
-from cflow_torch.data.arrays import ArraysLog
-from cflow_torch.data.arrays.cloud_file import write_cloud
+from cflow_torch.data.arrays import ArraysLog, write_array_log
+from cflow_torch.data.arrays.cloud_file import read_cloud, write_cloud
+from cflow_torch.data.catalog import open_log
 from cflow_torch.data.rigid_motion import to_quaternions, transform_points
 from cflow_torch.simulator import make_drive
 from cflow_torch.types import CFlowWarning
@@ -15,30 +16,60 @@ from cflow_torch.types import CFlowWarning
 pytest.importorskip("pypcd4", reason="needs the extra clouds: pip install pypcd4")
 
 
-@pytest.mark.parametrize(("frame", "origin"), [("sensor", 0), ("world", 0), ("world", 300)])
-def test_poses_are_read_and_the_frame_is_found(tmp_path, frame: str, origin: float) -> None:
-    drive = make_drive(seed=1, num_sweeps=4, profile="demo")
+def write_drive(root, frame: str, origin: float, num_sweeps: int = 4):
+    """Write the demo drive, and return it with its poses, of which the first is at x = `origin`."""
+    drive = make_drive(seed=1, num_sweeps=num_sweeps, profile="demo")
     to_start = np.linalg.inv(drive.poses[0])
     to_start[0, 3] += origin
-    for k in range(4):
-        sweep, pose, file = drive.sweep(k), to_start @ drive.poses[k], tmp_path / f"{k}.pcd"
+    poses = to_start @ drive.poses
+    for k, pose in enumerate(poses):
+        sweep = drive.sweep(k)
         points = sweep.points if frame == "sensor" else transform_points(sweep.points, pose).astype(np.float32)
-        write_cloud(file, points)
-        numbers = " ".join(f"{value:.12g}" for value in (*pose[:3, 3], *to_quaternions(pose[None, :3, :3])[0]))
-        default = b"VIEWPOINT 0.0 0.0 0.0 1.0 0.0 0.0 0.0"
-        content = file.read_bytes()
-        assert default in content
-        file.write_bytes(content.replace(default, f"VIEWPOINT {numbers}".encode()))
-    with pytest.warns(CFlowWarning, match=f"come from VIEWPOINT; we take its points to be in the {frame}'s frame"):
-        log = ArraysLog(tmp_path)
+        viewpoint = (*pose[:3, 3], *to_quaternions(pose[None, :3, :3])[0])
+        write_cloud(root / f"{k}.pcd", points, viewpoint=viewpoint)
+    return drive, poses
+
+
+@pytest.mark.parametrize(("frame", "origin"), [("sensor", 0), ("world", 0), ("sensor", 300), ("world", 300)])
+def test_poses_are_read_and_the_frame_is_found(tmp_path, frame: str, origin: float) -> None:
+    drive, poses = write_drive(tmp_path, frame, origin)
+    with pytest.warns(CFlowWarning, match="poses come from VIEWPOINT"):
+        log = open_log("arrays", tmp_path)
     for k in range(4):
-        assert np.allclose(log.sweep(k).pose, to_start @ drive.poses[k], atol=1e-6)
+        assert np.allclose(log.sweep(k).pose, poses[k], atol=1e-6)
         assert np.allclose(log.sweep(k).points, drive.sweep(k).points, atol=1e-3)
-    other = ArraysLog(tmp_path, points_frame="lidar" if frame == "world" else "world")
+    other = open_log("arrays", tmp_path, read_as=None if frame == "world" else "world", check=False)
     assert np.abs(other.sweep(3).points - drive.sweep(3).points).max() > 1
     assert ArraysLog(tmp_path, poses=None).poses is None
-    with pytest.raises(CFlowError, match="points_frame=world: .* has no poses"):
-        ArraysLog(tmp_path, poses=None, points_frame="world")
+
+
+@pytest.mark.parametrize("frame", ["sensor", "world"])
+def test_cleaned_clouds_have_the_same_form(tmp_path, frame: str) -> None:
+    """`cflow clean` writes VIEWPOINT and points in the frame of the input, and its output is read like the input."""
+    pytest.importorskip("hydra")
+    from command_line import cflow
+
+    (tmp_path / "drive" / "pcd").mkdir(parents=True)
+    _, poses = write_drive(tmp_path / "drive" / "pcd", frame, 300)
+    given = read_cloud(tmp_path / "drive" / "pcd" / "2.pcd")
+    assert cflow("clean", tmp_path / "drive", f"output={tmp_path / 'out'}", "map=true", "model.num_history=0") == 0
+    folder = tmp_path / "out" / "drive"
+    assert not (folder / "poses.txt").exists()
+    kept = read_cloud(folder / "points" / "000002.pcd")
+    assert 0.5 * len(given) < len(kept) < len(given)
+    assert np.isin(np.round(kept, 2).astype("f4").sum(1), np.round(given, 2).astype("f4").sum(1)).mean() > 0.9
+    log = open_log("arrays", folder)
+    assert np.allclose(log.poses, poses, atol=1e-6) and getattr(log, "read_as", None) == (
+        "world" if frame == "world" else None
+    )
+    world = read_cloud(tmp_path / "out" / "drive.ply")
+    assert abs(np.median(world[:, 0]) - 300) < 60, "the map is in the world"
+
+
+def test_viewpoints_need_poses_and_pcd(tmp_path) -> None:
+    drive = make_drive(seed=1, num_sweeps=2, profile="demo")
+    with pytest.raises(CFlowError, match="viewpoint='world' with suffix='.npy'"):
+        write_array_log(drive, tmp_path, ".npy", "world")
 
 
 def test_unset_viewpoints_are_no_poses(tmp_path) -> None:

@@ -92,24 +92,27 @@ def test_other_settings_are_rejected_by_name(fleet, single, out):
         run(fleet, out, settings={"settings": {"find_ground": "grid"}})
     with pytest.raises(CFlowError, match="resume=true"):
         run(fleet, out, resume=False)
-    with pytest.raises(CFlowError, match="remove the folder"):
+    with pytest.raises(CFlowError, match="remove that folder"):
         run(fleet, out, shard=Shard(0, 2), overwrite=True, settings=OTHER)
-    (out / "manifest.json").write_bytes(b"")
-    with pytest.raises(CFlowError, match=f"{out / 'manifest.json'} is not a manifest"):
-        run(fleet, out)
-    (out / "manifest.json").unlink()
+    manifest = frames(out)[0].with_name("manifest.json")
+    before = manifest.read_bytes()
+    manifest.write_bytes(b"")
+    ((_, message),) = run(fleet, out)["failures"]
+    assert f"{manifest} is not a manifest" in message
+    manifest.write_bytes(before)
     assert run(fleet, out)["frames"]["computed"] == 0
     assert tree(out) == single, "nothing was touched"
 
 
-def test_overwrite_removes_the_other_run(fleet, out, tmp_path):
-    shutil.copytree(out / frames(out)[0].parent.name, out / "a-log-of-the-other-run")
+def test_overwrite_replaces_the_logs_of_this_run_only(fleet, single, out, tmp_path):
+    shutil.copytree(out / frames(out)[0].parent.name, out / "another-log")
     (out / "mine.txt").write_text("not of a run")
-    (out / "manifest.json").unlink()  # an earlier attempt was killed in the middle
-    assert all("of another run" in message for _, message in run(fleet, out, settings=OTHER)["failures"])
     run(fleet, out, overwrite=True, settings=OTHER)
     run(fleet, tmp_path / "fresh", settings=OTHER)
-    assert tree(out) == {**tree(tmp_path / "fresh"), "mine.txt": b"not of a run"}
+    another = {f"another-log/{name}": content for name, content in tree(out / "another-log").items()}
+    (run_before,) = {name for name in single if name.startswith("runs/")}
+    kept = {**another, run_before: single[run_before], "mine.txt": b"not of a run"}
+    assert another and tree(out) == {**tree(tmp_path / "fresh"), **kept}
     assert run(fleet, out, overwrite=True, settings=OTHER)["frames"]["computed"] == PAIRS, "its own frames, too"
 
 

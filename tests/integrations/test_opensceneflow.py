@@ -242,7 +242,7 @@ def test_checkpoint_without_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         write_checkpoint()
 
 
-PRESETS = {"cflow": "default", "cflow_paper": "paper", "cflow_keypoints": "keypoints"}
+PRESETS = {"cflow": "default", "cflow_live": "live", "cflow_paper": "paper", "cflow_keypoints": "keypoints"}
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.data.files import json_ready
+from cflow_torch.data.json_file import json_ready
 
 CLASSES = ("CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
 SCALES = [(0.1,), (0.2, 0.1), (0.4, 0.2, 0.1), (0.8, 0.4, 0.2, 0.1), (0.8, 0.4, 0.3, 0.2, 0.1)]

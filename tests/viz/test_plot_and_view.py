@@ -16,7 +16,7 @@ from small_logs import make_small_drive
 
 from cflow_torch import CFlowError
 from cflow_torch.cli import plot as plot_command
-from cflow_torch.cli import run
+from cflow_torch.cli import view as view_command
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.simulator.writers.av2 import write_av2_log
@@ -123,7 +123,7 @@ def test_a_view_of_estimated_and_of_stored_flow(form, package, ending, cflow, tm
 
 
 def test_a_view_that_cannot_be_made_is_reported_before_the_work(cflow, monkeypatch, capsys):
-    monkeypatch.setattr(run, "open_logs", lambda cfg: pytest.fail("work"))
+    monkeypatch.setattr(view_command, "open_logs", lambda cfg: pytest.fail("work"))
     assert cflow("view", "format=pdf") == 2 and "format='pdf': give one of 'html', 'rerun'" in capsys.readouterr().err
     if find_spec("k3d"):
         assert cflow("view", "voxel=0") == 2 and "voxel=0: give a number above 0" in capsys.readouterr().err

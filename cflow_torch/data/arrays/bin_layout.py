@@ -10,7 +10,6 @@ from cflow_torch.types import CFlowError
 
 KITTI_COLUMNS = 4  # x, y, z, reflectance
 _COLUMNS = (4, 3, 5, 6, 7, 8)
-_TYPES = ("<f4", "<f8")
 _SMALLEST, _LARGEST = 1e-6, 1e7  # sizes that coordinates, intensities, rings and times have, besides 0
 _SHARE = 0.95  # of the numbers have such a size; of numbers read in a wrong type, less than 0.8
 _EXPLAINED, _AS_GOOD = 0.05, 0.9  # least share of the variance, and the share of the best that a smaller number needs
@@ -47,13 +46,10 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
     Raises:
         CFlowError: no layout fits. The message names `bin_columns`.
     """
-    kinds = [kind for kind in _TYPES if are_plausible(_numbers(content, kind))]
-    is_zero = _numbers(content, "<f4") == 0
-    if kinds == list(_TYPES) and len(is_zero) > 1 and is_zero[::2].mean() > _SHARE and is_zero[1::2].mean() < 0.5:
-        kinds = ["<f8"]  # the lower halves of float64 numbers with few digits are zeros
+    kind = _type_of(content)
     if columns is not None:
-        return BinLayout(columns, "<f8" if kinds == ["<f8"] and len(content) % (8 * columns) == 0 else "<f4")
-    fitting = [BinLayout(count, kind) for kind in kinds for count in _COLUMNS]
+        return BinLayout(columns, "<f8" if kind == "<f8" and len(content) % (8 * columns) == 0 else "<f4")
+    fitting = [BinLayout(count, kind) for count in _COLUMNS if kind]
     fitting = [layout for layout in fitting if len(content) % layout.step == 0]
     explained = [_explained(_numbers(content, layout.kind), layout.columns) for layout in fitting]
     best = max(explained, default=0.0)
@@ -68,6 +64,17 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
         "first. If it is complete, pass bin_columns, the numbers per point: 4 in KITTI, 5 in nuScenes. Convert packed "
         "records of several types to .npy"
     )
+
+
+def _type_of(content: bytes) -> str:
+    """Return "<f4", "<f8", or "" if the numbers fit neither. float32 can look like float64, but not the reverse."""
+    halves = _numbers(content, "<f4")
+    is_float64 = are_plausible(_numbers(content, "<f8"))
+    if not are_plausible(halves):
+        return "<f8" if is_float64 else ""
+    # The lower halves of float64 numbers with few digits are zeros, so they look like float32, too.
+    low, high = (float((half == 0).mean()) if len(half) else 0.0 for half in (halves[::2], halves[1::2]))
+    return "<f8" if is_float64 and low > 0.5 > high else "<f4"
 
 
 def are_plausible(numbers: np.ndarray) -> bool:

@@ -6,7 +6,7 @@ import io
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Mapping
+from typing import Any, Mapping, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +16,7 @@ from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bi
 from cflow_torch.data.arrays.pcd import pcd_fields, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.files import file_errors, shortened
+from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.types import CFlowError, check_array
 
@@ -81,7 +81,12 @@ def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return kept
 
 
-def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.ndarray] | None = None) -> None:
+def write_cloud(
+    path: PathLike,
+    points: np.ndarray,
+    columns: Mapping[str, np.ndarray] | None = None,
+    viewpoint: Sequence[float] | None = None,
+) -> None:
     """Write a cloud in the format of the suffix, atomically.
 
     Args:
@@ -89,6 +94,7 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
         points: (N, 3) float32 or float64, metres. `.bin` files are always float32, with a reflectance of 0 if there are
             no columns.
         columns: name -> (N,) bool, integers or floats, as `read_columns` returns them. None = only x, y, z.
+        viewpoint: of `.pcd` files, x, y, z and quaternion w, x, y, z of the sensor; None = not set.
 
     Convention:
         `.npy` files with named columns are structured arrays. A type that a format lacks becomes the next larger one:
@@ -114,6 +120,8 @@ def write_cloud(path: PathLike, points: np.ndarray, columns: Mapping[str, np.nda
         if suffix == ".pcd":
             pcd, kinds = pypcd4(), [values.dtype for values in fields.values()]
             cloud = pcd.PointCloud.from_points(list(fields.values()), list(fields), kinds)
+            if viewpoint is not None:
+                cloud.metadata.viewpoint = tuple(map(float, viewpoint))
             cloud.save(file, pcd.Encoding.BINARY)
         elif suffix == ".ply":
             file.write(ply_bytes(fields))

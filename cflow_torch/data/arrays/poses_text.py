@@ -8,7 +8,8 @@ from typing import NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.files import file_errors, read_npy
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.data.rigid_motion import interpolate_poses, poses_from_quaternions
 from cflow_torch.types import CFlowError

@@ -13,17 +13,18 @@ from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_columns, read_table
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
 from cflow_torch.data.arrays.poses_text import Trajectory
-from cflow_torch.data.files import file_errors, find_folders, read_npy
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log
+from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes, read_start
 from cflow_torch.data.point_times import TIME_FIELDS, PointTimes, seconds_after
-from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.ego_motion import rigid_transform
-from cflow_torch.windows.stillness import share_in_place, static_rows, thinned_rows
+from cflow_torch.windows.returns import missing_returns
 
-POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds")  # where the clouds may lie below the log's folder
+POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
 POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
 GROUND_FOLDER = "ground"
 _VIEWPOINT = "VIEWPOINT"
@@ -38,7 +39,7 @@ _FIRST_NANOSECOND = 10**17
 def find_array_logs(root: PathLike) -> list[Path]:
     """Find the folders of all logs, at most four levels below a folder, sorted.
 
-    A log has two or more clouds of one suffix, in its folder or in the subfolder points, lidar, velodyne or clouds.
+    A log has two or more clouds of one suffix, in its folder or in a subfolder of `POINT_FOLDERS`.
     """
     what = "a folder with one point cloud per file, or a folder of such"
     is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
@@ -50,7 +51,7 @@ class ArraysLog(Log):
 
     Args:
         folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
-            velodyne or clouds that does. Clouds are sorted naturally: 2 before 10.
+            velodyne, clouds or pcd that does. Clouds are sorted naturally: 2 before 10.
         poses: "auto" = poses.txt, odometry.csv or the like (`POSE_FILES`) in the folder, or KITTI's
             ../../poses/<name>.txt, if there is one, or VIEWPOINT of `.pcd` files if it is set; None = no poses; or a
             file (see `read_poses`); or a (K, 4, 4) array.
@@ -63,8 +64,6 @@ class ArraysLog(Log):
         ego_T_lidar: (4, 4), maps the frame of the stored points to the ego frame; None = they are the same.
         suffix: suffix of the clouds to read, if a folder has several kinds.
         bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes; "auto" = `find_bin_layout`.
-        points_frame: "lidar", or "world" = the stored points are in the world's frame, and we move them back by the
-            poses; "auto" = "lidar", but with poses from VIEWPOINT the one under which the static world stands still.
 
     Attributes:
         files: the clouds, in order.
@@ -73,6 +72,7 @@ class ArraysLog(Log):
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown. Sweeps before the first pose, after the
             last one, or in a gap of the poses of more than half a second are left out.
         gaps: indices of sweeps after which sweeps were left out.
+        has_viewpoints: whether the poses come from VIEWPOINT. Such clouds are often in the world's frame (`read_as`).
 
     Convention:
         `missing_returns` stay, as NaN, so that results have a row for every row of the file.
@@ -94,15 +94,12 @@ class ArraysLog(Log):
         ego_T_lidar: Any = None,
         suffix: str | None = None,
         bin_columns: int | str = "auto",
-        points_frame: str = "auto",
     ) -> None:
         self.folder = as_path(folder)
         if poses_of not in ("ego", "lidar"):
             raise CFlowError(f"poses_of={poses_of!r}: pass 'ego' or 'lidar'")
         if bin_columns != "auto" and (type(bin_columns) is not int or bin_columns < 3):
             raise CFlowError(f"bin_columns={bin_columns!r}: pass 'auto' or an integer of at least 3")
-        if points_frame not in ("auto", "lidar", "world"):
-            raise CFlowError(f"points_frame={points_frame!r}: pass 'auto', 'lidar' or 'world'")
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
         self._bin_layout = self._find_bin_layout(bin_columns)
@@ -117,13 +114,9 @@ class ArraysLog(Log):
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
         if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
-        self._are_in_world = points_frame == "world"
-        if points_frame == "world" and self.poses is None:
-            raise CFlowError(f"points_frame=world: {self.folder} has no poses; pass the poses of the LiDAR")
-        if points_frame == "auto" and trajectory is not None and trajectory.source == _VIEWPOINT:
-            self._are_in_world = self._world_stands_stiller()
-            frame = "the world's frame, and move them back" if self._are_in_world else "the sensor's frame"
-            self._note(f"its poses come from VIEWPOINT; we take its points to be in {frame} (data.points_frame)")
+        self.has_viewpoints = trajectory is not None and trajectory.source == _VIEWPOINT
+        if self.has_viewpoints:
+            self._note("its poses come from VIEWPOINT")
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and times where they are known."""
@@ -136,9 +129,7 @@ class ArraysLog(Log):
             is_missing |= times.is_stray
         if is_missing.any():
             points = np.where(is_missing[:, None], np.float32(np.nan), points)
-        if self._are_in_world and self.poses is not None:
-            points = transform_points(points, np.linalg.inv(self.poses[index]))
-        elif not np.array_equal(self.ego_T_lidar, np.eye(4)):
+        if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = transform_points(points, self.ego_T_lidar)
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
@@ -205,21 +196,6 @@ class ArraysLog(Log):
             return None
         poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
         return Trajectory(poses, None, "matrix", _VIEWPOINT)
-
-    def _world_stands_stiller(self) -> bool:
-        """Test whether the static world stands stiller if the stored points are in the world's frame."""
-        assert self.poses is not None
-        last, shares = len(self.files) - 1, []
-        for self._are_in_world in (False, True):
-            total = 0.0
-            for first in sorted({0, last // 2, last - 1}):
-                pair = [self.sweep(first), self.sweep(first + 1)]
-                source, target = (np.asarray(sweep.points)[static_rows(sweep)] for sweep in pair)
-                T_target_source = np.linalg.inv(self.poses[first + 1]) @ self.poses[first]
-                share = share_in_place(source[thinned_rows(source)], target, T_target_source)
-                total += 0.0 if np.isnan(share) else share
-            shares.append(total)
-        return shares[1] > shares[0]
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""

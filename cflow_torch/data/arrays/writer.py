@@ -12,16 +12,21 @@ from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
 from cflow_torch.data.arrays.reader import GROUND_FOLDER
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
+from cflow_torch.data.rigid_motion import to_quaternions, transform_points
 from cflow_torch.types import CFlowError
 
+_FARTHEST = 8000.0  # metres; float32 resolves half a millimetre up to here
 
-def write_array_log(log: Log, root: str | Path, suffix: str = ".npy") -> Path:
+
+def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint: str | None = None) -> Path:
     """Write a log to `root/<log_id>`: `points/000000.npy` ..., `ground/000000.npy` ..., `poses.txt`, `times.txt`.
 
     Args:
         log: any log.
         root: parent folder, created if it does not exist.
         suffix: suffix of the clouds, one of `cloud_file.SUFFIXES`.
+        viewpoint: "sensor" or "world" = write poses in VIEWPOINT of `.pcd` files, not in `poses.txt`, and points in
+            this frame, as tools for dynamic maps expect; None = `poses.txt`.
 
     Returns:
         The folder.
@@ -32,8 +37,11 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy") -> Path:
         cloud.
 
     Raises:
-        CFlowError: an unknown suffix, poses of only some sweeps, or the folder exists.
+        CFlowError: an unknown suffix, poses of only some sweeps, or the folder exists; a `viewpoint` without poses, or
+            with another suffix than `.pcd`.
     """
+    if viewpoint not in (None, "sensor", "world") or (viewpoint and suffix != ".pcd"):
+        raise CFlowError(f"viewpoint={viewpoint!r} with suffix={suffix!r}: pass 'sensor' or 'world' with .pcd, or None")
     if suffix not in SUFFIXES:
         raise CFlowError(f"suffix={suffix!r}: pass one of {', '.join(SUFFIXES)}")
     kept: list[Any] = []
@@ -41,7 +49,10 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy") -> Path:
         for index in range(len(log.timestamps)):
             sweep = log.sweep(index)
             points = np.asarray(sweep.points)[:, :3]
-            write_cloud(folder / "points" / f"{index:06d}{suffix}", points, log.columns(index))
+            where = None if viewpoint is None else _viewpoint(sweep.pose, f"log {log.log_id}: sweep {index}")
+            if viewpoint == "world" and sweep.pose is not None:
+                points = _rounded(transform_points(points, np.asarray(sweep.pose)))
+            write_cloud(folder / "points" / f"{index:06d}{suffix}", points, log.columns(index), where)
             kept.append((sweep.pose, sweep.timestamp_ns, sweep.is_ground))
         poses, times, masks = zip(*kept)
         if all(mask is not None for mask in masks):
@@ -53,6 +64,20 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy") -> Path:
         has_pose = [pose is not None for pose in poses]
         if any(has_pose) and not all(has_pose):
             raise CFlowError(f"log {log.log_id} has no pose of sweep {has_pose.index(False)}: give all poses or none")
-        if all(has_pose):
+        if all(has_pose) and viewpoint is None:
             write_kitti_poses(folder / "poses.txt", np.stack(poses))
     return Path(root) / log.log_id
+
+
+def _viewpoint(pose: Any, what: str) -> list[float]:
+    """Return x, y, z and quaternion w, x, y, z of a pose."""
+    if pose is None:
+        raise CFlowError(f"{what} has no pose for VIEWPOINT; pass viewpoint=None")
+    matrix = np.asarray(pose, np.float64)
+    return [*matrix[:3, 3].tolist(), *to_quaternions(matrix[None, :3, :3])[0].tolist()]
+
+
+def _rounded(points: np.ndarray) -> np.ndarray:
+    """Return float32 points, which most programs expect, if these resolve a millimetre there."""
+    farthest = float(np.abs(points[np.isfinite(points)]).max(initial=0))
+    return points.astype(np.float32) if farthest < _FARTHEST else points

@@ -7,10 +7,10 @@ from typing import Any, Tuple
 import numpy as np
 
 from cflow_torch.data.arrays.bin_layout import are_plausible
-from cflow_torch.data.files import shortened
-from cflow_torch.data.returns import missing_returns
+from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions
 from cflow_torch.types import CFlowError
+from cflow_torch.windows.returns import missing_returns
 
 _CONSTANT = 1e-9  # metres, and entries of a rotation: the change of a constant transform by rounding
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # PointField.datatype

@@ -11,7 +11,8 @@ import numpy as np
 
 from cflow_torch.data.arrays.poses_text import Trajectory, are_covered, covered_poses, describe_uncovered
 from cflow_torch.data.bags.messages import Frames, cloud_columns, sample, sorted_poses
-from cflow_torch.data.files import file_errors, find_folders, shortened
+from cflow_torch.data.file_errors import file_errors, shortened
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import TIME_FIELDS, seconds_after

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import weakref
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cflow_torch.data.arrays.reader import times_of_names
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
@@ -143,7 +143,7 @@ class HDF5Log(Log):
             raise CFlowError(f"{self.file}: sweep {self.timestamps[index]} has no {key}; it has {has}")
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
-    @property
+    @cached_property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_lidar` of every sweep, without reading any points."""
         stored = np.stack([self._stored_pose(index) for index in range(len(self))])

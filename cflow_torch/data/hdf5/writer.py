@@ -14,7 +14,7 @@ import numpy as np
 
 from cflow_torch.data.atomic import atomic_file, atomic_name
 from cflow_torch.data.boxes import points_in_box
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.reader import (
     EXTRINSIC,
     HDF5Log,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.ego_motion import rigid_transform

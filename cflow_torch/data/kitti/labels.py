@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, upright_poses
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import CFlowError
 

@@ -12,7 +12,7 @@ import numpy as np
 from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.boxes import flow_from_boxes
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.kitti import labels as stored_labels
 from cflow_torch.data.kitti.drives import KITTIDrive, find_kitti_drives
 from cflow_torch.data.kitti.geometry import in_image, poses_from_oxts, read_calibration, transform

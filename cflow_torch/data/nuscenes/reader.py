@@ -8,13 +8,13 @@ from typing import ClassVar, Literal, Mapping, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, points_in_box
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes, remote_errors
-from cflow_torch.data.returns import missing_returns
 from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.windows.returns import missing_returns
 
 MAX_UNIT_LAG = 60_000  # microseconds from another LiDAR's sweep to the reference's: a bit more than half a revolution
 _TIME_SLICE = 10_000  # microseconds during which we use one position of a moving box: 0.15 m off at most at 30 m/s

@@ -10,7 +10,9 @@ from typing import Any, Collection, Dict, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.files import file_errors, find_folders, read_json
+from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import find_folders
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.paths import PathLike, as_path, safe_name
 from cflow_torch.data.rigid_motion import interpolate_poses, poses_from_quaternions
 from cflow_torch.types import CFlowError

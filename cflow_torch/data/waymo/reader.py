@@ -12,7 +12,8 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, upright_poses
-from cflow_torch.data.files import check_columns, file_errors, find_folders
+from cflow_torch.data.file_errors import check_columns, file_errors
+from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, as_path, remote_errors, source_for_mmap, source_for_random_access
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points

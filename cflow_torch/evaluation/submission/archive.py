@@ -16,7 +16,7 @@ from pyarrow import feather
 
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.files import file_errors, shortened
+from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.paths import read_bytes
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy, vector_columns
 

@@ -10,7 +10,7 @@ from typing import Iterable, Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrow_file import FeatherFile
-from cflow_torch.data.files import file_errors
+from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import is_timestamp, read_bytes, safe_name
 from cflow_torch.evaluation.submission.archive import SubmissionVersion

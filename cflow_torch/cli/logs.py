@@ -1,0 +1,118 @@
+"""The logs that the settings `data` choose."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, NamedTuple, TextIO
+
+from cflow_torch.cli.choices import CONFIGS, read_settings
+from cflow_torch.cli.commands import AUTO
+from cflow_torch.cli.failures import Failures, collect_failures
+from cflow_torch.data.catalog import find_sources, find_user_sources, open_log, recognise
+from cflow_torch.data.log import Log
+from cflow_torch.simulator.benchmark import benchmark_logs, format_of
+from cflow_torch.types import CFlowError
+
+_MISSING = "???"  # a setting of another format
+
+
+def complete_data(data: dict[str, Any], choice: str, out: TextIO) -> dict[str, Any]:
+    """Replace data=auto by the settings of the recognised format, and print it to `out`.
+
+    `choice` is the chosen data set, the label of your own reader.
+    """
+    if "_target_" in data:
+        return {"label": choice, "first": 0, "step": 1, **data}
+    if data.get("name") != AUTO:
+        return data
+    formats = {path: recognise(path) for path in paths_of(data)}
+    for path, name in formats.items():
+        print(f"{path}: data={name}", file=out)
+    if len(set(formats.values())) > 1:
+        several = " and ".join(sorted(set(formats.values())))
+        raise CFlowError(f"the paths have several formats, {several}: give one command each")
+    name = next(iter(formats.values()), "synthetic")
+    settings = dict(read_settings(CONFIGS / "data" / f"{name}.yaml"))
+    if "cache" in settings:
+        settings["cache"] = os.environ.get("CFLOW_CACHE", "outputs/cache")
+    defaults = read_settings(CONFIGS / "data" / f"{AUTO}.yaml")
+    for key, value in data.items():
+        if key in settings and value != _MISSING:
+            settings[key] = value
+        elif key not in settings and value not in (_MISSING, defaults.get(key, _MISSING)):
+            raise CFlowError(f"data.{key}={value}: data={name} has no such setting; it has {', '.join(settings)}")
+    return {**settings, "name": name, "label": data["label"] or name}
+
+
+def paths_of(data: dict[str, Any]) -> list[Any]:
+    """Return the paths that were given as `data.root`."""
+    root = data.get("root")
+    if root is None:
+        return []
+    return list(root) if isinstance(root, (list, tuple)) else [root]
+
+
+def chosen_pairs(log: Log, first: int, step: int, count: int | None = None) -> list[int]:
+    """Return the indices of at most `count` pairs of a log, every `step`-th from `first` on, none over a gap."""
+    gaps = getattr(log, "gaps", ())
+    return [index for index in range(first, len(log.timestamps) - 1, step) if index not in gaps][:count]
+
+
+def check_pair(pair: int, log: Log) -> None:
+    """Reject the index of a pair that the log does not have."""
+    last = len(log.timestamps) - 2
+    if not 0 <= pair <= last:
+        raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {last}")
+
+
+class Sources(NamedTuple):
+    """Logs that are not open yet: name of their data set, settings of its reader, one source per log."""
+
+    reader: str
+    settings: dict[str, Any]
+    logs: list[Any]
+
+    def open(self, source: Any) -> Log:
+        return open_log(self.reader, source, **self.settings)
+
+
+def find_logs(data: dict[str, Any]) -> Sources:
+    """Find the logs of a data set; make simulated ones that are not cached. If there is none, raise a `CFlowError`."""
+    settings = {key: value for key, value in data.items() if key not in ("label", "first", "step")}
+    if "_target_" in settings:
+        target = settings.pop("_target_")
+        return Sources(target, settings, list(find_user_sources(target, settings)))
+    if data["name"] == "synthetic":
+        drives = benchmark_logs(data["cache"], "av2", [data["seed"]], data["num_sweeps"])
+        return Sources("av2", {"check": False}, drives)
+    if data["name"] == "benchmark":
+        seeds = range(data["first_seed"], data["first_seed"] + data["num_drives"])
+        chosen = format_of(data["profile"])
+        drives = benchmark_logs(data["cache"], data["profile"], seeds, data["num_sweeps"], data["scenes"])
+        return Sources(chosen.data_set, {"check": False, **chosen.settings}, drives)
+    name = settings.pop("name")
+    del settings["root"]
+    logs: list[Any] = []
+    for path in paths_of(data):
+        logs += [source for source in find_sources(name, path) if source not in logs]  # paths may overlap
+    return Sources(name, settings, logs)
+
+
+def open_first_log(data: dict[str, Any]) -> Log:
+    """Open the log of a command that uses only the first one. Several paths are a `CFlowError`."""
+    paths = paths_of(data)
+    if len(paths) > 1:
+        raise CFlowError(f"this command uses one log, but {len(paths)} paths were given: give one of them")
+    sources = find_logs(data)
+    return sources.open(sources.logs[0])
+
+
+def open_logs(data: dict[str, Any]) -> tuple[list[Log], Failures]:
+    """Open the logs of a data set. Those that cannot be opened are reported and skipped."""
+    sources = find_logs(data)
+    logs: list[Log] = []
+    failures: Failures = []
+    for source in sources.logs:
+        with collect_failures(failures, source.name):
+            logs.append(sources.open(source))
+    return logs, failures

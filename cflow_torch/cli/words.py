@@ -1,0 +1,124 @@
+"""The words after `cflow COMMAND`: settings, paths and options, and a check of their names.
+
+We do not import Hydra here, so that a mistyped name is told at once.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+from typing import NamedTuple
+
+from cflow_torch.cli.choices import choices, near, setting_names
+from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
+from cflow_torch.config import REMOVED, REMOVED_PRESETS, removed_preset
+from cflow_torch.errors import CFlowError
+
+# Options of Hydra that the next word belongs to; the first of them name configurations of your own.
+_OWN_CONFIGS = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path")
+_WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
+_FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
+_NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
+# Settings of commands that earlier versions had; for those of the methods, see `config.REMOVED`.
+_REMOVED = {**REMOVED, "standing": "use remove_stopped", "residual_axes": "leave it out"}
+
+
+class Call(NamedTuple):
+    """The words of a call. A word without "=" is a path."""
+
+    settings: list[str]
+    paths: list[str]
+    options: list[str]
+
+
+def read_call(words: list[str], command: str) -> Call:
+    """Read the words after a command. An option, a path or a name that does not exist is a `CFlowError`.
+
+    With `--config-dir`, your own configurations may have other choices and settings of groups; Hydra knows them.
+    """
+    call = split(words)
+    given = {option.partition("=")[0] for option in call.options if option.startswith("-")}
+    for option in given - {*_FLAGS, *_WITH_VALUE}:
+        raise CFlowError(f"unknown option {option!r}: give settings as NAME=VALUE; `cflow {command} --help` lists them")
+    for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
+        check_exists(path)
+    _check_names(call.settings, command, bool(given & set(_OWN_CONFIGS)))
+    return call
+
+
+def split(words: list[str]) -> Call:
+    """Split the words of a call. Hydra accepts no option, such as `-m`, between two settings."""
+    call = Call([], [], [])
+    for before, word in zip(["", *words], words):
+        if word.startswith("-") or before in _WITH_VALUE:
+            call.options.append(word)
+        elif ("=" in word or word[0:1] in ("+", "~")) and not _is_path(word):
+            call.settings.append(word)
+        else:
+            call.paths.extend(sorted(glob.glob(word)) or [word])
+    return call
+
+
+def _is_path(word: str) -> bool:
+    """Test whether a word with "=" is a path, such as date=2024-01-05/drive, and not a setting."""
+    return word.startswith(("/", "./", "../", "~/")) or os.path.exists(word)
+
+
+def _check_names(settings: list[str], command: str, has_own: bool) -> None:
+    kind = WITH_SETTINGS[command]
+    chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
+    known = setting_names(kind)
+    for word in settings:
+        key = word.partition("=")[0]
+        if key in chosen or _is_for_hydra(key) or any(name.startswith(f"{key}.") for name in known):
+            continue
+        if has_own and key.partition(".")[0] in chosen:
+            continue
+        own = key.rpartition(".")[2]
+        if key not in known and own in _REMOVED:
+            raise CFlowError(f"setting {own} was removed: {_REMOVED[own]}")
+        if key not in known:
+            hint = near(key, [*chosen, *known])
+            raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
+        owners = known[key]
+        group = owners[0].partition("=")[0] if owners else ""
+        if chosen.get(group) and not {f"{group}={choice}" for choice in chosen[group]} & set(owners):
+            raise CFlowError(f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out")
+
+
+def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
+    """Return the checked choices of each group; none if they are not known, as those of an experiment."""
+    given = dict(word.split("=", 1) for word in settings if "=" in word)
+    chosen: dict[str, list[str]] = {}
+    for group, default in kind.groups().items():
+        chosen[group] = [default] if default else []
+    for group in chosen.keys() & given.keys():
+        is_plain = not set(given[group]) & set(_NOT_PLAIN)
+        words = [word.strip() for word in given[group].split(",")] if is_plain else []
+        chosen[group] = [word for word in words if not word.startswith("base_")]  # base_dense: no preset
+        for choice in chosen[group]:
+            _check_choice(group, choice)
+    if "experiment" in given or "row" in given:
+        return {group: [] for group in chosen}
+    if "model" not in given and "picture" in given:
+        chosen["model"] = [PICTURES[name].PRESET or "default" for name in chosen["picture"]]
+    return chosen
+
+
+def _is_for_hydra(key: str) -> bool:
+    """Test whether a key adds or removes a setting, moves a group, or is a setting of Hydra itself."""
+    return key.startswith(("+", "~", "hydra")) or "@" in key
+
+
+def check_exists(path: str) -> None:
+    """Reject a path that does not exist. The address of an object store is not looked up."""
+    if "://" not in path and not os.path.exists(path):
+        raise CFlowError(f"{path}: there is no such file or folder; settings are NAME=VALUE")
+
+
+def _check_choice(group: str, choice: str) -> None:
+    if group == "model" and choice in REMOVED_PRESETS:
+        raise CFlowError(removed_preset(choice))
+    known = choices(group)
+    if choice not in (*known, "null"):
+        raise CFlowError(f"{group}={choice}{near(choice, known)}: give one of {', '.join(sorted(known))}")

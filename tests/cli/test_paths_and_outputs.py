@@ -1,0 +1,135 @@
+"""Several paths in a call, several data sets in an output, and what is checked before anything is computed."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+from typing import Any, Callable
+
+import pytest
+from small_logs import write_small_log
+
+from cflow_torch.errors import warn
+from cflow_torch.fleet.progress import show_warnings_as_lines
+
+SMALL = ("model=paper", "model.point_cloud_range=[-20,-20,-inf,20,20,inf]", "data.check=false")
+
+
+@pytest.fixture
+def drives(log_folder: Path, tmp_path: Path) -> list[Path]:
+    """Two logs of three pairs."""
+    return [Path(shutil.copytree(log_folder, tmp_path / f"drive_{number}")) for number in (1, 2)]
+
+
+def times(folder: Path) -> dict[Path, int]:
+    return {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file()}
+
+
+def test_all_paths_and_patterns_are_processed(drives, tmp_path, cflow, capsys):
+    call = ("flow", *SMALL, "engine.workers=1")
+    assert cflow(*call, *drives, f"output={tmp_path / 'paths'}") == 0
+    assert cflow(*call, tmp_path / "drive_*", f"output={tmp_path / 'pattern'}") == 0
+    for output in (tmp_path / "paths", tmp_path / "pattern"):
+        assert len(list(output.glob("drive_1/*.feather"))) == len(list(output.glob("drive_2/*.feather"))) == 3
+    assert cflow("eval", *SMALL, *drives, f"output={tmp_path / 'eval'}") == 0
+    assert "6 frames" in capsys.readouterr().out
+    assert cflow("check", *drives, "data.check=false") in (0, 1)
+    assert [line for line in capsys.readouterr().out.splitlines() if " (av2): " in line]
+    for command in ("stream", "plot", "bench"):
+        assert cflow(command, *drives, f"output={tmp_path / command}") == 2
+        assert "paths were given: give one of them" in capsys.readouterr().err
+
+
+def test_paths_of_several_formats_are_an_error(drives, tmp_path, cflow, capsys):
+    other = write_small_log("arrays", tmp_path / "other")
+    assert cflow("flow", *SMALL, drives[0], other, f"output={tmp_path / 'out'}") == 2
+    assert "several formats, arrays and av2" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_path_takes_the_settings_of_its_format(drives, tmp_path, cflow, capsys):
+    folder = write_small_log("arrays", tmp_path / "arrays")
+    assert cflow("flow", *SMALL, folder, "data.times=null", f"output={tmp_path / 'out'}", "engine.workers=1") == 0
+    assert list(tmp_path.glob("out/*/0.feather")), "time stamps are indices"
+    assert cflow("flow", *SMALL, drives[0], "data.times=null", f"output={tmp_path / 'other'}") == 2
+    assert "data=av2 has no such setting" in capsys.readouterr().err
+
+
+def test_flow_touches_only_the_logs_of_its_run(drives, tmp_path, cflow, capsys):
+    call = ("flow", *SMALL, f"output={tmp_path / 'out'}", "engine.workers=1")
+    assert cflow(*call, drives[0]) == 0
+    first = times(tmp_path / "out" / "drive_1")
+    assert cflow(*call, drives[1], "model.connectivity=4") == 0, "another method, another log"
+    assert cflow(*call, drives[0], "model.connectivity=4") == 2
+    assert "drive_1 has results of another run (method.connectivity was 8, is 4)" in capsys.readouterr().err
+    assert cflow(*call, drives[1], "overwrite=true") == 0
+    assert times(tmp_path / "out" / "drive_1") == first
+    assert cflow(*call, *drives) == 0
+    assert "complete before  6" in capsys.readouterr().out
+
+
+def test_clean_resumes_and_overwrites_as_flow_does(drives, tmp_path, cflow, capsys):
+    out = tmp_path / "out"
+    call = ("clean", *SMALL, f"output={out}")
+    assert cflow(*call, drives[0], "map=true", "voxel_size=0.2") == 0 and (out / "drive_1.ply").exists()
+    first = times(out / "drive_1")
+    assert cflow(*call, *drives, "voxel_size=0.2") == 0
+    assert times(out / "drive_1") == first and (out / "drive_2" / "points").is_dir()
+    second = times(out / "drive_2")
+    assert cflow(*call, drives[0], "remove_stopped=true") == 2
+    error = capsys.readouterr().err
+    assert "remove_stopped was False, is True" in error and "overwrite=true" in error
+    assert cflow(*call, drives[0], "voxel_size=0.2", "resume=false") == 2
+    assert times(out / "drive_1") == first
+    assert cflow(*call, drives[0], "remove_stopped=true", "overwrite=true") == 0
+    assert times(out / "drive_1").values() != first.values() and not (out / "drive_1.ply").exists()
+    assert times(out / "drive_2") == second
+    shutil.rmtree(drives[1])
+    shutil.copytree(drives[0], drives[1])
+    next((drives[1] / "sensors" / "lidar").iterdir()).unlink()
+    assert cflow(*call, drives[1], "voxel_size=0.2") == 2, "another log of this name"
+    assert times(out / "drive_2") == second
+
+
+def test_a_run_without_a_frame_claims_nothing(drives, tmp_path, cflow):
+    for file in (drives[0] / "sensors" / "lidar").iterdir():
+        file.write_bytes(b"broken")
+    call = ("flow", *SMALL, drives[0], f"output={tmp_path / 'out'}", "engine.workers=1")
+    assert cflow(*call) == 1
+    assert not list(tmp_path.rglob("manifest.json")) and not (tmp_path / "out" / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("package", "call", "extra"),
+    [
+        ("scipy.spatial", ("label", "hdf5", "model=offline"), "extra label"),
+        ("pypcd4", ("clean", "arrays", "suffix=.pcd"), "extra clouds"),
+        ("imageio_ffmpeg", ("plot", "arrays", "picture=animation", "format=mp4"), "extra video"),
+    ],
+)
+def test_what_a_command_needs_is_checked_first(package, call, extra, tmp_path, monkeypatch, cflow, capsys):
+    pytest.importorskip("h5py"), pytest.importorskip("matplotlib")
+    command, name, *settings = call
+    data = write_small_log(name, tmp_path / "data")
+    monkeypatch.setitem(sys.modules, package, None)
+    assert cflow(command, data, *settings, f"output={tmp_path / 'out'}") == 2
+    assert extra in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_second_eval_prints_its_tables(log_folder, tmp_path, cflow, capsys):
+    call = ("eval", *SMALL, log_folder, f"output={tmp_path / 'out'}")
+    texts = []
+    for _ in range(2):
+        assert cflow(*call) == 0
+        texts.append(capsys.readouterr().out)
+    assert "| **mean**" in texts[0] and "skipped, its results exist" in texts[1]
+    assert texts[1].endswith(texts[0].partition("\n")[2])
+
+
+def test_a_warning_is_shown_once(monkeypatch: Any, capsys: Any) -> None:
+    monkeypatch.setattr("warnings.showwarning", None)
+    show_warnings_as_lines()
+    calls: list[Callable[[], None]] = [lambda: warn("the same"), lambda: warn("the same"), lambda: warn("another")]
+    for call in calls:
+        call()
+    assert capsys.readouterr().err.splitlines() == ["warning: the same", "warning: another"]
