@@ -163,8 +163,8 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
 def _follow(parts: _Parts, cells: _Map, of_t: Tensor, velocity: Tensor, before_t: Tensor) -> tuple[Tensor, Tensor]:
     """Find the nearest part of each sweep to where a velocity puts a part of t, and its distance, (H, S) each.
 
-    `of_t` is (H,), `velocity` (2, H), and `before_t`, sweep intervals from each sweep to t, (H, S). Of t, it is the part
-    itself, and the distance is 0. Without a part near, the distance is infinite.
+    `of_t` is (H,), `velocity` (2, H), and `before_t`, sweep intervals from each sweep to t, (H, S). In t,
+    it is the part itself, and the distance is 0. Without a part near, the distance is infinite.
     """
     expected = take_columns(parts.centre, of_t)[..., None] - velocity[..., None] * before_t  # [2, H, S]
     step = torch.arange(before_t.shape[1], device=of_t.device).expand_as(before_t)
