@@ -7,7 +7,7 @@
 
 Sets: real (CFLOW_DATA, else ../shared/data), odd (the other windows of the same KITTI drive), merged (a car under a
 tree crown, a later part of KITTI), pandaset, scenes (small simulated drives, a window for each of five seeds), sim
-(simulated drives of five sensors, h = 4, and their mean). We chose settings on seeds 100-103 and checked the choice on
+(simulated drives of five sensors, h = 4, and their mean), motorway (simulated motorways, as sim). We chose settings on seeds 100-103 and checked the choice on
 400-403; use 300 and above for final scores only. Every setting has the history and the region of the set unless --set
 changes them; scenes have the region of the preset.
 
@@ -120,7 +120,7 @@ def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any], steps:
     if scored.group == "scenes":
         return mean_figures([pooled_figures([frame], reach=scored.reach) for frame in frames])
     figures = pooled_figures(frames, scored.step, scored.reach)
-    return {**figures, **range_figures(frames)} if scored.group == "sim" else figures
+    return {**figures, **range_figures(frames)} if scored.mean else figures
 
 
 def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NEAR) -> Figures:

@@ -23,6 +23,7 @@ from cflow_torch.data.hdf5 import HDF5Log
 from cflow_torch.data.log import CachedLog, FlowLabels, window
 from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
 from cflow_torch.simulator.benchmark import benchmark_logs
+from cflow_torch.simulator.drive import make_drive
 from cflow_torch.types import CFlowError, Window
 from cflow_torch.windows.ego_motion import relative_transform
 
@@ -38,8 +39,9 @@ NEAR, REGION = 35.0, 70.0  # metres, half sides: scored box of real data; region
 PROFILES = ("av2", "nuscenes", "truckscenes", "waymo", "aevascenes")
 SCENES = ("street", "highway", "crossing", "narrow")
 SIMULATED_SWEEPS, SIMULATED_WINDOWS = 15, (9, 12)  # per drive
+MOTORWAY_SWEEPS = 8
 SCENE_SEEDS = (0, 1, 2, 3, 4)  # of the small drives
-GROUPS = ("real", "odd", "merged", "pandaset", "scenes", "sim")
+GROUPS = ("real", "odd", "merged", "pandaset", "scenes", "sim", "motorway")
 AV2 = DATA / "av2-7fab2350" / "val" / "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 KITTI, KITTI_LATER = (DATA / "kitti-0000" / f"kitti-0000-{part}.h5" for part in ("a", "c2"))
 CROWN = DATA / "av2-crown" / "av2-crown.h5"
@@ -75,7 +77,7 @@ class ScoredSet:
 def make_sets(names: Sequence[str], seeds: Sequence[range]) -> list[ScoredSet]:
     """Return the sets of some names, of groups or of single sets; "walkers" selects "walkers-0.1" and so on.
 
-    Sets of "sim" are returned once per range of seeds; four seeds, or a multiple, have an even mix of scenes. Simulated
+    Sets of "sim" and "motorway" are returned once per range of seeds; for "sim", four seeds, or a multiple, have an even mix of scenes. Simulated
     drives that are not in the cache are made.
     """
     # With history, only windows with the whole history.
@@ -99,6 +101,8 @@ def make_sets(names: Sequence[str], seeds: Sequence[range]) -> list[ScoredSet]:
         for profile in PROFILES:
             name, mean = (f"sim {word}{drawn[0]}-{drawn[-1]} h={HISTORY}" for word in (f"{profile} ", ""))
             sets.append(ScoredSet(name, "sim", partial(simulated, profile, drawn), half_side=REGION, mean=mean))
+            name, mean = (f"motorway {word}{drawn[0]}-{drawn[-1]} h={HISTORY}" for word in (f"{profile} ", ""))
+            sets.append(ScoredSet(name, "motorway", partial(motorway, profile, drawn), half_side=REGION, mean=mean))
     for name in names:
         if not any(_is_of(scored, name) for scored in sets):
             raise CFlowError(f"set {name!r} does not exist; give {', '.join((*GROUPS, *(s.name for s in sets)))}")
@@ -182,6 +186,16 @@ def simulated(profile: str, seeds: Sequence[int]) -> list[Item]:
             nearest = sorted(pairs, key=lambda i: abs(i - wanted))  # noqa: B023
             index = next(i for i in nearest if log.labels(i) is not None)
             items.append(make_item(window(log, index, HISTORY, FUTURE), log.labels(index)))
+    return items
+
+
+def motorway(profile: str, seeds: Sequence[int]) -> list[Item]:
+    """A window of each simulated drive on a motorway with oncoming traffic."""
+    items = []
+    for seed in seeds:
+        log = CachedLog(make_drive(seed, MOTORWAY_SWEEPS, profile, "highway"), MOTORWAY_SWEEPS)
+        index = MOTORWAY_SWEEPS - 2 - 1
+        items.append(make_item(window(log, index, HISTORY), log.labels(index)))
     return items
 
 
