@@ -86,7 +86,7 @@ def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_l
     for motion in candidates:
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))
         own = evidence_of(*exact, z) + evidence_of(*near, 2 * z)
-        stays = node.level > num_levels and LEAVES * (exact[1] + near[1]) > exact[0] + near[0]
+        stays = node.level > num_levels and LEAVES * exact[1] > exact[0]
         counts = own > least and not stays and (node.travels or not slides_along_itself(sweeps, node.members, motion))
         evidence.append(own if counts else 0)
     best = evidence.index(max(evidence))  # ties: the first
