@@ -207,7 +207,9 @@ class Flow(FlowFiles):
     result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep but the last. The
     viewers of OpenSceneFlow read it there. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a
     log are complete: one row per moving object and sweep, with id, box and velocity. tracks=mot and tracks=kitti add
-    OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats.
+    OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats. labels=semantickitti writes
+    OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per point of
+    each sweep, 251 = moves at least 0.05 m per sweep, 9 = static, 0 = a sweep without flow, such as the last one.
 
     examples:
       cflow flow data=av2 data.root=/data/av2/val output=outputs/val
@@ -233,6 +235,12 @@ class Flow(FlowFiles):
         "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti = and text",
         kind=object,
         choices=(True, False, "mot", "kitti"),
+    )
+    labels: str | None = setting(
+        None,
+        "semantickitti = also write the moving points of each complete log to sequences/<log id>/predictions",
+        kind=str,
+        choices=(None, "semantickitti"),
     )
 
 

@@ -6,11 +6,13 @@ import os
 import sys
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
 from tqdm import tqdm
 
+from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.applications.tracking import track
 from cflow_torch.cli.commands import Flow, FlowFiles
@@ -21,13 +23,22 @@ from cflow_torch.cli.outputs import output_folder, settings_record, versions, wr
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
+from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Part, Shard, find_shard
 from cflow_torch.fleet.machine import AUTO, Layout, choose_layout, frames_per_worker
-from cflow_torch.fleet.manifest import check_logs, claim_run, complete_frames, frame_file, make_identity, release_run
+from cflow_torch.fleet.manifest import (
+    check_logs,
+    claim_run,
+    complete_frames,
+    frame_file,
+    labels_folder,
+    make_identity,
+    release_run,
+)
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
 from cflow_torch.fleet.work import source_name
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
 _TRACK_FORMATS = {"mot": write_mot, "kitti": write_kitti}
@@ -169,37 +180,56 @@ def _contents(cfg: Flow) -> tuple[str, ...]:
     needed = set(CONTENTS) if cfg.result_name is not None else set()
     if cfg.tracks:
         needed |= _FOR_TRACKS & set(allowed)
+    if cfg.labels is not None:
+        needed.add("residual")
     missing = sorted(needed - set(given))
     if missing:
-        raise CFlowError(f"contents={given}: result_name= and tracks= read the flow files: add {', '.join(missing)}")
+        readers = "result_name=, tracks= and labels= read the flow files"
+        raise CFlowError(f"contents={given}: {readers}: add {', '.join(missing)}")
     return tuple(name for name in allowed if name in given)
 
 
 def _write_more(cfg: Flow, flow: FlowRun, report: dict[str, Any]) -> Failures:
-    """Write the scenes and the tracks that the settings ask for."""
+    """Write the scenes, the tracks and the labels that the settings ask for."""
     output, failures = as_path(flow.job.output), []
     if cfg.result_name is not None:
         failures = _into_scenes(cfg.result_name, flow.sources.logs, output)
-    return failures + (_write_tracks(cfg.tracks, flow, output) if cfg.tracks else [])
+    if cfg.tracks or cfg.labels is not None:
+        failures += _write_logs(cfg, flow, output)
+    return failures
 
 
-def _write_tracks(kind: Any, flow: FlowRun, output: Path) -> Failures:
-    """Write the tracks of each log of this shard. Skip logs with incomplete frames, in this or another shard."""
+def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
+    """Write tracks and labels of each log of this shard. Skip logs with incomplete frames, in this or another shard."""
     failures: Failures = []
     stored = stored_flow(output, ())
-    for part in tqdm(flow.parts, desc="tracks", unit="log", disable=None):
+    wanted = [name for name in ("tracks", "labels") if getattr(cfg, name)]
+    for part in tqdm(flow.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
             log = flow.sources.open(part.source)
-            folder = output / log.log_id
             pairs = chosen_pairs(log, first=0, step=1)  # the pair over a gap has no flow
-            if not complete_frames(folder) >= {int(log.timestamps[index]) for index in pairs}:
+            if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
                 continue
-            if not (folder / TRACKS_FILE).exists():
-                results = ((index, stored(log, index)) for index in pairs)
-                write_tracks(folder / TRACKS_FILE, track(log, results))
-            if kind in _TRACK_FORMATS:
-                _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)
+            results = partial(_read_all, stored, log, pairs)
+            if cfg.tracks:
+                _write_tracks(cfg.tracks, log, results, output / log.log_id)
+            if cfg.labels is not None:
+                write_moving_labels(labels_folder(output, log.log_id), log, results())
     return failures
+
+
+def _read_all(
+    stored: Callable[[Log, int], FlowResult], log: Log, pairs: Iterable[int]
+) -> Iterator[tuple[int, FlowResult]]:
+    return ((index, stored(log, index)) for index in pairs)
+
+
+def _write_tracks(kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path) -> None:
+    """Write the tracks of a log, unless they exist, and then in the form `kind`. `results` reads the flow."""
+    if not (folder / TRACKS_FILE).exists():
+        write_tracks(folder / TRACKS_FILE, track(log, results()))
+    if kind in _TRACK_FORMATS:
+        _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:

@@ -4,6 +4,7 @@ OUTPUT/runs/<hash>.json           identity of a run: method, data settings, cont
 OUTPUT/<log id>/manifest.json     hash of the run, time stamps of the log, digests of its first, middle and last sweep
 OUTPUT/<log id>/<ns>.feather      a frame; its file gets this name when it is complete
 OUTPUT/<log id>/tracks.parquet    moving objects of a log whose frames are all complete
+OUTPUT/sequences/<log id>/predictions/<sweep>.label    moving points of such a log
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ RUNS = "runs"
 _FORMAT = 1
 _ENDING = b"ARROW1"  # last bytes of a feather file
 _OURS = re.compile(r"[0-9]+\.feather|manifest\.json|tracks\.parquet|mot\.txt|kitti\.txt|\..+\.tmp")
+_LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 _OVERWRITE = "give overwrite=true"
 
 
@@ -171,6 +173,11 @@ def frame_file(folder: Path, timestamp: int) -> Path:
     return folder / f"{timestamp}.feather"
 
 
+def labels_folder(output: Path, log_id: str) -> Path:
+    """Return the folder of a log's labels, as evaluators of SemanticKITTI expect it below `output`."""
+    return output / "sequences" / log_id / "predictions"
+
+
 def _is_whole(file: Path) -> bool:
     with suppress(OSError), open(file, "rb") as opened:
         opened.seek(-len(_ENDING), os.SEEK_END)
@@ -193,6 +200,10 @@ def _clear(folder: Path) -> None:
     """
     if not (folder / MANIFEST).exists():
         return
+    labels = labels_folder(folder.parent, folder.name)
+    for file in labels.iterdir() if labels.is_dir() else ():
+        if _LABELS.fullmatch(file.name):
+            file.unlink()
     for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
         if _OURS.fullmatch(file.name):
             file.unlink()
