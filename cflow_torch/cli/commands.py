@@ -207,7 +207,8 @@ class Flow(FlowFiles):
     result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep but the last. The
     viewers of OpenSceneFlow read it there. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a
     log are complete: one row per moving object and sweep, with id, box and velocity. tracks=mot and tracks=kitti add
-    OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats. labels=semantickitti writes
+    OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats. tracks=drivestudio adds instances_info.json and
+    frame_instances.json, which DriveStudio's loaders read. labels=semantickitti writes
     OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per point of
     each sweep, 251 = moves at least 0.05 m per sweep, 9 = static, 0 = a sweep without flow, such as the last one.
 
@@ -232,9 +233,10 @@ class Flow(FlowFiles):
     result_name: str | None = _path("key under which the total flow is also written into HDF5 scenes; null = none")
     tracks: bool | str = setting(
         False,
-        "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti = and text",
+        "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti, drivestudio "
+        "= and in this format",
         kind=object,
-        choices=(True, False, "mot", "kitti"),
+        choices=(True, False, "mot", "kitti", "drivestudio"),
     )
     labels: str | None = setting(
         None,

@@ -12,6 +12,7 @@ from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
 from tqdm import tqdm
 
+from cflow_torch.applications.instance_files import CAR, CLASS_OF_READER, write_drivestudio
 from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.applications.tracking import track
@@ -212,7 +213,8 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
                 continue
             results = partial(_read_all, stored, log, pairs)
             if cfg.tracks:
-                _write_tracks(cfg.tracks, log, results, output / log.log_id)
+                class_name = CLASS_OF_READER.get(flow.sources.reader, CAR)
+                _write_tracks(cfg.tracks, log, results, output / log.log_id, class_name)
             if cfg.labels is not None:
                 write_moving_labels(labels_folder(output, log.log_id), log, results())
     return failures
@@ -224,12 +226,16 @@ def _read_all(
     return ((index, stored(log, index)) for index in pairs)
 
 
-def _write_tracks(kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path) -> None:
+def _write_tracks(
+    kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, class_name: str
+) -> None:
     """Write the tracks of a log, unless they exist, and then in the form `kind`. `results` reads the flow."""
     if not (folder / TRACKS_FILE).exists():
         write_tracks(folder / TRACKS_FILE, track(log, results()))
     if kind in _TRACK_FORMATS:
         _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)
+    elif kind == "drivestudio":
+        write_drivestudio(folder, read_tracks(folder / TRACKS_FILE), log, class_name)
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:

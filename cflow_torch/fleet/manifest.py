@@ -35,7 +35,8 @@ MANIFEST = "manifest.json"
 RUNS = "runs"
 _FORMAT = 1
 _ENDING = b"ARROW1"  # last bytes of a feather file
-_OURS = re.compile(r"[0-9]+\.feather|manifest\.json|tracks\.parquet|mot\.txt|kitti\.txt|\..+\.tmp")
+_TRACKS = r"tracks\.parquet|mot\.txt|kitti\.txt|instances_info\.json|frame_instances\.json"
+_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 _OVERWRITE = "give overwrite=true"
 

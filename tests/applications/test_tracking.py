@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, Callable
 
@@ -15,6 +16,7 @@ from staged_cars import Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
 from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
+from cflow_torch.applications.instance_files import write_drivestudio
 from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.data.av2 import AV2Log
@@ -281,6 +283,48 @@ def test_tracks_are_written_as_text(tmp_path: Path) -> None:
     assert np.allclose(alpha, rotation - np.arctan2(x, z), atol=1e-4)
 
 
+def read_instances(folder: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Read the files by the steps of DriveStudio's loaders.
+
+    Returns poses (frames, instances, 4, 4), NaN where an instance is not in the list of a frame, the mean size
+    (instances, 3) and the classes.
+    """
+    infos = json.loads((folder / "instances_info.json").read_text())
+    frames = json.loads((folder / "frame_instances.json").read_text())
+    poses = np.full((len(frames), len(infos), 4, 4), np.nan)
+    sizes = np.zeros((len(frames), len(infos), 3))
+    classes = [""] * len(infos)
+    for number, info in infos.items():
+        classes[int(number)] = info["class_name"]
+        notes = info["frame_annotations"]
+        for frame, box, size in zip(notes["frame_idx"], notes["obj_to_world"], notes["box_size"]):
+            poses[frame, int(number)] = np.array(box).reshape(4, 4)
+            sizes[frame, int(number)] = size
+    is_listed = np.zeros(poses.shape[:2], bool)
+    for frame, numbers in frames.items():
+        is_listed[int(frame), numbers] = True
+    assert np.array_equal(is_listed, np.isfinite(poses).all((2, 3))), "both files name the same boxes"
+    return poses, sizes.sum(0) / is_listed.sum(0)[:, None], classes
+
+
+def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> None:
+    """Two cars, one hidden at first, seen from a vehicle that has turned. The world is that of the poses."""
+    hidden = straight((-12, 0), (0.0, 0.9))
+    hidden[:4] = np.nan
+    log = Staged([straight((0, -6), (0.8, 0.0)), hidden], np.tile(pose(-20, -5, np.pi / 2, 1), (12, 1, 1)))
+    table = track(log, log.results())
+    table["id"] = table["id"] * 3 + 5  # ids have gaps, because most tracks are not confirmed
+    write_drivestudio(tmp_path / "instances", table, log, "vehicle.car")
+    poses, sizes, classes = read_instances(tmp_path / "instances")
+    assert poses.shape[:2] == (12, 2) and classes == ["vehicle.car"] * 2
+    assert np.isfinite(poses[:, :, 0, 0]).sum(0).tolist() == [11, 7] and np.isnan(poses[11]).all()
+    corner = np.stack([straight((0, -6), (0.8, 0.0)), hidden], 1)
+    assert np.allclose(poses[4:11, :, :2, 3], corner[4:11] + (1.9, 0.7), atol=0.1), "the middle of the box"
+    assert np.allclose(poses[10, 0, :3, 0], (1, 0, 0), atol=0.01), "x along its length"
+    assert np.allclose(poses[10, 1, :3, 0], (0, 1, 0), atol=0.01)
+    assert np.allclose(sizes, [(3.8, 1.4, 1.2), (1.4, 3.8, 1.2)], atol=1e-4)
+
+
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
 RANGE = (-20, -20, -float("inf"), 20, 20, float("inf"))
 
@@ -314,10 +358,14 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     before = file.read_bytes()
     assert call("flow", "whole", *run[:3], "tracks=mot") == 0 and call("flow", "whole", *run[:3], "tracks=csv") == 2
     assert (file.parent / "mot.txt").read_text().count("\n") == len(whole["id"])
+    assert call("flow", "whole", *run[:3], "tracks=drivestudio") == 0
+    poses, _, classes = read_instances(file.parent)
+    assert np.isfinite(poses[:, :, 0, 0]).sum() == len(whole["id"]) and set(classes) == {"REGULAR_VEHICLE"}
     file.unlink()
     sorted(file.parent.glob("*.feather"))[2].unlink()
     assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
     assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
+    assert [other.name for other in file.parent.glob("*.json")] == ["manifest.json"], "nor their other forms"
     capsys.readouterr()
     assert call("flow", "small", *run, "contents=[residual,cluster_id,is_valid]") == 2
     assert "add confidence" in capsys.readouterr().err

@@ -1,0 +1,53 @@
+"""Write tracks as the instances of DriveStudio: `instances_info.json` and `frame_instances.json`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cflow_torch.applications.track_table import Table
+from cflow_torch.data.boxes import upright_poses
+from cflow_torch.data.json_file import write_json
+from cflow_torch.data.log import Log
+from cflow_torch.data.paths import PathLike, as_path
+
+INSTANCES_FILE = "instances_info.json"
+FRAMES_FILE = "frame_instances.json"
+CAR = "Car"
+"""Class of KITTI and PandaSet in DriveStudio, which reconstructs it as a rigid object."""
+CLASS_OF_READER = {"av2": "REGULAR_VEHICLE", "nuscenes": "vehicle.car", "waymo": "Vehicle"}
+"""Data set -> class in DriveStudio. Each of its loaders knows only the classes of its own data set."""
+
+
+def write_drivestudio(folder: PathLike, table: Table, log: Log, class_name: str = CAR) -> None:
+    """Write `folder/instances_info.json` and `folder/frame_instances.json`.
+
+    The first has, for each track, the sweeps in which it is seen, `T_world_box` (4, 4) and length, width, height in
+    metres. The second has the tracks of each sweep of the log, and none for the last one.
+
+    Args:
+        folder: created if it does not exist. DriveStudio reads `<scene>/instances`.
+        table: tracks, see `track`.
+        log: the drive. Frames are numbered by its sweeps, and boxes are in the world of its poses.
+        class_name: class of all objects, because tracks have none. DriveStudio chooses the kind of model by it.
+
+    Convention: instances are numbered 0, 1, 2, ... without gaps, in the order of the ids of their tracks. `id` is the
+        id of the track. A box has x along its length, y to the left and z up.
+    """
+    folder = as_path(folder)
+    ids, instance = np.unique(table["id"], return_inverse=True)
+    boxes = upright_poses(np.stack([table["heading"], table["x"], table["y"], table["z"]], 1))
+    sizes = np.stack([table["length"], table["width"], table["height"]], 1)
+    infos: dict[str, Any] = {}
+    for number, track_id in enumerate(ids.tolist()):
+        rows = np.flatnonzero(instance == number)
+        annotations = {
+            "frame_idx": table["sweep"][rows].tolist(),
+            "obj_to_world": boxes[rows].tolist(),
+            "box_size": sizes[rows].tolist(),
+        }
+        infos[str(number)] = {"id": str(track_id), "class_name": class_name, "frame_annotations": annotations}
+    frames = {str(sweep): instance[table["sweep"] == sweep].tolist() for sweep in range(len(log.timestamps))}
+    write_json(folder / FRAMES_FILE, frames)
+    write_json(folder / INSTANCES_FILE, infos)
