@@ -169,6 +169,8 @@ class FlowResult:
         confidence: (N,) float32 in [0, 1], estimated probability that the end-point error of the residual flow is
             below 0.1 m per sweep interval; 0 where is_valid is False; None unless the method is the verified one. The
             probabilities were fitted on simulated drives, see docs/verified.md.
+        track_id: (N,) int64, id of the track of each point in the table of `track`, -1 = none; None unless the result
+            was read from a file of `cflow flow tracks=true`.
     """
 
     residual_flow: Tensor
@@ -178,6 +180,7 @@ class FlowResult:
     score: Tensor
     is_valid: Tensor
     confidence: Tensor | None = None
+    track_id: Tensor | None = None
 
     def to(self, device: Any) -> FlowResult:
         """Copy the result to another device."""

@@ -34,6 +34,34 @@ class Tracked(NamedTuple):
     track_id: np.ndarray
 
 
+class TrackedPoints(NamedTuple):
+    """The points of a sweep that belong to tracks.
+
+    Args:
+        sweep: index of the sweep in its log.
+        num_points: N, all points of the sweep.
+        row: (M,) int64 rows of the points that have a track.
+        id: (M,) int64 ids of their tracks.
+    """
+
+    sweep: int
+    num_points: int
+    row: np.ndarray
+    id: np.ndarray
+
+    @classmethod
+    def of(cls, sweep: int, track_id: np.ndarray) -> TrackedPoints:
+        """Keep the points with an id, of (N,) ids where -1 = no track."""
+        row = np.flatnonzero(track_id >= 0)
+        return cls(sweep, len(track_id), row, track_id[row])
+
+    def track_id(self, kept: np.ndarray) -> np.ndarray:
+        """Return the id of every point, (N,) int64; -1 = no track, or one that is not among the ids `kept`."""
+        ids = np.full(self.num_points, -1)
+        ids[self.row] = np.where(np.isin(self.id, kept), self.id, -1)
+        return ids
+
+
 class _Times(NamedTuple):
     """Times of a pair of sweeps, seconds."""
 
@@ -277,6 +305,17 @@ def track(
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
     """
+    return track_points(log, results, sweep_interval)[0]
+
+
+def track_points(
+    log: Log, results: Iterable[tuple[int, FlowResult]] | None = None, sweep_interval: float = 0.1
+) -> tuple[dict[str, np.ndarray], list[TrackedPoints]]:
+    """Track the moving objects of a drive, and return the table of `track` and the points of the tracks.
+
+    Arguments and errors are those of `track`. There is a `TrackedPoints` for each result, in order. They also have the
+    ids of tracks that are never confirmed; `each.track_id(table["id"])` leaves these out.
+    """
     if results is None:
         model = make_model(make_config("default"))
         log = CachedLog(log, model.config.num_sweeps)
@@ -284,8 +323,10 @@ def track(
     recent = CachedLog(log, 2)
     tracker = Tracker(sweep_interval)
     tables = []
+    points = []
     for index, result in results:
-        table = tracker.push(window(recent, index), result).table
+        table, track_id = tracker.push(window(recent, index), result)
+        points.append(TrackedPoints.of(index, track_id))
         where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}
         tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
-    return confirmed(join_tables(tables))
+    return confirmed(join_tables(tables)), points

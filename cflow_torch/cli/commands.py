@@ -197,7 +197,8 @@ class Flow(FlowFiles):
     Each file has one row per point of sweep t. Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of
     objects, pose_t{x,y,z}_m ego motion (float32, metres per sweep, axes of the ego frame at t+1), cluster_id, score,
     is_valid. There is also a column confidence, unless model=paper or keypoints. contents=[residual,is_valid] writes
-    only these columns. Files are then much smaller; ego motion and total flow follow from the poses.
+    only these columns. Files are then much smaller; ego motion and total flow follow from the poses. The content points
+    adds x, y, z of the points of sweep t.
 
     OUTPUT/config.yaml contains settings and versions; OUTPUT/reports has the report. Run the command again to resume.
     Results of other logs in OUTPUT stay. After Ctrl-C, SIGTERM or SIGHUP the run finishes the frames that it has begun.
@@ -206,7 +207,8 @@ class Flow(FlowFiles):
 
     result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep but the last. The
     viewers of OpenSceneFlow read it there. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a
-    log are complete: one row per moving object and sweep, with id, box and velocity. tracks=mot and tracks=kitti add
+    log are complete: one row per moving object and sweep, with id, box and velocity. Its flow files get a column
+    track_id, the id of each point, -1 = none. tracks=mot and tracks=kitti add
     OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats. tracks=drivestudio adds instances_info.json and
     frame_instances.json, which DriveStudio's loaders read. labels=semantickitti writes
     OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per point of
@@ -228,7 +230,9 @@ class Flow(FlowFiles):
 
     output: str = setting("outputs/flow", "folder, or address in an object store")
     contents: Any = setting(
-        AUTO, "columns of each file, such as [residual, is_valid]; auto = all that the method has", several=True
+        AUTO,
+        "columns of each file, such as [points, residual, is_valid]; auto = all that the method has, without points",
+        several=True,
     )
     result_name: str | None = _path("key under which the total flow is also written into HDF5 scenes; null = none")
     tracks: bool | str = setting(

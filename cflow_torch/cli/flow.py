@@ -15,14 +15,14 @@ from tqdm import tqdm
 from cflow_torch.applications.instance_files import CAR, CLASS_OF_READER, write_drivestudio
 from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
-from cflow_torch.applications.tracking import track
+from cflow_torch.applications.tracking import track_points
 from cflow_torch.cli.commands import Flow, FlowFiles
 from cflow_torch.cli.failures import Failures, UnfinishedJob, collect_failures, is_sweep
 from cflow_torch.cli.flows import stored_flow
 from cflow_torch.cli.logs import Sources, chosen_pairs, find_logs
 from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, read_flow
+from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
@@ -174,6 +174,7 @@ def _contents(cfg: Flow) -> tuple[str, ...]:
     allowed = (*CONTENTS, *ON_REQUEST) if has_confidence else CONTENTS
     if cfg.contents == "auto":
         return allowed
+    allowed = (POINTS, *allowed)
     given = [cfg.contents] if isinstance(cfg.contents, str) else list(cfg.contents)
     if not given or set(given) - set(allowed):
         why = "" if has_confidence else "; only model=default, offline and live have a confidence"
@@ -229,9 +230,15 @@ def _read_all(
 def _write_tracks(
     kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, class_name: str
 ) -> None:
-    """Write the tracks of a log, unless they exist, and then in the form `kind`. `results` reads the flow."""
+    """Write the tracks of a log and the ids of its points, unless they exist, and then the form `kind`.
+
+    `results` reads the flow files.
+    """
     if not (folder / TRACKS_FILE).exists():
-        write_tracks(folder / TRACKS_FILE, track(log, results()))
+        table, points = track_points(log, results())
+        for each in points:
+            add_track_ids(frame_file(folder, log.timestamps[each.sweep]), each.track_id(table["id"]))
+        write_tracks(folder / TRACKS_FILE, table)  # last, so that a killed run begins again
     if kind in _TRACK_FORMATS:
         _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)
     elif kind == "drivestudio":

@@ -12,34 +12,55 @@ from pyarrow import feather
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.paths import PathLike, as_path
-from cflow_torch.types import VECTORS, CFlowError, FlowResult, vector_columns
+from cflow_torch.types import VECTORS, Array, CFlowError, FlowResult, as_numpy, vector_columns
 
 CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
 ON_REQUEST = ("confidence",)  # written only if you name it
-_COLUMNS = {name: vector_columns(name) if name in VECTORS else [name] for name in (*CONTENTS, *ON_REQUEST)}
+POINTS = "points"  # the same; the columns x, y, z
+TRACK_ID = "track_id"  # added by `add_track_ids`
+_FIELDS = (*CONTENTS, *ON_REQUEST, TRACK_ID)
+_COLUMNS = {name: vector_columns(name) if name in VECTORS else [name] for name in _FIELDS}
+_DTYPES = {"cluster_id": np.int64, "is_valid": bool, TRACK_ID: np.int64}
 
 
-def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CONTENTS) -> None:
+def write_flow(
+    path: PathLike, result: FlowResult, contents: Sequence[str] = CONTENTS, points: Array | None = None
+) -> None:
     """Write a result to `path`, atomically.
 
     Args:
         path: file name, by convention `<log id>/<time stamp of sweep t>.feather`.
         result: flow of one window.
-        contents: names in `CONTENTS` and `ON_REQUEST`. A file without pose flow and total flow is about 17 times
-            smaller. You can compute both from the residual flow and the poses.
+        contents: names in `CONTENTS` and `ON_REQUEST`, and `POINTS`. A file without pose flow and total flow is about
+            17 times smaller. You can compute both from the residual flow and the poses.
+        points: (N, 3+) of sweep t, metres, needed only for the content "points".
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
-        ego1, cluster_id int64, score and confidence float32, is_valid bool.
-        If you name a confidence that the result lacks, that is a `CFlowError`.
+        ego1, cluster_id int64, score and confidence float32, is_valid bool. x, y, z are float32, in metres and in the
+        ego frame of t.
+        If you name a confidence that the result lacks, or points without passing them, that is a `CFlowError`.
     """
     columns = result.columns()
-    names = [column for name in contents for column in _COLUMNS.get(name, [name])]
+    if POINTS in contents:
+        if points is None or len(points) != len(result.residual_flow):
+            raise CFlowError("the content points needs the points of sweep t, a row per row of the flow: pass points=")
+        columns.update(zip("xyz", as_numpy(points)[:, :3].astype(np.float32).T))
+    names = [column for name in contents for column in ("xyz" if name == POINTS else _COLUMNS.get(name, [name]))]
     if not columns.keys() >= set(names):
         lacking = ", ".join(sorted(set(names) - columns.keys()))
         raise CFlowError(f"this result has no {lacking}: estimate it with preset default or offline, or leave it out")
     with atomic_file(path) as file:
         feather.write_feather(pa.table({name: columns[name] for name in names}), file)
+
+
+def add_track_ids(path: PathLike, track_id: np.ndarray) -> None:
+    """Add the column `track_id` to a flow file, or replace it: (N,) int64, the track of each point, -1 = none."""
+    table = FeatherFile(as_path(path)).table
+    if TRACK_ID in table.column_names:
+        table = table.drop([TRACK_ID])
+    with atomic_file(path) as file:
+        feather.write_feather(table.append_column(TRACK_ID, pa.array(track_id.astype(np.int64))), file)
 
 
 def read_flow(path: PathLike) -> FlowResult:
@@ -53,7 +74,7 @@ def read_flow(path: PathLike) -> FlowResult:
         file = FeatherFile(path)
         for name, columns in _COLUMNS.items():
             if set(columns) & set(file.names):
-                values = file.matrix(columns, {"cluster_id": np.int64, "is_valid": bool}.get(name, np.float32))
+                values = file.matrix(columns, _DTYPES.get(name, np.float32))
                 fields[VECTORS.get(name, name)] = torch.from_numpy(values if name in VECTORS else values[:, 0])
         if not fields:
             raise CFlowError(f"its columns are {', '.join(file.names)}")

@@ -17,7 +17,7 @@ import torch
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
-from cflow_torch.data.flow_file import write_flow
+from cflow_torch.data.flow_file import POINTS, write_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.paths import as_path, safe_name
@@ -40,6 +40,7 @@ class _Frame:
 
     timestamp: int
     content: Window | FlowResult | Exception | None = None
+    points: Any = None  # of sweep t, if they are written
     is_repetition: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -161,6 +162,8 @@ class Worker:
             return frames
         seconds = {"compute": time.perf_counter() - start, **{f"compute/{name}": s for name, s in stages.items()}}
         for frame, result in zip(good, results):
+            if POINTS in self._job.contents and isinstance(frame.content, Window):
+                frame.points = frame.content.pc0.points
             frame.content = result
             frame.seconds.update({name: value / len(good) for name, value in seconds.items()})
         return frames
@@ -177,7 +180,8 @@ class Worker:
             result, frame.content = frame.content, None
             file = frame_file(folder, frame.timestamp)
             with _stage(frame, "write"):
-                write_flow(file, result, self._job.contents)
+                write_flow(file, result, self._job.contents, frame.points)
+            frame.points = None
         return frame
 
 

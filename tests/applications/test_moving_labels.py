@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import cflow
+from pyarrow import feather
 from small_logs import make_small_drive
 
 from cflow_torch.applications.moving_labels import moving_classes
@@ -42,7 +43,7 @@ def test_flow_writes_a_label_file_for_every_sweep(
     call = ("flow", "data=av2", f"data.root={folder}", "data.check=false", f"output={output}")
     assert cflow(*call, *RUN, "contents=[cluster_id,is_valid]") == 2 and "add residual" in capsys.readouterr().err
     assert cflow(*call, *RUN[:3], "labels=kitti") == 2 and "semantickitti" in capsys.readouterr().err
-    assert cflow(*call, *RUN) == 0
+    assert cflow(*call, *RUN, "contents=[residual,points]") == 0
     labels = output / "sequences" / log.log_id / "predictions"
     assert sorted(file.name for file in labels.iterdir()) == [f"{index:06d}.label" for index in range(5)]
     for index, stamp in enumerate(log.timestamps):
@@ -51,7 +52,11 @@ def test_flow_writes_a_label_file_for_every_sweep(
         if index in (1, 4):
             assert (classes == 0).all(), "there is no flow over a gap, nor from the last sweep on"
             continue
-        speed = read_flow(output / log.log_id / f"{stamp}.feather").residual_flow.norm(dim=1).numpy()
+        file = output / log.log_id / f"{stamp}.feather"
+        table = feather.read_table(file)
+        assert table.column_names == ["x", "y", "z", "residual_tx_m", "residual_ty_m", "residual_tz_m"]
+        assert np.array_equal(np.stack([table[axis] for axis in "xyz"], 1), log.sweep(index).points[:, :3])
+        speed = read_flow(file).residual_flow.norm(dim=1).numpy()
         assert 0 < (classes == 2).sum() < len(classes) and np.array_equal(classes == 2, speed >= 0.05)
         assert set(classes) == {1, 2}
 

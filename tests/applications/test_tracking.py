@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import cflow
+from pyarrow import feather
 from scenes import pose, rows_of
 from small_logs import make_small_drive
 from staged_cars import Staged, straight
@@ -21,6 +22,7 @@ from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import windows
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
@@ -349,6 +351,16 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     flow = [model([sweeps])[0] for sweeps in windows(log, model.config.num_history)]
     expected = track(log, enumerate(flow))
     assert all(np.array_equal(whole[name], expected[name]) for name in expected)
+    for row, stamp in enumerate(log.timestamps[:4]):
+        ids = read_flow(file.parent / f"{stamp}.feather").track_id.numpy()
+        now = {name: values[whole["sweep"] == row] for name, values in whole.items()}
+        number, count = np.unique(ids[ids >= 0], return_counts=True)
+        assert np.array_equal(number, now["id"]), "only confirmed tracks"
+        is_seen = now["is_moving"]
+        assert np.array_equal(count[is_seen], now["num_points"][is_seen])
+        cluster = flow[row].cluster_id.numpy()
+        for track_id, of_flow in zip(now["id"][is_seen], now["cluster_id"][is_seen]):
+            assert (cluster[ids == track_id] == of_flow).all()
     for index in (0, 1):
         assert not list((tmp_path / "shards").glob("*/tracks.parquet")), "half of the frames are not a whole log"
         assert call("flow", "shards", *run, f"shard.index={index}", "shard.count=2") == 0
@@ -364,6 +376,8 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     file.unlink()
     sorted(file.parent.glob("*.feather"))[2].unlink()
     assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
+    tables = [feather.read_table(each) for each in file.parent.glob("*.feather")]
+    assert all(table.column_names.count("track_id") == 1 for table in tables), "also in the frame that was missing"
     assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
     assert [other.name for other in file.parent.glob("*.json")] == ["manifest.json"], "nor their other forms"
     capsys.readouterr()

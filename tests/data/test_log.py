@@ -127,6 +127,8 @@ def test_every_flow_file_can_be_read(contents, result, tmp_path):
     wanted = {name for name in columns if name.startswith(tuple(f"{c}_t" for c in contents)) or name in contents}
     assert again.columns().keys() == wanted
     assert all(np.array_equal(values, columns[name]) for name, values in again.columns().items())
+    with pytest.raises(CFlowError, match="pass points="):
+        write_flow(file, result, ("points", *contents), np.zeros((3, 3)))
     with pytest.raises(CFlowError, match="not a flow file"):
         read_flow(Path(__file__))
 
