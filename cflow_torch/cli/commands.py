@@ -288,6 +288,7 @@ class Eval(Command):
       cflow eval data=av2 data.root=/data/av2/val model=paper
       cflow eval data=hdf5 data.root=/data/scenes model.num_history=2     fewer sweeps: faster
       cflow eval definition=av2                    scores as another public evaluator defines them
+      cflow eval /data/kitti/sequences/08 definition=mos    IoU of moving points, by the classes of SemanticKITTI
       cflow eval -m model.num_history=0,2,4        a sweep: outputs/eval/model.num_history=2/results.json, ...
       cflow eval -m experiment=pixel_size          a table or figure of the paper, see docs/settings.md
     """
@@ -299,7 +300,7 @@ class Eval(Command):
     device: str = _device()
     definition: str = setting(
         "opensceneflow",
-        "of the scores: opensceneflow | bucketed_scene_flow_eval | av2 | challenge_2026 | challenge_2026_box",
+        "of the scores: opensceneflow | bucketed_scene_flow_eval | av2 | challenge_2026 | challenge_2026_box | mos",
     )
     experiment_name: str | None = setting("${hydra:runtime.choices.experiment}", "name in results.json", optional=True)
     row: str | None = group(None, "row of an experiment whose rows differ in more than one setting")

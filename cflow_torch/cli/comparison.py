@@ -18,7 +18,9 @@ TABLE = "comparison.csv"
 _FEW = 1000
 # A setting and its value in the name of a job's folder.
 _SWEPT = re.compile(r"(?:^|,)([^=,]+)=(.*?)(?=,[^=,]+=|$)")
+_MOVING = "moving IoU"  # of jobs that have it
 _SCORES = {
+    _MOVING: "moving_iou",
     "mean dynamic error": "dynamic_error",
     "EPE FD [m]": "epe_fd",
     "EPE BS [m]": "epe_bs",
@@ -64,12 +66,16 @@ def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
         name = file.parent.relative_to(output).as_posix()
         settings = {**(dict(_SWEPT.findall(name)) or {"job": name}), "scored data": digest}
         jobs.append((settings, ["" if math.isnan(scores[key]) else scores[key] for key in _SCORES.values()]))
+    columns = list(_SCORES)
+    if all(scores[0] == "" for _, scores in jobs):
+        columns.remove(_MOVING)
+        jobs = [(settings, scores[1:]) for settings, scores in jobs]
     names = list(dict.fromkeys(name for settings, _ in jobs for name in settings if name != "scored data"))
     if len({settings["scored data"] for settings, _ in jobs}) > 1:
         names.append("scored data")
     rows = [[*(settings.get(name, "") for name in names), *scores] for settings, scores in jobs]
     rows.sort(key=lambda row: [_order(cell) for cell in row[: len(names)]])
-    return [*names, *_SCORES], rows
+    return [*names, *columns], rows
 
 
 def _order(cell: str) -> tuple[bool, float, str]:
@@ -84,7 +90,7 @@ def headline(results: dict[str, Any], seconds: dict[str, Any]) -> dict[str, floa
     """The most important scores of `SceneFlowMetrics.compute` and of `TimedModel.report`; NaN = no value.
 
     "dynamic_error" (mean over classes, and over ranges if the definition has them), "static_epe" (mean over classes),
-    "epe_fd" and "epe_bs" in metres, "seconds" (median per pair).
+    "epe_fd" and "epe_bs" in metres, "moving_iou", "seconds" (median per pair).
     """
     bucketed, three_way = results.get("bucketed", {}).get("mean", {}), results.get("three_way", {})
     found = {
@@ -92,6 +98,7 @@ def headline(results: dict[str, Any], seconds: dict[str, Any]) -> dict[str, floa
         "static_epe": bucketed.get("static_epe"),
         "epe_fd": three_way.get("epe_fd"),
         "epe_bs": three_way.get("epe_bs"),
+        "moving_iou": results.get("moving", {}).get("iou"),
         "seconds": seconds.get("median"),
     }
     return {name: math.nan if value is None else float(value) for name, value in found.items()}
@@ -101,7 +108,11 @@ def summary(results: dict[str, Any], seconds: dict[str, Any]) -> str:
     """Return a line with the most important scores and, if classes have few dynamic points, a line that lists these."""
     scores = headline(results, seconds)
     dynamic, static = "mean dynamic error {dynamic_error:.3f}", "static EPE {static_epe:.3f} m"
-    if "bucketed" not in results:
+    if "moving" in results:
+        found = {name: math.nan if value is None else value for name, value in results["moving"].items()}
+        dynamic = "moving IoU {iou:.3f}".format(**found)
+        static = "precision {precision:.3f}, recall {recall:.3f}".format(**found)
+    elif "bucketed" not in results:
         dynamic, static = "EPE FD {epe_fd:.3f} m", "EPE BS {epe_bs:.3f} m"
     lines = [f"{dynamic}, {static}, {{seconds:.2f}} s a frame".format(**scores)]
     classes = results.get("bucketed", {}).get("classes", {})

@@ -72,8 +72,13 @@ class Scores:
             return
         wanted = ("eval_mask", "stored_motion") if self.metrics.definition.ego_motion == "stored" else ("eval_mask",)
         parts = {name: getattr(log, name)(index) for name in wanted if hasattr(log, name)}
+        if self.metrics.definition.truth == "motion" and hasattr(log, "moving"):
+            parts["moving"] = log.moving(index)
         self.metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
-        for values in (sweeps.pc0.points, labels.flow, labels.category, labels.is_valid):
+        scored = [sweeps.pc0.points, labels.flow, labels.category, labels.is_valid]
+        if parts.get("moving") is not None:
+            scored.append(parts["moving"])
+        for values in scored:
             self._digest.update(np.ascontiguousarray(values).tobytes())
 
     def report(self, folder: Path, logs: Sequence[Log], seconds: dict[str, Any], failures: Failures) -> dict[str, Any]:
@@ -124,11 +129,16 @@ def finished_results(cfg: Eval, folder: Path) -> dict[str, Any] | None:
 
 
 def objective(results: dict[str, Any]) -> float:
-    """Return what a sweeper minimises: the mean dynamic error, else the three-way EPE in metres; NaN without points."""
+    """Return what a sweeper minimises; NaN without points.
+
+    This is the mean dynamic error, else the three-way EPE in metres, else 1 - IoU of moving points.
+    """
     if results.keys() & {"bucketed", "bucketed_by_range"}:
         return headline(results, {})["dynamic_error"]
-    value = results["three_way"]["epe_3way"]
-    return float("nan") if value is None else float(value)
+    if "three_way" in results:
+        value = results["three_way"]["epe_3way"]
+        return float("nan") if value is None else float(value)
+    return 1.0 - headline(results, {})["moving_iou"]
 
 
 def _origin(cfg: Demo | Eval) -> dict[str, Any]:

@@ -10,7 +10,8 @@ import numpy as np
 
 from cflow_torch.types import CFlowError
 
-METRICS = ("bucketed", "bucketed_by_range", "three_way", "range_wise")
+METRICS = ("bucketed", "bucketed_by_range", "three_way", "range_wise", "moving")
+_CHALLENGE = ("bucketed", "bucketed_by_range", "three_way", "range_wise")
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class Definition:
             scored; None = all.
         residual_axes: axes in which residuals are compared.
         three_way_flow: flow that the three-way scores compare. It affects accuracy and angle, not the end-point error.
+        ground: "ignored": ground is not scored; "scored": it is.
+        truth: "flow": points of unknown flow are not scored; "motion": they are, if the labels say that they move.
         half_precision: round truth and prediction of the three-way scores to float16, as the 2023 challenge does.
         foreground: "all": every category but background; "meta": only the four meta classes, others are ignored.
         background: "static": all background points are in bucket 0; "bucketed": each is in the bucket of its speed.
@@ -61,6 +64,8 @@ class Definition:
     mask_box: Optional[float] = None
     residual_axes: Literal["t", "t+1"] = "t+1"
     three_way_flow: Literal["total", "residual"] = "total"
+    ground: Literal["ignored", "scored"] = "ignored"
+    truth: Literal["flow", "motion"] = "flow"
     half_precision: bool = False
     foreground: Literal["all", "meta"] = "all"
     background: Literal["static", "bucketed"] = "static"
@@ -115,10 +120,12 @@ DEFINITIONS: Dict[str, Definition] = {
     ),
     # The two ranges of the 2026 multi-data-set challenge, scored in one pass with the rules of opensceneflow. The
     # challenge's own code is not public. We do not know whether it measures a disc or a box, so there is one of each.
-    "challenge_2026": Definition(name="challenge_2026", metrics=METRICS, average="frames", ego_motion="stored"),
+    "challenge_2026": Definition(name="challenge_2026", metrics=_CHALLENGE, average="frames", ego_motion="stored"),
     "challenge_2026_box": Definition(
-        name="challenge_2026_box", metrics=METRICS, average="frames", ego_motion="stored", region="box"
+        name="challenge_2026_box", metrics=_CHALLENGE, average="frames", ego_motion="stored", region="box"
     ),
+    # Moving object segmentation of SemanticKITTI: evaluate_mos.py of PRBonn/semantic-kitti-api.
+    "mos": Definition(name="mos", metrics=("moving",), max_range=math.inf, ground="scored", truth="motion"),
 }
 
 

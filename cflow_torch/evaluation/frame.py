@@ -38,6 +38,8 @@ class EvalFrame:
             or `residual_axes="t"` need it, and so does a `residual_flow` in the axes of t.
         is_ground: (N,) bool, True = ground; None = no point is ground.
         eval_mask: (N,) bool, True = scored; None = all.
+        moving: (N,) bool, True = the point moves, even if its flow is unknown. Definitions with `truth="motion"` use
+            it; None = points move by their true flow.
         residual_axes: axes of `residual_flow`, "t+1" or "t". This package predicts in "t+1".
 
     Convention: everything is checked and converted to NumPy in the constructor.
@@ -54,6 +56,7 @@ class EvalFrame:
     T_ego1_ego0: Array | None = None
     is_ground: Array | None = None
     eval_mask: Array | None = None
+    moving: Array | None = None
     residual_axes: str = "t+1"
 
     def __post_init__(self) -> None:
@@ -71,7 +74,7 @@ class EvalFrame:
         self._set("points", points.astype(np.float32))
         for name, dtype, shape in (
             *((name, np.float32, (rows, 3)) for name in ("residual_flow", "flow", "pose_flow")),
-            *((name, np.bool_, (rows,)) for name in ("is_ground", "eval_mask")),
+            *((name, np.bool_, (rows,)) for name in ("is_ground", "eval_mask", "moving")),
             ("T_ego1_ego0", np.float64, (4, 4)),
         ):
             self._set(name, _checked(name, getattr(self, name), dtype, shape))

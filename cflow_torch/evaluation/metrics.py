@@ -10,6 +10,7 @@ from typing import Any, Callable, Mapping, NamedTuple, Sequence
 from cflow_torch.evaluation.bucketed import BucketedByRange, BucketedEPE, RangeWiseEPE
 from cflow_torch.evaluation.definitions import DEFINITIONS, Definition
 from cflow_torch.evaluation.frame import EvalFrame
+from cflow_torch.evaluation.moving import MovingIoU
 from cflow_torch.evaluation.scored_points import Accumulator, score_points
 from cflow_torch.evaluation.three_way import ThreeWayEPE
 from cflow_torch.types import CFlowError
@@ -19,6 +20,7 @@ _ACCUMULATORS: dict[str, Callable[..., Accumulator]] = {
     "bucketed_by_range": BucketedByRange,
     "three_way": ThreeWayEPE,
     "range_wise": RangeWiseEPE,
+    "moving": MovingIoU,
 }
 
 

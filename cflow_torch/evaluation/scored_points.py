@@ -27,7 +27,8 @@ class ScoredPoints(NamedTuple):
     distance: np.ndarray  # (M,) float64, metres, from the origin at t, including height
     true_flow: np.ndarray  # (M, 3) float64, metres, true flow that the three-way scores compare
     predicted_flow: np.ndarray  # (M, 3) float64, metres, predicted flow that the three-way scores compare
-    is_dynamic: np.ndarray  # (M,) bool, whether the true residual reaches the dynamic threshold
+    # (M,) bool, the true residual reaches the dynamic threshold, or the point is known to move (truth="motion").
+    is_dynamic: np.ndarray
     predicted_dynamic: np.ndarray  # (M,) bool, whether the predicted residual reaches it
     num_nan: int  # number of points that are ignored because of NaN
 
@@ -74,7 +75,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
 
     Rounding follows the evaluator that the definition is named after. Totals and residuals are float32. Like the
     evaluators, we add the pose flow to a predicted residual and subtract it again. We compute lengths in `norm_dtype`.
-    Rows without a valid label have no effect.
+    Rows of unknown truth have no effect.
     """
     # Positions in the frame in which ranges are measured are float32 at t and float64 at t+1.
     points = as_numpy(frame.points)
@@ -101,6 +102,9 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
         true_flow = true_flow.astype(np.float16)
     reach = _reach(position, definition)
     threshold = np.float32(definition.dynamic_threshold)
+    is_dynamic = np.linalg.norm(true_residual, axis=1) >= threshold
+    if definition.truth == "motion" and frame.moving is not None:
+        is_dynamic |= as_numpy(frame.moving)[keep]
     difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
     return ScoredPoints(
         error=np.linalg.norm(difference, axis=1).astype(np.float64),
@@ -112,7 +116,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
         distance=np.linalg.norm(flows.points, axis=1).astype(np.float64),
         true_flow=true_flow.astype(np.float64),
         predicted_flow=predicted_flow.astype(np.float64),
-        is_dynamic=np.linalg.norm(true_residual, axis=1) >= threshold,
+        is_dynamic=is_dynamic,
         predicted_dynamic=np.linalg.norm(flows.total - flows.pose_flow, axis=1) >= threshold,
         num_nan=num_nan,
     )
@@ -182,9 +186,11 @@ def _residual_at_t(points: np.ndarray, total: np.ndarray, T_ego1_ego0: np.ndarra
 
 
 def _candidates(frame: EvalFrame, definition: Definition, position: np.ndarray) -> np.ndarray:
-    """Return (N,) bool: valid truth, not ground, inside the evaluation mask and the crop."""
+    """Return (N,) bool: known truth, not ground, inside the evaluation mask and the crop."""
     keep = frame.labels.is_valid.copy()
-    if frame.is_ground is not None:
+    if definition.truth == "motion" and frame.moving is not None:
+        keep |= as_numpy(frame.moving)
+    if definition.ground == "ignored" and frame.is_ground is not None:
         keep &= ~as_numpy(frame.is_ground)
     if frame.eval_mask is not None:
         keep &= as_numpy(frame.eval_mask)

@@ -49,6 +49,13 @@ def _three_way(scores: dict[str, Any]) -> Table:
     return titles, [[_number(scores[key]) for key in keys]]
 
 
+def _moving(scores: dict[str, Any]) -> Table:
+    ratios = [_number(scores[key]) for key in ("iou", "precision", "recall")]
+    counts = [scores[key] for key in ("num_moving", "num_predicted", "num_points")]
+    titles = ["moving IoU", "precision", "recall", "moving points", "predicted", "points"]
+    return titles, [[*ratios, *counts]]
+
+
 _TABLES: dict[str, Callable[[dict[str, Any]], Table]] = {
     "bucketed": lambda scores: _static_and_dynamic(
         "class", "dynamic error", "dynamic_error", {**scores["classes"], "mean": scores["mean"]}
@@ -56,6 +63,7 @@ _TABLES: dict[str, Callable[[dict[str, Any]], Table]] = {
     "bucketed_by_range": _by_range,
     "three_way": _three_way,
     "range_wise": lambda scores: _static_and_dynamic("range [m]", "dynamic EPE [m]", "dynamic_epe", scores),
+    "moving": _moving,
 }
 
 

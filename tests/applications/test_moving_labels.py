@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -63,3 +64,50 @@ def test_flow_writes_a_label_file_for_every_sweep(
     (labels / "notes.txt").write_text("mine")
     assert cflow(*call, *RUN[:3], "model.max_speed=20", "overwrite=true") == 0
     assert [file.name for file in labels.iterdir()] == ["notes.txt"], "labels of another flow go, other files stay"
+
+
+def write_sequence(folder: Path, num_sweeps: int) -> None:
+    """Write a simulated drive as SemanticKITTI, with the classes 252 (moving), 50 and 40 (ground)."""
+    drive = make_small_drive(num_sweeps=num_sweeps)
+    for name in ("velodyne", "labels"):
+        (folder / name).mkdir(parents=True)
+    poses = []
+    for index, sweep in enumerate(drive):
+        points = np.asarray(sweep.points, np.float32)[:, :3]
+        np.pad(points, ((0, 0), (0, 1))).tofile(folder / "velodyne" / f"{index:06d}.bin")
+        classes = np.where(np.asarray(sweep.is_ground), 40, 50)
+        labels = drive.labels(index)
+        if labels is not None:
+            T_ego1_ego0 = np.linalg.inv(drive.sweep(index + 1).pose) @ np.asarray(sweep.pose)
+            static = points @ T_ego1_ego0[:3, :3].T + T_ego1_ego0[:3, 3] - points
+            classes[np.linalg.norm(labels.flow - static, axis=1) >= 0.05] = 252
+            classes[~labels.is_valid] = 0
+        (classes.astype("<u4") + (7 << 16)).tofile(folder / "labels" / f"{index:06d}.label")
+        poses.append(np.asarray(sweep.pose)[:3].ravel())
+    np.savetxt(folder / "poses.txt", np.stack(poses))
+    np.savetxt(folder / "times.txt", 0.1 * np.arange(num_sweeps))
+
+
+def test_the_moving_iou_is_that_of_the_evaluator(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """`cflow eval definition=mos` against the counts of evaluate_mos.py over the files of `cflow flow`."""
+    folder = tmp_path / "sequences" / "08"
+    write_sequence(folder, 4)
+    data = (f"data.root={folder}", "data=kitti", "data.check=false")
+    assert cflow("flow", *data, *RUN, f"output={tmp_path / 'flow'}") == 0
+    assert cflow("eval", *data, *RUN[:2], "definition=mos", f"output={tmp_path / 'eval'}") == 0
+    learning_map = np.zeros(300, int)
+    learning_map[[40, 50, 252]] = 1, 1, 2
+    confusion = np.zeros((3, 3), int)
+    predicted = tmp_path / "flow" / "sequences" / "08" / "predictions"
+    for index in range(4):
+        truth = learning_map[np.fromfile(folder / "labels" / f"{index:06d}.label", np.int32) & 0xFFFF]
+        np.add.at(confusion, (evaluator_classes(predicted / f"{index:06d}.label"), truth), 1)
+    confusion[0] = confusion[:, 0] = 0  # not scored
+    both, union = confusion[2, 2], confusion[2].sum() + confusion[:, 2].sum() - confusion[2, 2]
+    scores = json.loads((tmp_path / "eval" / "results.json").read_text())["results"]["moving"]
+    assert scores["num_points"] == confusion.sum() and 0 < both < union
+    assert scores["num_moving"] == confusion[:, 2].sum() and scores["num_predicted"] == confusion[2].sum()
+    assert scores["iou"] == pytest.approx(both / union)
+    printed = capsys.readouterr().out
+    assert f"moving IoU {scores['iou']:.3f}, precision {scores['precision']:.3f}" in printed
+    assert "| moving IoU | precision |" in printed

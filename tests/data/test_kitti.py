@@ -196,6 +196,11 @@ def test_classes_of_semantic_kitti_become_labels_and_ground(tmp_path: Path) -> N
     )
     assert np.asarray(log.sweep(0).is_ground).tolist() == [False] * 6 + [True]
     assert log.columns(0)["instance"].tolist() == [5] * 7
+    np.array([251, 9, 9, 9, 0, 9, 251], "<u4").tofile(
+        tmp_path / "dataset" / "sequences" / "08" / "labels" / "000002.label"
+    )
+    assert log.sweep(2).is_ground is None, "these classes do not tell ground"
+    assert log.moving(2).tolist() == [True] + [False] * 5 + [True]
     (tmp_path / "dataset" / "sequences" / "08" / "labels" / "000001.label").write_bytes(b"1234")
     with pytest.raises(CFlowError, match="1 labels for 7 points"):
         log.sweep(1)

@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from public_evaluators import score
 from scenes import pose
 
+from cflow_torch.cli.comparison import summary
+from cflow_torch.cli.eval import objective
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.evaluation import EvalFrame, SceneFlowMetrics, errors_by_range, format_table, score_data_sets
@@ -349,3 +351,36 @@ def test_overall_score_from_frames() -> None:
     assert results["bucketed_by_range"]["mean"]["dynamic_error"] == 0.75
     with pytest.raises(CFlowError, match="challenge_2026"):
         errors_by_range({"bucketed": {}})
+
+
+def test_the_moving_iou_counts_ground_and_points_of_unknown_flow() -> None:
+    true = [[0.0, 0, 0], [0.05, 0, 0], [0.0, 0, 0], [0.0, 0, 0], [1.0, 0, 0], [0.049, 0, 0]]
+    parts: dict[str, Any] = {
+        "residual_flow": np.array([[0.2, 0, 0], [0.05, 0, 0], [0.3, 0, 0], [1.0, 0, 0], [0.0, 0, 0], [0.0, 0, 0]]),
+        "is_ground": [True, False, False, False, False, False],
+        "is_valid": [True, True, False, False, True, True],
+        "points": np.full((6, 3), 200.0),
+    }
+    by_flow = scores("mos", frame(true, **parts))["moving"]
+    assert by_flow == {
+        "iou": 1 / 3,  # point 1; point 0 is ground and predicted to move, point 4 is missed
+        "precision": 1 / 2,
+        "recall": 1 / 2,
+        "num_moving": 2,
+        "num_predicted": 2,
+        "num_points": 4,
+    }
+    moving = [False, False, True, False, False, False]
+    by_class = scores("mos", frame(true, **parts, moving=moving))["moving"]
+    assert (by_class["num_points"], by_class["num_moving"], by_class["iou"]) == (5, 3, 2 / 4)
+    assert scores(OSF, frame(true, **parts, moving=moving))["num_points"] == 3, "other definitions need flow"
+    nothing = scores("mos", frame(np.zeros((2, 3))))
+    assert math.isnan(nothing["moving"]["iou"]) and "| -" in format_table(nothing)
+    assert "moving IoU nan" in summary(nothing, {"median": 1.0}) and math.isnan(objective(nothing))
+    both = SceneFlowMetrics("mos")
+    both.update(frame(true, **parts))
+    other = SceneFlowMetrics("mos")
+    other.update(frame(true, **parts, moving=moving))
+    both.merge(other)
+    results = json.loads(json.dumps(both.compute()))
+    assert results["moving"]["iou"] == 3 / 7 and objective(results) == 1 - 3 / 7

@@ -40,7 +40,7 @@ _CLASSES = {
     "REGULAR_VEHICLE": (10, 252),
     "TRUCK": (18, 258),
 }
-MOVING = (252, 259)  # the first and last class of moving points
+MOVING = (251, 259)  # the first and last class of moving points; 251 in labels that tell only static (9) and moving
 GROUND = (40, 44, 48, 49, 60, 72)  # road, parking, sidewalk, other ground, lane marking, terrain
 UNLABELLED = (0, 1)  # unlabelled, outlier
 _NUM_CLASSES = 1 << 16

@@ -47,10 +47,11 @@ class KITTILog(ArraysLog):
           fewer measurements than sweeps, we warn, and there are no poses.
         - Poses of sequences (poses.txt, ../../poses/NN.txt) are of the camera, converted by `Tr` of calib.txt. If they
           drive along x (the LiDAR's axis ahead) and not along z (the camera's), they are the LiDAR's, and we say so.
-        - Ground masks come from the classes of points in `labels`; otherwise there are none.
+        - Ground masks come from the classes of points in `labels`. Sweeps without a class of the ground, as in labels
+          that tell only static (9) and moving (251), have none.
         - Truth of raw drives and the tracking set comes from tracked boxes (tracklet_labels.xml, label_02). Only the
           image of the left colour camera is annotated: elsewhere, and in regions DontCare, points are not valid.
-        - Truth of SemanticKITTI: points of the classes 252 to 259 move, by an unknown flow, so they are not valid, see
+        - Truth of SemanticKITTI: points of the classes 251 to 259 move, by an unknown flow, so they are not valid, see
           `moving`. All other labelled points are static.
     """
 
@@ -86,7 +87,8 @@ class KITTILog(ArraysLog):
         if self._label_files is None or sweep.is_ground is not None:
             return sweep
         classes, _ = self._classes(index, len(sweep.points))
-        return Sweep(sweep.points, np.isin(classes, stored_labels.GROUND), sweep.pose, sweep.timestamp_ns)
+        is_ground = np.isin(classes, stored_labels.GROUND)
+        return Sweep(sweep.points, is_ground if is_ground.any() else None, sweep.pose, sweep.timestamp_ns)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read reflectance and, in SemanticKITTI, class and instance of the points of sweep `index`."""
