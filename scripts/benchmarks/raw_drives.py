@@ -4,8 +4,8 @@
   python scripts/benchmarks/raw_drives.py DATA/kitti-raw-0027-empty16.h5 DATA/kitti-raw-0027-b2.h5
 
 moving: share of the points within 35 m, without ground, that move by at least 0.05 m per sweep. error: end-point error
-of the labelled points that truly move so, divided by their speed, over all windows; "-" without labels. With `auto`, the
-truth is converted to the instants of the sweeps, with `off`, it is that of the points as measured.
+of the labelled points that truly move so, divided by their speed, over all windows; "-" without labels. With `auto`,
+the truth is converted to the instants of the sweeps, with `off`, it is that of the points as measured.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from cflow_torch import make_model
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.config import make_config
 from cflow_torch.data.catalog import open_log
-from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.types import Window
 
