@@ -7,7 +7,8 @@
 
 Sets: real (CFLOW_DATA, else ../shared/data), odd (the other windows of the same KITTI drive), merged (a car under a
 tree crown, a later part of KITTI), pandaset, scenes (small simulated drives, a window for each of five seeds), sim
-(simulated drives of five sensors, h = 4, and their mean), motorway (simulated motorways, as sim). We chose settings on seeds 100-103 and checked the choice on
+(simulated drives of five sensors, h = 4, and their mean), motorway (the same on simulated motorways). We chose settings
+on seeds 100-103, those of fast objects on motorways 820-821, and checked the choice on
 400-403; use 300 and above for final scores only. Every setting has the history and the region of the set unless --set
 changes them; scenes have the region of the preset.
 

@@ -77,8 +77,8 @@ class ScoredSet:
 def make_sets(names: Sequence[str], seeds: Sequence[range]) -> list[ScoredSet]:
     """Return the sets of some names, of groups or of single sets; "walkers" selects "walkers-0.1" and so on.
 
-    Sets of "sim" and "motorway" are returned once per range of seeds; for "sim", four seeds, or a multiple, have an even mix of scenes. Simulated
-    drives that are not in the cache are made.
+    Sets of "sim" and "motorway" are returned once per range of seeds. For "sim", four seeds, or a multiple, have an
+    even mix of scenes. Simulated drives that are not in the cache are made.
     """
     # With history, only windows with the whole history.
     sets = [

@@ -138,7 +138,7 @@ def oncoming(seed: int) -> Staged:
     bodies = [objects.car(rng, Route(x, 7.0, WEST, speed=27)) for x in (62, 78, 90)]
     posts = [objects.pole(x, 3.5, 0.75, 0.05) for x in range(-20, 120, 4)]
     drive = drive_past([*bodies, *posts, objects.wall(50, 12, 120, 0.3, 3)], seed, speed=27)
-    return Staged(drive, "oncoming cars", "three cars at 27 m/s, 37 to 65 m ahead", [0, 1, 2], (20, -6, 80, 16))
+    return Staged(drive, "oncoming cars", "three cars at 27 m/s, 37 to 65 m ahead", [0, 1, 2], (20, -24, 80, 16))
 
 
 def far(seed: int) -> Staged:
