@@ -22,7 +22,7 @@ from cflow_torch.cli.flows import stored_flow
 from cflow_torch.cli.logs import Sources, chosen_pairs, find_logs
 from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, read_flow
+from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, has_track_ids, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
@@ -234,7 +234,8 @@ def _write_tracks(
 
     `results` reads the flow files.
     """
-    if not (folder / TRACKS_FILE).exists():
+    files = (frame_file(folder, log.timestamps[index]) for index in chosen_pairs(log, first=0, step=1))
+    if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, files)):
         table, points = track_points(log, results())
         for each in points:
             add_track_ids(frame_file(folder, log.timestamps[each.sweep]), each.track_id(table["id"]))

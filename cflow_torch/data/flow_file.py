@@ -11,7 +11,7 @@ from pyarrow import feather
 
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.paths import PathLike, as_path
+from cflow_torch.data.paths import PathLike, as_path, is_remote, read_bytes
 from cflow_torch.types import VECTORS, Array, CFlowError, FlowResult, as_numpy, vector_columns
 
 CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
@@ -61,6 +61,13 @@ def add_track_ids(path: PathLike, track_id: np.ndarray) -> None:
         table = table.drop([TRACK_ID])
     with atomic_file(path) as file:
         feather.write_feather(table.append_column(TRACK_ID, pa.array(track_id.astype(np.int64))), file)
+
+
+def has_track_ids(path: PathLike) -> bool:
+    """Test whether a flow file has the column `track_id`. Of a local file, only the footer is read."""
+    path = as_path(path)
+    with pa.BufferReader(read_bytes(path)) if is_remote(path) else pa.memory_map(str(path)) as source:
+        return TRACK_ID in pa.ipc.open_file(source).schema.names
 
 
 def read_flow(path: PathLike) -> FlowResult:
