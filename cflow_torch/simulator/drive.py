@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.log import FlowLabels
 from cflow_torch.simulator.car_park import build_car_park
 from cflow_torch.simulator.crossing import build_crossing
 from cflow_torch.simulator.highway import build_highway
