@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from cflow_torch.applications.tracking import track as track
     from cflow_torch.config import Config as Config
     from cflow_torch.config import make_config as make_config
+    from cflow_torch.data.catalog import open as open
     from cflow_torch.dense.method import CorrelationFlow as CorrelationFlow
     from cflow_torch.errors import CFlowError as CFlowError
     from cflow_torch.estimate import estimate_flow as estimate_flow
@@ -41,10 +42,12 @@ _MODULES = {
     "estimate_flow": "estimate",
     "make_config": "config",
     "make_model": "estimate",
+    "open": "data.catalog",
     "static_map": "applications.cleaning",
     "track": "applications.tracking",
 }
-__all__ = [*_MODULES, "__version__"]
+# `from cflow_torch import *` must not hide Python's own `open`.
+__all__ = [*(name for name in _MODULES if name != "open"), "__version__"]
 
 
 def __getattr__(name: str) -> Any:
@@ -56,4 +59,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *_MODULES})

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
-from typing import Any, Sequence
+from typing import Any, Sequence, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +18,8 @@ from cflow_torch.windows.collation import Batch, make_batch
 from cflow_torch.windows.inspection import Inspection, warn_of_inactive
 from cflow_torch.windows.memory import split_windows
 from cflow_torch.windows.validation import check_windows, choose_device
+
+_Model = TypeVar("_Model", bound="SceneFlowModel")
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ class SceneFlowModel(nn.Module):
         self.inspect: Any = Inspection()  # None = do not warn of likely mistakes in the windows
 
     @classmethod
-    def from_preset(cls: type[Any], preset: str | None = None, device: Any = "auto", **overrides: Any) -> Any:
+    def from_preset(cls: type[_Model], preset: str | None = None, device: Any = "auto", **overrides: Any) -> _Model:
         """Make the method with the settings of a preset, with some fields replaced.
 
         `preset` is a preset of this method; None = "default", "paper" or "keypoints". `overrides` are settings of the
@@ -112,8 +115,10 @@ class SceneFlowModel(nn.Module):
         bounds = self.config.point_cloud_range
         return Grid(pixel_size, bounds[:3], bounds[3:])
 
-    @torch.no_grad()
-    @one_thread()
+    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
+        """Estimate the flow of every window, see `forward`."""
+        return super().__call__(windows)  # type: ignore[no-any-return]
+
     def forward(self, windows: Sequence[Window]) -> list[FlowResult]:
         """Estimate the flow t -> t+1 of the points of every window's pc0.
 
@@ -127,11 +132,22 @@ class SceneFlowModel(nn.Module):
             CFlowWarning: likely mistakes in the windows, see `Inspection`.
             NoActivePoints: no point of a pc0 is active.
 
+        Convention: `torch.compile` does not change the model. Shapes differ from window to window, so compiling would
+            not pay.
+
         Cost: one CPU thread, whatever the number of threads of torch. To use more cores, start more processes.
 
         Raises:
             CFlowError: bad input, see `make_batch`.
         """
+        dynamo = sys.modules.get("torch._dynamo")  # loaded if anyone compiles; an import takes seconds
+        estimate = self._estimate if dynamo is None else dynamo.disable(self._estimate)
+        return estimate(windows)  # type: ignore[no-any-return]
+
+    @torch.no_grad()
+    @one_thread()
+    def _estimate(self, windows: Sequence[Window]) -> list[FlowResult]:
+        """Estimate the flow of every window, see `forward`."""
         check_windows(windows, self.config)
         grid = self.grid(self.config.pixel_sizes[-1])
         device = choose_device(windows, self.device)

@@ -23,6 +23,41 @@ _MOST_COLUMNS = 1000
 _OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8")
 _OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence")
 
+# The columns of the fields of `Objects` that are vectors.
+_OBJECT_COLUMNS = {"centre": "xyz", "size": ("length", "width", "height"), "velocity": ("vx", "vy", "vz")}
+
+
+class Objects(np.ndarray):
+    """The moving objects of a result: a structured array, (K,), see `FlowResult.objects`.
+
+    Examples:
+        >>> records = result.objects(points).to_records()
+        >>> table = pandas.DataFrame(records)
+        >>> text = json.dumps(records)
+    """
+
+    def to_records(self) -> list[dict[str, Any]]:
+        """Return a dictionary of plain numbers per object, for a data frame or JSON.
+
+        The keys are id, x, y, z (centre, metres), length, width, height (metres), vx, vy, vz (m/s), heading (radians),
+        num_points and confidence. A confidence of NaN, which JSON does not have, becomes None.
+        """
+        records = []
+        for row in self.reshape(-1):
+            record: dict[str, Any] = {"id": int(row["id"])}
+            for field, names in _OBJECT_COLUMNS.items():
+                record.update(zip(names, row[field].tolist()))
+            record["heading"] = float(row["heading"])
+            record["num_points"] = int(row["num_points"])
+            record["confidence"] = None if np.isnan(row["confidence"]) else float(row["confidence"])
+            records.append(record)
+        return records
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return one row, some rows, or a field. A field is a plain array."""
+        value = super().__getitem__(key)
+        return value.view(np.ndarray) if isinstance(value, np.ndarray) and value.dtype.names is None else value
+
 
 def as_numpy(value: Array, dtype: Any | None = None) -> np.ndarray:
     """Convert an array or a tensor on any device to NumPy; bfloat16, which NumPy lacks, becomes float32."""
@@ -57,6 +92,11 @@ def check_array(array: Any, name: str, shape: tuple[int | None, ...], kinds: str
         raise CFlowError(f"{name} has shape {tuple(array.shape)}: give {wanted}")
     if _kind(array.dtype) not in kinds:
         raise CFlowError(f"{name} has dtype {array.dtype}: give {wanted}")
+
+
+def last_row(shape: tuple[int, ...]) -> str:
+    """What to do with a transform of this shape: append the last row of a (3, 4) matrix; "" for other shapes."""
+    return "; append its last row: np.vstack([matrix, [0, 0, 0, 1]])" if tuple(shape) == (3, 4) else ""
 
 
 def _kind(dtype: Any) -> str:
@@ -111,7 +151,8 @@ class Sweep:
             wanted = f"({rows},) floats, seconds after the time stamp of the sweep, one per point"
             check_array(self.point_times, "Sweep.point_times", (rows,), "f", wanted)
         if self.pose is not None and np.shape(self.pose) != (4, 4):
-            raise CFlowError(f"Sweep.pose has shape {np.shape(self.pose)}: give one (4, 4) matrix T_world_ego")
+            wanted = f"give one (4, 4) matrix T_world_ego{last_row(np.shape(self.pose))}"
+            raise CFlowError(f"Sweep.pose has shape {np.shape(self.pose)}: {wanted}")
 
 
 @dataclass(frozen=True)
@@ -182,6 +223,17 @@ class FlowResult:
     confidence: Tensor | None = None
     track_id: Tensor | None = None
 
+    def __repr__(self) -> str:
+        """The numbers of points and clusters; fields that are None are named."""
+        parts = [f"{len(next(iter(self._given().values())))} points" if self._given() else "empty"]
+        if self.is_valid is not None:
+            parts.append(f"{int(self.is_valid.sum())} valid")
+        if self.cluster_id is not None:
+            in_cluster = self.cluster_id[self.cluster_id >= 0]
+            parts.append(f"{len(in_cluster)} in {len(in_cluster.unique())} clusters")
+        missing = [f.name for f in fields(self) if getattr(self, f.name) is None]
+        return f"FlowResult({', '.join(parts + [f'no {name}' for name in missing])})"
+
     def to(self, device: Any) -> FlowResult:
         """Copy the result to another device."""
         return FlowResult.of({name: value.to(device) for name, value in self._given().items()})
@@ -230,7 +282,7 @@ class FlowResult:
 
     def objects(
         self, points: Array, sweep_interval: float = 0.1, min_speed: float = 0.5, min_points: int = 10
-    ) -> np.ndarray:
+    ) -> Objects:
         """List the moving objects at t+1.
 
         Args:
@@ -243,7 +295,8 @@ class FlowResult:
             (K,) structured array, sorted by id, in the ego frame at t+1. `id`: cluster_id. `centre`: (3,) metres, of
             the box. `size`: (3,) metres, length along the heading, width, height. `velocity`: (3,) m/s over ground,
             mean over the points. `heading`: direction of the velocity, radians from +x to the left. `num_points`:
-            number of points. `confidence`: mean over the points, NaN if the method has none.
+            number of points. `confidence`: mean over the points, NaN if the method has none. `to_records()` of the
+            array returns dictionaries for a data frame or JSON.
 
         Convention:
             The box encloses the points of sweep t, moved by their flow. If only one side of an object is visible, the
@@ -262,7 +315,7 @@ class FlowResult:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds between two sweeps, for example 0.1")
         values = self.numpy()
         clusters = _Clusters.of(as_numpy(self.cluster_id))
-        objects = np.zeros(len(clusters.id), _OBJECT)
+        objects = np.zeros(len(clusters.id), _OBJECT).view(Objects)
         if len(objects) == 0:
             return objects
         objects["id"] = clusters.id

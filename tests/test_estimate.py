@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -213,3 +217,44 @@ def test_the_number_of_threads_is_as_before(number: int, monkeypatch: pytest.Mon
         assert (seen, torch.get_num_threads()) == ([1], number)
     finally:
         torch.set_num_threads(before)
+
+
+def test_compiling_leaves_the_model_alone():
+    """In a process of its own, because TorchDynamo takes seconds to load and stays loaded."""
+    script = """
+import numpy as np, torch
+from cflow_torch import CorrelationFlow, Sweep, Window
+points = np.random.default_rng(0).uniform(0, 20, (2, 3000, 3)).astype(np.float32)
+model, window = CorrelationFlow.from_preset(), Window(Sweep(points[0]), Sweep(points[1]))
+plain, graphs = model([window])[0].flow, []
+compiled = torch.compile(model, backend=lambda graph, _: graphs.append(graph) or graph.forward)
+assert torch.equal(compiled([window])[0].flow, plain) and compiled.config is model.config
+if hasattr(torch.nn.Module, "compile"):  # not in torch 2.0
+    model.compile()
+assert torch.equal(model([window])[0].flow, plain) and graphs == []
+print("equal")
+"""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", script], capture_output=True, text=True, check=False)
+    if "torch.compile unsupported" in done.stderr or "not yet supported" in done.stderr:
+        pytest.skip(done.stderr.splitlines()[-1])
+    assert done.stdout.strip() == "equal", done.stderr
+
+
+@pytest.mark.slow
+def test_models_are_typed_for_users(tmp_path):
+    """A user's type checker knows the class of a model and of its results."""
+    api = pytest.importorskip("mypy.api")
+    file = tmp_path / "user.py"
+    file.write_text(
+        "from cflow_torch import VerifiedFlow, Window\n"
+        "def use(window: Window) -> None:\n"
+        "    model = VerifiedFlow.from_preset('live')\n"
+        "    reveal_type(model)\n"
+        "    reveal_type(model([window]))\n",
+        encoding="utf-8",
+    )
+    package = str(Path(__file__).resolve().parents[1])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MYPYPATH", package)
+        printed, _, _ = api.run(["--config-file=", "--ignore-missing-imports", "--follow-imports=silent", str(file)])
+    assert "verified.method.VerifiedFlow" in printed and re.search(r"list\[cflow_torch.types.FlowResult\]", printed)

@@ -32,7 +32,8 @@ class FlowStream:
         preset: "live", "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
         config: settings, from `make_config`, in place of a preset.
         device: "auto" = that of the given tensors, else a GPU if available, else the CPU.
-        ground: None = use only the given masks; "auto" or "patchwork" = find the ground of each sweep without a mask.
+        ground: what to do with a sweep without a mask. "auto" = find its ground, with a warning; "grid" = the same,
+            without one; "patchwork" = use Patchwork++ (`pip install pypatchworkpp`); None = no point is ground.
         max_gap: seconds; sweeps that are further apart are not compared, and the stream starts again.
         **overrides: any field of the settings.
 
@@ -62,7 +63,7 @@ class FlowStream:
         *,
         config: Config | None = None,
         device: Any = "auto",
-        ground: str | None = None,
+        ground: str | None = "auto",
         max_gap: float = 0.5,
         **overrides: Any,
     ) -> None:
@@ -80,6 +81,7 @@ class FlowStream:
         self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
         self._odometry: Odometry | None = None
         self._has_told_missing = False
+        self._has_told_ground = False
         self.window: Window | None = None
 
     def reset(self) -> None:
@@ -174,9 +176,20 @@ class FlowStream:
             is_ground = read_ground([sweep], device)
         elif self._ground is not None:
             is_ground = find_ground(points, self._ground)
+            self._tell_ground(is_ground)
         if times is not None:
             times = torch.as_tensor(times).to(device, copy=True)
         if pose is None:
             self._odometry = self._odometry or Odometry()
             pose = self._odometry.next_pose(as_numpy(points), "the sweep")
         return Sweep(points, is_ground, as_numpy(pose).copy(), sweep.timestamp_ns, times)
+
+    def _tell_ground(self, is_ground: Any) -> None:
+        """Warn once that a sweep has no mask and that we found its ground."""
+        if self._ground != "auto" or self._has_told_ground or not bool(is_ground.any()):
+            return
+        self._has_told_ground = True
+        warn(
+            "there is no ground mask for a sweep of the stream, so we find the ground. To turn this line off give "
+            "masks (is_ground), ground='grid' (the same result), or ground=None if the clouds have no ground"
+        )

@@ -21,7 +21,8 @@ from cflow_torch.windows.memory import keep_freed_memory
 def task(cfg: Stream) -> None:
     output = output_folder(cfg)
     keep_freed_memory()
-    stream = FlowStream(config=cfg.model, device=cfg.device, max_gap=cfg.max_gap)
+    # The log finds the ground, or has none where data.find_ground is null.
+    stream = FlowStream(config=cfg.model, device=cfg.device, ground=None, max_gap=cfg.max_gap)
     log = open_first_log(cfg.data)
     ensure_writable(output)
     report = {"log": log.log_id, **play(stream, log, cfg.pace, cfg.count)}

@@ -8,7 +8,7 @@ from collections import Counter
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Mapping, NamedTuple, Sequence
+from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 
 from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
 from cflow_torch.data.deskewing import DeskewedLog
@@ -19,7 +19,7 @@ from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import read_as as read_log_as
-from cflow_torch.types import CFlowError, Sweep
+from cflow_torch.types import CFlowError, Sweep, Window
 from cflow_torch.windows.deskewing import SCANS
 from cflow_torch.windows.ground import CHOICES
 from cflow_torch.windows.ground import find_ground as ground_of
@@ -253,7 +253,7 @@ def open_log(
 
 def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
     _, reader = _reader(name)
-    known = list(inspect.signature(reader.__init__).parameters)[2:]  # the class has Protocol's signature in Python 3.8
+    known = list(inspect.signature(reader.__init__).parameters)[2:]  # without self and the source
     unknown = sorted(set(settings) - set(known))
     if unknown:
         raise CFlowError(f"data set {name} has no setting {', '.join(unknown)}; it has {', '.join(known) or 'none'}")
@@ -265,6 +265,58 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
             raise
         given = ", ".join(f"{key}={value!r:.80}" for key, value in settings.items())
         raise CFlowError(f"data set {name} cannot be opened with {given}: {error}") from error
+
+
+class Logs(Sequence[Log]):
+    """The logs of a folder. Each is opened when you ask for it, as `open_log` does with the same arguments."""
+
+    def __init__(self, name: str, sources: Sequence[Any], settings: Mapping[str, Any]) -> None:
+        self._name, self._sources, self._settings = name, sources, settings
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    @overload
+    def __getitem__(self, index: int) -> Log: ...
+    @overload
+    def __getitem__(self, index: slice) -> Logs: ...
+    def __getitem__(self, index: int | slice) -> Log | Logs:
+        if isinstance(index, slice):
+            return Logs(self._name, self._sources[index], self._settings)
+        return open_log(self._name, self._sources[index], **self._settings)
+
+    def __repr__(self) -> str:
+        return f"Logs(data={self._name}, {len(self)} logs)"
+
+    def windows(self, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
+        """Iterate over the windows of each log in turn, see `Log.windows`."""
+        for log in self:
+            with log:
+                yield from log.windows(num_history, num_future)
+
+
+def open(path: Any, data: str = AUTO, **settings: Any) -> Log | Logs:
+    """Open the log at a path, or the logs of a folder. `cflow_torch.open` is this function.
+
+    Args:
+        path: file or folder.
+        data: name of the format, a key of `DATA_SETS`; "auto" = recognise it.
+        **settings: as for `open_log`: `find_ground`, `odometry`, `read_as`, `deskew`, ..., and those of the reader.
+
+    Returns:
+        The log if there is one, else a sequence of logs, each of which is opened when you ask for it. Both have
+        `windows(num_history=..., num_future=...)`.
+
+    Raises:
+        CFlowError: no format fits, or several do; there is no log; an error of `open_log`.
+
+    Examples:
+        >>> for window in cflow_torch.open("/data/my_drive").windows(num_history=4):
+        ...     (result,) = model([window])
+    """
+    name = recognise(path) if data == AUTO else data
+    logs = Logs(name, find_sources(name, path), settings)
+    return logs[0] if len(logs) == 1 else logs
 
 
 class GroundSegmentedLog(LogWrapper):

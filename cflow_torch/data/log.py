@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Iterator, Mapping, Protocol, Sequence, TypeVar, overload
+from typing import Any, Iterator, Mapping, Sequence, TypeVar, overload
 
 import numpy as np
 from torch.utils.data import Dataset
@@ -37,8 +38,10 @@ class FlowLabels:
         check_array(self.is_valid, "FlowLabels.is_valid", (rows,), "b", f"({rows},) bool, False = unknown")
 
 
-class Log(Protocol):
+class Log(ABC):
     """One drive, a sequence of sweeps: `len(log)`, `log[-1]`, `log[1:3]`, `for sweep in log` and `with log` work.
+
+    `log.windows(num_history=4)` gives the input of a model for every pair of sweeps.
 
     To write your own reader, inherit from this class, set `log_id` and `timestamps`, and implement `sweep`. If the log
     has truth, implement `labels`, too.
@@ -74,9 +77,9 @@ class Log(Protocol):
     lidar_position: Any = (0.0, 0.0, 0.0)
     turn_seconds: float | None = None
 
+    @abstractmethod
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: float32 points, float64 pose `T_world_ego`, ground mask, time."""
-        raise NotImplementedError
 
     def labels(self, index: int) -> FlowLabels | None:
         """Read the truth of the pair (index, index + 1); None for the last sweep, and where the log has none."""
@@ -97,6 +100,10 @@ class Log(Protocol):
         """
         self._timestamp(index)
         return {}
+
+    def windows(self, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
+        """Iterate over the windows of all pairs, in order; each sweep is read once. See `window`."""
+        return windows(self, num_history, num_future)
 
     @property
     def notes(self) -> list[str]:

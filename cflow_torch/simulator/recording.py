@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Mapping, Protocol, Sequence
+from typing import Mapping, Sequence
 
 import numpy as np
 
@@ -72,7 +73,7 @@ class UnitReturns:
     num_columns: int
 
 
-class Recording(Log, Protocol):
+class Recording(Log):
     """A log with all that writers need: ground masks, true flow, calibration, returns of each LiDAR, and boxes."""
 
     poses: np.ndarray
@@ -80,18 +81,23 @@ class Recording(Log, Protocol):
     calibration: Mapping[str, np.ndarray]
     """Sensor name -> (4, 4) float64 `T_ego_sensor`."""
 
+    @abstractmethod
     def units(self, index: int) -> Sequence[UnitReturns]:
         """Returns of each LiDAR in sweep `index`. Their points, transformed to the ego frame and concatenated in this
         order, are the points of `sweep(index)`, and `labels(index)` has the same rows."""
 
+    @abstractmethod
     def elevations(self, unit: str) -> np.ndarray:
         """(num_rings,) float64 radians, elevation of each ring of the LiDAR named `unit`, lowest first."""
 
+    @abstractmethod
     def boxes(self, index: int) -> Boxes:
         """Annotation boxes of sweep `index`."""
 
+    @abstractmethod
     def channels(self, index: int) -> Mapping[str, np.ndarray]:
         """(N,) uint8 intensity, uint8 laser_number, int32 offset_ns of every point; only the av2 writer calls it."""
 
+    @abstractmethod
     def ground_raster(self) -> GroundRaster:
         """Ground height of the whole drive; only the av2 writer calls it."""

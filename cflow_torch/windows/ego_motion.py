@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.types import Array, CFlowError, as_numpy
+from cflow_torch.types import Array, CFlowError, as_numpy, last_row
 from cflow_torch.windows.validation import resolution
 
 # A pose moves all points, so its type must resolve this distance, metres.
@@ -29,19 +29,20 @@ def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         raise CFlowError(f"{name} is {type(matrix).__name__}: give a (4, 4) matrix of numbers") from None
     if result.shape != (4, 4):
-        raise CFlowError(f"{name} has shape {result.shape}: give one (4, 4) matrix (no batch dimension)")
+        wanted = f"give one (4, 4) matrix (no batch dimension){last_row(result.shape)}"
+        raise CFlowError(f"{name} has shape {result.shape}: {wanted}")
     if not np.isfinite(result).all():
         raise CFlowError(f"{name} holds NaN or infinite values: give a finite rigid transform")
     rotation = result[:3, :3]
-    last_row = result[3]
+    bottom = result[3]
     with np.errstate(over="ignore", invalid="ignore"):  # values that are far from a rotation may overflow
         error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         determinant = np.linalg.det(rotation)
-    wrong_row = np.abs(last_row - (0, 0, 0, 1)).max()
+    wrong_row = np.abs(bottom - (0, 0, 0, 1)).max()
     if not (error <= _ORTHOGONALITY and wrong_row <= _ORTHOGONALITY and determinant > 0):
         raise CFlowError(
             f"{name} is not rigid (|R R^T - I| up to {error:.3g}, det {determinant:.3g}, last row "
-            f"{last_row.tolist()}): give [R t; 0 0 0 1] with a rotation R, row-major"
+            f"{bottom.tolist()}): give [R t; 0 0 0 1] with a rotation R, row-major"
         )
     farthest = max(reach, float(np.abs(result[:3, 3]).max()))
     step = max(resolution(kind, farthest) for kind in (np.dtype(np.float64), dtype) if kind is not None)

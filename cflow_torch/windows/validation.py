@@ -67,9 +67,17 @@ def _check_resolution(dtype: Any, name: str, config: Config) -> None:
     if step > 0.5 * pixel_size:
         raise CFlowError(
             f"{name} is {dtype}, which at {farthest:g} m (the far end of point_cloud_range) only holds multiples of "
-            f"{step:g} m, too coarse for pixels of {pixel_size:g} m: give points of a wider type, or a frame whose "
+            f"{step:g} m, too coarse for pixels of {pixel_size:g} m: {_wider(dtype)}, or a frame whose "
             "origin is nearer (point_cloud_range and poses with it), or larger pixel_sizes"
         )
+
+
+def _wider(dtype: Any) -> str:
+    """Say how to write points of a wider type."""
+    itemsize = torch.empty(0, dtype=dtype).element_size() if isinstance(dtype, torch.dtype) else dtype.itemsize
+    width = "float32" if itemsize < 4 else "float64"
+    of_tensor = "points.float()" if itemsize < 4 else "points.double()"
+    return f"give {of_tensor if isinstance(dtype, torch.dtype) else f'points.astype(np.{width})'}"
 
 
 def choose_device(windows: Sequence[Window], device: Any) -> torch.device:

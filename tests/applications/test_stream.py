@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import warnings
 import weakref
 from dataclasses import replace
 from importlib.util import find_spec
@@ -16,7 +17,8 @@ from command_line import cflow
 from preset_windows import small
 from scenes import assert_same_bits, scene
 
-from cflow_torch import CFlowError, FlowResult, FlowStream, Sweep, Window, make_model
+from cflow_torch import CFlowError, FlowResult, FlowStream, Sweep, Window, make_config, make_model
+from cflow_torch.errors import CFlowWarning
 from cflow_torch.simulator import make_drive
 
 
@@ -133,7 +135,7 @@ def test_settings_that_a_stream_cannot_have_are_refused(sweeps):
 
 def test_missing_ground_and_poses_are_estimated():
     drive = make_drive(seed=2, num_sweeps=4, profile="demo")
-    stream = FlowStream("default", num_history=0, ground="auto")
+    stream = FlowStream("default", num_history=0)
     if find_spec("kiss_icp") is None:
         with pytest.raises(CFlowError, match="pip install kiss-icp"):
             stream.push(drive.sweep(0).points)
@@ -145,6 +147,31 @@ def test_missing_ground_and_poses_are_estimated():
     moved = np.linalg.inv(stream.window.pc0.pose) @ stream.window.pc1.pose
     true = np.linalg.inv(drive.sweep(2).pose) @ drive.sweep(3).pose
     assert np.abs(moved - true).max() < 0.2 and result.residual_flow.any()
+
+
+def test_ground_is_found_by_default_but_a_given_mask_wins():
+    drive = make_drive(seed=2, num_sweeps=2, profile="demo")
+    settings = make_config(num_history=0, point_cloud_range=(-20, -20, -9, 20, 20, 9))
+    given = [drive.sweep(index) for index in range(2)]
+    bare = [replace(sweep, is_ground=None) for sweep in given]
+
+    def masks(sweeps: list[Sweep], **arguments: Any) -> list[np.ndarray | None]:
+        stream = FlowStream(config=settings, device="cpu", **arguments)
+        for sweep in sweeps:
+            push(stream, sweep)
+        pair = (stream.window.pc0, stream.window.pc1)
+        return [None if sweep.is_ground is None else np.asarray(sweep.is_ground) for sweep in pair]
+
+    with pytest.warns(CFlowWarning, match="no ground mask") as told:
+        found = masks(bare)
+    assert len([one for one in told if "no ground mask" in str(one.message)]) == 1, "it warns once"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert all(map(np.array_equal, masks(bare, ground="grid"), found)), "the same without the warning"
+        own = [replace(sweep, is_ground=~sweep.is_ground) for sweep in given]
+        assert all(np.array_equal(mask, sweep.is_ground) for mask, sweep in zip(masks(own), own))
+    truth = [sweep.is_ground for sweep in given]
+    assert all((mask == ground).mean() > 0.95 for mask, ground in zip(found, truth))
 
 
 def test_the_command_reports_latency(tmp_path, capsys):

@@ -14,8 +14,10 @@ from command_line import cflow
 from small_logs import make_small_drive
 from writers import FORMATS
 
+import cflow_torch
 from cflow_torch.data.arrays import write_array_log
-from cflow_torch.data.catalog import GroundSegmentedLog, find_sources, open_log, recognise
+from cflow_torch.data.catalog import GroundSegmentedLog, Logs, find_sources, open_log, recognise
+from cflow_torch.data.log import Log, window
 from cflow_torch.simulator import Drive
 from cflow_torch.simulator.benchmark import benchmark_logs
 from cflow_torch.types import CFlowError, CFlowWarning
@@ -125,3 +127,35 @@ def test_what_is_not_read_is_said(names: list, message: str, tmp_path: Path) -> 
     if len(names) == 1:
         with pytest.raises(CFlowError, match=message):
             recognise(tmp_path / names[0])
+
+
+def test_a_path_is_opened_with_one_call(drive: Drive, arrays: Path, tmp_path: Path) -> None:
+    log = cflow_torch.open(arrays, find_ground="grid")
+    assert isinstance(log, Log) and log.log_id == drive.log_id
+    pairs = list(log.windows(num_history=1))
+    assert [len(pair.pch) for pair in pairs] == [0, 1]
+    expected = window(open_log("arrays", arrays, find_ground="grid"), 1, 1)
+    assert np.array_equal(pairs[1].pch[0].points, expected.pch[0].points)
+    assert np.array_equal(pairs[1].pc1.is_ground, expected.pc1.is_ground)
+
+    for name in ("one", "two"):
+        (tmp_path / name).symlink_to(arrays)
+    (tmp_path / "two_more").mkdir()
+    broken = tmp_path / "two_more" / "000000.npy"
+    broken.write_bytes(b"")
+    broken.with_name("000001.npy").write_bytes(b"")
+    logs = cflow_torch.open(tmp_path, find_ground="grid", check=False)
+    assert isinstance(logs, Logs) and len(logs) == 3 and "3 logs" in repr(logs)
+    assert len(list(logs[:2].windows())) == 4 and logs[1].log_id
+    with pytest.raises(CFlowError):
+        logs[2][0]
+    with pytest.raises(CFlowError, match="has no setting sweeps"):
+        cflow_torch.open(arrays, sweeps=3)
+    with pytest.raises(CFlowError, match="data set 'ply'"):
+        cflow_torch.open(arrays, data="ply")
+
+
+def test_the_name_open_does_not_hide_that_of_python() -> None:
+    names: dict[str, Any] = {}
+    exec("from cflow_torch import *", names)
+    assert "open" not in names and "estimate_flow" in names and "open" in dir(cflow_torch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import sys
 from pathlib import Path
@@ -159,6 +160,14 @@ def test_an_open3d_cloud_has_all_fields(drive, result, monkeypatch):
         assert np.array_equal(cloud.point[name].numpy().reshape(values.shape), values), name
 
 
+def test_a_result_is_printed_in_one_line(result):
+    in_cluster = result.cluster_id[result.cluster_id >= 0]
+    counts = f"{len(result.flow)} points, {int(result.is_valid.sum())} valid, {len(in_cluster)} in"
+    assert repr(result) == f"FlowResult({counts} {len(set(in_cluster.tolist()))} clusters)"
+    part = FlowResult.of({"flow": result.flow})
+    assert repr(part).startswith(f"FlowResult({len(result.flow)} points, no residual_flow, no pose_flow, no cluster_id")
+
+
 def test_objects_are_the_moving_objects_of_the_simulator(drive, result):
     """Objects with 50 points or more; the articulated lorry is left out because it is not a rigid body."""
     objects = result.objects(drive.sweep(3).points)
@@ -190,5 +199,16 @@ def test_objects_are_the_moving_objects_of_the_simulator(drive, result):
     assert np.array_equal(every[every["num_points"] >= 10], objects) and len(every) > len(objects)
     with pytest.raises(CFlowError, match="without"):
         FlowResult.of({"flow": result.flow}).objects(drive.sweep(3).points)
+    assert type(objects["velocity"]) is np.ndarray
+    records = objects[:2].to_records()
+    assert json.loads(json.dumps(records, allow_nan=False)) == records and len(records) == 2
+    first, row = records[0], objects[0]
+    assert [first["x"], first["y"], first["z"]] == row["centre"].tolist() and first["id"] == row["id"]
+    assert [first["length"], first["width"], first["height"]] == row["size"].tolist()
+    assert [first["vx"], first["vy"], first["vz"]] == row["velocity"].tolist()
+    assert (first["heading"], first["num_points"]) == (row["heading"], row["num_points"])
+    without = FlowResult.of({**vars(result), "confidence": None}).objects(drive.sweep(3).points).to_records()
+    assert without[0]["confidence"] is None and json.dumps(without, allow_nan=False)
     empty = result.objects(drive.sweep(3).points, min_speed=1e3)
+    assert empty.to_records() == []
     assert len(empty) == 0 and empty.dtype == objects.dtype

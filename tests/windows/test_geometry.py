@@ -97,7 +97,7 @@ def test_a_relative_transform_maps_through_the_world():
     "matrix, complaint",
     [
         (np.eye(4)[None], r"T has shape \(1, 4, 4\).*no batch"),
-        (np.eye(4)[:3], r"T has shape \(3, 4\)"),
+        (np.eye(4)[:3], r"T has shape \(3, 4\).*append its last row: np.vstack"),
         (np.diag([1.0, 1.0, np.inf, 1.0]), "T holds NaN or inf"),
         (np.diag([2.0, 2.0, 2.0, 1.0]), "T is not rigid"),
         (np.diag([1.0, -1.0, 1.0, 1.0]), "T is not rigid"),

@@ -121,6 +121,29 @@ def test_too_coarse_types_of_points_are_refused(points, far, is_refused):
         model([window])
 
 
+@pytest.mark.parametrize(
+    "points, advice",
+    [
+        (np.zeros((4, 3), np.float16), r"give points.astype\(np.float32\)"),
+        (torch.zeros(4, 3, dtype=torch.float16), r"give points.float\(\)"),
+        (torch.full((4, 3), 1e7, dtype=torch.float32), r"give points.double\(\)"),
+    ],
+)
+def test_the_error_says_how_to_write_wider_points(points, advice):
+    far = 1e7 if points.dtype == torch.float32 else 0.0
+    region = (far - 90, far - 90, -8, far + 90, far + 90, 8)
+    with pytest.raises(CFlowError, match=advice):
+        estimate_flow(points, np.zeros((4, 3)), preset="paper", point_cloud_range=region)
+
+
+def test_the_error_says_how_to_complete_a_transform():
+    matrix = np.eye(4)[:3]
+    for call in (lambda m: Sweep(P0, pose=m), lambda m: estimate_flow(P0, P1, T_ego1_ego0=m)):
+        with pytest.raises(CFlowError, match=r"shape \(3, 4\).*np.vstack\(\[matrix, \[0, 0, 0, 1\]\]\)"):
+            call(matrix)
+        call(np.vstack([matrix, [0, 0, 0, 1]]))
+
+
 def test_unusable_and_mixed_devices_are_refused():
     cpu, other = torch.from_numpy(P0), torch.from_numpy(P1).to("meta")
     for pc0, pc1 in ((cpu, other), (other, cpu)):
