@@ -12,7 +12,7 @@ from cflow_torch.dense.method import CorrelationFlow
 from cflow_torch.errors import warn
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
 from cflow_torch.model import SceneFlowModel
-from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window
+from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, check_sweep
 from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.windows.ground import CHOICES, find_ground_batch
 from cflow_torch.windows.returns import MISSING, without_missing
@@ -174,13 +174,9 @@ def _sweep(
 ) -> Sweep:
     """Make a sweep in a world that is the ego frame at t+1: its pose is `transform`, or None if none is given."""
     pose = None if given is None else np.eye(4) if transform is None else transform
-    try:
-        return Sweep(points, is_ground, pose, point_times=times)
-    except CFlowError as error:
-        message = str(error)
-        for field, argument in (("points", "pc"), ("is_ground", "gm"), ("pose", "T_ego1_ego"), ("point_times", "dt")):
-            message = message.replace(f"Sweep.{field}", argument + name)
-        raise CFlowError(message) from None
+    names = [f"{argument}{name}" for argument in ("pc", "gm", "T_ego1_ego", "dt")]
+    check_sweep(names, points, is_ground, pose, times)
+    return Sweep(points, is_ground, pose, point_times=times)
 
 
 def _sweeps(given: str | None, side: str, clouds: Sequence[Any], **others: Sequence[Any]) -> tuple[Sweep, ...]:

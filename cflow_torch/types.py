@@ -141,18 +141,23 @@ class Sweep:
     point_times: Array | None = None
 
     def __post_init__(self) -> None:
-        check_points(self.points, "Sweep.points")
-        rows = self.points.shape[0]
-        if self.is_ground is not None:
-            check_array(
-                self.is_ground, "Sweep.is_ground", (rows,), "b", f"({rows},) bool, True = ground, one per point"
-            )
-        if self.point_times is not None:
-            wanted = f"({rows},) floats, seconds after the time stamp of the sweep, one per point"
-            check_array(self.point_times, "Sweep.point_times", (rows,), "f", wanted)
-        if self.pose is not None and np.shape(self.pose) != (4, 4):
-            wanted = f"give one (4, 4) matrix T_world_ego{last_row(np.shape(self.pose))}"
-            raise CFlowError(f"Sweep.pose has shape {np.shape(self.pose)}: {wanted}")
+        names = ("Sweep.points", "Sweep.is_ground", "Sweep.pose", "Sweep.point_times")
+        check_sweep(names, self.points, self.is_ground, self.pose, self.point_times)
+
+
+def check_sweep(names: Sequence[str], points: Any, is_ground: Any, pose: Any, point_times: Any) -> None:
+    """Check the arrays of a sweep. `names` are what the user calls points, ground mask, pose and times."""
+    of_points, of_ground, of_pose, of_times = names
+    check_points(points, of_points)
+    rows = points.shape[0]
+    if is_ground is not None:
+        check_array(is_ground, of_ground, (rows,), "b", f"({rows},) bool, True = ground, one per point")
+    if point_times is not None:
+        wanted = f"({rows},) floats, seconds after the time stamp of the sweep, one per point"
+        check_array(point_times, of_times, (rows,), "f", wanted)
+    if pose is not None and np.shape(pose) != (4, 4):
+        wanted = f"give one (4, 4) rigid transform{last_row(np.shape(pose))}"
+        raise CFlowError(f"{of_pose} has shape {np.shape(pose)}: {wanted}")
 
 
 @dataclass(frozen=True)
