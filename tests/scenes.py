@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import partial
 from typing import Iterator
 
 import numpy as np
@@ -14,8 +15,10 @@ from oracle import reference_flow
 from cflow_torch.config import CONFIGS, Config, VerifiedConfig
 from cflow_torch.estimate import make_model
 from cflow_torch.types import FlowResult, Sweep, Window
-from cflow_torch.verified import method, refinement
+from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.method import VerifiedFlow
+from cflow_torch.verified.refinement import refine
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import make_batch
 
@@ -142,13 +145,18 @@ def assert_same(a: FlowResult, b: FlowResult, atol: float = 1e-6) -> None:
 def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
     """The result of the method of the settings, which is the oracle's, without the steps that the oracle lacks."""
     with pytest.MonkeyPatch.context() as without:
-        without.setattr(method, "add_overhung", lambda sweeps, components, nodes: (sweeps, nodes))
-        without.setattr(
-            refinement, "subpixel_motion", lambda sweeps, _, motion, __: motion.flip(1) * sweeps.grid.pixel_size
-        )
+        without.setattr(VerifiedFlow, "add_overhung", staticmethod(lambda sweeps, components, tree: (sweeps, tree)))
+        without.setattr(VerifiedFlow, "refine", staticmethod(partial(refine, find_slow=_nothing_is_slow)))
         (result,) = make_model(settings)([window])
     assert_same(result, reference_flow(window, settings))
     return result
+
+
+def _nothing_is_slow(
+    sweeps: HeightSlicedSweeps, objects: Objects, motion: torch.Tensor, _: torch.Tensor
+) -> torch.Tensor:
+    """The motion of all objects in metres, instead of `subpixel_motion`."""
+    return motion.flip(1) * sweeps.grid.pixel_size
 
 
 def assert_same_bits(a: FlowResult, b: FlowResult) -> None:
