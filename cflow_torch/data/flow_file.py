@@ -15,7 +15,7 @@ from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.types import VECTORS, CFlowError, FlowResult, vector_columns
 
 CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
-ON_REQUEST = ("confidence",)  # written only if you name it
+ON_REQUEST = ("confidence", "moving")  # written only if you name it
 _COLUMNS = {name: vector_columns(name) if name in VECTORS else [name] for name in (*CONTENTS, *ON_REQUEST)}
 
 
@@ -30,8 +30,8 @@ def write_flow(path: PathLike, result: FlowResult, contents: Sequence[str] = CON
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
-        ego1, cluster_id int64, score and confidence float32, is_valid bool.
-        If you name a confidence that the result lacks, that is a `CFlowError`.
+        ego1, cluster_id int64, score, confidence and moving float32, is_valid bool.
+        If you name a field that the result lacks, that is a `CFlowError`.
     """
     columns = result.columns()
     names = [column for name in contents for column in _COLUMNS.get(name, [name])]
