@@ -32,6 +32,7 @@ class Motion:
     cluster_id: Tensor  # (M + 1,) int64, counted from 0 in each window
     score: Tensor  # (M + 1,) float32
     confidence: Tensor | None = None  # (M + 1,) float32, see `FlowResult`; None = the method does not estimate it
+    moving: Tensor | None = None  # (M + 1,) float32, likewise
     # (A, P) float64, metres per sweep interval, flow of each point summed over coarser scales; None = no coarser scale.
     before: Tensor | None = None
 
@@ -175,10 +176,12 @@ def _results(batch: Batch, motion: Motion) -> list[FlowResult]:
     is_valid = batch.has_result[points].clone()
     residual = motion.residual_flow(points, batch.positions[:, points]).add_(0.0)  # turns -0.0 into 0.0
     cluster_id, score = (values.index_select(0, cluster) for values in (motion.cluster_id, motion.score))
-    confidence = motion.confidence
-    if confidence is not None:
-        confidence = confidence.index_select(0, cluster).masked_fill_(~is_valid, 0.0)
-    columns = (residual, batch.pose_flow, residual + batch.pose_flow, cluster_id, score, is_valid, confidence)
+    given = (motion.confidence, motion.moving)
+    is_left_out = ~is_valid
+    probabilities = [
+        None if values is None else values.index_select(0, cluster).masked_fill_(is_left_out, 0.0) for values in given
+    ]
+    columns = (residual, batch.pose_flow, residual + batch.pose_flow, cluster_id, score, is_valid, *probabilities)
     sizes = [rows.stop - rows.start for rows in batch.rows]
     of_window = [[None] * len(sizes) if column is None else column.split(sizes) for column in columns]
     return [FlowResult(*fields) for fields in zip(*of_window)]

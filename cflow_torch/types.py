@@ -16,12 +16,13 @@ from cflow_torch.errors import CFlowWarning as CFlowWarning
 from cflow_torch.errors import import_optional
 
 Array = Union[np.ndarray, Tensor]
+MOVING = 0.05  # metres per sweep: least residual flow of a moving point, as in evaluation
 # Names in flow files and data frames -> fields of `FlowResult`.
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}
 # No sweep has more columns than this, so a wider array is a transposed one, (3, N) or (4, N).
 _MOST_COLUMNS = 1000
-_OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8")
-_OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence")
+_OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8, f8")
+_OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence", "moving")
 
 # The columns of the fields of `Objects` that are vectors.
 _OBJECT_COLUMNS = {"centre": "xyz", "size": ("length", "width", "height"), "velocity": ("vx", "vy", "vz")}
@@ -40,7 +41,7 @@ class Objects(np.ndarray):
         """Return a dictionary of plain numbers per object, for a data frame or JSON.
 
         The keys are id, x, y, z (centre, metres), length, width, height (metres), vx, vy, vz (m/s), heading (radians),
-        num_points and confidence. A confidence of NaN, which JSON does not have, becomes None.
+        num_points, confidence and moving. A NaN, which JSON does not have, becomes None.
         """
         records = []
         for row in self.reshape(-1):
@@ -49,7 +50,8 @@ class Objects(np.ndarray):
                 record.update(zip(names, row[field].tolist()))
             record["heading"] = float(row["heading"])
             record["num_points"] = int(row["num_points"])
-            record["confidence"] = None if np.isnan(row["confidence"]) else float(row["confidence"])
+            for field in ("confidence", "moving"):
+                record[field] = None if np.isnan(row[field]) else float(row[field])
             records.append(record)
         return records
 
@@ -215,6 +217,8 @@ class FlowResult:
         confidence: (N,) float32 in [0, 1], estimated probability that the end-point error of the residual flow is
             below 0.1 m per sweep interval; 0 where is_valid is False; None unless the method is the verified one. The
             probabilities were fitted on simulated drives, see docs/verified.md.
+        moving: (N,) float32 in [0, 1], estimated probability that the true residual flow is at least `MOVING`, 0.05 m
+            per sweep interval, whatever the flow says; 0 and None like `confidence`.
         track_id: (N,) int64, id of the track of each point in the table of `track`, -1 = none; None unless the result
             was read from a file of `cflow flow tracks=true`.
     """
@@ -226,7 +230,17 @@ class FlowResult:
     score: Tensor
     is_valid: Tensor
     confidence: Tensor | None = None
+    moving: Tensor | None = None
     track_id: Tensor | None = None
+
+    @property
+    def is_moving(self) -> Tensor:
+        """(N,) bool, points with a residual flow of at least `MOVING` and a probability `moving` of at least one half.
+
+        Without `moving`, the flow alone decides.
+        """
+        is_moving = self.residual_flow.norm(dim=1) >= MOVING
+        return is_moving if self.moving is None else is_moving & (self.moving >= 0.5)
 
     def __repr__(self) -> str:
         """The numbers of points and clusters; fields that are None are named."""
@@ -286,7 +300,12 @@ class FlowResult:
         return cloud
 
     def objects(
-        self, points: Array, sweep_interval: float = 0.1, min_speed: float = 0.5, min_points: int = 10
+        self,
+        points: Array,
+        sweep_interval: float = 0.1,
+        min_speed: float = 0.5,
+        min_points: int = 10,
+        min_moving: float = 0.5,
     ) -> Objects:
         """List the moving objects at t+1.
 
@@ -295,13 +314,15 @@ class FlowResult:
             sweep_interval: seconds from sweep t to sweep t+1.
             min_speed: m/s; slower clusters are left out.
             min_points: clusters with fewer points are left out; most of them are small parts of the static world.
+            min_moving: clusters whose mean of `moving` is lower are left out; most of them are static. 0 = keep them.
+                Without `moving`, it has no effect.
 
         Returns:
             (K,) structured array, sorted by id, in the ego frame at t+1. `id`: cluster_id. `centre`: (3,) metres, of
             the box. `size`: (3,) metres, length along the heading, width, height. `velocity`: (3,) m/s over ground,
             mean over the points. `heading`: direction of the velocity, radians from +x to the left. `num_points`:
-            number of points. `confidence`: mean over the points, NaN if the method has none. `to_records()` of the
-            array returns dictionaries for a data frame or JSON.
+            number of points. `confidence`, `moving`: means over the points, NaN if the method has none. `to_records()`
+            of the array returns dictionaries for a data frame or JSON.
 
         Convention:
             The box encloses the points of sweep t, moved by their flow. If only one side of an object is visible, the
@@ -327,12 +348,14 @@ class FlowResult:
         objects["num_points"] = clusters.num_points
         objects["velocity"] = clusters.mean(values["residual_flow"]) / sweep_interval
         objects["heading"] = np.arctan2(objects["velocity"][:, 1], objects["velocity"][:, 0])
-        objects["confidence"] = clusters.mean(values["confidence"]) if "confidence" in values else np.nan
+        for name in ("confidence", "moving"):
+            objects[name] = clusters.mean(values[name]) if name in values else np.nan
         objects["centre"], objects["size"] = clusters.boxes(
             self._positions(points) + values["flow"], objects["heading"]
         )
         is_fast = np.linalg.norm(objects["velocity"], axis=1) >= min_speed
-        return objects[is_fast & (objects["num_points"] >= min_points)]
+        is_static = objects["moving"] < min_moving  # False for NaN
+        return objects[is_fast & (objects["num_points"] >= min_points) & ~is_static]
 
     def save(self, path: str | Path) -> None:
         """Write every field that is not None to one .npz file."""

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.indices import unique_pairs
+from cflow_torch.types import MOVING as MOVING
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
-MOVING = 0.05  # metres per sweep: least residual flow of a moving point, as in evaluation
 MIN_POINTS = 5  # of a group, at least
 
 

@@ -15,7 +15,7 @@ from cflow_torch.data.paths import PathLike, as_path, is_remote, read_bytes
 from cflow_torch.types import VECTORS, Array, CFlowError, FlowResult, as_numpy, vector_columns
 
 CONTENTS = (*VECTORS, "cluster_id", "score", "is_valid")
-ON_REQUEST = ("confidence",)  # written only if you name it
+ON_REQUEST = ("confidence", "moving")  # written only if you name it
 POINTS = "points"  # the same; the columns x, y, z
 TRACK_ID = "track_id"  # added by `add_track_ids`
 _FIELDS = (*CONTENTS, *ON_REQUEST, TRACK_ID)
@@ -37,9 +37,9 @@ def write_flow(
 
     Convention:
         Columns flow_t{x,y,z}_m (total), residual_t{x,y,z}_m, pose_t{x,y,z}_m float32 in metres and in the axes of
-        ego1, cluster_id int64, score and confidence float32, is_valid bool. x, y, z are float32, in metres and in the
-        ego frame of t.
-        If you name a confidence that the result lacks, or points without passing them, that is a `CFlowError`.
+        ego1, cluster_id int64, score, confidence and moving float32, is_valid bool. x, y, z are float32, in
+        metres and in the ego frame of t.
+        If you name a field that the result lacks, or points without passing them, that is a `CFlowError`.
     """
     columns = result.columns()
     if POINTS in contents:

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Confidence of the flow: fit its table on simulated drives, or evaluate it on real data.
+"""Confidence of the flow and P(moving): fit their tables on simulated drives, or evaluate them on other data.
 
   python scripts/ablation/calibrate_confidence.py fit         writes verified/confidence.json
-  python scripts/ablation/calibrate_confidence.py evaluate    Argoverse 2 pair, KITTI 0000, PandaSet
+  python scripts/ablation/calibrate_confidence.py evaluate    Argoverse 2 pair, KITTI 0000, PandaSet, simulated drives
 
-The windows come from sets.py. We fit on pairs (h = 0) and history (h = 4) of five sensors and four kinds of scenes,
-seeds 100-103, region +-70 m, without ground. docs/verified.md explains the columns.
+The windows come from sets.py. We fit on pairs (h = 0) and history (h = 4) of five sensors, region +-70 m, without
+ground: four kinds of scenes, seeds 100-103, and motorways, seeds 822-825. We evaluate on motorways, seeds 826-827, and
+on drives with seeds 500-501. docs/verified.md explains the columns.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.types import FlowResult
 from cflow_torch.verified import confidence
 
-SEEDS = range(100, 104)
+SEEDS, MOTORWAYS = range(100, 104), range(822, 826)
+OTHER_SEEDS, OTHER_MOTORWAYS = range(500, 502), range(826, 828)
+TABLES = ("probabilities", "moving")  # of the confidence, of P(moving)
 RIGHT = 0.1  # metres
 DROPPED = (0.0, 0.05, 0.1, 0.3)
 NUM_BINS = 10  # of the calibration error
@@ -73,38 +76,53 @@ def _sums(result: FlowResult, frame: EvalFrame, num_bins: int) -> np.ndarray:
     return np.stack([np.bincount(bins, column, num_bins) for column in columns], 1)
 
 
-def fit(sums: np.ndarray) -> list[float]:
-    """Probability of each bin: share of right points, made monotonic along each row of the table."""
+def fit(sums: np.ndarray) -> dict[str, list[float]]:
+    """Probability of each bin in both tables: share of points, made monotonic along each row of a table."""
     table = confidence.TABLE
-    sizes = [1, 1 + len(table["crowd"]), 1 + len(table["share"]), 1] + 4 * [1 + len(table["margin"])]
-    starts = np.cumsum([0, *sizes])
-    result: list[float] = []
-    for row, (start, end) in enumerate(zip(starts, starts[1:])):
-        points, right = sums[start:end, POINTS], sums[start:end, RIGHT_ONES]
-        prior = right.sum() / max(points.sum(), 1)
-        share = (right + prior) / (points + 1)
-        is_falling = row == 1  # the more is unlinked, the worse
-        rising = isotonic_regression(-share if is_falling else share, sample_weight=points + 1)
-        result += [min(round(abs(float(value)), 4), 0.9999) for value in rising]  # nothing is certain
+    crowds, shares, margins = (1 + len(table[name]) for name in ("crowd", "share", "margin"))
+    # Lengths of rows, and whether the confidence falls along them: the more is unlinked, the worse.
+    rows = [(1, False), *4 * [(crowds, True)], *4 * [(shares, False)], *4 * [(1, False)], *8 * [(margins, False)]]
+    first_moving = len(rows) - 8
+    result: dict[str, list[float]] = {name: [] for name in TABLES}
+    start = 0
+    for number, (length, is_falling) in enumerate(rows):
+        of_row = sums[start : start + length]
+        start += length
+        result["probabilities"] += monotonic(of_row[:, POINTS], of_row[:, RIGHT_ONES], is_falling)
+        grows = is_falling or number >= first_moving
+        result["moving"] += monotonic(of_row[:, POINTS], of_row[:, DYNAMIC], not grows)
     return result
 
 
-def calibration_error(sums: np.ndarray, dynamic: bool) -> float:
-    """Mean difference of confidence and share of right points over tenths of confidence, weighted by points."""
-    predicted = np.array(confidence.TABLE["probabilities"])
-    points, right = sums[:, [DYNAMIC, RIGHT_DYNAMIC] if dynamic else [POINTS, RIGHT_ONES]].T
+def monotonic(points: np.ndarray, hits: np.ndarray, is_falling: bool) -> list[float]:
+    """Share of hits of each bin of a row, (L,) each. An empty row has the share one half."""
+    prior = (hits.sum() + 0.5) / (points.sum() + 1)
+    share = (hits + prior) / (points + 1)
+    rising = isotonic_regression(-share if is_falling else share, sample_weight=points + 1)
+    return [min(max(round(abs(float(value)), 4), 0.0001), 0.9999) for value in rising]  # nothing is certain
+
+
+def calibration_error(sums: np.ndarray, dynamic: bool, table: str = "probabilities") -> float:
+    """Mean difference of a probability and its share of points over tenths of it, weighted by points."""
+    predicted = np.array(confidence.TABLE[table])
+    columns = [POINTS, DYNAMIC] if table == "moving" else [DYNAMIC, RIGHT_DYNAMIC] if dynamic else [POINTS, RIGHT_ONES]
+    points, right = sums[:, columns].T
     tenth = np.minimum((predicted * NUM_BINS).astype(int), NUM_BINS - 1)
     gaps = np.abs(np.bincount(tenth, predicted * points - right, NUM_BINS))
     return float(gaps.sum() / max(points.sum(), 1))
 
 
-def least_trusted(points: np.ndarray, share: float) -> np.ndarray:
-    """(C,) share of each bin that is among the least trusted `share` of the points (C,). Ties: proportional."""
-    order = np.argsort(confidence.TABLE["probabilities"], kind="stable")
+def first(order: np.ndarray, points: np.ndarray, share: float) -> np.ndarray:
+    """(C,) part of each bin that is among the first `share` of the points (C,), in an order of bins."""
     before = np.cumsum(points[order]) - points[order]
     taken = np.empty(len(points))
     taken[order] = np.clip((share * points.sum() - before) / np.maximum(points[order], 1), 0, 1)
     return taken
+
+
+def least_trusted(points: np.ndarray, share: float) -> np.ndarray:
+    """(C,) part of each bin that is among the least trusted `share` of the points (C,)."""
+    return first(np.argsort(confidence.TABLE["probabilities"], kind="stable"), points, share)
 
 
 def sparsification(sums: np.ndarray, dynamic: bool) -> list[float]:
@@ -116,10 +134,28 @@ def sparsification(sums: np.ndarray, dynamic: bool) -> list[float]:
     return [float((error * left).sum() / max((points * left).sum(), 1)) for left in kept]
 
 
-def share_of_missed_found(sums: np.ndarray) -> float:
-    """Share of the missed points among the least trusted ones that hold `FALSE_ALARMS` of the static points."""
-    taken = least_trusted(sums[:, POINTS] - sums[:, DYNAMIC], FALSE_ALARMS)
+def share_of_missed_found(sums: np.ndarray, table: str = "probabilities") -> float:
+    """Share of the missed points among those that hold `FALSE_ALARMS` of the static points.
+
+    These are the points of least confidence, or of the highest P(moving).
+    """
+    values = np.array(confidence.TABLE[table])
+    order = np.argsort(-values if table == "moving" else values, kind="stable")
+    taken = first(order, sums[:, POINTS] - sums[:, DYNAMIC], FALSE_ALARMS)
     return float((sums[:, MISSED] * taken).sum() / max(sums[:, MISSED].sum(), 1))
+
+
+def share_of_missed_trusted(sums: np.ndarray) -> float:
+    """Share of the missed points with a confidence above one half."""
+    is_trusted = np.array(confidence.TABLE["probabilities"]) > 0.5
+    return float(sums[is_trusted, MISSED].sum() / max(sums[:, MISSED].sum(), 1))
+
+
+def simulated(seeds: Sequence[int], motorways: Sequence[int]) -> Iterable[Item]:
+    """The windows of simulated drives of all sensors, and of motorways."""
+    for profile in sets.PROFILES:
+        yield from sets.simulated(profile, seeds)
+        yield from sets.motorway(profile, motorways)
 
 
 def main() -> None:
@@ -128,25 +164,36 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.task == "fit":
-        items = (item for profile in sets.PROFILES for item in sets.simulated(profile, SEEDS))
-        table = {**confidence.TABLE, "probabilities": fit(statistics(items, (0, HISTORY), MAX_POINTS))}
+        table = {**confidence.TABLE, **fit(statistics(simulated(SEEDS, MOTORWAYS), (0, HISTORY), MAX_POINTS))}
         TABLE_FILE.write_text(json.dumps(table) + "\n", encoding="utf-8")
         return
     pair = [sets.make_item(item.window, item.frame.labels) for item in sets.av2_pair()]  # ego motion of the poses
     kitti = [item for path in (sets.KITTI, sets.KITTI_LATER) for item in sets.kitti(path)[HISTORY:]]
     pandaset = [item for path in sets.PANDASET.values() for item in sets.kitti(path)[HISTORY::4]]
+    others = {
+        "KITTI 0000": kitti,
+        "PandaSet": pandaset,
+        "simulated": list(simulated(OTHER_SEEDS, ())),
+        "motorways": list(simulated((), OTHER_MOTORWAYS)),
+    }
     dropped = ", ".join(f"{100 * share:.0f}" for share in DROPPED)
     columns = f"error, all / dynamic | dynamic, dropped {dropped} % | static, the same | missed found"
-    print(f"| set | {columns} |\n|{'---|' * 5}")
+    columns += " | P(moving): error | missed found | missed, confidence > .5"
+    print(f"| set | {columns} |\n|{'---|' * 8}")
     for name, items, h in (
         ("Argoverse 2 pair", pair, 0),
-        *((name, items, h) for h in (0, HISTORY) for name, items in (("KITTI 0000", kitti), ("PandaSet", pandaset))),
+        *((name, items, h) for h in (0, HISTORY) for name, items in others.items()),
     ):
         sums = statistics(items, (h,))
         gaps = " / ".join(f"{calibration_error(sums, dynamic):.4f}" for dynamic in (False, True))
         left = (", ".join(f"{value:.4f}" for value in sparsification(sums, dynamic)) for dynamic in (True, False))
         found = f"{share_of_missed_found(sums):.2f} of {sums[:, MISSED].sum():.0f}"
-        print(f"| {name}, h = {h} | {gaps} | {' | '.join(left)} | {found} |")
+        gap, share, trusted = (
+            calibration_error(sums, False, "moving"),
+            share_of_missed_found(sums, "moving"),
+            share_of_missed_trusted(sums),
+        )
+        print(f"| {name}, h = {h} | {gaps} | {' | '.join(left)} | {found} | {gap:.4f} | {share:.2f} | {trusted:.2f} |")
 
 
 if __name__ == "__main__":

@@ -46,9 +46,10 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
         pose_flow = (clouds[0].points - xyz(window.pc0)).astype(np.float32)
     pose_flow = np.nan_to_num(pose_flow, nan=0.0, posinf=0.0, neginf=0.0)
     residual_flow = found.flow[0].astype(np.float32)
-    confidence = None
-    if found.confidence is not None:
-        confidence = torch.from_numpy(np.where(is_valid, found.confidence, 0).astype(np.float32))
+    confidence, moving = (
+        None if values is None else torch.from_numpy(np.where(is_valid, values, 0).astype(np.float32))
+        for values in (found.confidence, found.moving)
+    )
     return FlowResult(
         residual_flow=torch.from_numpy(residual_flow),
         pose_flow=torch.from_numpy(pose_flow),
@@ -57,6 +58,7 @@ def reference_flow(window: Window, config: Config) -> FlowResult:
         score=torch.from_numpy(found.score.astype(np.float32)),
         is_valid=torch.from_numpy(is_valid),
         confidence=confidence,
+        moving=moving,
     )
 
 

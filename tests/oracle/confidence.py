@@ -49,15 +49,20 @@ def motion_of_pixels(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMoti
     return np.where(rotates, own, flow / sweeps.size)[:, ::-1]
 
 
-def confidences(
-    sweeps: SlicedSweeps, object_of: np.ndarray, rigid: Sequence[RigidMotion], margins: Sequence[float]
+def probabilities(
+    sweeps: SlicedSweeps,
+    object_of: np.ndarray,
+    rigid: Sequence[RigidMotion],
+    margins: Sequence[float],
+    is_missing: np.ndarray,
 ) -> np.ndarray:
-    """(P,): probability of every pixel; undefined for those of sweeps other than t. Given are the object of each pixel,
-    and the motion of each object and its margin.
+    """(2, P): of every pixel, that its motion is right, and that it moves; undefined for those of sweeps other than t.
+    Given are the object of each pixel, the motion of each object and its margin, and the missing pixels.
 
     The bins of the table: left out; unlinked, by how many slices lie in the block around; static, by the share of them
-    that is found; static beside something that moves; moving, by the margin, for pairs near and far, then with history.
-    A block is 1.6 m wide, and its slices are found if t+1 has them where they move to.
+    that is found; static beside something that moves; moving, by the margin. Each but the first has rows: not missing
+    and missing, for pairs, then with history; if it moves, near slow, near fast, far slow, far fast. A block is 1.6 m
+    wide, and its slices are found if t+1 has them where they move to. In pairs, what t+1 lacks around is missing.
     """
     motion = np.array([*(each.flow[::-1] for each in rigid), (0.0, 0.0)])[object_of] / sweeps.size
     step, row, col = sweeps.pixels.T
@@ -69,16 +74,24 @@ def confidences(
         np.add.at(of_block, (row // side, col // side), np.where(step == 1, of_pixel, 0))
     total, found = counts[:, row // side, col // side]
     crowd, share, bounds = (np.array(TABLE[name]) for name in ("crowd", "share", "margin"))
-    static = 2 + len(crowd)
-    beside = static + len(share) + 1
+    static = 1 + 4 * (1 + len(crowd))
+    beside = static + 4 * (1 + len(share))
 
     is_moving = np.zeros(sweeps.image.shape, dtype=bool)
     is_moving[tuple(sweeps.pixels.T)] = moves
     is_beside = over_squares(is_moving, 1, np.logical_or)[tuple(sweeps.pixels.T)]
+    if not sweeps.has_history:
+        is_missing = (sweeps.slices & ~sweeps.around[0, row, col]) > 0
+    kind = 2 * sweeps.has_history + is_missing
+    bins = static + kind * (1 + len(share)) + (10 * found[:, None] >= share * total[:, None]).sum(1)
+    bins[is_beside] = (beside + kind)[is_beside]
+    unlinked = 1 + kind * (1 + len(crowd)) + (total[:, None] >= crowd).sum(1)
+    bins[object_of < 0] = unlinked[object_of < 0]
+
     is_far = (sweeps.middle(sweeps.pixels) ** 2).sum(1) >= TABLE["far"] ** 2
+    is_fast = np.array([*(each.flow[0] ** 2 + each.flow[1] ** 2 >= TABLE["fast"] ** 2 for each in rigid), False])
     reached = (np.array([*margins, 0.0])[object_of, None] >= bounds).sum(1)
-    bins = static + (10 * found[:, None] >= share * total[:, None]).sum(1)
-    bins[is_beside] = beside
-    bins[object_of < 0] = (1 + (total[:, None] >= crowd).sum(1))[object_of < 0]
-    moving = beside + 1 + (2 * sweeps.has_history + is_far) * (1 + len(bounds)) + reached
-    return np.array(TABLE["probabilities"])[np.where(moves, moving, bins)]
+    kind = 4 * sweeps.has_history + 2 * is_far + is_fast[object_of]
+    moving = beside + 4 + kind * (1 + len(bounds)) + reached
+    table = np.array([TABLE["probabilities"], TABLE["moving"]])
+    return table[:, np.where(moves, moving, bins)]

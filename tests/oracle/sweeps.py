@@ -36,12 +36,14 @@ class PointMotion(NamedTuple):
         cluster_id: of sweep t, (N,) int64, -1 without a cluster.
         score: of sweep t, (N,) float64, NCC at the peak of the newest sweep; 0 without a cluster.
         confidence: of sweep t, (N,) float64, for active points; None = the method does not estimate it.
+        moving: likewise, the probability that a point moves.
     """
 
     flow: list[np.ndarray]
     cluster_id: np.ndarray
     score: np.ndarray
     confidence: np.ndarray | None = None
+    moving: np.ndarray | None = None
 
 
 def compensate(window: Window, config: Config) -> tuple[list[Cloud], Cloud]:

@@ -17,7 +17,7 @@ from oracle.aperture import slides_along_itself
 from oracle.candidates import propose
 from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, select_objects
-from oracle.confidence import TABLE, confidences, margin
+from oracle.confidence import TABLE, margin, probabilities
 from oracle.height_slices import SlicedSweeps, Vector, ground_slope, is_residue, over_squares
 from oracle.paired_test import count_wins, evidence_of
 from oracle.pixels import in_range
@@ -60,20 +60,23 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     size, members = sweeps.size, [np.flatnonzero(object_of == i) for i in range(len(chosen))]
     rigid = register(sweeps, object_of, [(x * size, y * size) for y, x in motions])
     margins = [margin(sweeps, *given) for given in zip(members, rigid)]
-    of_pixels = confidences(sweeps, object_of, rigid, [z for z, _ in margins])
+    of_pixels = probabilities(sweeps, object_of, rigid, [z for z, _ in margins], change[0])
 
     flow, ids = np.zeros(points.shape), np.full(len(points), -1, dtype=np.int64)
-    score, confidence = np.zeros(len(points)), np.full(len(points), TABLE["probabilities"][0])
+    score, confidence, moving = (
+        np.full(len(points), value) for value in (0.0, TABLE["probabilities"][0], TABLE["moving"][0])
+    )
     pixels = sweeps.pixel_of_point[len(drawn[0]) :][: len(drawn[1])]
     rows, pixels = drawn[1][is_inside[drawn[1]]], pixels[is_inside[drawn[1]]]
-    confidence[rows], ids[rows] = of_pixels[pixels], object_of[pixels]
+    confidence[rows], moving[rows] = of_pixels[:, pixels]
+    ids[rows] = object_of[pixels]
     for number in np.unique(ids[ids >= 0]).tolist():
         own = ids == number
         score[own] = scores[chosen[number]] if chosen[number] >= 0 else 0.0
         if margins[number][1]:
             flow[own, :2] = rigid[number].flow_at(points[own, :2])
             flow[own, 2] = flow[own, :2] @ ground_slope(ground, rigid[number].centre, config)
-    return PointMotion([flow], ids, score, confidence)
+    return PointMotion([flow], ids, score, confidence, moving)
 
 
 def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_levels: int) -> tuple[Vector, int]:

@@ -17,23 +17,49 @@ from cflow_torch.simulator import make_drive
 from cflow_torch.verified import confidence
 
 
-def test_the_table_is_monotone_and_the_oracle_reads_it():
+def test_the_tables_are_monotone_and_the_oracle_reads_them():
     assert oracle.TABLE == confidence.TABLE
-    table, start, rows = confidence.TABLE, 1, []
-    for length in (len(table["crowd"]) + 1, len(table["share"]) + 1, 1, *4 * (len(table["margin"]) + 1,)):
-        rows.append(table["probabilities"][start : start + length])
-        start += length
-    assert start == len(table["probabilities"]) and all(0 < p < 1 for p in table["probabilities"])
-    unlinked, static, (beside,), *moving = rows
-    assert unlinked == sorted(unlinked, reverse=True) and unlinked[0] > unlinked[-1]
-    assert all(row == sorted(row) and row[0] < row[-1] for row in (static, *moving)) and beside < static[0]
+    table = confidence.TABLE
+    crowds, shares, margins = (len(table[name]) + 1 for name in ("crowd", "share", "margin"))
+    for name, falls in (("probabilities", False), ("moving", True)):
+        rows, start = [], 1
+        for length in (*4 * (crowds,), *4 * (shares,), *4 * (1,), *8 * (margins,)):
+            rows.append(table[name][start : start + length])
+            start += length
+        assert start == len(table[name]) and all(0 < p < 1 for p in table[name])
+        unlinked, static, moving = rows[:4], rows[4:8], rows[12:]
+        assert all(row == sorted(row, reverse=not falls) for row in unlinked)
+        assert all(row == sorted(row, reverse=falls) for row in static)
+        assert all(row == sorted(row) for row in moving)
+    # With history, a missed object is in the missing pixels of a component that is not at t+1.
+    assert unlinked[3][-1] > 0.5 > max(static[2])
+
+
+def test_a_point_that_is_missing_in_another_sweep_has_bins_of_its_own(numbered):
+    # A car of t appears from nowhere, and a wall stays.
+    rng = np.random.default_rng(0)
+    wall = np.stack((rng.uniform(-3, 3, 900), np.full(900, 4.05), rng.uniform(-1, 1, 900)), 1)
+    car = np.stack((rng.uniform(-2, 2, 300), np.full(300, -3.05), rng.uniform(-1, 1, 300)), 1)
+    both = Sweep(np.concatenate((wall, car)))
+    shares = len(confidence.TABLE["share"]) + 1
+    for older in ((), (Sweep(wall),)):
+        result = flow_as_oracle(Window(both, Sweep(wall), older), MODEL.replace(num_history=1))
+        bins = (result.confidence * 128).round().int()
+        row = 2 * len(older)
+        is_static = (bins >= confidence._Bins.static + row * shares) & (
+            bins < confidence._Bins.static + (row + 1) * shares
+        )
+        assert is_static[:900].float().mean() > 0.9
+        crowds = len(confidence.TABLE["crowd"]) + 1
+        is_missing = (bins >= 1 + (row + 1) * crowds) & (bins < 1 + (row + 2) * crowds)
+        assert is_missing[900:].all()
 
 
 def test_a_wall_next_to_a_pedestrian_has_less_confidence(numbered):
     window, is_walker = beside_a_wall(0.13, 20.0)
     settings = MODEL.replace(point_cloud_range=(-10.0, -10.0, -3.0, 10.0, 10.0, 8.0), num_history=4)
-    bins = (64 * flow_as_oracle(window, settings).confidence).round()
-    is_beside = bins == 11
+    bins = (128 * flow_as_oracle(window, settings).confidence).round()
+    is_beside = (bins >= confidence._Bins.beside) & (bins < confidence._Bins.moving)
     assert is_beside.any() and not is_beside[is_walker].all()
     assert np.abs(window.pc0.points[is_beside, 0] - 4.0).max() < 1.0
 
@@ -45,8 +71,8 @@ def test_far_begins_where_the_table_says(numbered, monkeypatch):
     far = VerifiedFlow(MODEL)([window])[0]
     moves = near.residual_flow.any(1)
     distance = torch.from_numpy(np.linalg.norm(window.pc0.points[:, :2], axis=1))
-    change = (far.confidence - near.confidence) * 64
-    assert (change[moves & (distance > 3.1)] == 6).all() and (change[~moves | (distance < 2.9)] == 0).all()
+    change = (far.confidence - near.confidence) * 128
+    assert (change[moves & (distance > 3.1)] == 12).all() and (change[~moves | (distance < 2.9)] == 0).all()
     assert (moves & (distance > 3.1)).any() and (moves & (distance < 2.9)).any()
 
 
