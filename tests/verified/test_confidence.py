@@ -10,7 +10,7 @@ from scenes import flow_as_oracle
 from test_changed_pixels import beside_a_wall
 from turning_car import MODEL, turning_car
 
-from cflow_torch import Sweep, VerifiedFlow, Window, make_config, make_model
+from cflow_torch import FlowResult, Sweep, VerifiedFlow, Window, make_config, make_model
 from cflow_torch.data.log import window as window_of
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
@@ -132,6 +132,26 @@ def test_the_margin_follows_the_rotation_of_a_bus():
     result = flow_as_oracle(Window(Sweep(bus), Sweep(moved)), MODEL.replace(max_object_length=15.0))
     error = np.linalg.norm(result.residual_flow.numpy() - (moved - bus), axis=1)
     assert error.mean() < 0.1
+
+
+def test_a_point_moves_if_its_flow_and_its_probability_say_so():
+    flow = torch.tensor([[0.0, 0.0, 0.0], [0.04, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    moving = torch.tensor([0.9, 0.9, 0.4, 0.6])
+    assert FlowResult.of({"residual_flow": flow, "moving": moving}).is_moving.tolist() == [False, False, False, True]
+    assert FlowResult.of({"residual_flow": flow}).is_moving.tolist() == [False, False, True, True]
+
+
+def test_objects_leaves_out_what_is_probably_static():
+    points = np.zeros((30, 3)) + np.arange(30)[:, None]
+    flow = torch.zeros(30, 3)
+    flow[:, 0] = 0.3
+    given = {"residual_flow": flow, "flow": flow, "cluster_id": torch.arange(30) // 15}
+    result = FlowResult.of({**given, "moving": torch.tensor([0.4, 0.8]).repeat_interleave(15)})
+    assert result.objects(points)["id"].tolist() == [1] and result.objects(points, min_moving=0)["id"].tolist() == [
+        0,
+        1,
+    ]
+    assert len(FlowResult.of(given).objects(points)) == 2
 
 
 @pytest.mark.slow
