@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple, Sequence, Union
 
@@ -243,14 +243,14 @@ class FlowResult:
         return is_moving if self.moving is None else is_moving & (self.moving >= 0.5)
 
     def __repr__(self) -> str:
-        """The numbers of points and clusters; fields that are None are named."""
+        """The numbers of points and clusters; fields that every method has are named if they are None."""
         parts = [f"{len(next(iter(self._given().values())))} points" if self._given() else "empty"]
         if self.is_valid is not None:
             parts.append(f"{int(self.is_valid.sum())} valid")
         if self.cluster_id is not None:
             in_cluster = self.cluster_id[self.cluster_id >= 0]
             parts.append(f"{len(in_cluster)} in {len(in_cluster.unique())} clusters")
-        missing = [f.name for f in fields(self) if getattr(self, f.name) is None]
+        missing = [f.name for f in fields(self) if f.default is MISSING and getattr(self, f.name) is None]
         return f"FlowResult({', '.join(parts + [f'no {name}' for name in missing])})"
 
     def to(self, device: Any) -> FlowResult:
