@@ -28,7 +28,7 @@ from cflow_torch.verified.height_slices import HeightSlicedSweeps
 _LONGEST = 8.0  # metres, of a part
 _CELL = 0.8  # metres, of the map of the parts; a cell holds one part
 _NEAR = 2  # cells, around the place where a velocity puts a part
-_FAR = 8  # cells; objects that move farther from sweep to sweep are not linked
+_REACH = 8  # cells; objects that move farther from sweep to sweep are not linked
 _ERROR = 0.7  # metres from that place to a part that confirms the velocity, at most, ...
 _ERROR_SHARE = 0.05  # ... and further for each metre that the object has moved
 _FASTEST = 60.0  # m/s, if the settings have no bound
@@ -62,17 +62,8 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
     objects = objects.select(kept)
     member = flat_nonzero(objects.is_member)
     window = objects.max(sweeps.pixels.window, empty=0)
-    no_parents = Groups(torch.full_like(window, objects.count), objects.count)
-    return Tree(
-        pixel=torch.cat((tree.pixel, member)),
-        members=tree.members.followed_by(objects[member]),
-        children=tree.children.followed_by(no_parents),
-        kind=torch.cat((tree.kind, torch.full_like(window, NodeKind.UNLINKED))),
-        window=torch.cat((tree.window, window)),
-        travels=torch.cat((tree.travels, torch.zeros_like(window, dtype=torch.bool))),
-        velocity=torch.cat((tree.velocity, tracks.velocity.index_select(0, kept))),
-        num_levels=tree.num_levels,
-    )
+    velocity = tracks.velocity.index_select(0, kept)
+    return tree.with_nodes(member, objects[member], window, NodeKind.UNLINKED, velocity)
 
 
 class _Parts(NamedTuple):
@@ -106,8 +97,8 @@ class _Map:
         grid = sweeps.grid
         self._cell = max(1, round(_CELL / grid.pixel_size))  # finest pixels
         # An empty border as wide as the farthest neighbours, so that they need no tests.
-        self._height = (grid.height - 1) // self._cell + 1 + 2 * _FAR
-        self._width = (grid.width - 1) // self._cell + 1 + 2 * _FAR
+        self._height = (grid.height - 1) // self._cell + 1 + 2 * _REACH
+        self._width = (grid.width - 1) // self._cell + 1 + 2 * _REACH
         self._num_steps = sweeps.num_steps
         num_cells = sweeps.batch.num_windows * sweeps.num_steps * self._height * self._width
         number = torch.arange(1, len(parts) + 1, dtype=torch.int32, device=parts.step.device)
@@ -128,9 +119,9 @@ class _Map:
 
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
-        row, col = (centre / self._cell).floor_().long() + _FAR
-        row = row.clamp_(_FAR, self._height - 1 - _FAR)
-        col = col.clamp_(_FAR, self._width - 1 - _FAR)
+        row, col = (centre / self._cell).floor_().long() + _REACH
+        row = row.clamp_(_REACH, self._height - 1 - _REACH)
+        col = col.clamp_(_REACH, self._width - 1 - _REACH)
         return ((window * self._num_steps + step) * self._height + row) * self._width + col
 
 
@@ -154,7 +145,7 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     velocity = (take_columns(parts.centre, of_t) - take_columns(parts.centre, other)) / interval  # [2, H]
     part, error = _follow(parts, cells, of_t, velocity, before_t)  # [H, S] each
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
-    is_given = (elapsed != 0) | (elapsed.cumsum(1) == 0)  # t+1 comes first, and its time is 0
+    is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
     kept = flat_nonzero(_are_best(_ranks(error, is_found, is_given), part, len(parts)))
     return _Tracks(*gather(kept, part, is_found, _median_velocity(parts, part, is_found, before_t)))
@@ -209,7 +200,7 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
     step = constant(((0,), (2,)), torch.int64, of_t.device).expand(2, len(of_t))
     window = parts.window.index_select(0, of_t).expand_as(step)
     centre = take_columns(parts.centre, of_t)
-    other, is_part = cells.around(window, step, centre[:, None].expand(2, *step.shape), _FAR)  # [2, of t, 289]
+    other, is_part = cells.around(window, step, centre[:, None].expand(2, *step.shape), _REACH)  # [2, of t, 289]
     distance = (_centres(parts, other) - centre[:, None, :, None]).square_().sum(0).sqrt_()
     seconds = (sweeps.batch.seconds - sweeps.batch.seconds[:, 1:2]).abs()[window, step]
     pixel_size = sweeps.grid.pixel_size
