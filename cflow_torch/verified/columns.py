@@ -7,7 +7,7 @@ window tells which column is at a position, and small tables have a row for each
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, lazy_zeros, nonzero_pairs, split_index
+from cflow_torch.verified.spacing import Spacing
 from cflow_torch.windows.bev_grid import Grid
 
 NUM_SLICES = 4
@@ -99,13 +100,20 @@ class Columns:
     slices: Tensor  # (C + 1, T) uint8
     # (C + 1, T) int32, 1 + position of each occupied pixel in the list of pixels; 0 = the pixel is empty
     rank: Tensor
+    reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
+    most_reach: int
 
     @classmethod
-    def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int) -> Columns:
+    def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int, spacing: Spacing) -> Columns:
         """Make empty columns at and around the occupied positions, (B * area,) bool. The border must be False."""
         stride = grid.width + 2 * REACH
         device = is_occupied.device
         is_column = _dilate(is_occupied, stride)
+        reach_at = torch.ones_like(is_column, dtype=torch.uint8) if spacing.most > 1 else None
+        for reach in range(2, spacing.most + 1):
+            is_wide = spacing.are_wide(grid, REACH, reach).view(-1)
+            is_column |= _dilate(is_column, stride) & is_wide
+            reach_at += is_wide
         images = is_column.view(-1, grid.height + 2 * REACH, stride)
         images[:, :REACH] = images[:, -REACH:] = False
         images[:, :, :REACH] = images[:, :, -REACH:] = False
@@ -117,7 +125,8 @@ class Columns:
         shape = (len(position), 2 * _WORD * -(-num_steps // _WORD))
         slices = torch.zeros(shape, dtype=torch.uint8, device=device)
         rank = torch.zeros(shape, dtype=torch.int32, device=device)
-        return cls(grid.height, grid.width, image, position, slices, rank)
+        reach_of = None if reach_at is None else reach_at.index_select(0, position)
+        return cls(grid.height, grid.width, image, position, slices, rank, reach_of, spacing.most)
 
     @property
     def stride(self) -> int:
@@ -160,6 +169,12 @@ class Columns:
         index += start
         return self.image.index_select(0, index.view(-1)).view_as(index)
 
+    def are_wide(self, pixels: Pixels) -> Tensor | None:
+        """Tell which of K pixels have a reach of more than one pixel, (K,) bool; None = none has."""
+        if self.reach is None:
+            return None
+        return self.reach.index_select(0, floor_divide(pixels.first_slot, self.num_slots)) > 1
+
     def words(self, pixels: Pixels) -> Tensor:
         """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""
         words = self.slices.view(torch.int64)[:, : self.first_of_copies // _WORD]  # not of copies
@@ -194,6 +209,24 @@ class Columns:
         words = words | words.index_select(0, left) | words.index_select(0, right)
         return words | words.index_select(0, above) | words.index_select(0, below)
 
+    def _or_within_reach(self, words: Tensor) -> Tensor:
+        """Return the bitwise OR over the columns within the reach of each column, (C + 1, W) int64."""
+        around = self.or_around(words)
+        if self.reach is None:
+            return around
+        wide = flat_nonzero(self.reach > 1)
+        reach = self.reach.index_select(0, wide)[:, None]
+        line = range(-1, 2)
+        offsets = tuple((down * self.stride + right,) for down in line for right in line)
+        beside = self.position.index_select(0, wide) + constant(offsets, torch.int64, wide.device)
+        beside = self.image.index_select(0, beside.view(-1))  # [9 wide]
+        for step in range(2, self.most_reach + 1):
+            # The columns beside one of this reach have at least the reach before.
+            near = around.index_select(0, beside).view(9, -1, around.shape[1])
+            wider = reduce(torch.bitwise_or, near.unbind(0))
+            around = around.index_copy(0, wide, torch.where(reach >= step, wider, near[4]))
+        return around
+
     @cached_property
     def _neighbours(self) -> Tensor:
         """(4, C + 1) int32, column to the left and to the right of each column, above and below it; 0 = none."""
@@ -212,7 +245,7 @@ class Columns:
         """
         words = self.as_words(slices)
         half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
-        self.slices.view(torch.int64)[:, half] = words | self.or_around(words) << NUM_SLICES
+        self.slices.view(torch.int64)[:, half] = words | self._or_within_reach(words) << NUM_SLICES
         occupied = self._occupied(slices, num_windows)
         step = occupied.step
         slot = occupied.column * self.num_slots + (step + first)  # counted through all columns

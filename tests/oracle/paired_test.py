@@ -29,12 +29,13 @@ def count_wins(
     """
     won, lost = np.zeros((2, len(members)), dtype=int)
     step, row, col = sweeps.pixels[members].T
+    is_wide = is_alone & (sweeps.reach[row, col] > 1) | (not is_alone and bool((sweeps.reach[row, col] > 1).any()))
     for other, elapsed in enumerate(sweeps.elapsed):
         own = np.where((step == 0) != (other == 0), sweeps.slices[members], 0)
         intervals = (sweeps.elapsed[step] - elapsed)[:, None]
         dy, dx = np.floor(np.array(motion) * intervals + 0.5).astype(int).T
         here, there = sweeps.both[other, row, col], value_at(sweeps.both[other], row + dy, col + dx)
-        is_far = np.maximum(np.abs(dy), np.abs(dx)) >= 2
+        is_far = (np.maximum(np.abs(dy), np.abs(dx)) >= 2) | is_wide
         near_here, near_there = (np.where(is_far, slices >> NUM_SLICES, slices) for slices in (here, there))
         if is_near:
             here, there = near_here, near_there

@@ -22,6 +22,7 @@ from oracle.height_slices import SlicedSweeps, Vector, ground_slope, is_residue,
 from oracle.paired_test import count_wins, evidence_of
 from oracle.pixels import in_range
 from oracle.registration import register
+from oracle.spacing import angle_between_points, reach_of_pixels
 from oracle.sweeps import Cloud, PointMotion
 from oracle.unlinked import link_unlinked
 
@@ -47,6 +48,7 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
         [cloud.intervals for cloud in every],
         [cloud.seconds for cloud in every],
         config,
+        reach_of_pixels(angle_between_points(seen[0]), config),
     )
     change = find_changed(sweeps, seen, [cloud.origin for cloud in every])
     tree = grow(sweeps, change, config)
