@@ -111,7 +111,7 @@ class Columns:
         stride = grid.width + 2 * REACH
         device = is_occupied.device
         is_column = _dilate(is_occupied, stride)
-        reach_at = torch.ones_like(is_column, dtype=torch.uint8) if spacing.most > 1 else None
+        reach_at = torch.ones(len(is_column) if spacing.most > 1 else 0, dtype=torch.uint8, device=device)
         for reach in range(2, spacing.most + 1):
             is_wide = spacing.are_wide(grid, REACH, reach).view(-1)
             is_column |= _dilate(is_column, stride) & is_wide
@@ -127,7 +127,7 @@ class Columns:
         shape = (len(position), 2 * _WORD * -(-num_steps // _WORD))
         slices = torch.zeros(shape, dtype=torch.uint8, device=device)
         rank = torch.zeros(shape, dtype=torch.int32, device=device)
-        reach_of = None if reach_at is None else reach_at.index_select(0, position)
+        reach_of = reach_at.index_select(0, position) if spacing.most > 1 else None
         return cls(grid.height, grid.width, image, position, slices, rank, reach_of, spacing.most)
 
     @property

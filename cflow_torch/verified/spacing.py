@@ -22,6 +22,7 @@ _ELEVATIONS = 120  # bins of about one degree
 _ANGLES = 1024  # bins of angle of 0.007 degrees
 _PER_AZIMUTH = 4  # of them are as wide as the narrowest bin of azimuth
 _NEAREST = 10.0  # metres; nearer to the origin, the position of the sensor would matter
+_FEWEST = 100  # gaps between directions; fewer do not tell the spacing
 _SHARE = 1.5  # reach over spacing; beams are not evenly spaced, and some returns are lost
 _FARTHEST = 6  # pixels, the largest reach
 
@@ -38,7 +39,7 @@ class Spacing(NamedTuple):
 
         Convention:
             We divide the directions of the points into rows of one degree of elevation, above the origin of the ego
-            frame. The angle is the median of the gaps between the directions in a row, 0 without points.
+            frame. The angle is the median of the gaps between the directions in a row, and 0 if there are few gaps.
 
         Cost: some passes over the points of t+1.
         """
@@ -56,7 +57,7 @@ class Spacing(NamedTuple):
         device = self.angle.device
         row = torch.arange(-border, grid.height + border, device=device) + (grid.lower[1] / grid.pixel_size + 0.5)
         col = torch.arange(-border, grid.width + border, device=device) + (grid.lower[0] / grid.pixel_size + 0.5)
-        least = (reach - 0.5) / (_SHARE * self.angle[:, None])  # [B, 1], pixels, infinite without points
+        least = (reach - 0.5) / (_SHARE * self.angle[:, None])  # [B, 1], pixels, infinite if the angle is 0
         # From row to row, a pixel is wide if its column is farther than this from the middle.
         beyond = (least.square() - row.double().square()).clamp_(min=0).sqrt_()
         return exceeds(col.abs(), beyond.float()[..., None])
@@ -79,5 +80,5 @@ def _median_gap(batch: Batch) -> Tensor:
     angle += floor_divide(row[:-1], _ELEVATIONS) * _ANGLES
     is_gap = (row[1:] == row[:-1]).long()
     below = scatter_count(angle, batch.num_windows * _ANGLES, is_gap).view(-1, _ANGLES).cumsum(1)
-    median = (2 * below < below[:, -1:]).sum(1)  # the first bin that reaches half; 0 without gaps
-    return median.double() * (4 / _AZIMUTHS / _PER_AZIMUTH)
+    median = (2 * below < below[:, -1:]).sum(1)  # the first bin that reaches half
+    return median.double() * (below[:, -1] >= _FEWEST) * (4 / _AZIMUTHS / _PER_AZIMUTH)

@@ -12,7 +12,7 @@ import numpy as np
 import cflow_torch
 from oracle.aperture import principal_axis
 from oracle.height_slices import COUNT, SlicedSweeps, over_squares, value_at
-from oracle.paired_test import count_wins, found_in_place
+from oracle.paired_test import are_wide, count_wins, found_in_place
 from oracle.registration import RigidMotion
 
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
@@ -31,7 +31,11 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
         return 0.0, False
     off, motion = DISPLACEMENT / sweeps.size, motion_of_pixels(sweeps, members, rigid)
     displaced = [motion + shift for shift in ((0, 0), (off, 0), (-off, 0), (0, off), (0, -off))]
-    surplus, *others = (int(np.subtract(*count_wins(sweeps, members, each)).sum()) for each in displaced)
+    is_alone, is_wide = (motion != np.array(rigid.flow)[::-1] / sweeps.size).any(1), are_wide(sweeps, members)
+    is_wide = np.where(is_alone, is_wide, is_wide[~is_alone].any())
+    surplus, *others = (
+        int(np.subtract(*count_wins(sweeps, members, each, False, is_wide)).sum()) for each in displaced
+    )
     gain, stays = surplus - max(others), found_in_place(sweeps, members, sweeps.image)[:, 0].sum()
     z = gain / math.sqrt(surplus + stays) if gain > 0 else 0.0
     is_line = principal_axis(sweeps, members[sweeps.pixels[members, 0] == 0]) is not None

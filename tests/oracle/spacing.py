@@ -10,7 +10,7 @@ from cflow_torch.config import VerifiedConfig
 from oracle.changed_pixels import directions
 from oracle.pixels import bev_dims
 
-AZIMUTHS, NEAREST, SHARE, FARTHEST = 8192, 10.0, 1.5, 6
+AZIMUTHS, NEAREST, FEWEST, SHARE, FARTHEST = 8192, 10.0, 100, 1.5, 6
 UNIT = 4 / AZIMUTHS / 4  # radians, of an angle; a bin of azimuth is 4 to 8 of them wide
 
 
@@ -19,7 +19,7 @@ def angle_between_points(cloud1: np.ndarray) -> float:
 
     Convention: points nearer than 10 m to the origin of the ego frame do not count, nor do two rows meet. Angles are
         rounded down to a unit, and are less than 1024 units. The median is the first angle that at least half of all
-        do not exceed; 0 without any.
+        do not exceed; 0 if there are fewer than 100.
     """
     far = cloud1[(cloud1[:, :2] ** 2).sum(1) >= NEAREST**2]
     (rows, azimuths), _ = directions(far, np.zeros(3), AZIMUTHS)
@@ -29,7 +29,7 @@ def angle_between_points(cloud1: np.ndarray) -> float:
         middle = (azimuth[:-1] % (AZIMUTHS // 4) + 0.5) / (AZIMUTHS // 4)
         units = np.floor(np.diff(azimuth) * (4 / (middle**2 + (1 - middle) ** 2)))
         found.extend(np.minimum(units, 1023).tolist())
-    return float(sorted(found)[(len(found) - 1) // 2] * UNIT) if found else 0.0
+    return float(sorted(found)[(len(found) - 1) // 2] * UNIT) if len(found) >= FEWEST else 0.0
 
 
 def reach_of_pixels(angle: float, config: VerifiedConfig) -> np.ndarray:

@@ -19,7 +19,7 @@ from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, select_objects
 from oracle.confidence import TABLE, margin, probabilities
 from oracle.height_slices import SlicedSweeps, Vector, ground_slope, is_residue, over_squares
-from oracle.paired_test import count_wins, evidence_of
+from oracle.paired_test import are_wide, count_wins, evidence_of
 from oracle.pixels import in_range
 from oracle.registration import register
 from oracle.spacing import angle_between_points, reach_of_pixels
@@ -112,7 +112,9 @@ def add_unchanged(sweeps: SlicedSweeps, nodes: list[Node], motions: Sequence[Vec
         nearest[nodes[i].members] = -1
     for i in growing:
         near = np.flatnonzero(nearest == i)
-        surplus[tuple(sweeps.pixels[near].T)] = np.subtract(*count_wins(sweeps, near, motions[i]))
+        surplus[tuple(sweeps.pixels[near].T)] = np.subtract(
+            *count_wins(sweeps, near, motions[i], False, are_wide(sweeps, near))
+        )
     gains = over_squares(surplus, 1, np.add)[tuple(sweeps.pixels.T)] > 0
     found = list(nodes)
     for i in growing:
