@@ -180,11 +180,12 @@ class Columns:
         index += start
         return self.image.index_select(0, index.view(-1)).view_as(index)
 
-    def are_wide(self, pixels: Pixels) -> Tensor | None:
-        """Tell which of K pixels have a reach of more than one pixel, (K,) bool; None = none has."""
+    def are_wide(self, pixels: Pixels, groups: Groups) -> Tensor:
+        """Tell which of M groups of K pixels have one with a reach of more than one pixel, (M,) bool."""
         if self.reach is None:
-            return None
-        return self.reach.index_select(0, floor_divide(pixels.first_slot, self.num_slots)) > 1
+            return torch.zeros(groups.count, dtype=torch.bool, device=self.image.device)
+        reach = self.reach.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
+        return groups.any(reach > 1)
 
     def words(self, pixels: Pixels) -> Tensor:
         """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""
