@@ -35,6 +35,8 @@ _SECOND = 32  # bits; where the second of two counts in one number begins
 _BOTH_COUNTS = tuple(low + (high << _SECOND) for high in _COUNTS for low in _COUNTS)
 _EMPTY = torch.iinfo(torch.int32).max  # where a table of pixels has none
 _WORD = 8  # sweeps whose slices make up one int64
+_OWN_OF_WORD = OWN * 0x0101010101010101  # the bits of the pixels themselves in a word
+SLICE_HEIGHT = 0.5  # metres
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ class Columns:
     rank: Tensor
     reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
     most_reach: int
+    tall: Tensor | None  # (K,) int64, the tall columns; None = there are none
 
     @classmethod
     def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int, spacing: Spacing) -> Columns:
@@ -125,6 +128,7 @@ class Columns:
             is_wide = spacing.are_wide(grid, REACH, reach).view(-1)
             is_column |= _dilate(is_column, stride) & is_wide
             reach_at += is_wide
+        is_tall = spacing.are_tall(grid, REACH, SLICE_HEIGHT).view(-1) if spacing.has_tall else None
         images = is_column.view(-1, grid.height + 2 * REACH, stride)
         images[:, :REACH] = images[:, -REACH:] = False
         images[:, :, :REACH] = images[:, :, -REACH:] = False
@@ -137,7 +141,8 @@ class Columns:
         slices = torch.zeros(shape, dtype=torch.uint8, device=device)
         rank = torch.full(shape, _EMPTY, dtype=torch.int32, device=device)
         reach_of = reach_at.index_select(0, position) if spacing.most > 1 else None
-        return cls(grid.height, grid.width, image, position, slices, rank, reach_of, spacing.most)
+        tall = None if is_tall is None else flat_nonzero(is_tall.index_select(0, position))
+        return cls(grid.height, grid.width, image, position, slices, rank, reach_of, spacing.most, tall)
 
     @property
     def stride(self) -> int:
@@ -222,7 +227,16 @@ class Columns:
         return words | words.index_select(0, above) | words.index_select(0, below)
 
     def _or_within_reach(self, words: Tensor) -> Tensor:
-        """Return the bitwise OR over the columns within the reach of each column, (C + 1, W) int64."""
+        """Return the slices within the reach of each column, in the bits of those of the pixels, (C + 1, W) int64."""
+        around = self._or_within_pixels(words)
+        if self.tall is None:
+            return around
+        own = around.index_select(0, self.tall)
+        above = own << 1 | own >> (NUM_SLICES - 1)  # the highest slice is below the lowest one
+        below = own >> 1 | own << (NUM_SLICES - 1)
+        return around.index_copy(0, self.tall, own | (above | below) & _OWN_OF_WORD)
+
+    def _or_within_pixels(self, words: Tensor) -> Tensor:
         around = self.or_around(words)
         if self.reach is None:
             return around

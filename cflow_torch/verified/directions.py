@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-_RISE = 1 / 57.3  # of a bin of elevation, height over distance; half of the bins are below the horizontal
+_RISE = 1 / 57.3  # of a degree of elevation, height over distance
 
 
 def azimuth_bin(x: Tensor, y: Tensor, count: int) -> Tensor:
@@ -18,10 +18,10 @@ def azimuth_bin(x: Tensor, y: Tensor, count: int) -> Tensor:
     return around.mul_(count / 4).long().clamp_(max=count - 1)
 
 
-def elevation_bin(z: Tensor, distance: Tensor, count: int) -> Tensor:
-    """Return the bin of elevation, (K,) int64, of about one degree, by heights and horizontal distances, (K,) float32.
+def elevation_bin(z: Tensor, distance: Tensor, count: int, per_degree: int = 1) -> Tensor:
+    """Return the bin of elevation, (K,) int64, by heights and horizontal distances, (K,) float32.
 
-    There are `count` bins, half of them below the horizontal.
+    There are `count` bins, half of them below the horizontal, and `per_degree` of them to about one degree.
     """
-    rise = z / distance.clamp(min=0.1).mul_(_RISE)
+    rise = z / distance.clamp(min=0.1).mul_(_RISE / per_degree)
     return rise.add_(count // 2).nan_to_num_(0.0).clamp_(0, count - 1).long()

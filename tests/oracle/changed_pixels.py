@@ -44,7 +44,7 @@ def find_changed(
 
 
 def directions(
-    points: np.ndarray, sensor: np.ndarray, azimuths: int = AZIMUTHS
+    points: np.ndarray, sensor: np.ndarray, azimuths: int = AZIMUTHS, per_degree: int = 1
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Bin of the range image and distance over ground of points (N, 3), as a sensor sees them; in float32.
 
@@ -55,8 +55,9 @@ def directions(
     around = y / np.maximum(np.abs(x) + np.abs(y), np.float32(1e-3))
     around = np.where(x >= 0, around + np.float32(1), np.float32(3) - around)  # 0 ... 4
     azimuth = np.minimum((around * np.float32(azimuths / 4)).astype(int), azimuths - 1)
-    rise = z / (np.maximum(distance, np.float32(0.1)) * np.float32(RISE)) + np.float32(ELEVATIONS // 2)
-    return (np.clip(np.floor(rise), 0, ELEVATIONS - 1).astype(int), azimuth), distance
+    elevations = per_degree * ELEVATIONS
+    rise = z / (np.maximum(distance, np.float32(0.1)) * np.float32(RISE / per_degree)) + np.float32(elevations // 2)
+    return (np.clip(np.floor(rise), 0, elevations - 1).astype(int), azimuth), distance
 
 
 def sensor_height(cloud1: np.ndarray) -> float:

@@ -24,6 +24,7 @@ class SlicedSweeps:
         elapsed, seconds: from each sweep to t+1, in sweep intervals and in seconds.
 
         reach: (H, W), pixels around each pixel that the spacing of points covers; None = 1.
+        is_tall: (H, W) bool, the slices above and below those around count as well.
 
     Attributes:
         image, around: (S, H, W), bit c = a point of slice c lies in the pixel, or within its reach.
@@ -41,6 +42,7 @@ class SlicedSweeps:
         seconds: Sequence[float],
         config: VerifiedConfig,
         reach: np.ndarray | None = None,
+        is_tall: np.ndarray | bool = False,
     ) -> None:
         self.elapsed, self.seconds, self.config = np.array(elapsed), seconds, config
         self.has_history = len(elapsed) > 2
@@ -57,6 +59,8 @@ class SlicedSweeps:
         for pixels in np.unique(self.reach).tolist():
             around = over_squares(self.image, pixels, np.bitwise_or)
             self.around = np.where(self.reach == pixels, around, self.around)
+        above, below = (self.around << 1 | self.around >> 3) & 15, (self.around >> 1 | self.around << 3) & 15
+        self.around = np.where(is_tall, self.around | above | below, self.around)
         self.both = self.image | self.around << NUM_SLICES
         self.pixels, self.slices = np.argwhere(self.image), self.image[self.image > 0]
         self.number = np.where(self.image > 0, np.cumsum(self.image > 0).reshape(self.image.shape) - 1, -1)

@@ -22,7 +22,7 @@ from oracle.height_slices import SlicedSweeps, Vector, ground_slope, is_residue,
 from oracle.paired_test import are_wide, count_wins, evidence_of
 from oracle.pixels import in_range
 from oracle.registration import register
-from oracle.spacing import angle_between_points, reach_of_pixels
+from oracle.spacing import are_tall, reach_of_pixels, spacing_of
 from oracle.sweeps import Cloud, PointMotion
 from oracle.unlinked import link_unlinked
 
@@ -43,12 +43,14 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
         if config.min_height is not None:
             is_drawn[is_drawn] = ~is_residue(seen[-1], ground, config)
         drawn.append(np.flatnonzero(is_drawn))
+    angle, rise = spacing_of(seen[0])
     sweeps = SlicedSweeps(
         [cloud.points[rows] for cloud, rows in zip(every, drawn)],
         [cloud.intervals for cloud in every],
         [cloud.seconds for cloud in every],
         config,
-        reach_of_pixels(angle_between_points(seen[0]), config),
+        reach_of_pixels(angle, config),
+        are_tall(rise, config),
     )
     change = find_changed(sweeps, seen, [cloud.origin for cloud in every])
     tree = grow(sweeps, change, config)

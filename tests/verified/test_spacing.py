@@ -7,13 +7,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from oracle import spacing as oracle
 from oracle.height_slices import SlicedSweeps
-from oracle.spacing import angle_between_points, reach_of_pixels
 from scenes import sweeps_of
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.verified import spacing
+from cflow_torch.verified.columns import SLICE_HEIGHT
 from cflow_torch.verified.spacing import Spacing
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import make_batch
@@ -36,7 +37,7 @@ def spacing_of(clouds: list[np.ndarray], settings: VerifiedConfig = SETTINGS) ->
     """The spacing of windows whose sweep t+1 is given."""
     grid = Grid(settings.pixel_sizes[-1], settings.point_cloud_range[:3], settings.point_cloud_range[3:])
     windows = [Window(Sweep(cloud), Sweep(cloud)) for cloud in clouds]
-    return Spacing.of(make_batch(windows, settings, grid, torch.device("cpu"), 3), grid), grid
+    return Spacing.of(make_batch(windows, settings, grid, torch.device("cpu"), 3), grid, SLICE_HEIGHT), grid
 
 
 def test_the_angle_is_that_between_beams_and_as_the_oracle_measures_it():
@@ -49,18 +50,23 @@ def test_the_angle_is_that_between_beams_and_as_the_oracle_measures_it():
     ]
     found, grid = spacing_of(clouds)
     inside = [cloud[(np.abs(cloud) <= (40, 30, 8)).all(1)].astype(np.float32) for cloud in clouds]
-    assert found.angle.tolist() == [angle_between_points(cloud.astype(np.float64)) for cloud in inside]
+    expected = [oracle.spacing_of(cloud.astype(np.float64)) for cloud in inside]
+    assert list(zip(found.angle.tolist(), found.rise.tolist())) == expected
+    assert np.degrees(found.rise.numpy()[:2]) == pytest.approx(2.0, abs=0.2)
     degrees = np.degrees(found.angle.numpy())
     assert degrees[:2] == pytest.approx([1.2, 0.3], abs=0.1) and degrees[2] == degrees[3] == 0
     for window, angle in enumerate(found.angle.tolist()):
         wide = [found.are_wide(grid, 0, reach)[window].numpy() for reach in range(2, 7)]
-        assert np.array_equal(1 + np.sum(wide, 0), reach_of_pixels(angle, SETTINGS))
-    assert found.most == 6
+        assert np.array_equal(1 + np.sum(wide, 0), oracle.reach_of_pixels(angle, SETTINGS))
+        tall = found.are_tall(grid, 0, SLICE_HEIGHT)[window].numpy()
+        assert np.array_equal(tall, oracle.are_tall(expected[window][1], SETTINGS))
+    assert found.most == 6 and found.has_tall
 
 
 def test_dense_sweeps_are_looked_up_in_three_by_three_pixels():
     cloud = np.random.default_rng(0).uniform((-40, -30, 0), (40, 30, 2), (20_000, 3))
-    assert spacing_of([cloud])[0].most == 1
+    found, _ = spacing_of([cloud])
+    assert found.most == 1 and not found.has_tall
 
 
 def test_the_slices_around_are_those_within_the_reach():
@@ -73,8 +79,10 @@ def test_the_slices_around_are_those_within_the_reach():
         own = torch.nonzero(sweeps.pixels.window == len(windows) - 1)[:, 0]
         pixels = sweeps.pixels[own]
         inside = [cloud[(np.abs(cloud) <= (40, 30, 8)).all(1)].astype(np.float32).astype(float) for cloud in clouds]
-        reach = reach_of_pixels(angle_between_points(inside[0]), SETTINGS)
-        expected = SlicedSweeps(inside, [0.0, 1.0, 2.0], [0.0, 0.1, 0.2], SETTINGS, reach)
+        angle, rise = oracle.spacing_of(inside[0])
+        reach, tall = oracle.reach_of_pixels(angle, SETTINGS), oracle.are_tall(rise, SETTINGS)
+        expected = SlicedSweeps(inside, [0.0, 1.0, 2.0], [0.0, 0.1, 0.2], SETTINGS, reach, tall)
+        assert tall.any() and not tall.all()
         assert len(pixels) == len(expected.pixels) and len(np.unique(reach[tuple(expected.pixels[:, 1:].T)])) > 2
         _, row, col = expected.pixels.T
         for step in range(3):
