@@ -10,10 +10,9 @@ import numpy as np
 
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
 from cflow_torch.data.log_motion import judge_log
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, deskew_points, scan_fractions
-from cflow_torch.windows.ego_motion import relative_transform
 from cflow_torch.windows.readings import Judgement
 
 CHOICES = ("auto", "times", "off", *SCANS)

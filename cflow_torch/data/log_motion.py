@@ -10,18 +10,8 @@ import numpy as np
 
 from cflow_torch.data.log import Log
 from cflow_torch.errors import CFlowError
-from cflow_torch.windows.readings import (
-    GIVEN,
-    OFF,
-    STILL,
-    WORLD,
-    Judgement,
-    difference,
-    is_around,
-    judge,
-    make_pair,
-    turn_of,
-)
+from cflow_torch.transforms import turn_of
+from cflow_torch.windows.readings import GIVEN, OFF, STILL, WORLD, Judgement, difference, is_around, judge, make_pair
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
 _LEAST_SPEED = 0.5  # metres a sweep; below, a wrong scan moves static objects by millimetres only

@@ -9,11 +9,10 @@ import numpy as np
 
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper
 from cflow_torch.data.log_motion import is_in_world
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.errors import CFlowError
+from cflow_torch.transforms import as_matrix, rigid_transform, transform_points
 from cflow_torch.types import Sweep
-from cflow_torch.windows.ego_motion import rigid_transform
-from cflow_torch.windows.readings import AXES, CAMERA, EARLY, LATE, MOUNT, OF_POSES, WORLD, as_matrix
+from cflow_torch.windows.readings import AXES, CAMERA, EARLY, LATE, MOUNT, OF_POSES, WORLD
 
 _OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
 _OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}  # axes of points and poses

@@ -13,9 +13,9 @@ from typing import Any, Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about
 from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS
-from cflow_torch.windows.ego_motion import rigid_transform
 from cflow_torch.windows.stillness import Structure, structure_rows
 
 GIVEN = "as given"
@@ -64,13 +64,6 @@ _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
 _CELL, _CELLS = 0.1, 640  # metres, and cells along a side
 _TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4])
 _FARTHEST_SHIFT = 5.0  # metres
-
-
-def as_matrix(rotation: np.ndarray, shift: Sequence[float] | np.ndarray = (0, 0, 0)) -> np.ndarray:
-    """Return the (4, 4) float64 rigid transform of a (3, 3) rotation and a shift, metres."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, shift
-    return matrix
 
 
 def _scaled(unit: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -336,7 +329,7 @@ def find_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     most = -1.0
     found = np.eye(4)
     for turn in _TURNS:
-        T = as_matrix(rotation_about_z(turn))
+        T = as_matrix(rotations_about(2, turn))
         turned = np.fft.rfft2(_image(source @ T[:3, :3].T, 0))
         counts = np.fft.irfft2(image * np.conj(turned), (_CELLS, _CELLS))[np.ix_(steps, steps)]
         row, column = np.unravel_index(int(counts.argmax()), counts.shape)
@@ -373,17 +366,6 @@ def is_around(points: Array, pose: np.ndarray) -> bool:
         return False
     near_pose, near_origin = (np.log(np.hypot(*(xy - each).T) + 1.0).mean() for each in (position, np.zeros(2)))
     return bool(near_pose < near_origin)
-
-
-def rotation_about_z(angle: float) -> np.ndarray:
-    """Return the (3, 3) rotation by an angle, radians, about z."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-
-
-def turn_of(T: np.ndarray) -> float:
-    """Return the angle of the rotation of a rigid transform, radians."""
-    return float(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
 
 
 def difference(T: np.ndarray, other: np.ndarray) -> float:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.ground import find_ground
 
 NEAREST, FARTHEST = 3.0, 40.0  # metres from the origin in the plane: beyond the vehicle itself, and dense enough
 VOXEL = 0.3  # metres; one point per voxel, so that near surfaces do not outvote the rest

@@ -19,17 +19,9 @@ from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, 
 from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
 from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import as_matrix, rotations_about
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.readings import (
-    AXES,
-    CAMERA,
-    MOUNT,
-    NO_READING,
-    UNKNOWN,
-    WORLD,
-    as_matrix,
-    rotation_about_z,
-)
+from cflow_torch.windows.readings import AXES, CAMERA, MOUNT, NO_READING, UNKNOWN, WORLD
 
 MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
 
@@ -259,7 +251,7 @@ def test_single_poses_that_are_off_are_found(drive):
 
     def turned(poses):
         poses = poses.copy()
-        poses[6] = poses[6] @ as_matrix(rotation_about_z(np.radians(5)))
+        poses[6] = poses[6] @ as_matrix(rotations_about(2, np.radians(5)))
         return poses
 
     def jump(poses):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep
 from cflow_torch.windows.stillness import REACH, Structure, static_rows, thinned_rows
 
