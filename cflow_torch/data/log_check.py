@@ -109,7 +109,8 @@ def _motion(log: Log) -> Finding | None:
         fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
     elif judgement.offset is not None:
         x, y = judgement.offset
-        why, fix = "in turns,", f"pass data.ego_T_lidar with about x = {x:g} m, y = {y:g} m (data=arrays or hdf5)"
+        place = f"x = {x:g} m" if x else f"y = {y:g} m"
+        why, fix = "in turns,", f"pass data.ego_T_lidar with about {place} (data=arrays or hdf5)"
     elif name == NO_READING:
         why, fix = "", "check that the poses belong to this log, their times, units and quaternions"
     else:

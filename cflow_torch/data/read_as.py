@@ -34,6 +34,7 @@ def read_as(log: Log, reading: str | None = "auto") -> Log:
             - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; the first, or last, is extrapolated;
             - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
               camera's, or the x axis points to the left, backward or to the right of that of the points;
+            - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
             - "millimetres", "centimetres": unit of the poses; "points_millimetres", "points_centimetres": of points;
             - "points_camera", "points_upside_down": points and poses have a camera's axes (x right, y down, z
               forward), or z points down and y to the right.

@@ -13,7 +13,7 @@ from typing import Any, Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, to_quaternions, to_rotations
 from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS
 from cflow_torch.windows.stillness import Structure, structure_rows
@@ -33,6 +33,8 @@ CAUSES = {
     "left": "the poses are of a frame whose x axis points to the left of the points' x axis",
     "back": "the poses are of a frame whose x axis points backward",
     "right": "the poses are of a frame whose x axis points to the right of the points' x axis",
+    "w_first": "the quaternions of the poses begin with w, but were read with w last",
+    "w_last": "the quaternions of the poses end with w, but were read with w first",
     "millimetres": "the poses are in millimetres",
     "centimetres": "the poses are in centimetres",
 }
@@ -70,6 +72,10 @@ def _scaled(unit: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda pose: as_matrix(pose[:3, :3], unit * pose[:3, 3])
 
 
+def _reordered(order: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda pose: as_matrix(to_rotations(to_quaternions(pose[None, :3, :3])[:, order])[0], pose[:3, 3])
+
+
 def _moved(stored_T_ego: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     return lambda pose: pose @ stored_T_ego
 
@@ -84,6 +90,7 @@ OF_POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     STILL: lambda pose: np.eye(4),
     INVERTED: np.linalg.inv,
     **{name: _moved(as_matrix(AXES[name].T)) for name in (CAMERA, "left", "back", "right")},
+    **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
     **{name: _scaled(unit) for name, unit in (("millimetres", 1e-3), ("centimetres", 1e-2))},
     **{name: _moved(as_matrix(np.eye(3), (*offset, 0))) for name, offset in _MOUNTS.items()},
 }

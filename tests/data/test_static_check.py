@@ -19,7 +19,7 @@ from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, 
 from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
 from cflow_torch.simulator import make_drive
-from cflow_torch.transforms import as_matrix, rotations_about
+from cflow_torch.transforms import as_matrix, rotations_about, to_quaternions, to_rotations
 from cflow_torch.types import CFlowWarning
 from cflow_torch.windows.readings import AXES, CAMERA, MOUNT, NO_READING, UNKNOWN, WORLD
 
@@ -100,11 +100,18 @@ def turning(kitti_file):
     return CachedLog(hdf5.HDF5Log(file), 27)
 
 
+def reordered(order):
+    """Poses whose quaternion (w, x, y, z) is read in another order."""
+    return lambda pose: as_matrix(to_rotations(to_quaternions(pose[None, :3, :3])[:, order])[0], pose[:3, 3])
+
+
 POSES = {
     "inverted": np.linalg.inv,
     CAMERA: lambda pose: pose @ as_matrix(AXES[CAMERA]),
     "left": lambda pose: pose @ as_matrix(AXES["left"]),
     "back": lambda pose: pose @ as_matrix(AXES["back"]),
+    "w_first": reordered((3, 0, 1, 2)),
+    "w_last": reordered((1, 2, 3, 0)),
     "right": lambda pose: pose @ as_matrix(AXES["right"]),
 }
 WRONG_POSES = {
