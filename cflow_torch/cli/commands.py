@@ -573,7 +573,7 @@ class ListSettings(Words):
     With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
 
     --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-    cflow_live.yaml, cflow_paper.yaml and cflow_keypoints.yaml. The package contains the same files.
+    cflow_live.yaml, cflow_paper.yaml, ... The package contains the same files.
 
     examples:
       cflow settings max_speed          default, allowed values and meaning of a setting

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from cflow_torch.cli.choices import own_names
 from cflow_torch.cli.commands import DATA_SETTINGS, ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
 from cflow_torch.cli.words import Call, check_exists
-from cflow_torch.config import CONFIGS, PRESETS, config_from, make_config
+from cflow_torch.config import PRESETS, config_from
 from cflow_torch.errors import CFlowError
 from cflow_torch.setting import Settings, checked
 
@@ -36,10 +36,8 @@ def _register() -> None:
     for name, command in WITH_SETTINGS.items():
         groups = [{group: choice} for group, choice in command.groups().items()]
         store(name, {"defaults": ["hydra", "_self_", *groups], **_defaults(command)})
-    for method, config in CONFIGS.items():
-        store(f"base_{method}", config().as_dict(), "model")
-    for preset in PRESETS:
-        store(preset, make_config(preset).as_dict(), "model")
+    for name, config in PRESETS.items():
+        store(name, config.as_dict(), "model")
     for name, engine in ENGINES.items():
         store(name, _defaults(engine), "engine")
     for name, picture in PICTURES.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any, NamedTuple, TextIO
 
-from cflow_torch.cli.choices import CONFIGS, read_settings
+from cflow_torch.cli.choices import FOLDER, read_settings
 from cflow_torch.cli.commands import AUTO
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.data.catalog import find_sources, find_user_sources, open_log, recognise
@@ -32,10 +32,10 @@ def complete_data(data: dict[str, Any], choice: str, out: TextIO) -> dict[str, A
         several = " and ".join(sorted(set(formats.values())))
         raise CFlowError(f"the paths have several formats, {several}: give one command each")
     name = next(iter(formats.values()), "synthetic")
-    settings = dict(read_settings(CONFIGS / "data" / f"{name}.yaml"))
+    settings = dict(read_settings(FOLDER / "data" / f"{name}.yaml"))
     if "cache" in settings:
         settings["cache"] = os.environ.get("CFLOW_CACHE", "outputs/cache")
-    defaults = read_settings(CONFIGS / "data" / f"{AUTO}.yaml")
+    defaults = read_settings(FOLDER / "data" / f"{AUTO}.yaml")
     for key, value in data.items():
         if key in settings and value != _MISSING:
             settings[key] = value

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from cflow_torch.cli.choices import choices, near, setting_names
 from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
-from cflow_torch.config import REMOVED, REMOVED_PRESETS, removed_preset
 from cflow_torch.errors import CFlowError
 
 # Options of Hydra that the next word belongs to; the first of them name configurations of your own.
@@ -19,8 +18,6 @@ _OWN_CONFIGS = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-
 _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
-# Settings of commands that earlier versions had; for those of the methods, see `config.REMOVED`.
-_REMOVED = {**REMOVED, "standing": "use remove_stopped", "residual_axes": "leave it out"}
 
 
 class Call(NamedTuple):
@@ -74,9 +71,6 @@ def _check_names(settings: list[str], command: str, has_own: bool) -> None:
             continue
         if has_own and key.partition(".")[0] in chosen:
             continue
-        own = key.rpartition(".")[2]
-        if key not in known and own in _REMOVED:
-            raise CFlowError(f"setting {own} was removed: {_REMOVED[own]}")
         if key not in known:
             hint = near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
@@ -94,8 +88,7 @@ def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
         chosen[group] = [default] if default else []
     for group in chosen.keys() & given.keys():
         is_plain = not set(given[group]) & set(_NOT_PLAIN)
-        words = [word.strip() for word in given[group].split(",")] if is_plain else []
-        chosen[group] = [word for word in words if not word.startswith("base_")]  # base_dense: no preset
+        chosen[group] = [word.strip() for word in given[group].split(",")] if is_plain else []
         for choice in chosen[group]:
             _check_choice(group, choice)
     if "experiment" in given or "row" in given:
@@ -117,8 +110,6 @@ def check_exists(path: str) -> None:
 
 
 def _check_choice(group: str, choice: str) -> None:
-    if group == "model" and choice in REMOVED_PRESETS:
-        raise CFlowError(removed_preset(choice))
     known = choices(group)
     if choice not in (*known, "null"):
         raise CFlowError(f"{group}={choice}{near(choice, known)}: give one of {', '.join(sorted(known))}")

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.config import make_config
+from cflow_torch.config import Config
 from cflow_torch.data.log import window
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
@@ -47,16 +47,18 @@ class SequenceFlow(nn.Module):
     """Base class of models that estimate residual flow from frames. They have no parameters and no buffers.
 
     Args:
-        preset: "default", "offline", "live", "keypoints" or "paper" (`make_config`).
+        preset: as for `make_config`.
         device: "auto" = that of the given tensors, else a GPU if there is one, else the CPU.
         ground: None = the masks of the frames exclude the ground (`with_ground=False`). Otherwise the `method` of
             `find_ground`, by which we find the ground of every sweep and exclude it, too.
-        **settings: `method`, or any setting of the method.
+        **settings: any setting of the method.
     """
 
-    def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
+    def __init__(
+        self, preset: str | Config = "default", device: Any = "auto", ground: str | None = None, **settings: Any
+    ) -> None:
         super().__init__()
-        self.model = make_model(make_config(preset, **settings), device)
+        self.model = make_model(preset, device, **settings)
         self.num_history: int = self.model.config.num_history
         self.ground = ground
         self._has_checked_ground = False

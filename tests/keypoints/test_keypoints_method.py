@@ -53,9 +53,9 @@ def test_real_drives_equal_the_oracle(av2_folder, kitti_file):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["keypoints", "paper"])
+@pytest.mark.parametrize("preset", ["keypoints", "paper_keypoints"])
 def test_the_whole_real_pair_equals_the_oracle(av2_folder, preset):
-    flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config(preset, method="keypoints"))
+    flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config(preset))
 
 
 METRE = config(

@@ -35,7 +35,7 @@ class CFlow(nn.Module):
             iter_only, which ignores the indices.
         device: "auto" = that of the batch.
         voxel_size, grid_feature_size: ignored. The harness passes them.
-        preset, method: as for `make_config`; "default" if neither is given.
+        preset: as for `make_config`.
         **settings: settings of the method, which replace those of the preset. We ignore `num_history`, `num_future` and
             settings that the method does not have, and name them in a warning.
 
@@ -50,18 +50,17 @@ class CFlow(nn.Module):
         device: Any = "auto",
         voxel_size: Any = None,
         grid_feature_size: Any = None,
-        preset: str | None = None,
-        method: str | None = None,
+        preset: str | Config = "default",
         **settings: Any,
     ) -> None:
         super().__init__()
-        config: Config = make_config(preset, method)
-        names = ["pixel_size", *(f.name for f in fields(config) if f.name not in ("method", *WINDOW))]
+        config: Config = make_config(preset)
+        names = ["pixel_size", *(f.name for f in fields(config) if f.name not in WINDOW)]
         unknown = [name for name in sorted(settings) if name not in names]
         if unknown:
-            known = f"method={config.method!r} has {', '.join(names)} (history is set by num_frames)"
+            known = f"method {config.method!r} has {', '.join(names)} (history is set by num_frames)"
             warn(f"ignored settings: {', '.join(unknown)}; {known}")
-        config = config.replace(**{name: value for name, value in settings.items() if name in names})
+        config = make_config(config, **{name: value for name, value in settings.items() if name in names})
         self.config = _with_history(config, num_frames)
         self.estimator = make_model(self.config, device)
         if output not in ("full", "valid"):
