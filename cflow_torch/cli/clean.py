@@ -90,7 +90,7 @@ def _record(cfg: Clean, log: Log) -> dict[str, Any]:
     """Return what the clean points follow from: settings, versions and the sweeps of the log."""
     settings = settings_record(cfg)
     settings["data"].pop("root", None)  # several logs, which may be elsewhere tomorrow
-    return {**settings, "versions": versions(), "log": describe_log(log, "")}
+    return {**settings, "versions": versions(), "log": describe_log(log)}
 
 
 def _record_file(folder: Path) -> Path:

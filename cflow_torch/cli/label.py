@@ -40,7 +40,7 @@ def _check(cfg: Label, flow: FlowRun) -> None:
         maker = None
         with suppress(CFlowError):  # a scene that cannot be read is reported later
             maker = labelled_by(scene)
-        if maker not in (None, flow.job.identity) and not cfg.overwrite:
+        if maker not in (None, flow.job.identity["hash"]) and not cfg.overwrite:
             why = "labels of other settings or of another program"
             raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
 
@@ -56,7 +56,7 @@ def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = as_path(flow.job.output) / scene.stem
         with collect_failures(failures, scene.stem):
-            if labelled_by(scene) == flow.job.identity and not flow.job.redo:
+            if labelled_by(scene) == flow.job.identity["hash"] and not flow.job.redo:
                 continue
             log = flow.sources.open(scene)
             stamps = log.timestamps[:-1]
@@ -65,7 +65,7 @@ def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
                 continue
             flows = (read_flow(frame_file(folder, stamp)) for stamp in stamps)
             labels = find_labels(log, flows, model, workers)
-            write_hdf5_labels(scene, labels, flow.job.identity, overwrite=flow.job.redo)
+            write_hdf5_labels(scene, labels, flow.job.identity["hash"], overwrite=flow.job.redo)
             labelled.append(scene.name)
     print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
     file = scenes[0].parent / f"cflow_label-{flow.shard.index}-of-{flow.shard.count}.json"

@@ -17,7 +17,7 @@ from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.fleet.executors import Executor, describe, make_object
 from cflow_torch.fleet.job import Event, Job, Part
 from cflow_torch.fleet.machine import AUTO, Layout
-from cflow_torch.fleet.manifest import make_identity, run_file
+from cflow_torch.fleet.manifest import make_identity
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.work import Worker, make_worker
 
@@ -79,9 +79,9 @@ def make_worker_on_node(folder: str, job: Job, device: str) -> Worker:
     import ray
 
     node = ray.util.get_node_ip_address()
-    if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
+    if make_identity(job.config, job.reader, job.settings, job.contents) != job.identity:
         raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than the driver")
-    if not run_file(as_path(job.output), job.identity).exists():
+    if not as_path(job.output).is_dir():
         raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
     with suppress(OSError):  # relative paths of data must mean the same as in the driver
         os.chdir(folder)

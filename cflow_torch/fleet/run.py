@@ -40,7 +40,7 @@ def run_fleet(
 ) -> dict[str, Any]:
     """Compute the frames of a shard that are not complete, and write a report.
 
-    Call `manifest.check_logs` and `manifest.claim_run` first. `sources` are the logs of all shards.
+    Call `manifest.check_logs` first. `sources` are the logs of all shards.
 
     Returns:
         The report of `Counters.report` with the entries of `about`. It is also written to OUTPUT/reports/<shard>.json.
