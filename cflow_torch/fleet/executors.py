@@ -20,7 +20,7 @@ class CannotStart(CFlowError):
 
 
 class Executor(ABC):
-    """A process that holds one object. The first call starts it, and so does the first call after `close`."""
+    """A process that holds one object. A call starts it if it has not begun, has ended or was closed."""
 
     @abstractmethod
     def submit(self, method: str, *arguments: Any) -> Future[Any]:
@@ -69,7 +69,9 @@ class ProcessExecutor(Executor):
             answer, error = pipe.recv()
         except (EOFError, OSError):
             process.join()
-            raise BrokenExecutor(_ending(process.exitcode)) from None
+            how = _ending(process.exitcode)
+            self.close()
+            raise BrokenExecutor(how) from None
         if error is not None:
             raise error
         return answer
