@@ -16,11 +16,11 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import own_names
-from cflow_torch.cli.commands import DATA_SETTINGS, ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
-from cflow_torch.cli.words import Call, check_exists
+from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
+from cflow_torch.cli.words import MISSING, Call, check_data, check_exists
 from cflow_torch.config import PRESETS, config_from
 from cflow_torch.errors import CFlowError
-from cflow_torch.setting import Settings, checked
+from cflow_torch.setting import Settings
 
 _PARSER = OverridesParser.create()
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
@@ -150,11 +150,9 @@ def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Setting
 
 
 def _check_data(data: dict[str, Any]) -> None:
-    for name, limits in DATA_SETTINGS.items():
-        if name in data and data[name] != "???":
-            checked(f"data.{name}", data[name], limits)
+    check_data(data)
     root = data.get("root")
-    if root == "???":
+    if root == MISSING:
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     for path in root if isinstance(root, list) else [root]:
         if isinstance(path, str) and "_target_" not in data:

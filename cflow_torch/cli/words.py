@@ -6,17 +6,32 @@ We do not import Hydra here, so that a mistyped name is told at once.
 from __future__ import annotations
 
 import glob
+import math
 import os
-from typing import NamedTuple
+from contextlib import suppress
+from dataclasses import fields
+from typing import Any, NamedTuple
 
 from cflow_torch.cli.choices import choices, near, setting_names
-from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
+from cflow_torch.cli.commands import (
+    DATA_SETTINGS,
+    ENGINES,
+    PICTURES,
+    WITH_SETTINGS,
+    Command,
+    Plot,
+    ShardSettings,
+)
+from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError
+from cflow_torch.setting import checked
 
 # Options of Hydra that the next word belongs to; the first of them name configurations of your own.
 _OWN_CONFIGS = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path")
 _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
+_LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan": math.nan}
+MISSING = "???"  # a setting without a value
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
 
 
@@ -65,8 +80,9 @@ def _check_names(settings: list[str], command: str, has_own: bool) -> None:
     kind = WITH_SETTINGS[command]
     chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
     known = setting_names(kind)
+    values: dict[str, Any] = {}  # that are plain
     for word in settings:
-        key = word.partition("=")[0]
+        key, _, value = word.partition("=")
         if key in chosen or _is_for_hydra(key) or any(name.startswith(f"{key}.") for name in known):
             continue
         if has_own and key.partition(".")[0] in chosen:
@@ -78,6 +94,55 @@ def _check_names(settings: list[str], command: str, has_own: bool) -> None:
         group = owners[0].partition("=")[0] if owners else ""
         if chosen.get(group) and not {f"{group}={choice}" for choice in chosen[group]} & set(owners):
             raise CFlowError(f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out")
+        with suppress(ValueError):
+            values[key] = plain_value(value)
+    check_values(values, kind, {group: names[0] for group, names in chosen.items() if len(names) == 1})
+
+
+def plain_value(text: str) -> Any:
+    """Return the value that Hydra reads from a text: null, a truth, a number, text, or a list of them.
+
+    A ValueError is raised for a text that is more than this, such as the values of a sweep.
+    """
+    if text[:1] == "[" and text[-1:] == "]":
+        return [plain_value(one.strip()) for one in text[1:-1].split(",")]
+    if not text or set(text) & set(_NOT_PLAIN) or "," in text:
+        raise ValueError(text)
+    if text.lower() in _LITERALS:
+        return _LITERALS[text.lower()]
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def check_values(values: dict[str, Any], kind: type[Command], chosen: dict[str, str]) -> None:
+    """Reject values that are not allowed, before Hydra, which takes most of a second, composes all settings.
+
+    `values` are dotted names and plain values; `chosen` is the choice of a group, if there is exactly one.
+    """
+    groups: dict[str, dict[str, Any]] = {"": {}}
+    for key, value in values.items():
+        group, _, own = key.rpartition(".")
+        groups.setdefault(group, {})[own] = value
+    if kind is Plot and "picture" in chosen:
+        kind = PICTURES[chosen["picture"]]
+    texts = {f.name for f in fields(kind) if f.metadata.get("kind") is str}  # Hydra gets them in quotes
+    kind(**{name: value for name, value in groups[""].items() if name not in texts and hasattr(kind, name)})
+    if "model" in chosen:
+        PRESETS[chosen["model"]].replace(**groups.get("model", {}))
+    if "engine" in chosen and "engine" in groups:
+        ENGINES[chosen["engine"]](**groups["engine"])
+    if "shard" in groups:
+        ShardSettings(**groups["shard"])
+    check_data(groups.get("data", {}))
+
+
+def check_data(data: dict[str, Any]) -> None:
+    """Reject values of settings of data sets that are not allowed."""
+    for name, limits in DATA_SETTINGS.items():
+        if name in data and data[name] != MISSING:
+            checked(f"data.{name}", data[name], limits)
 
 
 def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
