@@ -12,7 +12,7 @@ import numpy as np
 from cflow_torch.applications.cleaning import CleanLog, static_map
 from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
-from cflow_torch.cli.flows import make_model, stored_flow
+from cflow_torch.cli.flows import make_log_model, stored_flow
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import local_folder, settings_record, versions, write_config
 from cflow_torch.data.arrays import ArraysLog, write_array_log
@@ -54,7 +54,7 @@ def task(cfg: Clean) -> None:
 def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
     """Return a function that makes the clean log, by the flow of earlier files or by the method."""
     if cfg.flow is None:
-        model = make_model(cfg.model, cfg.device)
+        model = make_log_model(cfg.model, cfg.device)
         return lambda log: CleanLog(log, model, None, cfg.remove_stopped)
     stored = stored_flow(cfg.flow, _NEEDED)
     return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped)

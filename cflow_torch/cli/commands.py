@@ -11,9 +11,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Iterator, Union
 
 from cflow_torch.config import Config
-from cflow_torch.setting import Settings, bounds, setting
+from cflow_torch.setting import AUTO, Settings, bounds, setting
 
-AUTO = "auto"
 # Settings of data sets that we check before a reader gets them. configs/data/ has the defaults of all of them.
 DATA_SETTINGS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("first", "seed", "first_seed"), bounds(int, low=0)),

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import own_names
 from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
-from cflow_torch.cli.words import MISSING, Call, check_data, check_exists
+from cflow_torch.cli.words import NOT_GIVEN, Call, check_data, check_exists
 from cflow_torch.config import PRESETS, config_from
 from cflow_torch.errors import CFlowError
 from cflow_torch.setting import Settings
@@ -152,7 +152,7 @@ def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Setting
 def _check_data(data: dict[str, Any]) -> None:
     check_data(data)
     root = data.get("root")
-    if root == MISSING:
+    if root == NOT_GIVEN:
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     for path in root if isinstance(root, list) else [root]:
         if isinstance(path, str) and "_target_" not in data:

@@ -27,7 +27,7 @@ from cflow_torch.data.hdf5.writer import check_result_name, check_writable, writ
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Part, Shard, find_shard
-from cflow_torch.fleet.machine import AUTO, Layout, choose_layout, frames_per_worker
+from cflow_torch.fleet.machine import Layout, choose_layout, frames_per_worker
 from cflow_torch.fleet.manifest import (
     check_logs,
     clear_log,
@@ -38,6 +38,7 @@ from cflow_torch.fleet.manifest import (
 )
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
 from cflow_torch.fleet.work import source_name
+from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents

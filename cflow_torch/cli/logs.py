@@ -6,11 +6,11 @@ import os
 from typing import Any, NamedTuple, TextIO
 
 from cflow_torch.cli.choices import FOLDER, read_settings
-from cflow_torch.cli.commands import AUTO
 from cflow_torch.cli.failures import Failures, collect_failures
-from cflow_torch.cli.words import MISSING
+from cflow_torch.cli.words import NOT_GIVEN
 from cflow_torch.data.catalog import find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.log import Log
+from cflow_torch.setting import AUTO
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.types import CFlowError
 
@@ -36,9 +36,9 @@ def complete_data(data: dict[str, Any], choice: str, out: TextIO) -> dict[str, A
         settings["cache"] = os.environ.get("CFLOW_CACHE", "outputs/cache")
     defaults = read_settings(FOLDER / "data" / f"{AUTO}.yaml")
     for key, value in data.items():
-        if key in settings and value != MISSING:
+        if key in settings and value != NOT_GIVEN:
             settings[key] = value
-        elif key not in settings and value not in (MISSING, defaults.get(key, MISSING)):
+        elif key not in settings and value not in (NOT_GIVEN, defaults.get(key, NOT_GIVEN)):
             raise CFlowError(f"data.{key}={value}: data={name} has no such setting; it has {', '.join(settings)}")
     return {**settings, "name": name, "label": data["label"] or name}
 

@@ -17,10 +17,11 @@ import torch
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.fleet.executors import ProcessExecutor, describe
-from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
+from cflow_torch.fleet.executors import ProcessExecutor, describe_error
+from cflow_torch.fleet.machine import choose_layout, frames_per_worker
 from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
 from cflow_torch.model import SceneFlowModel
+from cflow_torch.setting import AUTO
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.inspection import inactive_is_an_error
@@ -28,12 +29,12 @@ from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # windows per worker that are read ahead
 
-Pair = Tuple[Log, int]  # a log and the index of the first of two sweeps
+LogPair = Tuple[Log, int]  # a log and the index of the first of two sweeps
 Answer = Callable[[], Tuple[Window, FlowResult]]
 
 
 def for_each_pair(
-    pairs: Sequence[Pair], model: TimedModel, use: Callable[[Log, int, Window, FlowResult], None]
+    pairs: Sequence[LogPair], model: TimedModel, use: Callable[[Log, int, Window, FlowResult], None]
 ) -> Failures:
     """Estimate the flow of pairs, and call `use` with the log, index, window and result of each pair, in order.
 
@@ -47,7 +48,7 @@ def for_each_pair(
     return failures
 
 
-def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, Answer]]:
+def _answers(pairs: Sequence[LogPair], model: TimedModel) -> Iterator[tuple[LogPair, Answer]]:
     """Yield each pair and a function that returns its window and flow, or raises the error of that pair."""
     method: Any = model.model
     devices = choose_layout(method.device, AUTO, AUTO, os.environ).devices
@@ -72,7 +73,7 @@ def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, A
             executor.close()
 
 
-def _windows(pairs: Sequence[Pair], config: Config) -> Iterator[Window | Exception]:
+def _windows(pairs: Sequence[LogPair], config: Config) -> Iterator[Window | Exception]:
     """Read the window of each pair. An error is yielded, so that the next windows follow."""
     recent: CachedLog | None = None  # the log of the last pair
     for log, index in pairs:
@@ -111,7 +112,7 @@ class _Call:
             try:
                 arrays, seconds = self._executor.submit("estimate", self._sweeps).result()
             except BrokenExecutor as error:
-                raise CFlowError(f"2 worker processes died on it, the last one: {describe(error)}") from error
+                raise CFlowError(f"2 worker processes died on it, the last one: {describe_error(error)}") from error
         self._model.pairs.append(seconds)
         result = FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
         return self._sweeps, result  # type: ignore[return-value]  # an exception was raised above

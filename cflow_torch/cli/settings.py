@@ -11,7 +11,7 @@ from cflow_torch.cli.choices import files, near, setting_names
 from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Plot, as_yaml, setting_lines
 from cflow_torch.config import METHODS, PRESETS, WINDOW
 from cflow_torch.errors import CFlowError
-from cflow_torch.setting import describe
+from cflow_torch.setting import describe_limits
 
 _PAGE = """# Settings
 
@@ -67,7 +67,7 @@ def harness_models() -> dict[str, str]:
         for f in fields(config):
             value = region if f.name == "point_cloud_range" else getattr(config, f.name)
             if f.name not in ("method", *WINDOW):  # preset and num_frames replace them
-                text += f"  {f.name}: {as_yaml(value)}  # {describe(f.metadata)}\n"
+                text += f"  {f.name}: {as_yaml(value)}  # {describe_limits(f.metadata)}\n"
         models[name] = text
     return models
 
@@ -107,7 +107,7 @@ def _method_table(method: str, presets: list[str]) -> list[str]:
         values = {preset: getattr(PRESETS[preset], f.name) for preset in presets}
         changed = [f"{preset} `{as_yaml(value)}`" for preset, value in values.items() if value != f.default]
         default = f"`{as_yaml(f.default)}`"
-        cells = [f"`model.{f.name}`", default, ", ".join(changed), describe(f.metadata), f.metadata["help"]]
+        cells = [f"`model.{f.name}`", default, ", ".join(changed), describe_limits(f.metadata), f.metadata["help"]]
         rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return rows
 

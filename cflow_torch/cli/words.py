@@ -31,7 +31,7 @@ _OWN_CONFIGS = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-
 _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
 _LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan": math.nan}
-MISSING = "???"  # a setting without a value
+NOT_GIVEN = "???"  # a setting without a value
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
 
 
@@ -141,7 +141,7 @@ def check_values(values: dict[str, Any], kind: type[Command], chosen: dict[str, 
 def check_data(data: dict[str, Any]) -> None:
     """Reject values of settings of data sets that are not allowed."""
     for name, limits in DATA_SETTINGS.items():
-        if name in data and data[name] != MISSING:
+        if name in data and data[name] != NOT_GIVEN:
             checked(f"data.{name}", data[name], limits)
 
 

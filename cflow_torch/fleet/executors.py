@@ -83,7 +83,7 @@ class ProcessExecutor(Executor):
         try:
             process.start()
         except OSError as error:
-            raise BrokenExecutor(f"it could not start: {describe(error)}") from error
+            raise BrokenExecutor(f"it could not start: {describe_error(error)}") from error
         finally:
             pipe.close()
         self._process = process
@@ -115,10 +115,10 @@ def make_object(make: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return make(*arguments)
     except Exception as error:
-        raise CannotStart(describe(error)) from error
+        raise CannotStart(describe_error(error)) from error
 
 
-def describe(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Describe an error in one line; its class is named unless the text says enough."""
     text = " ".join(str(error).split()) or "no message"
     return text if isinstance(error, (CFlowError, OSError, BrokenExecutor)) else f"{type(error).__name__}: {text}"

@@ -7,7 +7,7 @@ from typing import Any, Mapping, NamedTuple, Sequence, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
-from cflow_torch.fleet.machine import AUTO
+from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError
 
 # So that the last part does not keep the other workers waiting for long. A log is divided only if there are too few

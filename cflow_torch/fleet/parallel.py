@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Callable, Iterator, Sequence
 
-from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, describe
+from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.work import Worker, make_worker, source_name
@@ -105,7 +105,7 @@ class _Task:
         if error is not None:
             self.executor.close()
             self.is_done = True
-            yield from self._try_again(todo, describe(error))
+            yield from self._try_again(todo, describe_error(error))
             return
         event: Event | None = self.answer.result()
         if event is None:

@@ -16,7 +16,7 @@ from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.keypoints import matching
 from cflow_torch.keypoints.match_candidates import KeyPoints, Patches
-from cflow_torch.keypoints.matching import match
+from cflow_torch.keypoints.matching import match_keypoints
 
 DENSIFIERS = ("components", "clusters", "nearest")
 
@@ -126,7 +126,7 @@ def patches_of(patch: torch.Tensor) -> Patches:
 
 def shifts(pc0: KeyPoints, pc1: KeyPoints, reach: float = 10.0, ratio: float = 1.1) -> dict[int, tuple[int, int]]:
     settings = config("keypoints", patch_size=11, ratio_threshold=ratio)
-    found = match(pc0, pc1, torch.tensor([reach], dtype=torch.float64), settings)
+    found = match_keypoints(pc0, pc1, torch.tensor([reach], dtype=torch.float64), settings)
     return dict(zip(found.source.tolist(), map(tuple, found.shift.tolist())))
 
 

@@ -16,7 +16,7 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.hdf5.frames import harness_pose_flow, residual_for_harness
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
-from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
+from cflow_torch.integrations.opensceneflow.batch import BatchSample, read_batch
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.windows.ego_motion import rigid_transform
 
@@ -95,7 +95,7 @@ class CFlow(nn.Module):
             outputs = [self._output(batch, b, *pair) for b, pair in enumerate(zip(samples, results))]
         return {key: [output[key] for output in outputs] for key in outputs[0]}
 
-    def _output(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> dict[str, Tensor]:
+    def _output(self, batch: Mapping[str, Any], b: int, sample: BatchSample, result: FlowResult) -> dict[str, Tensor]:
         num_points = len(sample.rows0)  # the rows after these are ground points
         residual = result.residual_flow[:num_points]
         is_valid = result.is_valid[:num_points]
@@ -112,7 +112,7 @@ class CFlow(nn.Module):
         pose_flow = harness_pose_flow(points, sample.T_ego1_ego0)
         return {"flow": flow[rows], "pose_flow": pose_flow, "pc0_valid_point_idxes": rows}
 
-    def _check_history(self, samples: list[Sample]) -> None:
+    def _check_history(self, samples: list[BatchSample]) -> None:
         """Warn once if the batches have less history than the settings."""
         num_history = self.config.num_history
         given = min(len(sample.window.pch) for sample in samples)
