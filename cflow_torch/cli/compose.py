@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, Callable
 
 import hydra
@@ -17,14 +17,13 @@ from omegaconf import OmegaConf
 
 from cflow_torch.cli.choices import own_names
 from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
-from cflow_torch.cli.words import NOT_GIVEN, Call, check_data, check_exists
-from cflow_torch.config import PRESETS, config_from
+from cflow_torch.cli.words import NOT_GIVEN, Call, check_exists, make_settings, text_names
+from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError
 from cflow_torch.setting import Settings
 
 _PARSER = OverridesParser.create()
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
-_PATHS = ("data.root", "data.cache")  # settings of data sets whose values are text
 
 
 def _register() -> None:
@@ -83,7 +82,7 @@ def run_with_hydra(name: str, call: Call, job: Callable[[Any], Any]) -> None:
 
 def hydra_overrides(command: type[Command], call: Call) -> list[str]:
     """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
-    texts = {f.name for f in fields(command) if f.metadata.get("kind") is str} | set(_PATHS)
+    texts = text_names(command)
     overrides = []
     for word in call.settings:
         key, _, value = word.partition("=")
@@ -123,17 +122,8 @@ def settings_of(name: str, composed: Any) -> Command:
     """
     values: dict[str, Any] = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
     values.pop("versions", None)  # of the config.yaml of an earlier run
-    command = WITH_SETTINGS[name]
-    if command is Plot:
-        command = PICTURES[values["picture"]]
-    values["model"] = config_from(values["model"])
-    engine = values.get("engine")
-    if engine is not None:
-        if engine["name"] not in ENGINES:
-            raise CFlowError(f"engine={engine['name']!r}: give one of {', '.join(ENGINES)}")
-        values["engine"] = _make(ENGINES[engine["name"]], engine, name)
-    _check_data(values["data"])
-    settings: Any = _make(command, values, name)
+    settings: Any = make_settings(name, values)
+    _check_paths(settings.data)
     from cflow_torch.cli.logs import complete_data  # imports torch, which takes seconds
 
     choice = str(HydraConfig.get().runtime.choices.get("data"))
@@ -141,16 +131,7 @@ def settings_of(name: str, composed: Any) -> Command:
     return replace(settings, data=complete_data(settings.data, choice, out))  # type: ignore[no-any-return]
 
 
-def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Settings:
-    names = kind.__dataclass_fields__  # type: ignore[attr-defined]
-    for name in values:
-        if name not in names:
-            raise CFlowError(f"unknown setting {kind.PREFIX}{name}: `cflow {command} --cfg job` prints all settings")
-    return kind(**values)
-
-
-def _check_data(data: dict[str, Any]) -> None:
-    check_data(data)
+def _check_paths(data: dict[str, Any]) -> None:
     root = data.get("root")
     if root == NOT_GIVEN:
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")

@@ -19,12 +19,10 @@ from cflow_torch.cli.commands import (
     PICTURES,
     WITH_SETTINGS,
     Command,
-    Plot,
-    ShardSettings,
 )
-from cflow_torch.config import PRESETS
+from cflow_torch.config import PRESETS, config_from
 from cflow_torch.errors import CFlowError
-from cflow_torch.setting import checked
+from cflow_torch.setting import Settings, checked
 
 # Options of Hydra that the next word belongs to; the first of them name configurations of your own.
 _OWN_CONFIGS = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path")
@@ -54,7 +52,7 @@ def read_call(words: list[str], command: str) -> Call:
         raise CFlowError(f"unknown option {option!r}: give settings as NAME=VALUE; `cflow {command} --help` lists them")
     for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
         check_exists(path)
-    _check_names(call.settings, command, bool(given & set(_OWN_CONFIGS)))
+    _check_settings(call.settings, command, bool(given & set(_OWN_CONFIGS)))
     return call
 
 
@@ -76,11 +74,13 @@ def _is_path(word: str) -> bool:
     return word.startswith(("/", "./", "../", "~/")) or os.path.exists(word)
 
 
-def _check_names(settings: list[str], command: str, has_own: bool) -> None:
+def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
+    """Reject names that do not exist and plain values that are not allowed."""
     kind = WITH_SETTINGS[command]
     chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
     known = setting_names(kind)
-    values: dict[str, Any] = {}  # that are plain
+    texts = text_names(kind)
+    values: dict[str, Any] = {}
     for word in settings:
         key, _, value = word.partition("=")
         if key in chosen or _is_for_hydra(key) or any(name.startswith(f"{key}.") for name in known):
@@ -95,8 +95,15 @@ def _check_names(settings: list[str], command: str, has_own: bool) -> None:
         if chosen.get(group) and not {f"{group}={choice}" for choice in chosen[group]} & set(owners):
             raise CFlowError(f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out")
         with suppress(ValueError):
-            values[key] = plain_value(value)
-    check_values(values, kind, {group: names[0] for group, names in chosen.items() if len(names) == 1})
+            plain = plain_value(value)
+            values[key] = value if key in texts and plain is not None else plain
+    single = {group: names[0] for group, names in chosen.items() if len(names) == 1}
+    make_settings(command, _nested(values, kind, single))
+
+
+def text_names(kind: type[Command]) -> set[str]:
+    """Return the names of settings whose values are text, even if they look like numbers."""
+    return {f.name for f in fields(kind) if f.metadata.get("kind") is str} | {"data.root", "data.cache"}
 
 
 def plain_value(text: str) -> Any:
@@ -116,33 +123,48 @@ def plain_value(text: str) -> Any:
     return text
 
 
-def check_values(values: dict[str, Any], kind: type[Command], chosen: dict[str, str]) -> None:
-    """Reject values that are not allowed, before Hydra, which takes most of a second, composes all settings.
-
-    `values` are dotted names and plain values; `chosen` is the choice of a group, if there is exactly one.
-    """
-    groups: dict[str, dict[str, Any]] = {"": {}}
+def _nested(values: dict[str, Any], kind: type[Command], chosen: dict[str, str]) -> dict[str, Any]:
+    """Nest the values of dotted names, and fill in the groups of which one choice is known. Others are left out."""
+    nested: dict[str, Any] = {}
     for key, value in values.items():
         group, _, own = key.rpartition(".")
-        groups.setdefault(group, {})[own] = value
-    if kind is Plot and "picture" in chosen:
-        kind = PICTURES[chosen["picture"]]
-    texts = {f.name for f in fields(kind) if f.metadata.get("kind") is str}  # Hydra gets them in quotes
-    kind(**{name: value for name, value in groups[""].items() if name not in texts and hasattr(kind, name)})
+        level = nested.setdefault(group, {}) if group else nested
+        level[own] = value
+    model = nested.pop("model", {})
     if "model" in chosen:
-        PRESETS[chosen["model"]].replace(**groups.get("model", {}))
-    if "engine" in chosen and "engine" in groups:
-        ENGINES[chosen["engine"]](**groups["engine"])
-    if "shard" in groups:
-        ShardSettings(**groups["shard"])
-    check_data(groups.get("data", {}))
+        nested["model"] = {**PRESETS[chosen["model"]].as_dict(), **model}
+    engine = nested.pop("engine", {})
+    if "engine" in chosen:
+        nested["engine"] = {"name": chosen["engine"], **engine}
+    if "picture" in chosen:
+        return {**nested, "picture": chosen["picture"]}
+    return {name: value for name, value in nested.items() if name in kind.__dataclass_fields__}
 
 
-def check_data(data: dict[str, Any]) -> None:
-    """Reject values of settings of data sets that are not allowed."""
-    for name, limits in DATA_SETTINGS.items():
-        if name in data and data[name] != NOT_GIVEN:
-            checked(f"data.{name}", data[name], limits)
+def make_settings(command: str, values: dict[str, Any]) -> Command:
+    """Make the settings of a command, and check the values. This does not import torch."""
+    kind = WITH_SETTINGS[command]
+    if "picture" in values:
+        kind = PICTURES[values["picture"]]
+    made = dict(values)
+    if "model" in values:
+        made["model"] = config_from(values["model"])
+    engine = values.get("engine")
+    if engine is not None:
+        if engine["name"] not in ENGINES:
+            raise CFlowError(f"engine={engine['name']!r}: give one of {', '.join(ENGINES)}")
+        made["engine"] = _make(ENGINES[engine["name"]], engine, command)
+    for name, value in values.get("data", {}).items():
+        if name in DATA_SETTINGS and value != NOT_GIVEN:
+            checked(f"data.{name}", value, DATA_SETTINGS[name])
+    return _make(kind, made, command)  # type: ignore[return-value]
+
+
+def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Settings:
+    for name in values:
+        if name not in kind.__dataclass_fields__:  # type: ignore[attr-defined]
+            raise CFlowError(f"unknown setting {kind.PREFIX}{name}: `cflow {command} --cfg job` prints all settings")
+    return kind(**values)
 
 
 def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
