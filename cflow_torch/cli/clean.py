@@ -23,7 +23,7 @@ from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.read_as import read_as
 from cflow_torch.errors import import_optional
-from cflow_torch.fleet.changes import describe_changes
+from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
@@ -67,10 +67,9 @@ def _is_new(cfg: Clean, log: Log, output: Path) -> bool:
         return True
     file = _record_file(folder)
     before: dict[str, Any] = read_json(file) if file.exists() else {}
-    changes = describe_changes(before, json_ready(_record(cfg, log)), _FREE)
-    if changes or not cfg.resume:
-        why = changes or "with the same settings; resume=true continues it"
-        raise CFlowError(f"{folder} has results of another run ({why}): give overwrite=true, or output=FOLDER")
+    check_same_run(folder, before, json_ready(_record(cfg, log)), _FREE)
+    if not cfg.resume:
+        raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
     return False
 
 

@@ -24,7 +24,7 @@ from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
-from cflow_torch.fleet.changes import describe_changes
+from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -122,9 +122,7 @@ def finished_results(cfg: Eval, folder: Path) -> dict[str, Any] | None:
         return None
     record: dict[str, Any] = read_json(file)
     now = _origin(cfg)
-    changed = describe_changes({key: record.get(key) for key in now}, now, _PATHS)
-    if changed:
-        raise CFlowError(f"{folder} has results of another run ({changed}): give output=FOLDER, or overwrite=true")
+    check_same_run(folder, {key: record.get(key) for key in now}, now, _PATHS)
     return record
 
 
