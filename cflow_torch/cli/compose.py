@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from typing import Any, Callable
 
 import hydra
@@ -15,7 +15,6 @@ from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 
-from cflow_torch.cli.choices import own_names
 from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
 from cflow_torch.cli.words import NOT_GIVEN, Call, check_exists, make_settings, text_names
 from cflow_torch.config import PRESETS
@@ -53,15 +52,9 @@ def _picture_node(name: str, picture: type[Plot]) -> dict[str, Any]:
 
 def _defaults(kind: type[Settings]) -> dict[str, Any]:
     """Return the defaults of the settings of a class, in types that OmegaConf has."""
-    defaults: dict[str, Any] = {}
-    for name in own_names(kind):
-        *parents, own = name.split(".")
-        level, default = defaults, kind
-        for parent in parents:
-            level, default = level.setdefault(parent, {}), getattr(default, parent)
-        value = getattr(default, own)
-        level[own] = list(value) if isinstance(value, tuple) else value
-    return defaults
+    own = [f.name for f in fields(kind) if "kind" in f.metadata]  # type: ignore[arg-type]
+    values: dict[str, Any] = asdict(kind())  # type: ignore[call-overload]
+    return {name: list(values[name]) if isinstance(values[name], tuple) else values[name] for name in own}
 
 
 _register()
