@@ -111,7 +111,7 @@ def find_own_modules() -> None:
 def settings_of(name: str, composed: Any) -> Command:
     """Make the settings of a command from those that Hydra has composed. Values are checked before torch is imported.
 
-    data=auto is replaced by the format of the path, which is printed.
+    data=auto is replaced by the format of the path, which is printed; `cflow check` does this for each of its paths.
     """
     values: dict[str, Any] = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
     values.pop("versions", None)  # of the config.yaml of an earlier run
@@ -119,9 +119,11 @@ def settings_of(name: str, composed: Any) -> Command:
     _check_paths(settings.data)
     from cflow_torch.cli.logs import complete_data  # imports torch, which takes seconds
 
-    choice = str(HydraConfig.get().runtime.choices.get("data"))
-    out = sys.stderr if isinstance(settings, Check) and settings.json else sys.stdout
-    return replace(settings, data=complete_data(settings.data, choice, out))  # type: ignore[no-any-return]
+    if "_target_" in settings.data:  # your own reader
+        choice = str(HydraConfig.get().runtime.choices.get("data"))
+        return replace(settings, data={"label": choice, "first": 0, "step": 1, **settings.data})  # type: ignore[no-any-return]
+    is_completed = isinstance(settings, Check)
+    return settings if is_completed else replace(settings, data=complete_data(settings.data))  # type: ignore[no-any-return]
 
 
 def _check_paths(data: dict[str, Any]) -> None:

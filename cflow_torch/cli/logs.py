@@ -15,13 +15,8 @@ from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.types import CFlowError
 
 
-def complete_data(data: dict[str, Any], choice: str, out: TextIO) -> dict[str, Any]:
-    """Replace data=auto by the settings of the recognised format, and print it to `out`.
-
-    `choice` is the chosen data set, the label of your own reader.
-    """
-    if "_target_" in data:
-        return {"label": choice, "first": 0, "step": 1, **data}
+def complete_data(data: dict[str, Any], out: TextIO | None = None) -> dict[str, Any]:
+    """Replace data=auto by the settings of the recognised format, and print it to `out`; None = standard output."""
     if data.get("name") != AUTO:
         return data
     formats = {path: recognise(path) for path in paths_of(data)}
