@@ -210,9 +210,11 @@ class Flow(FlowFiles):
     log are complete: one row per moving object and sweep, with id, box and velocity. Its flow files get a column
     track_id, the id of each point, -1 = none. tracks=mot and tracks=kitti add
     OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats. tracks=drivestudio adds instances_info.json and
-    frame_instances.json, which DriveStudio's loaders read. labels=semantickitti writes
-    OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per point of
-    each sweep, 251 = moves at least 0.05 m per sweep, 9 = static, 0 = a sweep without flow, such as the last one.
+    frame_instances.json, which DriveStudio's loaders read, tracks=nuscenes adds nuscenes_detection.json and
+    nuscenes_tracking.json, and tracks=openpcdet adds result.pkl, OpenPCDet's table of boxes. labels=semantickitti
+    writes OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per
+    point of each sweep, 251 = moves at least 0.05 m per sweep, 9 = static, 0 = a sweep without flow, such as the last
+    one.
 
     examples:
       cflow flow data=av2 data.root=/data/av2/val output=outputs/val
@@ -237,10 +239,10 @@ class Flow(FlowFiles):
     result_name: str | None = _path("key under which the total flow is also written into HDF5 scenes; null = none")
     tracks: bool | str = setting(
         False,
-        "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti, drivestudio "
-        "= and in this format",
+        "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti, "
+        "drivestudio, nuscenes, openpcdet = and in this format",
         kind=object,
-        choices=(True, False, "mot", "kitti", "drivestudio"),
+        choices=(True, False, "mot", "kitti", "drivestudio", "nuscenes", "openpcdet"),
     )
     labels: str | None = setting(
         None,

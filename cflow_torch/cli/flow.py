@@ -12,6 +12,7 @@ from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
 from tqdm import tqdm
 
+from cflow_torch.applications.detection_files import OPENPCDET_FILE, write_nuscenes, write_openpcdet
 from cflow_torch.applications.instance_files import CAR, CLASS_OF_READER, write_drivestudio
 from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
@@ -42,7 +43,11 @@ from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
-_TRACK_FORMATS = {"mot": write_mot, "kitti": write_kitti}
+_TRACK_FILES = {
+    "mot": ("mot.txt", write_mot),
+    "kitti": ("kitti.txt", write_kitti),
+    "openpcdet": (OPENPCDET_FILE, write_openpcdet),
+}
 
 
 class FlowRun(NamedTuple):
@@ -240,10 +245,13 @@ def _write_tracks(
         for each in points:
             add_track_ids(frame_file(folder, log.timestamps[each.sweep]), each.track_id(table["id"]))
         write_tracks(folder / TRACKS_FILE, table)  # last, so that a killed run begins again
-    if kind in _TRACK_FORMATS:
-        _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)
+    if kind in _TRACK_FILES:
+        name, write = _TRACK_FILES[kind]
+        write(folder / name, read_tracks(folder / TRACKS_FILE), log)
     elif kind == "drivestudio":
         write_drivestudio(folder, read_tracks(folder / TRACKS_FILE), log, class_name)
+    elif kind == "nuscenes":
+        write_nuscenes(folder, read_tracks(folder / TRACKS_FILE), log)
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:

@@ -36,7 +36,8 @@ RUNS = "runs"
 _FORMAT = 1
 _ENDING = b"ARROW1"  # last bytes of a feather file
 _TRACKS = r"tracks\.parquet|mot\.txt|kitti\.txt|instances_info\.json|frame_instances\.json"
-_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|\..+\.tmp")
+_DETECTIONS = r"nuscenes_detection\.json|nuscenes_tracking\.json|result\.pkl"
+_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|{_DETECTIONS}|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 _OVERWRITE = "give overwrite=true"
 

@@ -373,13 +373,18 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert call("flow", "whole", *run[:3], "tracks=drivestudio") == 0
     poses, _, classes = read_instances(file.parent)
     assert np.isfinite(poses[:, :, 0, 0]).sum() == len(whole["id"]) and set(classes) == {"REGULAR_VEHICLE"}
+    assert call("flow", "whole", *run[:3], "tracks=nuscenes") == 0
+    detections = json.loads((file.parent / "nuscenes_detection.json").read_text())["results"]
+    assert sum(map(len, detections.values())) == len(whole["id"]) and len(detections) == 5
+    assert call("flow", "whole", *run[:3], "tracks=openpcdet") == 0 and (file.parent / "result.pkl").exists()
     for lost in (file, sorted(file.parent.glob("*.feather"))[2]):
         lost.unlink()
         assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
         tables = [feather.read_table(each) for each in file.parent.glob("*.feather")]
         assert [table.column_names.count("track_id") for table in tables] == [1] * 4, "also in a frame that was missing"
     assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
-    assert [other.name for other in file.parent.glob("*.json")] == ["manifest.json"], "nor their other forms"
+    others = [other.name for other in file.parent.iterdir() if other.suffix != ".feather"]
+    assert others == ["manifest.json"], "nor their other forms"
     capsys.readouterr()
     assert call("flow", "small", *run, "contents=[residual,cluster_id,is_valid]") == 2
     assert "add confidence" in capsys.readouterr().err

@@ -79,6 +79,7 @@ class NuScenesLog(Log):
     Attributes:
         log_id: name of the scene.
         timestamps: sweep times of the data set, in microseconds; `Sweep.timestamp_ns` is in nanoseconds.
+        sample_tokens: token of each key frame; None = the sweep is not a key frame.
 
     Convention:
         - Points are in the ego frame at the sweep's time stamp (x forward, y left, z up, origin on the ground below the
@@ -131,6 +132,7 @@ class NuScenesLog(Log):
         self._check_count(f"scene {self.log_id} in {folder}")
         self._check_files(reference, kept, int((row - last_key).max()) + 1)
         self._poses = reference.ego[kept]
+        self.sample_tokens = [reference.samples[k] if reference.is_key_frame[k] else None for k in kept.tolist()]
         self._T_ego_world = np.linalg.inv(self._poses)
 
     @property

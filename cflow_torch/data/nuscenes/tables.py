@@ -57,6 +57,7 @@ class LidarChain(NamedTuple):
     files: tuple[str, ...]  # relative to the data root
     ego: np.ndarray  # (M, 4, 4) float64 `T_world_ego` at each sweep's own time
     mount: np.ndarray  # (M, 4, 4) float64 `T_ego_sensor`
+    samples: tuple[str, ...]  # token of the sample that each sweep belongs to
 
 
 class Annotations(NamedTuple):
@@ -180,6 +181,7 @@ class Tables:
             files=tuple(row["filename"] for row in rows),
             ego=self._poses("ego_pose", [self._by_token["ego_pose"][row["ego_pose_token"]] for row in rows]),
             mount=self._poses("calibrated_sensor", mounts),
+            samples=tuple(row["sample_token"] for row in rows),
         )
 
     def _annotations(self, rows: Sequence[Row]) -> Annotations:
