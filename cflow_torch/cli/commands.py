@@ -514,8 +514,9 @@ class Clean(Command):
     data=arrays reads such a folder. A point is dynamic if its residual flow is at least 0.05 m per sweep.
     remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car. map=true
     also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them, <log id>.png.
-    We keep the other columns of cloud folders, bags, Argoverse 2 and PandaSet, such as intensity, and poses in
-    VIEWPOINT of .pcd files. A log is written as a whole or not at all. Run the command again to write the missing logs.
+    Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other columns of
+    bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True = not in
+    the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing logs.
     OUTPUT/config.yaml has settings and versions, and OUTPUT/<log id>.json those of the log. Results of other logs in
     OUTPUT stay.
 

@@ -19,6 +19,8 @@ _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}  # metres
 _OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
 _OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}  # axes of points and poses
 _OF_POSES = {name: AXES[name] for name in (CAMERA, "left", "back", "right")}
+CHANGES_POINTS = frozenset({*_OF_BOTH, *_OF_POINTS})
+"""Readings under which the numbers of the points are others than those in the files."""
 READ_AS = (
     *("auto", None, WORLD, INVERTED, STILL, LATE, EARLY),
     *(*_OF_POSES, *_UNITS, *_OF_BOTH, *_OF_POINTS),
