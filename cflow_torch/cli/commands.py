@@ -453,11 +453,11 @@ class View(Command):
     """Writes a 3-D page per log, OUTPUT/<log id>.html, that any browser opens without a network.
 
     The extra `html` makes pages. A page has a timeline of sweeps. It shows the points of sweep t, coloured by residual
-    flow, speed, object, confidence and, if the log has labels, truth or error. It also shows an arrow per moving
-    cluster, and the boxes, trails, ids and speeds of tracks. flow=FOLDER shows the output of `cflow flow`, and its
-    tracks, instead of new estimates. format=rerun writes a recording OUTPUT/<log id>.rrd for the viewer rerun instead
-    of a page, with all points and sweep t+1 (extra `rerun`). show=true opens the files at the end. OUTPUT/config.yaml
-    contains the settings and versions.
+    flow, speed, object, confidence, P(moving) and, if the log has labels, truth or error. It also shows an arrow per
+    moving cluster, and the boxes, trails, ids and speeds of tracks. Click on an object for more. flow=FOLDER shows the
+    output of `cflow flow`, and its tracks, instead of new estimates. format=rerun writes a recording OUTPUT/<log
+    id>.rrd for the viewer rerun instead of a page, with all points and sweep t+1 (extra `rerun`). show=true opens the
+    files at the end. OUTPUT/config.yaml contains the settings and versions.
 
     examples:
       cflow view                                                   a simulated street, no data needed
