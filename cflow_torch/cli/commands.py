@@ -214,7 +214,8 @@ class Flow(FlowFiles):
     nuscenes_tracking.json, and tracks=openpcdet adds result.pkl, OpenPCDet's table of boxes. labels=semantickitti
     writes OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per
     point of each sweep, 251 = moves at least 0.05 m per sweep, 9 = static, 0 = a sweep without flow, such as the last
-    one.
+    one. masks=true writes OUTPUT/<log id>/masks/<camera>/<image>.png, 255 = dynamic, 0 = static, for the images nearest
+    to the sweeps of Argoverse 2, PandaSet, nuScenes and KITTI (extra `viz`).
 
     examples:
       cflow flow data=av2 data.root=/data/av2/val output=outputs/val
@@ -249,6 +250,10 @@ class Flow(FlowFiles):
         "semantickitti = also write the moving points of each complete log to sequences/<log id>/predictions",
         kind=str,
         choices=(None, "semantickitti"),
+    )
+    masks: bool = setting(
+        False,
+        "true = also write masks of dynamic objects for the calibrated cameras of each complete log, and its tracks",
     )
 
 

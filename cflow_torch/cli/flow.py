@@ -7,6 +7,7 @@ import sys
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
@@ -14,6 +15,7 @@ from tqdm import tqdm
 
 from cflow_torch.applications.detection_files import OPENPCDET_FILE, write_nuscenes, write_openpcdet
 from cflow_torch.applications.instance_files import CAR, CLASS_OF_READER, write_drivestudio
+from cflow_torch.applications.masks import check_cameras, check_pillow, write_masks
 from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
@@ -36,6 +38,7 @@ from cflow_torch.fleet.manifest import (
     frame_file,
     labels_folder,
     make_identity,
+    masks_folder,
     release_run,
 )
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
@@ -59,13 +62,17 @@ class FlowRun(NamedTuple):
     identity: dict[str, Any]  # whose hash the job has
     parts: list[Part]
 
-    def log_ids(self) -> Iterator[str]:
-        """Open the logs of this shard, and yield their ids, which name their folders."""
+    def logs(self) -> Iterator[Log]:
+        """Open the logs of this shard one by one, without what takes time."""
         cheap = {"check": False, "odometry": False, "read_as": None}
         sources = self.sources._replace(settings={**self.sources.settings, **cheap})
         for part in self.parts:
             with suppress(Exception), sources.open(part.source) as log:  # the worker reports the error
-                yield log.log_id
+                yield log
+
+    def log_ids(self) -> Iterator[str]:
+        """Yield the ids of the logs of this shard, which name their folders."""
+        return (log.log_id for log in self.logs())
 
 
 def task(cfg: Flow) -> None:
@@ -163,6 +170,10 @@ def _finish(cfg: FlowFiles, flow: FlowRun, report: dict[str, Any], failures: Fai
 
 
 def _check_results(cfg: Flow, flow: FlowRun) -> None:
+    if cfg.masks:
+        check_pillow()
+        for log in islice(flow.logs(), 1):
+            check_cameras(log, log.cameras(0))
     if cfg.result_name is None:
         return
     if cfg.data.get("name") != "hdf5":
@@ -185,13 +196,13 @@ def _contents(cfg: Flow) -> tuple[str, ...]:
         why = "" if has_confidence else "; only model=default, offline and live have a confidence"
         raise CFlowError(f"contents={given}: give auto, or some of {', '.join(allowed)}{why}")
     needed = set(CONTENTS) if cfg.result_name is not None else set()
-    if cfg.tracks:
+    if cfg.tracks or cfg.masks:
         needed |= _FOR_TRACKS & set(allowed)
     if cfg.labels is not None:
         needed.add("residual")
     missing = sorted(needed - set(given))
     if missing:
-        readers = "result_name=, tracks= and labels= read the flow files"
+        readers = "result_name=, tracks=, labels= and masks= read the flow files"
         raise CFlowError(f"contents={given}: {readers}: add {', '.join(missing)}")
     return tuple(name for name in allowed if name in given)
 
@@ -201,16 +212,19 @@ def _write_more(cfg: Flow, flow: FlowRun, report: dict[str, Any]) -> Failures:
     output, failures = as_path(flow.job.output), []
     if cfg.result_name is not None:
         failures = _into_scenes(cfg.result_name, flow.sources.logs, output)
-    if cfg.tracks or cfg.labels is not None:
+    if cfg.tracks or cfg.masks or cfg.labels is not None:
         failures += _write_logs(cfg, flow, output)
     return failures
 
 
 def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
-    """Write tracks and labels of each log of this shard. Skip logs with incomplete frames, in this or another shard."""
+    """Write tracks, labels and masks of each log of this shard.
+
+    We skip logs with incomplete frames, in this or another shard.
+    """
     failures: Failures = []
     stored = stored_flow(output, ())
-    wanted = [name for name in ("tracks", "labels") if getattr(cfg, name)]
+    wanted = [name for name in ("tracks", "labels", "masks") if getattr(cfg, name)]
     for part in tqdm(flow.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
             log = flow.sources.open(part.source)
@@ -218,9 +232,12 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
             if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
                 continue
             results = partial(_read_all, stored, log, pairs)
-            if cfg.tracks:
+            if cfg.tracks or cfg.masks:
                 class_name = CLASS_OF_READER.get(flow.sources.reader, CAR)
                 _write_tracks(cfg.tracks, log, results, output / log.log_id, class_name)
+            if cfg.masks:
+                tracks = read_tracks(output / log.log_id / TRACKS_FILE)
+                write_masks(masks_folder(output, log.log_id), log, results(), tracks)
             if cfg.labels is not None:
                 write_moving_labels(labels_folder(output, log.log_id), log, results())
     return failures

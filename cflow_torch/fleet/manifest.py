@@ -180,6 +180,11 @@ def labels_folder(output: Path, log_id: str) -> Path:
     return output / "sequences" / log_id / "predictions"
 
 
+def masks_folder(output: Path, log_id: str) -> Path:
+    """Return the folder of the masks of a log's images, which has a folder for each camera."""
+    return output / log_id / "masks"
+
+
 def _is_whole(file: Path) -> bool:
     with suppress(OSError), open(file, "rb") as opened:
         opened.seek(-len(_ENDING), os.SEEK_END)
@@ -206,6 +211,14 @@ def _clear(folder: Path) -> None:
     for file in labels.iterdir() if labels.is_dir() else ():
         if _LABELS.fullmatch(file.name):
             file.unlink()
+    masks = masks_folder(folder.parent, folder.name)
+    for camera in masks.iterdir() if masks.is_dir() else ():
+        for file in camera.glob("*.png"):
+            file.unlink()
+        with suppress(OSError):
+            camera.rmdir()
+    with suppress(OSError):
+        masks.rmdir()
     for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
         if _OURS.fullmatch(file.name):
             file.unlink()
