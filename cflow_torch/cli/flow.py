@@ -11,10 +11,23 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
+import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.applications.detection_files import OPENPCDET_FILE, write_nuscenes, write_openpcdet
-from cflow_torch.applications.instance_files import CAR, CLASS_OF_READER, write_drivestudio
+from cflow_torch.applications.detection_files import (
+    DETECTIONS_FILE,
+    OPENPCDET_FILE,
+    TRACKING_FILE,
+    write_nuscenes,
+    write_openpcdet,
+)
+from cflow_torch.applications.instance_files import (
+    CAR,
+    CLASS_OF_READER,
+    FRAMES_FILE,
+    INSTANCES_FILE,
+    write_drivestudio,
+)
 from cflow_torch.applications.masks import check_cameras, check_pillow, write_masks
 from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
@@ -234,12 +247,16 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
             results = partial(_read_all, stored, log, pairs)
             if cfg.tracks or cfg.masks:
                 class_name = CLASS_OF_READER.get(flow.sources.reader, CAR)
-                _write_tracks(cfg.tracks, log, results, output / log.log_id, class_name)
+                tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, class_name))
             if cfg.masks:
                 tracks = read_tracks(output / log.log_id / TRACKS_FILE)
-                write_masks(masks_folder(output, log.log_id), log, results(), tracks)
+                masks = masks_folder(output, log.log_id)
+                write_masks(masks, log, results(), tracks)
+                tqdm.write(f"{masks}: masks of {len(pairs)} sweeps")
             if cfg.labels is not None:
-                write_moving_labels(labels_folder(output, log.log_id), log, results())
+                labels = labels_folder(output, log.log_id)
+                write_moving_labels(labels, log, results())
+                tqdm.write(f"{labels}: labels of {len(log.timestamps)} sweeps")
     return failures
 
 
@@ -251,24 +268,30 @@ def _read_all(
 
 def _write_tracks(
     kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, class_name: str
-) -> None:
+) -> str:
     """Write the tracks of a log and the ids of its points, unless they exist, and then the form `kind`.
 
-    `results` reads the flow files.
+    `results` reads the flow files. Returns a line with the files.
     """
-    files = (frame_file(folder, log.timestamps[index]) for index in chosen_pairs(log, first=0, step=1))
-    if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, files)):
+    frames = (frame_file(folder, log.timestamps[index]) for index in chosen_pairs(log, first=0, step=1))
+    if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, frames)):
         table, points = track_points(log, results())
         for each in points:
             add_track_ids(frame_file(folder, log.timestamps[each.sweep]), each.track_id(table["id"]))
         write_tracks(folder / TRACKS_FILE, table)  # last, so that a killed run begins again
+    table = read_tracks(folder / TRACKS_FILE)
+    files = [TRACKS_FILE]
     if kind in _TRACK_FILES:
         name, write = _TRACK_FILES[kind]
-        write(folder / name, read_tracks(folder / TRACKS_FILE), log)
+        write(folder / name, table, log)
+        files.append(name)
     elif kind == "drivestudio":
-        write_drivestudio(folder, read_tracks(folder / TRACKS_FILE), log, class_name)
+        write_drivestudio(folder, table, log, class_name)
+        files += [INSTANCES_FILE, FRAMES_FILE]
     elif kind == "nuscenes":
-        write_nuscenes(folder, read_tracks(folder / TRACKS_FILE), log)
+        write_nuscenes(folder, table, log)
+        files += [DETECTIONS_FILE, TRACKING_FILE]
+    return f"{folder}: {len(np.unique(table['id']))} tracks in {', '.join(files)}"
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:
