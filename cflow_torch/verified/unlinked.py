@@ -21,6 +21,7 @@ from torch import Tensor
 from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
 from cflow_torch.ops.segments import masked_median
+from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.component_tree import Components, NodeKind, Tree
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
@@ -58,18 +59,24 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         return tree
     tracks = _tracks(sweeps, parts, _FASTEST if max_speed is None else max_speed)
     objects = _pixels_of(tracks, parts)
-    kept = flat_nonzero(_are_wide(sweeps, objects, tracks.velocity))
+    pixels = sweeps.pixels[parts.pixel]
+    kept = flat_nonzero(_are_linked(pixels, objects) & _are_wide(sweeps, pixels, objects, tracks.velocity))
     objects = objects.select(kept)
     member = flat_nonzero(objects.is_member)
-    window = objects.max(sweeps.pixels.window, empty=0)
-    velocity = tracks.velocity.index_select(0, kept)
-    return tree.with_nodes(member, objects[member], window, NodeKind.UNLINKED, velocity)
+    return tree.with_nodes(
+        pixel=parts.pixel.index_select(0, member),
+        members=objects[member],
+        window=objects.max(pixels.window, empty=0),
+        kind=NodeKind.UNLINKED,
+        velocity=tracks.velocity.index_select(0, kept),
+    )
 
 
 class _Parts(NamedTuple):
-    """Q parts: missing pixels of one sweep that lie together."""
+    """Parts: missing pixels of one sweep that lie together. There are Q parts of K pixels."""
 
-    pixels: Groups  # the P pixels, grouped by part
+    pixel: Tensor  # (K,) int64, positions in the list of pixels
+    pixels: Groups  # these K pixels, grouped by part
     window: Tensor  # (Q,) int64
     step: Tensor  # (Q,) int64
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
@@ -77,14 +84,15 @@ class _Parts(NamedTuple):
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
         """Select the parts of at least two pixels that are at most `_LONGEST` long."""
-        pixels = sweeps.pixels
         parts = components.parts
+        pixels = sweeps.pixels[components.missing]
         extent = parts.max(pixels.row_col, empty=0) - parts.min(pixels.row_col, empty=FAR)  # [2, count]
         is_short = extent.amax(0) * sweeps.grid.pixel_size <= _LONGEST
         parts = parts.only(is_short & (parts.size() >= 2))
         image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
         window, step = split_index(image, sweeps.num_steps)
-        return cls(parts, window, step, parts.sum(pixels.row_col).double() / parts.size())
+        centre = parts.sum(pixels.row_col).double() / parts.size()
+        return cls(components.missing, parts, window, step, centre)
 
     def __len__(self) -> int:
         return len(self.step)
@@ -148,7 +156,8 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
     kept = flat_nonzero(_are_best(_ranks(error, is_found, is_given), part, len(parts)))
-    return _Tracks(*gather(kept, part, is_found, _median_velocity(parts, part, is_found, before_t)))
+    part, is_found, before_t = gather(kept, part, is_found, before_t)
+    return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
 
 
 def _follow(parts: _Parts, cells: _Map, of_t: Tensor, velocity: Tensor, before_t: Tensor) -> tuple[Tensor, Tensor]:
@@ -223,7 +232,7 @@ def _are_best(rank: Tensor, part: Tensor, num_parts: int) -> Tensor:
 
 
 def _pixels_of(tracks: _Tracks, parts: _Parts) -> Groups:
-    """Group the P pixels by track, by way of their parts."""
+    """Group the K pixels of the parts by track."""
     count = len(tracks.part)
     track = torch.arange(count, device=tracks.part.device)[:, None].expand_as(tracks.part)
     of_track = Groups(tracks.part.reshape(-1), len(parts)).where(tracks.is_found.reshape(-1))
@@ -231,12 +240,15 @@ def _pixels_of(tracks: _Tracks, parts: _Parts) -> Groups:
     return Groups(parts.pixels.spread(first_track, none=count), count)
 
 
-def _are_wide(sweeps: HeightSlicedSweeps, objects: Groups, velocity: Tensor) -> Tensor:
-    """Tell which objects have pixels at t+1 and before, and are wide enough across their motion, (N,) bool."""
-    pixels = sweeps.pixels
+def _are_linked(pixels: Pixels, objects: Groups) -> Tensor:
+    """Tell which objects have pixels at t+1 and before, (N,) bool."""
+    return objects.any(pixels.step == 0) & objects.any(pixels.step > 0)
+
+
+def _are_wide(sweeps: HeightSlicedSweeps, pixels: Pixels, objects: Groups, velocity: Tensor) -> Tensor:
+    """Tell which objects are wide enough across their motion, (N,) bool."""
     speed = velocity.square().sum(1).sqrt().clamp(min=1)
     across = (velocity / speed[:, None]).flip(1) * constant((1.0, -1.0), torch.float64, speed.device)  # [N, 2]
     side = (objects.spread(across).t() * pixels.row_col).sum(0)
     width = objects.max(side, empty=-math.inf) - objects.min(side, empty=math.inf)
-    is_linked = objects.any(pixels.step == 0) & objects.any(pixels.step > 0)
-    return is_linked & (width * sweeps.grid.pixel_size >= _NARROWEST)
+    return width * sweeps.grid.pixel_size >= _NARROWEST

@@ -56,12 +56,12 @@ class GroundHeights:
         mean = torch.div(height, count.clamp(min=1), rounding_mode="floor")
         return mean.masked_fill_(count < _FEWEST_POINTS, _UNKNOWN)
 
-    def at(self, positions: Tensor, window: Tensor, mean: Tensor) -> Tensor:
+    def at(self, positions: Tensor, window: int | Tensor, mean: Tensor) -> Tensor:
         """Return the height of the ground around each position, (N,) float64, centimetres.
 
-        Positions are (3, N), metres, in the region; `window` is (N,). `mean` is the result of the method `mean`.
+        Positions are (3, N), metres, in the region; `window` is (N,) or one number. `mean` is what `mean()` returns.
         """
-        block = torch.add(self._block(positions), window, alpha=mean.shape[1] * mean.shape[2])
+        block = self._block(positions) + window * (mean.shape[1] * mean.shape[2])
         return mean.view(-1).double().index_select(0, block.clamp_(0, mean.numel() - 1))
 
     def slopes(self, centre: Tensor, window: Tensor) -> Tensor:
