@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from cflow_torch.applications.association import box_of_point, boxes
-from cflow_torch.applications.moving_groups import MOVING, pose_of
+from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
@@ -70,15 +70,15 @@ class MaskedLog(Log):
 class CleanLog(MaskedLog):
     """A log without its moving points, and without points that have no position (NaN).
 
-    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep, and one before a gap of the log,
+    A point moves by `FlowResult.is_moving`. The last sweep, and one before a gap of the log,
     have no flow. There, we take the boxes of the objects that move in the sweep before, shift them by the flow, and
     remove the points inside.
 
     Args:
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
         model: the method; None = preset `offline`.
-        flow: index -> flow of that pair, in place of a model. We use residual_flow and cluster_id, and with
-            `remove_stopped` also is_valid.
+        flow: index -> flow of that pair, in place of a model. We use residual_flow, cluster_id and, if it
+            has it, moving, and with `remove_stopped` also is_valid.
         remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
             finds them. It takes a pass over the log before the first sweep is returned, and 1 bit of memory per point.
 
@@ -135,7 +135,7 @@ class CleanLog(MaskedLog):
         sweep = self._log.sweep(index)
         if not self._has_flow(index):
             return self._reached(sweep, index) if self._has_flow(index - 1) else np.zeros(len(sweep.points), bool)
-        moves = (self._flow(index).residual_flow.norm(dim=1) >= MOVING).cpu().numpy()
+        moves = as_numpy(self._flow(index).is_moving)
         if len(moves) != len(sweep.points):
             raise CFlowError(
                 f"sweep {index} has {len(sweep.points)} points, but its flow {len(moves)} rows: give both of one log"

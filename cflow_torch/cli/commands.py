@@ -213,9 +213,11 @@ class Flow(FlowFiles):
     frame_instances.json, which DriveStudio's loaders read, tracks=nuscenes adds nuscenes_detection.json and
     nuscenes_tracking.json, and tracks=openpcdet adds result.pkl, OpenPCDet's table of boxes. labels=semantickitti
     writes OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per
-    point of each sweep, 251 = moves at least 0.05 m per sweep, 9 = static, 0 = a sweep without flow, such as the last
-    one. masks=true writes OUTPUT/<log id>/masks/<camera>/<image>.png, 255 = dynamic, 0 = static, for the images nearest
-    to the sweeps of Argoverse 2, PandaSet, nuScenes and KITTI (extra `viz`).
+    point of each sweep, 251 = moves (flow of 0.05 m per sweep, P(moving) of 0.5), 9 = static, 0 = a sweep without flow,
+    such as the last one.
+
+    masks=true writes OUTPUT/<log id>/masks/<camera>/<image>.png, 255 = dynamic, 0 = static, for the images nearest to
+    the sweeps of Argoverse 2, PandaSet, nuScenes and KITTI (extra `viz`).
 
     examples:
       cflow flow data=av2 data.root=/data/av2/val output=outputs/val
@@ -516,14 +518,14 @@ class Stream(Command):
 class Clean(Command):
     """Writes logs without dynamic objects: OUTPUT/<log id>, a folder of point clouds, poses, times and ground masks.
 
-    data=arrays reads such a folder. A point is dynamic if its residual flow is at least 0.05 m per sweep.
-    remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car. map=true
-    also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them, <log id>.png.
-    Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other columns of
-    bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True = not in
-    the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing logs.
-    OUTPUT/config.yaml has settings and versions, and OUTPUT/<log id>.json those of the log. Results of other logs in
-    OUTPUT stay.
+    data=arrays reads such a folder. A point is dynamic if its flow is at least 0.05 m per sweep and P(moving) at least
+    0.5. remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car.
+    map=true also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them,
+    <log id>.png. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other
+    columns of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True
+    = not in the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing
+    logs. OUTPUT/config.yaml has settings and versions, and OUTPUT/<log id>.json those of the log. Results of other logs
+    in OUTPUT stay.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag
