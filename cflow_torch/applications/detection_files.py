@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.applications.track_table import Table, boxes_in_sweeps, score_of
+from cflow_torch.applications.track_table import KITTI_NAMES, Table, boxes_in_sweeps, class_of, score_of
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
@@ -18,8 +18,6 @@ TRACKING_FILE = "nuscenes_tracking.json"
 OPENPCDET_FILE = "result.pkl"  # the name of OpenPCDet
 NUSCENES_NAMES = {"pedestrian": "pedestrian", "cyclist": "bicycle", "car": "car", "truck": "truck"}
 """Class of a track -> class of nuScenes' tasks."""
-KITTI_NAMES = {"car": "Car", "pedestrian": "Pedestrian", "cyclist": "Cyclist", "truck": "Truck"}
-"""Class of a track -> name in KITTI and OpenPCDet, in the order of the labels 1, 2, 3, 4."""
 _ATTRIBUTES = {  # class in nuScenes -> attribute of an object that moves, and of one that stands
     "pedestrian": ("pedestrian.moving", "pedestrian.standing"),
     "bicycle": ("cycle.with_rider", "cycle.with_rider"),
@@ -54,7 +52,7 @@ def write_nuscenes(folder: PathLike, table: Table, log: Log) -> None:
         token = tokens[int(table["sweep"][row])]
         if token is None or len(detections[token]) == _MOST_BOXES:
             continue
-        name = NUSCENES_NAMES[_class_of(table, row)]
+        name = NUSCENES_NAMES[class_of(table, row)]
         box = _nuscenes_box(table, row, token)
         attribute = _ATTRIBUTES[name][0 if table["is_moving"][row] else 1]
         detection = {"detection_name": name, "detection_score": score[row], "attribute_name": attribute}
@@ -84,11 +82,6 @@ def _nuscenes_box(table: Table, row: int, token: str) -> dict[str, Any]:
     }
 
 
-def _class_of(table: Table, row: int) -> str:
-    """Return the class of a row; tables of earlier versions have none, and then it is a car."""
-    return str(table["class"][row]) if "class" in table else "car"
-
-
 def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
     """Write a pickle of a list with a dictionary per sweep of the log, as OpenPCDet writes its detections.
 
@@ -102,7 +95,7 @@ def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
     size = np.stack([table[name] for name in ("length", "width", "height")], 1)
     box = np.concatenate([centre, size, heading[:, None]], 1).astype(np.float32)
     score = score_of(table).astype(np.float32)
-    label = np.array([1 + names.index(_class_of(table, row)) for row in range(len(score))], np.int64)
+    label = np.array([1 + names.index(class_of(table, row)) for row in range(len(score))], np.int64)
     kitti_name = np.array([KITTI_NAMES[names[number - 1]] for number in label.tolist()], "<U10")
     frames = []
     for sweep in range(len(log.timestamps)):

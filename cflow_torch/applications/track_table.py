@@ -28,6 +28,10 @@ COLUMNS = {
 }
 
 
+KITTI_NAMES = {"car": "Car", "pedestrian": "Pedestrian", "cyclist": "Cyclist", "truck": "Truck"}
+"""Class of a track -> name in KITTI and OpenPCDet, in the order of OpenPCDet's labels 1, 2, 3, 4."""
+
+
 def join_tables(tables: Sequence[Table]) -> Table:
     """Concatenate tables. Without tables, all columns are empty."""
     return {
@@ -71,7 +75,7 @@ def write_mot(path: PathLike, table: Table, log: Log) -> None:
 def write_kitti(path: PathLike, table: Table, log: Log) -> None:
     """Write tracks as text of KITTI's tracking benchmark, with poses from the log: a line of 18 columns per row.
 
-    Frames and ids count from 0; the type is Misc, because tracks have no class; unknown columns are -1. The camera is
+    Frames and ids count from 0; the type is Misc in tables without classes; unknown columns are -1. The camera is
     at the origin of the ego frame of the sweep, looks to +x, and has KITTI's axes: x to the right, y down, z ahead. The
     position is the middle of the lower face of the box.
 
@@ -81,9 +85,19 @@ def write_kitti(path: PathLike, table: Table, log: Log) -> None:
     x, y, z = -centre[:, 1], table["height"] / 2 - centre[:, 2], centre[:, 0]
     rotation = _wrapped(-heading - np.pi / 2)
     alpha = _wrapped(rotation - np.arctan2(x, z))
-    columns = (table["sweep"], table["id"], alpha, table["height"], table["width"], table["length"])
-    form = "%d %d Misc -1 -1 %.6f -1 -1 -1 -1" + 8 * " %.6f"
-    _write_lines(path, form, *columns, x, y, z, rotation, score_of(table))
+    size = (table["height"], table["width"], table["length"])
+    numbers = np.stack([alpha, *size, x, y, z, rotation, score_of(table)], 1)
+    lines = []
+    for row, values in enumerate(numbers.tolist()):
+        kind = KITTI_NAMES[class_of(table, row)] if "class" in table else "Misc"
+        first = f"{table['sweep'][row]} {table['id'][row]} {kind} -1 -1 {values[0]:.6f} -1 -1 -1 -1"
+        lines.append(" ".join([first, *(f"{value:.6f}" for value in values[1:])]) + "\n")
+    write_text(as_path(path), "".join(lines))
+
+
+def class_of(table: Table, row: int) -> str:
+    """Return the class of a row; in tables without classes, everything is a car."""
+    return str(table["class"][row]) if "class" in table else "car"
 
 
 def score_of(table: Table) -> np.ndarray:

@@ -23,7 +23,7 @@ from cflow_torch.applications.detection_files import (
 )
 from cflow_torch.applications.instance_files import (
     CAR,
-    CLASS_OF_READER,
+    CLASSES_OF_READER,
     FRAMES_FILE,
     INSTANCES_FILE,
     write_drivestudio,
@@ -246,8 +246,8 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
                 continue
             results = partial(_read_all, stored, log, pairs)
             if cfg.tracks or cfg.masks:
-                class_name = CLASS_OF_READER.get(flow.sources.reader, CAR)
-                tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, class_name))
+                classes = CLASSES_OF_READER.get(flow.sources.reader, (CAR, None))
+                tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, classes))
             if cfg.masks:
                 tracks = read_tracks(output / log.log_id / TRACKS_FILE)
                 masks = masks_folder(output, log.log_id)
@@ -267,7 +267,7 @@ def _read_all(
 
 
 def _write_tracks(
-    kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, class_name: str
+    kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, classes: Sequence[Any]
 ) -> str:
     """Write the tracks of a log and the ids of its points, unless they exist, and then the form `kind`.
 
@@ -286,7 +286,7 @@ def _write_tracks(
         write(folder / name, table, log)
         files.append(name)
     elif kind == "drivestudio":
-        write_drivestudio(folder, table, log, class_name)
+        write_drivestudio(folder, table, log, *classes)
         files += [INSTANCES_FILE, FRAMES_FILE]
     elif kind == "nuscenes":
         write_nuscenes(folder, table, log)

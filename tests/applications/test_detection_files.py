@@ -21,7 +21,7 @@ from cflow_torch.data.nuscenes.reader import NuScenesLog, find_nuscenes_scenes
 
 
 def empty_rows(count: int) -> Table:
-    return {name: np.zeros(count, dtype) for name, dtype in COLUMNS.items()}
+    return {**{name: np.zeros(count, dtype) for name, dtype in COLUMNS.items()}, "class": np.full(count, "car")}
 
 
 def exact_tracks(recording: TinyRecording) -> Table:
@@ -92,13 +92,15 @@ def test_samples_of_other_logs_are_their_sweeps_and_hold_at_most_500_boxes(tmp_p
     table["confidence"] = np.linspace(0.0, 1.0, 1003)
     table["confidence"][0] = np.nan
     table["is_moving"][1] = True
+    table["class"] = np.where(table["sweep"] == 3, "pedestrian", "truck")
     write_nuscenes(tmp_path, table, log)
     results = read_results(tmp_path, "detection")
     assert list(results) == [f"staged_{stamp}" for stamp in log.timestamps]
     assert sorted(map(len, results.values())) == [0] * 10 + [2, 500]
     first, second = results[f"staged_{log.timestamps[3]}"]
-    assert first["detection_score"] == 1.0 and first["attribute_name"] == "vehicle.stopped"
-    assert second["attribute_name"] == "vehicle.moving"
+    assert first["detection_score"] == 1.0 and first["attribute_name"] == "pedestrian.standing"
+    assert second["attribute_name"] == "pedestrian.moving" and second["detection_name"] == "pedestrian"
+    assert {box["detection_name"] for box in results[f"staged_{log.timestamps[5]}"]} == {"truck"}
     scores = [box["tracking_score"] for box in read_results(tmp_path, "tracking")[f"staged_{log.timestamps[5]}"]]
     assert scores == sorted(table["confidence"][2:], reverse=True)[:500]
 
@@ -107,10 +109,13 @@ def test_openpcdet_reads_boxes_in_the_frame_of_the_points(tmp_path: Path) -> Non
     """A vehicle that has turned and tilted stands beside a car that drives along the world's x axis."""
     vehicle = pose(-20, -5, np.pi / 2, 1)
     log = Staged([straight((0, -6), (0.8, 0.0))], np.tile(vehicle, (12, 1, 1)))
-    write_openpcdet(tmp_path / "result.pkl", track(log, log.results()), log)
+    table = track(log, log.results())
+    table["class"] = np.where(table["sweep"] == 2, "cyclist", "car")
+    write_openpcdet(tmp_path / "result.pkl", table, log)
     frames = pickle.loads((tmp_path / "result.pkl").read_bytes())
     assert [frame["frame_id"] for frame in frames] == [f"{sweep:06d}" for sweep in range(12)]
-    for frame in frames[:11]:
+    assert frames[2]["name"].tolist() == ["Cyclist"] and frames[2]["pred_labels"].tolist() == [3]
+    for frame in (*frames[:2], *frames[3:11]):
         assert frame["name"].tolist() == ["Car"] and frame["pred_labels"].tolist() == [1]
         assert frame["score"].shape == (1,) and frame["boxes_lidar"].dtype == np.float32
     assert frames[11]["boxes_lidar"].shape == (0, 7) and len(frames[11]["name"]) == 0

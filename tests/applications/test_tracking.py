@@ -319,6 +319,9 @@ def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> No
     write_drivestudio(tmp_path / "instances", table, log, "vehicle.car")
     poses, sizes, classes = read_instances(tmp_path / "instances")
     assert poses.shape[:2] == (12, 2) and classes == ["vehicle.car"] * 2
+    person = {**table, "class": np.where(table["id"] == table["id"].max(), "pedestrian", "truck")}
+    write_drivestudio(tmp_path / "people", person, log, "vehicle.car", "vehicle.bicycle")
+    assert read_instances(tmp_path / "people")[2] == ["vehicle.car", "vehicle.bicycle"]
     assert np.isfinite(poses[:, :, 0, 0]).sum(0).tolist() == [11, 7] and np.isnan(poses[11]).all()
     corner = np.stack([straight((0, -6), (0.8, 0.0)), hidden], 1)
     assert np.allclose(poses[4:11, :, :2, 3], corner[4:11] + (1.9, 0.7), atol=0.1), "the middle of the box"
