@@ -23,7 +23,7 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_arr
 _MARGIN = 0.2  # metres, added to the sides of the box around the visible part of an object
 _SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
 _MAX_DISTANCE = 100.0  # metres from the vehicle to a box, at most
-_INTENSITIES = ("intensity", "reflectance", "reflectivity", "remission", "column_3")
+_INTENSITIES = ("intensity", "reflectance", "reflectivity", "remission", "i", "column_3")
 _MAX_VOXELS = 1 << 20  # voxels in x, y and z from the first sweep to a point of a map, at most
 
 
@@ -219,7 +219,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
 def static_map_with_intensity(log: Log, voxel_size: float = 0.1) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the map of `static_map`, and the (M,) intensities of its points; None if a sweep has no such column.
 
-    The column is called intensity, reflectance, reflectivity or remission. In files without names, it is the fourth.
+    The column is called intensity, reflectance, reflectivity, remission or i. In files without names, it is the fourth.
     """
     if not voxel_size > 0:
         raise CFlowError(f"voxel_size={voxel_size}: give a positive length in metres")
