@@ -59,6 +59,7 @@ from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
+_FOR_MOVING = {"residual", "moving"}
 _TRACK_FILES = {
     "mot": ("mot.txt", write_mot),
     "kitti": ("kitti.txt", write_kitti),
@@ -211,8 +212,8 @@ def _contents(cfg: Flow) -> tuple[str, ...]:
     needed = set(CONTENTS) if cfg.result_name is not None else set()
     if cfg.tracks or cfg.masks:
         needed |= _FOR_TRACKS & set(allowed)
-    if cfg.labels is not None:
-        needed.add("residual")
+    if cfg.labels is not None or cfg.masks:
+        needed |= _FOR_MOVING & set(allowed)
     missing = sorted(needed - set(given))
     if missing:
         readers = "result_name=, tracks=, labels= and masks= read the flow files"
