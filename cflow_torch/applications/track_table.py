@@ -24,6 +24,7 @@ COLUMNS = {
     **dict.fromkeys(_FLOATS, np.float64),
     "is_moving": np.bool_,
     "is_confirmed": np.bool_,
+    "class": np.str_,
 }
 
 
