@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from cflow_torch.applications.association import box_of_point, boxes
-from cflow_torch.applications.moving_groups import MOVING, pose_of
+from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
@@ -29,7 +29,7 @@ _MAX_VOXELS = 1 << 20  # voxels in x, y and z from the first sweep to a point of
 class CleanLog(Log):
     """A log without its moving points. Every command, writer and loader accepts it like any other log.
 
-    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep, and one before a gap of the log,
+    A point moves if the flow says so (`FlowResult.is_moving`). The last sweep, and one before a gap of the log,
     have no flow. There, we take the boxes of the objects that move in the sweep before, shift them by the flow, and
     remove the points inside.
 
@@ -110,7 +110,7 @@ class CleanLog(Log):
         sweep = self._log.sweep(index)
         if not self._has_flow(index):
             return self._reached(sweep, index) if self._has_flow(index - 1) else np.zeros(len(sweep.points), bool)
-        moves = (self._flow(index).residual_flow.norm(dim=1) >= MOVING).cpu().numpy()
+        moves = self._flow(index).is_moving.cpu().numpy()
         if len(moves) != len(sweep.points):
             raise CFlowError(
                 f"sweep {index} has {len(sweep.points)} points, but its flow {len(moves)} rows: give both of one log"

@@ -64,9 +64,9 @@ class Edges(NamedTuple):
         """Turn points (P, 3) of R objects into the axes of boxes with (R,) headings; few points are strays."""
         local = turned(points, -heading[row])
         count = len(heading)
-        low = [quantile(local[:, axis], row, count, _STRAY) for axis in range(3)]
-        high = [quantile(local[:, axis], row, count, 1 - _STRAY) for axis in range(3)]
-        return cls(torch.stack(low, 1), torch.stack(high, 1), turned(sensor, -heading))
+        ends = [torch.stack(quantiles(local[:, axis], row, count, _STRAY, 1 - _STRAY)) for axis in range(3)]
+        low, high = torch.stack(ends, 2)
+        return cls(low, high, turned(sensor, -heading))
 
     @property
     def middle(self) -> Tensor:
@@ -123,7 +123,8 @@ def whole_boxes(sightings: Sightings) -> WholeBoxes:
         edges = Edges.of(sightings.points, sightings.row, sightings.sensor, heading)
         speed = motion.velocity[:, :2].norm(dim=1)
         along_path = edges.relative_to(turned(motion.position, -heading))
-        kind, size = kinds_and_sizes(along_path, track, count, quantile(speed, track, count, _SHARE))
+        (typical_speed,) = quantiles(speed, track, count, _SHARE)
+        kind, size = kinds_and_sizes(along_path, track, count, typical_speed)
         local, noise = edges.anchor(size[track], kind[track])
         centre = turned(local, heading)
         motion = _smoothed(sightings, centre, noise)
@@ -175,8 +176,8 @@ def _kind(size: Tensor, speed: Tensor) -> Tensor:
 
 def _extent(edges: Edges, axis: int, track: Tensor, count: int, is_used: Tensor) -> Tensor:
     """(K,) metres between the edges on which most of the used sightings of each track agree; NaN without one."""
-    high = quantile(edges.high[is_used, axis], track[is_used], count, _SHARE)
-    low = quantile(edges.low[is_used, axis], track[is_used], count, 1 - _SHARE)
+    (high,) = quantiles(edges.high[is_used, axis], track[is_used], count, _SHARE)
+    (low,) = quantiles(edges.low[is_used, axis], track[is_used], count, 1 - _SHARE)
     return high - low
 
 
@@ -200,14 +201,21 @@ def turned(values: Tensor, angle: Tensor) -> Tensor:
     return torch.stack([*rotate(values[:, 0], values[:, 1], angle), values[:, 2]], 1)
 
 
-def quantile(values: Tensor, group: Tensor, count: int, share: float) -> Tensor:
-    """Quantile of the (N,) values of each group, (count,); the nearest value. NaN if a group is empty."""
-    order = values.argsort()
-    order = order[group[order].argsort(stable=True)]
+def quantiles(values: Tensor, group: Tensor, count: int, *shares: float) -> list[Tensor]:
+    """Quantiles of the (N,) values of each group, (count,) for each share; the nearest value. NaN for empty groups."""
     size = torch.bincount(group, minlength=count)
-    position = size.cumsum(0) - size + ((size - 1) * share).round().long().clamp(min=0)
-    ordered = torch.cat([values[order], values.new_full((1,), torch.nan)])
-    return torch.where(size > 0, ordered[position.clamp(max=len(values))], torch.nan)
+    if len(values) == 0:
+        return [values.new_full((count,), torch.nan) for _ in shares]
+    lowest = values.min()
+    span = values.max() - lowest + 1
+    order = (group * span + (values - lowest)).argsort()  # by group, then value
+    first = size.cumsum(0) - size
+    found = []
+    for share in shares:
+        position = first + ((size - 1) * share).round().long()
+        value = values[order[position.clamp(max=len(values) - 1)]]
+        found.append(torch.where(size > 0, value, torch.nan))
+    return found
 
 
 def _means(values: Tensor, group: Tensor, count: int) -> Tensor:

@@ -54,7 +54,9 @@ class TrueBoxes(NamedTuple):
         return np.arctan2(self.pose[:, 1, 0], self.pose[:, 0, 0])
 
 
-def scored(boxes: Boxes, pose: np.ndarray, later: Dict[str, np.ndarray], seconds: float, points: np.ndarray) -> TrueBoxes:
+def scored(
+    boxes: Boxes, pose: np.ndarray, later: Dict[str, np.ndarray], seconds: float, points: np.ndarray
+) -> TrueBoxes:
     """Keep the boxes that are scored.
 
     Args:
@@ -155,7 +157,9 @@ class SceneBoxes(LabelledLog):
         world = sweep.pose @ boxes.pose
         for row, pose in enumerate(boxes.pose):
             local = (sweep.points[:, :3] - pose[:3, 3]) @ pose[:3, :3]
-            inside = (np.abs(local) <= boxes.size[row] / 2).all(1) & labels.is_valid & (np.linalg.norm(residual, axis=1) > 0)
+            inside = (
+                (np.abs(local) <= boxes.size[row] / 2).all(1) & labels.is_valid & (np.linalg.norm(residual, axis=1) > 0)
+            )
             if inside.sum() >= POINTS // 2:
                 start = sweep.points[inside, :3].astype(np.float64) @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
                 end = start + residual[inside] @ after.pose[:3, :3].T
@@ -232,7 +236,9 @@ def score(log: Any, table: Dict[str, np.ndarray], sweeps: range) -> list[Row]:
             shares = [iou(true, each) for each in found]
             best = int(np.argmax(shares)) if shares else -1
             row = {"log": log.log_id, "sweep": index, "object": truth.name[k], "kind": truth.kind[k], "iou": 0.0}
-            row.update(track=-1, true=truth.size[k], centre=truth.pose[k, :3, 3], speed=np.linalg.norm(truth.velocity[k]))
+            row.update(
+                track=-1, true=truth.size[k], centre=truth.pose[k, :3, 3], speed=np.linalg.norm(truth.velocity[k])
+            )
             row.update(yaw=truth.heading[k])
             if best >= 0 and shares[best] > 0:
                 of_track = chosen[best]
@@ -295,7 +301,11 @@ def main() -> None:
     for sensor in given.simulated:
         logs = [SimulatedBoxes(sensor, seed, scene, given.num_sweeps) for seed, scene in DRIVES]
         drives.append((f"simulated {sensor}", logs))
-    print(markdown([summary(name, [row for log in logs for row in score(log, *boxes_of(log, model))]) for name, logs in drives]))
+    print(
+        markdown(
+            [summary(name, [row for log in logs for row in score(log, *boxes_of(log, model))]) for name, logs in drives]
+        )
+    )
 
 
 if __name__ == "__main__":

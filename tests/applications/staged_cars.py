@@ -12,7 +12,7 @@ from cflow_torch.data.log import Log
 
 INTERVAL_NS = 100_000_000
 SIZE = (4.5, 1.9, 1.2)  # metres; cars have the size that is typical, so that it does not matter which sides are seen
-_BODY = np.stack(np.meshgrid(*(np.linspace(0, side, 16) for side in SIZE)), -1).reshape(-1, 3)
+_BODY = np.stack(np.meshgrid(*map(np.linspace, (0, 0, 0), SIZE, (20, 9, 7))), -1).reshape(-1, 3)
 _WALL = np.stack(np.meshgrid(np.arange(-10, 30, 0.2), [12.0], np.arange(0, 3, 0.2)), -1).reshape(-1, 3)
 
 

@@ -124,7 +124,9 @@ def test_two_cars_in_one_cluster_keep_their_ids() -> None:
     assert len(table["id"]) == 22 and len(set(table["id"])) == 2
     for car in (0, 1):
         assert len(set(ids_of(log, table, car))) == 1
-    assert np.allclose(table["vx"][table["sweep"] > 5], 8, atol=0.05) and np.allclose(table["width"], SIZE[1], atol=0.01)
+    assert np.allclose(table["vx"][table["sweep"] > 5], 8, atol=0.05) and np.allclose(
+        table["width"], SIZE[1], atol=0.01
+    )
 
 
 def test_a_far_car_of_few_points_has_one_id() -> None:
@@ -141,7 +143,7 @@ def test_a_far_car_of_few_points_has_one_id() -> None:
 
 
 def test_low_confidence_confirms_only_long_motion_that_fits_and_missing_confidence_any() -> None:
-    log = Staged([straight((0, 0), (0.9, 0.0))])
+    log = Staged([straight((0, 0), (0.95, 0.0))])
     unsure = [(index, log.result(index, 0.5)) for index in range(11)]
     table = track(log, unsure)
     assert np.flatnonzero(table["is_confirmed"])[0] == 5, "it has moved by its own length"
