@@ -18,9 +18,9 @@ from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.writer import write_hdf5_labels
 from cflow_torch.data.log import CachedLog, Log, windows
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.errors import import_optional
 from cflow_torch.stages import FlowModel
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
 AGREEMENT = 1.3  # we chose it on simulated drives of five sensors, seeds 100 to 103, and on KITTI 0000

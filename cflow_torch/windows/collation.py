@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
-from typing import Sequence
+from typing import Iterator, NamedTuple, Sequence
 
 import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
+from cflow_torch.ground.heights import GroundHeights
+from cflow_torch.ops.chunks import chunks
+from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.types import Window
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.ground_heights import GroundHeights
 from cflow_torch.windows.pieces import read_pieces
 from cflow_torch.windows.timeline import Timeline
+
+
+class Chunk(NamedTuple):
+    """Points of a batch that we process at once."""
+
+    points: slice
+    window: int | Tensor  # of all these points, or (n,) int64
+    step: int | Tensor
 
 
 @dataclass(frozen=True)
@@ -50,6 +61,21 @@ class Batch:
     # window if one of its sweeps has no times of points. None = no window has them, or the method does not need them.
     point_times: Tensor | None = None
 
+    @cached_property
+    def chunks(self) -> list[Chunk]:
+        """The points in chunks that suit the device: on a CPU those of one sweep, on a GPU those of many."""
+        if self.image.device.type == "cpu":
+            return list(self._chunks_of_sweeps())
+        window, step = split_index(self.image.long(), self.num_steps)
+        return [Chunk(points, window[points], step[points]) for points in chunks(0, len(window), self.image.device)]
+
+    def _chunks_of_sweeps(self) -> Iterator[Chunk]:
+        """Yield the points of each sweep alone."""
+        ends = (flat_nonzero(self.image[1:] != self.image[:-1]) + 1).tolist()
+        for start, stop in zip([0, *ends], [*ends, len(self.image)]):
+            for points in chunks(start, stop, self.image.device):
+                yield Chunk(points, *divmod(int(self.image[start]), self.num_steps))
+
     def with_empty_windows(self) -> Batch:
         """Append B windows without points, which have the same times and origins as the B windows of the batch."""
         elapsed, seconds, origin = (torch.cat((of, of)) for of in (self.elapsed, self.seconds, self.origin))
@@ -83,7 +109,7 @@ def make_batch(
     """
     timeline = Timeline.of(windows, config, grid, needs_times)
     num_windows, num_steps = timeline.table.shape[1:]
-    ground = GroundHeights(num_windows, grid, device) if needs_ground else None
+    ground = GroundHeights(num_windows, grid.lower, grid.upper, device) if needs_ground else None
     pieces = list(read_pieces(timeline, config, grid, device, num_axes, ground))
     point_times = [piece.point_times for piece in pieces if piece.point_times is not None]
     num_newest = sum(piece.image.numel() for piece in pieces if piece.step == 0)

@@ -11,11 +11,12 @@ from scipy import ndimage
 from oracle.clustering import SQUARE
 from oracle.component_tree import Node, Tree
 from oracle.height_slices import SlicedSweeps
+from oracle.paired_test import count_wins
 
 GAP, LONGEST, CELL = 0.4, 8.0, 0.8  # metres: pixels of a part, length of a part, cells of the map
 NEAR, REACH = 2, 8  # cells
 ERROR, SHARE = 0.7, 0.05  # metres, and metres for each metre
-SHORTEST, NARROWEST = 0.3, 0.4  # metres
+NARROWEST = 0.4  # metres
 
 
 def parts_of(sweeps: SlicedSweeps, is_missing: np.ndarray) -> list[np.ndarray]:
@@ -65,7 +66,8 @@ def link_unlinked(sweeps: SlicedSweeps, is_missing: np.ndarray, tree: Tree) -> l
         for i in np.flatnonzero(np.array(step_of) == 1).tolist():
             for other in around(other_step, centres[i], REACH):
                 distance = np.linalg.norm(centres[other] - centres[i])
-                if SHORTEST / sweeps.size <= distance <= farthest:
+                length = np.ptp(sweeps.pixels[parts[i], 1:], axis=0).max() + 1
+                if length / 2 <= distance <= farthest:
                     velocity = (centres[i] - centres[other]) / since[other_step]
                     tracks.append(follow(sweeps, i, velocity, centres, since, around))
     chosen = []
@@ -87,7 +89,10 @@ def link_unlinked(sweeps: SlicedSweeps, is_missing: np.ndarray, tree: Tree) -> l
         velocity = tuple(median(axis) for axis in np.transpose(shifts).tolist())
         speed = max(math.hypot(*velocity), 1)
         side = sweeps.pixels[members, 1:] @ (np.array([velocity[1], -velocity[0]]) / speed)
-        if (steps == 0).any() and (steps > 0).any() and np.ptp(side) * sweeps.size >= NARROWEST:
+        if not ((steps == 0).any() and (steps > 0).any() and np.ptp(side) * sweeps.size >= NARROWEST):
+            continue
+        won, lost = count_wins(sweeps, members, velocity, is_near=True).sum(1)
+        if 2 * won > lost:
             nodes.append(Node(members, len(tree.levels) + 1, -1, False, velocity))
     return nodes
 
