@@ -25,6 +25,7 @@ COLUMNS = {
     **dict.fromkeys(_FLOATS, np.float64),
     "is_moving": np.bool_,
     "is_confirmed": np.bool_,
+    "class": np.str_,
 }
 
 
