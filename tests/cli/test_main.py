@@ -47,6 +47,7 @@ CHEAP = (
         "eval model.densify=nearest",
         "setting 'model.densify' belongs to model=keypoints or model=paper_keypoints: give that as well",
     ),
+    ("eval model=null", "model=null: give one of default, keypoints, live,"),
     ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
     ("plot cluster=3", "setting 'cluster' belongs to picture=correlation or picture=scales: give that as well"),
     ("flow data=av2", "the data is missing: give data.root=PATH"),
