@@ -93,6 +93,21 @@ def assert_nothing_was_computed(folder: Path) -> None:
     assert not list(folder.rglob("*results.json")) + list(folder.glob("outputs/flow/**/*.feather"))
 
 
+def test_wrong_names_and_values_are_told_without_hydra(tmp_path):
+    """Hydra takes most of a second."""
+    calls = [call for call, message in CHEAP if "=" in call and ("give a" in message or "did you mean" in message)]
+    assert len(calls) > 10
+    code = f"""
+import sys
+from command_line import cflow
+for call in {calls}:
+    assert cflow(*call.split()) == 2 and "hydra" not in sys.modules, call
+"""
+    path = {"env": {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, "cwd": tmp_path}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, **path)
+    assert done.returncode == 0, done.stderr
+
+
 def test_help_comes_without_torch_and_hydra_and_wrong_calls_without_torch(tmp_path, cflow, capsys):
     code = f"""
 import sys
