@@ -10,13 +10,14 @@ import numpy as np
 from cflow_torch.config import Config, make_config
 from cflow_torch.dense.method import CorrelationFlow
 from cflow_torch.errors import warn
+from cflow_torch.ground.segmentation import CHOICES, find_ground_batch
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
 from cflow_torch.model import SceneFlowModel
+from cflow_torch.tensors import choose_device
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, check_sweep
 from cflow_torch.verified.method import VerifiedFlow
-from cflow_torch.windows.ground import CHOICES, find_ground_batch
 from cflow_torch.windows.returns import MISSING, without_missing
-from cflow_torch.windows.validation import choose_device, keep_nearest
+from cflow_torch.windows.validation import keep_nearest
 
 # Arguments that a `Sweep` contains.
 _IN_SWEEPS = {"dt0", "dt1", "pch", "gmh", "dth", "T_ego1_egoh", "pcf", "gmf", "dtf", "T_ego1_egof"}

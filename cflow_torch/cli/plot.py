@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.applications.deskewing import deskew
 from cflow_torch.cli.commands import Animation, CorrelationPicture, FlowPicture, Plot
 from cflow_torch.cli.failures import finish
 from cflow_torch.cli.flows import make_log_model
@@ -29,6 +28,7 @@ from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.clusters import plot_clusters
 from cflow_torch.viz.stage_pictures import plot_correlation, plot_keypoints, plot_scales
 from cflow_torch.viz.style import blank_figure
+from cflow_torch.windows.deskewing import deskew_objects
 
 
 def task(cfg: Plot) -> None:
@@ -82,7 +82,7 @@ def _draw(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: Window)
 def _from_above(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: Window) -> Any:
     points, (result,) = sweeps.pc0.points, model([sweeps])
     if cfg.deskew:
-        points = deskew(sweeps, result).cpu()
+        points = deskew_objects(sweeps, result).cpu()
     view: dict[str, Any] = {
         "is_ground": sweeps.pc0.is_ground,
         "point_cloud_range": model.config.point_cloud_range,

@@ -35,7 +35,8 @@ MANIFEST = "manifest.json"
 _FORMAT = 2
 _ENDING = b"ARROW1"  # last bytes of a feather file
 _TRACKS = r"tracks\.parquet|mot\.txt|kitti\.txt|instances_info\.json|frame_instances\.json"
-_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|\..+\.tmp")
+_DETECTIONS = r"nuscenes_detection\.json|nuscenes_tracking\.json|result\.pkl"
+_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|{_DETECTIONS}|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 _OVERWRITE = "give overwrite=true"
 
@@ -139,6 +140,14 @@ def clear_log(folder: Path) -> None:
     for file in labels.iterdir() if labels.is_dir() else ():
         if _LABELS.fullmatch(file.name):
             file.unlink()
+    masks = masks_folder(folder.parent, folder.name)
+    for camera in masks.iterdir() if masks.is_dir() else ():
+        for file in camera.glob("*.png"):
+            file.unlink()
+        with suppress(OSError):
+            camera.rmdir()
+    with suppress(OSError):
+        masks.rmdir()
     for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
         if _OURS.fullmatch(file.name):
             file.unlink()
@@ -168,6 +177,11 @@ def frame_file(folder: Path, timestamp: int) -> Path:
 def labels_folder(output: Path, log_id: str) -> Path:
     """Return the folder of a log's labels, as evaluators of SemanticKITTI expect it below `output`."""
     return output / "sequences" / log_id / "predictions"
+
+
+def masks_folder(output: Path, log_id: str) -> Path:
+    """Return the folder of the masks of a log's images, which has a folder for each camera."""
+    return output / log_id / "masks"
 
 
 def _is_whole(file: Path) -> bool:

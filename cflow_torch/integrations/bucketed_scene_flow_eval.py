@@ -9,8 +9,8 @@ import numpy as np
 
 from cflow_torch.errors import import_optional
 from cflow_torch.integrations.sequence import SequenceFlow, SequenceSweep, times_in_ns
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, check_array
-from cflow_torch.windows.ego_motion import rigid_transform
 
 
 class CorrelationFlowEstimator(SequenceFlow):

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from cflow_torch.errors import import_optional
 from cflow_torch.integrations.sequence import SequenceFlow, SequenceSweep
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, check_array
-from cflow_torch.windows.ego_motion import rigid_transform
 
 _NEED = (
     "SceneFlowZoo is not a package: clone github.com/kylevedder/SceneFlowZoo, install its requirements, and run from "

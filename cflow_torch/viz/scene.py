@@ -27,6 +27,7 @@ class ViewedPair:
     truth: np.ndarray | None  # (N, 3) float64, true residual flow, NaN where unknown; None = the pair has no labels
     cluster: np.ndarray  # (N,) int64, -1 = none
     confidence: np.ndarray | None  # (N,) float64, or None
+    moving: np.ndarray | None  # (N,) float64, probability that a point moves, or None
     is_ground: np.ndarray  # (N,) bool
     pose: np.ndarray | None  # (4, 4) float64 `T_world_ego` of t+1, or None
 
@@ -54,6 +55,7 @@ class ViewedPair:
             truth=truth,
             cluster=as_numpy(result.cluster_id)[kept],
             confidence=None if result.confidence is None else as_numpy(result.confidence, np.float64)[kept],
+            moving=None if result.moving is None else as_numpy(result.moving, np.float64)[kept],
             is_ground=ground[kept],
             pose=None if pc1.pose is None else as_numpy(pc1.pose, np.float64),
         )

@@ -28,7 +28,7 @@ import cflow_torch
 from cflow_torch import evaluation, viz
 from cflow_torch.config import METHODS
 from cflow_torch.data.arrays import write_array_log
-from cflow_torch.data.arrays.cloud_file import read_cloud
+from cflow_torch.data.arrays.cloud_file import read_cloud, read_columns, write_cloud
 from cflow_torch.data.catalog import DATA_SETS
 from cflow_torch.simulator import make_drive
 
@@ -110,6 +110,28 @@ def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: dict
         printed = capfd.readouterr().out
         assert re.search(r"object \d+ at \[.*\] m: \d+\.\d m/s", printed) and re.search(r"object \d+: .* m/s", printed)
         assert Path("flow.png").is_file() and 0 < len(read_cloud("clean_map.ply")) < len(read_cloud("map.ply"))
+
+
+def test_three_commands_of_the_readme_make_actors_and_a_clean_map(folder: Path, capfd: Any) -> None:
+    """They run one after the other on a folder of .pcd files with poses."""
+    pytest.importorskip("pypcd4", reason="needs the extra clouds: pip install pypcd4")
+    drive = make_drive(seed=4, num_sweeps=7, profile="demo")
+    (folder / "data" / "my_drive").mkdir(parents=True)
+    for index, sweep in enumerate(drive):
+        write_cloud(folder / "data" / "my_drive" / f"scan_{index}.pcd", sweep.points, {"intensity": sweep.points[:, 2]})
+    np.savetxt(folder / "data" / "my_drive" / "poses.txt", drive.poses[:, :3].reshape(-1, 12))
+    commands = [words for kind, words in parts("README.md") if kind == "cflow" and "/data/my_drive" in words]
+    assert [words[0] for words in commands] == ["check", "flow", "clean"]
+    for words in commands:
+        assert cflow(*(word.replace("/data/", "data/") for word in words)) == 0, words
+    printed = capfd.readouterr().out
+    frames = json.loads(Path("outputs/flow/my_drive/frame_instances.json").read_text())
+    actors = json.loads(Path("outputs/flow/my_drive/instances_info.json").read_text())
+    assert list(frames) == [str(index) for index in range(7)] and max(map(len, frames.values())) > 2
+    assert f"{len(actors)} tracks in tracks.parquet, instances_info.json, frame_instances.json" in printed
+    points = read_columns("outputs/clean/my_drive.ply")["intensity"]
+    kept = [read_cloud(f"outputs/clean/my_drive/points/scan_{index}.pcd") for index in range(7)]
+    assert 1000 < len(points) < sum(map(len, kept)) < 0.95 * sum(len(sweep.points) for sweep in drive)
 
 
 EVERY_PAGE = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.[im][pd]*")]

@@ -21,9 +21,9 @@ from torch.nn.utils.rnn import pad_sequence
 
 from cflow_torch import CFlowError, Sweep, Window, make_config, make_model
 from cflow_torch.data.hdf5.frames import harness_motion, harness_pose_flow, recognized_extrinsics
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.integrations.opensceneflow import CFlow
 from cflow_torch.integrations.opensceneflow.__main__ import main as write_checkpoint
+from cflow_torch.transforms import transform_points
 
 Batch = Dict[str, Any]
 SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE)}

@@ -13,8 +13,8 @@ from cflow_torch.data.aevascenes import CATEGORY_NAME, GROUND
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.paths import safe_name
-from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import AnnotationBoxes, Recording, UnitReturns
+from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import CFlowError
 
 CLASS_OF: dict[str, str] = {

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from cflow_torch.data.hdf5.frames import harness_motion, recognized_extrinsics
+from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import CFlowError, Sweep, Window, check_array, check_points
-from cflow_torch.windows.ego_motion import relative_transform, rigid_transform
 
 
 class BatchSample(NamedTuple):

@@ -17,8 +17,8 @@ from cflow_torch.data.hdf5.frames import harness_pose_flow, residual_for_harness
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import BatchSample, read_batch
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, FlowResult
-from cflow_torch.windows.ego_motion import rigid_transform
 
 
 class CFlow(nn.Module):

@@ -12,8 +12,8 @@ from pyarrow import feather
 
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid, Recording
+from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import Sweep
 
 CITY = "SYN"  # code of the city in file names; real logs have PIT, MIA, ...

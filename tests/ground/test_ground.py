@@ -12,8 +12,8 @@ from scenes import assert_same, needs_gpu
 from cflow_torch import CFlowError, Sweep, estimate_flow
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
+from cflow_torch.ground.segmentation import find_ground, find_ground_batch, has_ground
 from cflow_torch.simulator import make_drive
-from cflow_torch.windows.ground import find_ground, find_ground_batch, has_ground
 
 SEED = 410  # the method was tuned on 400 ... 409
 Point = Tuple[float, float, float]
