@@ -149,8 +149,8 @@ def kinds_and_sizes(edges: Edges, track: Tensor, count: int, speed: Tensor) -> t
         count: K.
         speed: (K,) m/s.
 
-    Returns: (K,) int64 kinds and (K, 3) float64 sizes, metres. Lengths and widths that are not seen are typical ones, or
-        what is visible if it is larger.
+    Returns: (K,) int64 kinds and (K, 3) float64 sizes, metres. Lengths and widths that are not seen are typical ones,
+        or what is visible if it is larger.
     """
     every = torch.ones_like(track, dtype=torch.bool)
     size = torch.stack([_extent(edges, axis, track, count, every) for axis in range(3)], 1)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -37,14 +37,14 @@ _CLASSES = {
     "truck": ("BUS", "BOX_TRUCK", "TRUCK", "TRUCK_CAB", "LARGE_VEHICLE", "VEHICULAR_TRAILER", "ARTICULATED_BUS"),
 }
 CLASS_OF = {name: kind for kind, names in _CLASSES.items() for name in names}
-Row = Dict[str, Any]
+Row = dict[str, Any]
 
 
 class TrueBoxes(NamedTuple):
     """The K scored objects of one sweep, in the world."""
 
-    name: List[str]
-    kind: List[str]  # pedestrian, cyclist, car, truck
+    name: list[str]
+    kind: list[str]  # pedestrian, cyclist, car, truck
     size: np.ndarray  # (K, 3) metres
     pose: np.ndarray  # (K, 4, 4) `T_world_box`
     velocity: np.ndarray  # (K, 3) m/s
@@ -55,7 +55,7 @@ class TrueBoxes(NamedTuple):
 
 
 def scored(
-    boxes: Boxes, pose: np.ndarray, later: Dict[str, np.ndarray], seconds: float, points: np.ndarray
+    boxes: Boxes, pose: np.ndarray, later: dict[str, np.ndarray], seconds: float, points: np.ndarray
 ) -> TrueBoxes:
     """Keep the boxes that are scored.
 
@@ -222,7 +222,7 @@ def area(polygon: np.ndarray) -> float:
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 if len(polygon) else 0.0
 
 
-def score(log: Any, table: Dict[str, np.ndarray], sweeps: range) -> list[Row]:
+def score(log: Any, table: dict[str, np.ndarray], sweeps: range) -> list[Row]:
     """A row for each scored object and sweep."""
     rows: list[Row] = []
     for index in sweeps:
@@ -273,14 +273,14 @@ def summary(name: str, rows: list[Row]) -> Row:
 
 def constancy(hits: list[Row]) -> float:
     """Share of the boxes whose length and width are within 2 % of the median of their track."""
-    tracks: Dict[Any, list[np.ndarray]] = {}
+    tracks: dict[Any, list[np.ndarray]] = {}
     for row in hits:
         tracks.setdefault((row["log"], row["track"]), []).append(row["size"][:2])
     off = [np.abs(np.array(sizes) / np.median(sizes, 0) - 1).max(1) for sizes in tracks.values()]
     return float(100 * (np.concatenate(off) <= 0.02).mean()) if off else np.nan
 
 
-def boxes_of(log: Log, model: VerifiedFlow) -> tuple[Dict[str, np.ndarray], range]:
+def boxes_of(log: Log, model: VerifiedFlow) -> tuple[dict[str, np.ndarray], range]:
     """Track a drive."""
     seen = windows(GroundSegmentedLog(log), model.config.num_history, model.config.num_future)
     results = [(index, model([given])[0]) for index, given in enumerate(seen)]

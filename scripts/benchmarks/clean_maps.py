@@ -27,7 +27,6 @@ from typing import Any, Mapping, Sequence
 import numpy as np
 import torch
 from beams import SENSOR_HEIGHT
-from cflow_torch.data.rigid_motion import transform_points
 from labelled import SENSORS, LabelledLog, SimulatedLog
 from labels import RANGE, dufomap_labels
 from table import markdown
@@ -42,6 +41,7 @@ from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.trajectories import Route
+from cflow_torch.transforms import transform_points
 
 SEED = 300
 DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cflow_torch.data.rigid_motion import to_quaternions
 from tiny_recording import CAR_SIZE, NUM_ON_CAR, NUM_STATIC, TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.pandaset import PandaSetLog
 from cflow_torch.data.pickles import load_columns
+from cflow_torch.transforms import to_quaternions
 
 # Two points (x, y, d, label) by pandas 1.0.5 in protocol 4, the layout of the released files.
 OLD_FRAME = (
