@@ -10,6 +10,7 @@ from typing import Any, Iterator, Mapping, Sequence, TypeVar, overload
 import numpy as np
 from torch.utils.data import Dataset
 
+from cflow_torch.data.camera import Camera
 from cflow_torch.errors import MissingFile, warn
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
 
@@ -77,6 +78,11 @@ class Log(ABC):
     lidar_position: Any = (0.0, 0.0, 0.0)
     turn_seconds: float | None = None
 
+    @property
+    def judgement(self) -> Any:
+        """How well readings of the poses fit (`cflow_torch.windows.readings.Judgement`); None = not compared yet."""
+        return None
+
     @abstractmethod
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: float32 points, float64 pose `T_world_ego`, ground mask, time."""
@@ -100,6 +106,11 @@ class Log(ABC):
         """
         self._timestamp(index)
         return {}
+
+    def cameras(self, index: int) -> Sequence[Camera]:
+        """Return the calibrated cameras at the time of sweep `index`; () if the log has no calibration of cameras."""
+        self._timestamp(index)
+        return ()
 
     def windows(self, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
         """Iterate over the windows of all pairs, in order; each sweep is read once. See `window`."""
@@ -242,12 +253,19 @@ class LogWrapper(Log):
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
         return self.log.columns(index)
 
+    def cameras(self, index: int) -> Sequence[Camera]:
+        return self.log.cameras(index)
+
     @property
     def notes(self) -> list[str]:
         return self.log.notes
 
     def _note(self, text: str, kind: str = "") -> None:
         self.log._note(text, kind)
+
+    @property
+    def judgement(self) -> Any:
+        return self.log.judgement
 
     def close(self) -> None:
         self.log.close()

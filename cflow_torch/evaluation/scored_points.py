@@ -6,9 +6,9 @@ from typing import Any, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.evaluation.definitions import Definition, interval_of
 from cflow_torch.evaluation.frame import EvalFrame
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, as_numpy
 
 CLOSE_RANGE = 35.0  # metres, half side of the square that Argoverse 2 calls "close"
@@ -105,6 +105,9 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     is_dynamic = np.linalg.norm(true_residual, axis=1) >= threshold
     if definition.truth == "motion" and frame.moving is not None:
         is_dynamic |= as_numpy(frame.moving)[keep]
+    predicted_dynamic = np.linalg.norm(flows.total - flows.pose_flow, axis=1) >= threshold
+    if definition.truth == "motion" and frame.predicted_moving is not None:
+        predicted_dynamic = as_numpy(frame.predicted_moving)[keep]
     difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
     return ScoredPoints(
         error=np.linalg.norm(difference, axis=1).astype(np.float64),
@@ -117,7 +120,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
         true_flow=true_flow.astype(np.float64),
         predicted_flow=predicted_flow.astype(np.float64),
         is_dynamic=is_dynamic,
-        predicted_dynamic=np.linalg.norm(flows.total - flows.pose_flow, axis=1) >= threshold,
+        predicted_dynamic=predicted_dynamic,
         num_nan=num_nan,
     )
 

@@ -11,9 +11,8 @@ import numpy as np
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.data.rigid_motion import interpolate_poses, poses_from_quaternions
+from cflow_torch.transforms import interpolate_poses, poses_from_quaternions, rigid_transform
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.ego_motion import rigid_transform
 
 CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets
 # Names of columns without punctuation, as odometry programs and exports of ROS messages write them.
@@ -55,8 +54,9 @@ def read_poses(path: PathLike) -> Trajectory:
         matrices = read_npy(path, "pass a .npy file of (K, 4, 4) numbers")
         return Trajectory(checked_poses(matrices, str(path)), None, layout, str(path))
     names, words = _read_table(path)
-    words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]  # programs write a line twice
     roles = _roles(names)
+    if (roles is not None and len(roles) > 7) or words.shape[1] == 8:  # with times; others repeat if the vehicle stands
+        words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]  # programs write a line twice
     if roles is not None:
         time, columns = roles[:-7], roles[-7:]
     elif words.shape[1] == 8:
