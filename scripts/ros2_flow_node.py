@@ -23,7 +23,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from sensor_msgs_py.point_cloud2 import create_cloud, read_points_numpy
 
 from cflow_torch import CFlowError, FlowStream
-from cflow_torch.data.rigid_motion import poses_from_quaternions
+from cflow_torch.transforms import poses_from_quaternions
 
 _NAMES = ("x", "y", "z", "vx", "vy", "vz", "object")
 _FIELDS = [PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, name in enumerate(_NAMES)]

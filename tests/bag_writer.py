@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tiny_recording import TinyRecording, rigid, turn_z
 
-from cflow_torch.data.rigid_motion import to_quaternions
+from cflow_torch.transforms import to_quaternions
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="the extra bags is not installed")
 rosbag2 = pytest.importorskip("rosbags.rosbag2")

@@ -8,7 +8,7 @@ from typing import Any, Sequence
 import numpy as np
 import pytest
 
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.transforms import transform_points
 
 STAMPS = (1_533_279_682_150_532, 1_533_279_682_250_532, 1_533_279_682_350_532)  # microseconds
 

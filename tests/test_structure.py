@@ -14,8 +14,9 @@ from cflow_torch import CorrelationFlow
 PACKAGE = Path(cflow_torch.__file__).parent
 # A room imports from itself and from rooms that stand before it.
 ROOMS = (
-    *("errors", "types", "setting", "config", "stages", "ops", "windows", "model", "dense", "keypoints", "verified"),
-    *("estimate", "data", "simulator", "evaluation", "viz", "fleet", "applications", "integrations", "configs", "cli"),
+    *("errors", "types", "setting", "config", "stages", "tensors", "transforms", "ops", "ground", "windows", "model"),
+    *("dense", "keypoints", "verified", "estimate", "data", "simulator", "evaluation", "viz", "fleet", "applications"),
+    *("integrations", "configs", "cli"),
 )
 HEAVY = ("kornia", "matplotlib", "hydra", "omegaconf", "pyarrow", "h5py", "cv2", "sklearn", "ray", "rerun", "k3d")
 

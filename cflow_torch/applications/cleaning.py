@@ -15,9 +15,9 @@ from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_array
 
 _MARGIN = 0.2  # metres, added to the sides of the box around the visible part of an object

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.applications.track_table import Table, class_of
-from cflow_torch.data.boxes import upright_poses
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
+from cflow_torch.transforms import upright_poses
 
 INSTANCES_FILE = "instances_info.json"
 FRAMES_FILE = "frame_instances.json"

@@ -10,11 +10,10 @@ import numpy as np
 from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import Table, boxes_in_sweeps
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.boxes import upright_poses
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.log import Log
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.errors import import_optional
+from cflow_torch.transforms import transform_points, upright_poses
 from cflow_torch.types import CFlowError, FlowResult, as_numpy
 
 DYNAMIC, STATIC = 255, 0  # values of pixels

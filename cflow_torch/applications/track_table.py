@@ -14,7 +14,7 @@ from cflow_torch.data.atomic import atomic_file, write_text
 from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.data.rigid_motion import transform_each
+from cflow_torch.transforms import transform_each
 
 Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # next to the flow files of a log
@@ -25,6 +25,7 @@ COLUMNS = {
     **dict.fromkeys(_FLOATS, np.float64),
     "is_moving": np.bool_,
     "is_confirmed": np.bool_,
+    "class": np.str_,
 }
 
 

@@ -13,7 +13,7 @@ from cflow_torch.applications.clean_files import own_suffix, stored_masks, write
 from cflow_torch.applications.cleaning import CleanLog, MaskedLog, static_map_with_intensity
 from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
-from cflow_torch.cli.flows import make_model, stored_flow
+from cflow_torch.cli.flows import make_log_model, stored_flow
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import local_folder, settings_record, versions, write_config
 from cflow_torch.data.arrays import ArraysLog
@@ -23,7 +23,7 @@ from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
-from cflow_torch.fleet.changes import describe_changes
+from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
@@ -53,7 +53,7 @@ def task(cfg: Clean) -> None:
 def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
     """Return a function that makes the clean log, by the flow of earlier files or by the method."""
     if cfg.flow is None:
-        model = make_model(cfg.model, cfg.device)
+        model = make_log_model(cfg.model, cfg.device)
         return lambda log: CleanLog(log, model, None, cfg.remove_stopped)
     stored = stored_flow(cfg.flow, _NEEDED)
     return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped)
@@ -66,10 +66,9 @@ def _is_new(cfg: Clean, log: Log, output: Path) -> bool:
         return True
     file = _record_file(folder)
     before: dict[str, Any] = read_json(file) if file.exists() else {}
-    changes = describe_changes(before, json_ready(_record(cfg, log)), _FREE)
-    if changes or not cfg.resume:
-        why = changes or "with the same settings; resume=true continues it"
-        raise CFlowError(f"{folder} has results of another run ({why}): give overwrite=true, or output=FOLDER")
+    check_same_run(folder, before, json_ready(_record(cfg, log)), _FREE)
+    if not cfg.resume:
+        raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
     return False
 
 
@@ -89,7 +88,7 @@ def _record(cfg: Clean, log: Log) -> dict[str, Any]:
     """Return what the clean points follow from: settings, versions and the sweeps of the log."""
     settings = settings_record(cfg)
     settings["data"].pop("root", None)  # several logs, which may be elsewhere tomorrow
-    return {**settings, "versions": versions(), "log": describe_log(log, "")}
+    return {**settings, "versions": versions(), "log": describe_log(log)}
 
 
 def _record_file(folder: Path) -> Path:

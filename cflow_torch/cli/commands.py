@@ -11,9 +11,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Iterator, Union
 
 from cflow_torch.config import Config
-from cflow_torch.setting import Settings, bounds, setting
+from cflow_torch.setting import AUTO, Settings, bounds, setting
 
-AUTO = "auto"
 # Settings of data sets that we check before a reader gets them. configs/data/ has the defaults of all of them.
 DATA_SETTINGS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("first", "seed", "first_seed"), bounds(int, low=0)),
@@ -583,7 +582,7 @@ class ListSettings(Words):
     With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
 
     --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-    cflow_live.yaml, cflow_paper.yaml and cflow_keypoints.yaml. The package contains the same files.
+    cflow_live.yaml, cflow_paper.yaml, ... The package contains the same files.
 
     examples:
       cflow settings max_speed          default, allowed values and meaning of a setting

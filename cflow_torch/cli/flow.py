@@ -43,19 +43,19 @@ from cflow_torch.data.hdf5.writer import check_result_name, check_writable, writ
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Part, Shard, find_shard
-from cflow_torch.fleet.machine import AUTO, Layout, choose_layout, frames_per_worker
+from cflow_torch.fleet.machine import Layout, choose_layout, frames_per_worker
 from cflow_torch.fleet.manifest import (
     check_logs,
-    claim_run,
+    clear_log,
     complete_frames,
     frame_file,
     labels_folder,
     make_identity,
     masks_folder,
-    release_run,
 )
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
 from cflow_torch.fleet.work import source_name
+from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
@@ -73,7 +73,6 @@ class FlowRun(NamedTuple):
     sources: Sources
     job: Job
     shard: Shard
-    identity: dict[str, Any]  # whose hash the job has
     parts: list[Part]
 
     def logs(self) -> Iterator[Log]:
@@ -116,16 +115,15 @@ def compute(
     if not cfg.dry_run:
         check(cfg, flow)
         ensure_writable(output)
-    check_logs(output, names, flow.identity, cfg.resume, cfg.overwrite, is_alone)
+    check_logs(output, names, flow.job.identity, cfg.resume, cfg.overwrite, is_alone)
     if cfg.dry_run:
         print(forecast(flow.job, flow.parts))
         return
-    claim_run(output, flow.identity, flow.log_ids() if cfg.overwrite and is_alone else ())
+    if cfg.overwrite and is_alone:
+        for log_id in flow.log_ids():
+            clear_log(output / log_id)
     write_config(cfg, output)
     report = _run(cfg, flow, layout)
-    frames = report["frames"]
-    if is_alone and frames["computed"] + frames["complete_before"] == 0:
-        release_run(output, flow.job.identity)
     failures = [] if report["stopped_by"] else use(cfg, flow, report)  # a signal leaves no time for this
     _finish(cfg, flow, report, failures)
 
@@ -134,10 +132,9 @@ def _plan(cfg: FlowFiles, contents: tuple[str, ...], batch: int) -> FlowRun:
     """Find the logs, and this process's share of them."""
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
     sources = find_logs(cfg.data)
-    identity = make_identity(cfg.model, sources.reader, sources.settings, contents)
     job = Job(
         config=cfg.model,
-        identity=identity["hash"],
+        identity=make_identity(cfg.model, sources.reader, sources.settings, contents),
         reader=sources.reader,
         settings=sources.settings,
         output=str(output_folder(cfg)),
@@ -145,7 +142,7 @@ def _plan(cfg: FlowFiles, contents: tuple[str, ...], batch: int) -> FlowRun:
         batch=batch,
         redo=cfg.overwrite,
     )
-    return FlowRun(sources, job, shard, identity, list(shard.parts(sources.logs)))
+    return FlowRun(sources, job, shard, list(shard.parts(sources.logs)))
 
 
 def _run(cfg: FlowFiles, flow: FlowRun, layout: Layout) -> dict[str, Any]:

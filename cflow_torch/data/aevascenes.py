@@ -15,7 +15,7 @@ from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes
 from cflow_torch.data.pickles import load_array
-from cflow_torch.data.rigid_motion import poses_from_json, transform_points
+from cflow_torch.transforms import poses_from_json, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array
 from cflow_torch.windows.returns import missing_returns
 

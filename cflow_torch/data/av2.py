@@ -18,7 +18,7 @@ from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_errors, safe_name
-from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions, transform_points
+from cflow_torch.transforms import poses_at, poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array, vector_columns
 
 # Rule -> largest distance of a ground point from the surface, metres, and the function that rounds grid positions to

@@ -10,7 +10,7 @@ import numpy as np
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import FlowLabels, Log
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError
 
 _LISTED = 20  # names in a message
@@ -49,16 +49,6 @@ def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int
     if unknown:
         raise CFlowError(f"the categories {shortened(unknown[:_LISTED])} are unknown; known are {list(known)}")
     return [CATEGORY_INDEX[known[name]] for name in names]
-
-
-def upright_poses(heading_centre: Any) -> np.ndarray:
-    """Return (K, 4, 4) float64 poses of upright boxes, from rows of heading (radians about z) and x, y, z (metres)."""
-    values = np.array(heading_centre, dtype=np.float64).reshape(-1, 4)
-    pose = np.tile(np.eye(4), (len(values), 1, 1))
-    cos, sin = np.cos(values[:, 0]), np.sin(values[:, 0])
-    pose[:, 0, 0], pose[:, 0, 1], pose[:, 1, 0], pose[:, 1, 1] = cos, -sin, sin, cos
-    pose[:, :3, 3] = values[:, 1:]
-    return pose
 
 
 def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.transforms import transform_points
 
 _NEAREST = 0.1  # metres; nearer points are not projected
 

@@ -19,13 +19,13 @@ from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import read_as as read_log_as
+from cflow_torch.ground.segmentation import CHOICES
+from cflow_torch.ground.segmentation import find_ground as ground_of
+from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, Sweep, Window
 from cflow_torch.windows.deskewing import SCANS
-from cflow_torch.windows.ground import CHOICES
-from cflow_torch.windows.ground import find_ground as ground_of
 
 _OF_ALL = ("find_ground", "odometry", "read_as", "own_vehicle", "deskew", "check")  # settings of every data set
-AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
 
@@ -201,7 +201,7 @@ def open_log(
     Args:
         name: a key of `DATA_SETS`, or the `target` that you gave `find_user_sources`.
         source: from `find_sources` or `find_user_sources`.
-        find_ground: method of `cflow_torch.windows.ground.find_ground` for sweeps without a ground mask, "grid" or
+        find_ground: method of `cflow_torch.ground.find_ground` for sweeps without a ground mask, "grid" or
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.

@@ -4,34 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.data.log_motion import judge_log
+from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
-from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS, deskew_points, scan_fractions
-from cflow_torch.windows.ego_motion import relative_transform
-from cflow_torch.windows.stillness import share_in_place, static_rows, thinned_rows
+from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, deskew_points, scan_fractions
+from cflow_torch.windows.readings import Judgement
 
 CHOICES = ("auto", "times", "off", *SCANS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
 _INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
-_LEAST_MOTION = 0.5  # metres a sweep; below, a wrong reading moves static objects by millimetres only
-# The later sweep of a pair comes after about 6 m, at most 5 sweeps. There, a wrong reading shows several times as
-# clearly as between neighbours, and most of the structure is still in view.
-_BASELINE = 6.0
-_MOST_SWEEPS = 5
-_PAIRS = 3
-_MOST_POINTS = 3000  # of the earlier sweep; the share is then within 0.008
-_FEWEST_POINTS = 300
-# The best share must be larger than the next one by this factor. For raw drives it was larger by 1.2 at 1.2 m a sweep,
-# and by 1.3 at 2 m, by 1.055 at 0.6 m. For compensated drives, the factor of a wrong reading was at most 1.02.
-_CLEARLY = 1.08
-_LIKELY = 1.03  # for the order of the readings, and for another start of the turn
-# After a shift along the path (metres), the share must be smaller by this factor. It was 1.6 on raw drives.
-_SHIFT, _PEAK = 0.15, 1.2
 
 
 class Reading(NamedTuple):
@@ -47,7 +33,9 @@ class DeskewedLog(LogWrapper):
     Args:
         log: the log; sweeps without poses stay as they are.
         deskew: "times" = by `Sweep.point_times`; "clockwise", "counterclockwise", "clockwise_left", ... = by the
-            azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = by `choose_reading`.
+            azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = the scan under which
+            the static world stands still best (`cflow_torch.windows.readings`). Without a clear one, points with times
+            of raw points are moved by these, and others stay.
 
     Attributes:
         reading: the `Reading` in use. It is decided at first use, from the log alone.
@@ -74,10 +62,59 @@ class DeskewedLog(LogWrapper):
 
     @cached_property
     def reading(self) -> Reading:
-        if self._deskew == "auto":
-            return choose_reading(self)
-        is_moved = self._deskew == "times" and has_moved_by_times(self)
-        return Reading("off" if is_moved else self._deskew)
+        if self._deskew != "auto":
+            is_moved = self._deskew == "times" and self._has_moved_by_times()
+            return Reading("off" if is_moved else self._deskew)
+        scan = self._scans[0] if self._judged is None else self._judged.scan or self._scans[0]
+        return Reading(scan, self._note_of(scan))
+
+    @property
+    def judgement(self) -> Judgement | None:
+        return self._judged
+
+    @cached_property
+    def _judged(self) -> Judgement | None:
+        """Compare the scans, and the readings of the poses under the best one; None if there is one scan only."""
+        if self._deskew != "auto" or len(self._scans) == 1:
+            return None
+        return judge_log(self.log, self._place, self._scans)
+
+    @cached_property
+    def _scans(self) -> tuple[str, ...]:
+        """Return how the sweeps may be scanned; the first is what we expect.
+
+        Logs of formats that are known to be compensated stay as they are (`Log.is_compensated`), and so do logs without
+        `poses`. Times of points are expected to be those of raw points if the reader says so (`Log.has_raw_times`).
+        """
+        own = self.log.unwrapped
+        if own.is_compensated or self.ego_poses is None or self._has_moved_by_times():
+            return ("off",)
+        if self._recent.sweep(0).point_times is None:
+            return ("off", *DIRECTIONS)
+        return ("times", "off") if own.has_raw_times else ("off", "times")
+
+    def _has_moved_by_times(self) -> bool:
+        """Test whether the reader has already moved the points by their times."""
+        return self.log.unwrapped.moves_by_times and self._recent.sweep(0).point_times is not None
+
+    def _place(self, index: int, sweep: Sweep, rows: np.ndarray, scan: str) -> np.ndarray:
+        points = as_numpy(sweep.points)[rows, :3].astype(np.float64)
+        return points if scan == "off" else self.move(points, self.seconds(sweep, scan, rows), index, scan)
+
+    def _note_of(self, scan: str) -> str:
+        """Return what the user should know of the scan that was found."""
+        expected = self._scans[0]
+        if scan == expected == "off":
+            return ""
+        shares = {} if self._judged is None else self._judged.shares_of_scans
+        compared = ", ".join(f"{share:.0%} with {name}" for name, share in shares.items())
+        measured = f" (of the static structure, {compared} is in place some metres later)" if compared else ""
+        same = f"data.deskew={scan} does the same without this line"
+        if scan == "off":
+            return f"its points have times, but seem to be de-skewed already, so we leave them{measured}. {same}"
+        by = "the times of its points" if scan == "times" else f"the azimuth ({scan}; ahead = the instant)"
+        moved = f"its sweeps are not de-skewed, so we move each point by the ego motion according to {by}"
+        return f"{moved}{measured}. {same}, data.deskew=off leaves the points as they are"
 
     def sweep(self, index: int) -> Sweep:
         return self.read(index, self.reading.name)
@@ -162,132 +199,3 @@ class DeskewedLog(LogWrapper):
     def _interval(self) -> float:
         """Seconds of one turn."""
         return self.log.unwrapped.turn_seconds or float(np.median(self._gaps))
-
-
-def has_moved_by_times(log: DeskewedLog) -> bool:
-    """Test whether the reader has already moved the points by their times."""
-    return log.unwrapped.moves_by_times and log.read(0, "off").point_times is not None
-
-
-def choose_reading(log: DeskewedLog) -> Reading:
-    """Choose how to read the sweeps of a log for deskew=auto.
-
-    Convention:
-        - Logs of formats that are known to be compensated stay as they are (`Log.is_compensated`), and so do logs
-          without the attribute `poses`.
-        - Otherwise, times of points are used if they are known to be those of raw points (`Log.has_raw_times`).
-        - If the vehicle moves by more than half a metre a sweep, the static world decides: three pairs of sweeps some
-          6 m apart, and the share of the structure of the earlier one that is in place in the later one. If the log has
-          times, we compare the readings "times" and "off", otherwise "off" and both directions. We depart from the
-          above only for a reading that is better than "off" by 8 %, and better in every pair. With a wrong direction,
-          the error of "off" doubles, so "off" must also be better than the other direction, by 3 %. And the share must
-          fall by a sixth if we shift the earlier sweep by 15 cm: along smooth walls it does not.
-        - Of the starts of a turn, we take the one with the largest share, and the one behind if none is better by 3 %.
-
-    Cost: 0.3 s and up to six sweeps; nothing where the format or the speed decides.
-    """
-    own = log.unwrapped
-    if own.is_compensated or log.ego_poses is None:
-        return Reading("off")
-    if has_moved_by_times(log):
-        return Reading("off")
-    has_times = log.read(0, "off").point_times is not None
-    expected = "times" if has_times and own.has_raw_times else "off"
-    others = ["off" if expected == "times" else "times"] if has_times else list(DIRECTIONS)
-    pairs = _choose_pairs(log)
-    shares = _shares(log, pairs, [expected, *others])
-    best = expected
-    if shares:
-        ranked = sorted(shares, key=lambda name: float(shares[name].mean()), reverse=True)
-        means = [float(shares[name].mean()) for name in ranked]
-        found = ranked[0]
-        is_ordered = found != expected and ranked[1] == expected and means[0] >= _LIKELY * means[1]
-        if is_ordered and found in DIRECTIONS:
-            found, shares[ranked[0]] = _best_start(log, pairs, found, shares[found])
-        is_ordered &= all(better >= _LIKELY * worse for better, worse in zip(means[1:], means[2:]))
-        is_clear = is_ordered and shares[ranked[0]].mean() >= _CLEARLY * means[1]
-        if is_clear and (shares[ranked[0]] > shares[expected]).all():
-            shifted = _shares(log, pairs, [found], _SHIFT)[found]
-            best = found if shares[ranked[0]].mean() > _PEAK * shifted.mean() else expected
-    if best == "off" and expected == "off":
-        return Reading("off")
-    measured = f": {_described(shares)} of the static structure is in place some metres later" if shares else ""
-    same = f"data.deskew={best} does the same without this line"
-    if best == "off":
-        return Reading(
-            "off", f"its points have times, but seem to be de-skewed already, so we leave them{measured}. {same}"
-        )
-    by = "the times of its points" if best == "times" else f"the azimuth ({best}; ahead = the instant)"
-    note = f"its sweeps are not de-skewed, so we move each point by the ego motion according to {by}{measured}. {same}"
-    return Reading(best, note + ", data.deskew=off leaves the points as they are")
-
-
-def _best_start(log: DeskewedLog, pairs: Sequence[_Pair], direction: str, behind: np.ndarray) -> tuple[str, np.ndarray]:
-    """Return where a turn begins, as the name of the reading, and its shares. `behind` are those of a start behind."""
-    shares = _shares(log, pairs, [direction + start for start in STARTS if start])
-    best = max(shares, key=lambda name: float(shares[name].mean()))
-    is_better = shares[best].mean() >= _LIKELY * behind.mean()
-    return (best, shares[best]) if is_better else (direction, behind)
-
-
-def _described(shares: dict[str, np.ndarray]) -> str:
-    return ", ".join(f"{values.mean():.1%} with {name}" for name, values in shares.items())
-
-
-class _Pair(NamedTuple):
-    """Two sweeps some metres apart, as stored, and the rows of their static structure, thinned."""
-
-    indices: tuple[int, int]  # the earlier and the later one
-    sweeps: tuple[Sweep, Sweep]
-    rows: tuple[np.ndarray, np.ndarray]
-
-
-def _choose_pairs(log: DeskewedLog) -> list[_Pair]:
-    """Read three pairs of sweeps about 6 m apart; [] if the vehicle is too slow, or too little structure is in view."""
-    poses: Any = log.ego_poses
-    motion = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    is_fast = motion > _LEAST_MOTION
-    if not is_fast.any():
-        return []
-    distance = int(np.clip(round(_BASELINE / float(np.median(motion[is_fast]))), 1, _MOST_SWEEPS))
-    distance = min(distance, len(log) - 1)
-    starts = np.flatnonzero(is_fast[: len(log) - distance])
-    if not len(starts):
-        return []
-    chosen = np.unique(starts[np.linspace(0, len(starts) - 1, _PAIRS).round().astype(int)])
-    pairs = []
-    for earlier in chosen.tolist():
-        indices = earlier, earlier + distance
-        sweeps = log.read(indices[0], "off"), log.read(indices[1], "off")
-        source, target = (_thinned_structure(sweep) for sweep in sweeps)
-        if min(len(source), len(target)) >= _FEWEST_POINTS:
-            source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
-            pairs.append(_Pair(indices, sweeps, (source, target)))
-    return pairs
-
-
-def _thinned_structure(sweep: Sweep) -> np.ndarray:
-    static = static_rows(sweep)
-    return static[thinned_rows(as_numpy(sweep.points)[static, :3])]
-
-
-def _shares(
-    log: DeskewedLog, pairs: Sequence[_Pair], readings: Sequence[str], shift: float = 0.0
-) -> dict[str, np.ndarray]:
-    """Return the share of static structure in place in each pair, by reading; {} without pairs.
-
-    The earlier sweep of each pair is moved by `shift` metres along the path.
-    """
-    shares: dict[str, list[float]] = {name: [] for name in readings if pairs}
-    for pair in pairs:
-        T_later_earlier = relative_transform(pair.sweeps[1].pose, pair.sweeps[0].pose)
-        T_later_earlier[:3, 3] *= 1 + shift / float(np.linalg.norm(T_later_earlier[:3, 3]))
-        for reading, of_pairs in shares.items():
-            clouds = []
-            for sweep, rows, index in zip(pair.sweeps, pair.rows, pair.indices):
-                points = as_numpy(sweep.points)[rows, :3]
-                if reading != "off":
-                    points = log.move(points, log.seconds(sweep, reading, rows), index, reading)
-                clouds.append(points)
-            of_pairs.append(share_in_place(clouds[0], clouds[1], T_later_earlier))
-    return {name: np.array(of_pairs) for name, of_pairs in shares.items()}

@@ -12,8 +12,8 @@ from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import Sweep
-from cflow_torch.windows.ego_motion import rigid_transform
 
 _OTHERS = {"rosbag": "bags", "mcap": "bags"}  # loaders without random access -> our own reader
 

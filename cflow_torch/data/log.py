@@ -78,6 +78,11 @@ class Log(ABC):
     lidar_position: Any = (0.0, 0.0, 0.0)
     turn_seconds: float | None = None
 
+    @property
+    def judgement(self) -> Any:
+        """How well readings of the poses fit (`cflow_torch.windows.readings.Judgement`); None = not compared yet."""
+        return None
+
     @abstractmethod
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: float32 points, float64 pose `T_world_ego`, ground mask, time."""
@@ -257,6 +262,10 @@ class LogWrapper(Log):
 
     def _note(self, text: str, kind: str = "") -> None:
         self.log._note(text, kind)
+
+    @property
+    def judgement(self) -> Any:
+        return self.log.judgement
 
     def close(self) -> None:
         self.log.close()

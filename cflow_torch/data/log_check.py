@@ -12,11 +12,10 @@ from cflow_torch.errors import CFlowError, warn
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import CAUSES, MOUNT, NO_READING, STILL, UNKNOWN, WORLD
+from cflow_torch.windows.readings import CAUSES, NO_READING, STILL, UNKNOWN, WORLD, Judgement
 
 RIGHT, FOUND, WRONG = "right", "found and used", "wrong"
 _CACHED = 12  # sweeps that several checks read
-_PAIRS, _ALL_PAIRS = 3, 6  # pairs that are compared in the quick check and in the whole one
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
 _GAP = 2.5  # usual intervals between sweeps; a longer one is a gap
 _LONGEST_GAP = 0.5  # seconds
@@ -56,7 +55,7 @@ def examine(log: Log) -> list[Finding]:
     """
     cached = CachedLog(log, _CACHED)
     checks = (
-        *(_sensor, _frame, _reading, _times, _poses, _lapses, _motion_of_all, _deskew),
+        *(_sensor, _frame, _reading, _times, _poses, _lapses, _motion, _deskew),
         *(_repeated, _ground, _mask, _own_vehicle, _labels),
     )
     findings = _collect(cached, checks, tells_errors=True)
@@ -97,27 +96,21 @@ def _reading(log: Any) -> Finding | None:
 
 
 def _motion(log: Log) -> Finding | None:
-    return _motion_of(log, _PAIRS)
-
-
-def _motion_of_all(log: Log) -> Finding | None:
-    return _motion_of(log, _ALL_PAIRS)
-
-
-def _motion_of(log: Log, count: int) -> Finding | None:
-    judgement = judge_log(log, count)
+    judgement: Judgement = log.judgement or judge_log(log)
     if not judgement.shares:
         return None
     has_poses = log.sweep(0).pose is not None
     if not judgement.best:
-        text = f"{judgement.given:.2f} of the static structure is in place in the next sweep"
+        text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)
     name = judgement.best[0]
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
         fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
-    elif name == MOUNT:
-        why, fix = "in turns,", f"pass data.ego_T_lidar with about x = {judgement.offset:g} m (data=arrays or hdf5)"
+    elif judgement.offset is not None:
+        x, y = judgement.offset
+        place = f"x = {x:g} m" if x else f"y = {y:g} m"
+        why, fix = "in turns,", f"pass data.ego_T_lidar with about {place} (data=arrays or hdf5)"
     elif name == NO_READING:
         why, fix = "", "check that the poses belong to this log, their times, units and quaternions"
     else:

@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from functools import partial
+from typing import Callable, NamedTuple, Sequence
 
 import numpy as np
 
 from cflow_torch.data.log import Log
 from cflow_torch.errors import CFlowError
-from cflow_torch.windows.readings import (
-    CERTAIN,
-    STILL,
-    WORLD,
-    Judgement,
-    difference,
-    is_around,
-    judge,
-    make_pair,
-    turn_of,
-)
-from cflow_torch.windows.stillness import Structure
+from cflow_torch.transforms import turn_of
+from cflow_torch.windows.readings import GIVEN, OFF, STILL, WORLD, Judgement, difference, is_around, judge, make_pair
 
-_LONGEST_STEP, _MOST_SWEEPS = 3.2, 5  # metres and sweeps between the two sweeps of a pair
+_LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
+_LEAST_SPEED = 0.5  # metres a sweep; below, a wrong scan moves static objects by millimetres only
+_LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
 _LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 # A step between two poses is suspect if it differs from its neighbours' by this, as a length or as a part of theirs.
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
 _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
-_CONFIRMED = 1.25  # the neighbours' motion fits better than the step between the poses, by this factor
 
 
 class Lapse(NamedTuple):
@@ -49,24 +42,23 @@ def known_poses(log: Log) -> np.ndarray | None:
     return np.asarray(poses, np.float64)
 
 
-def choose_pairs(num_sweeps: int, poses: np.ndarray | None, count: int) -> list[tuple[int, int]]:
-    """Choose pairs of sweeps spread over a log, up to `count`, in order.
+def choose_pairs(num_sweeps: int, poses: np.ndarray | None) -> list[tuple[int, int]]:
+    """Choose pairs of sweeps that show wrong readings best, up to four, in order.
 
-    With poses, two pairs are those whose motion differs most from that one sweep earlier, and later, because they show
-    poses that are early or late. The others are those over which the vehicle turns most, each in its part of the log.
-    The sweeps of a pair are up to five apart, and up to 3.2 m, because readings differ more over a longer motion.
+    With poses, these are the pairs over which the vehicle turns most, in which it is fastest, and whose motion differs
+    most from that one sweep earlier, and later, because they show poses that are early or late. The sweeps of a pair
+    are up to five apart, and up to 6.4 m, because readings differ more over a longer motion. Without poses, and if the
+    vehicle does not move, they are neighbours spread over the log.
     """
-    if poses is None:
-        middle = np.linspace(0, num_sweeps - 1, 2 * count + 1).astype(int)[1::2]
-        return sorted({(min(first, num_sweeps - 2), min(first, num_sweeps - 2) + 1) for first in middle.tolist()})
-    pairs = [(first, _partner(poses, first)) for first in range(num_sweeps - 1)]
+    firsts = range(num_sweeps - 1)
+    pairs = [] if poses is None else [(first, _partner(poses, first)) for first in firsts]
+    if poses is None or max(difference(_motion(poses, *pair), np.eye(4)) for pair in pairs) < _LEAST_MOTION:
+        spread = {min(num_sweeps * part // 6, num_sweeps - 2) for part in (1, 3, 5)}
+        return [(first, first + 1) for first in sorted(spread)]
     inner = [pair for pair in pairs if pair[0] > 0 and pair[1] + 1 < num_sweeps]  # with poses before and after
-    chosen = {max(inner, key=lambda pair: _change(poses, *pair, step)) for step in (-1, 1)} if inner else set()
-    edges = np.linspace(0, num_sweeps - 1, max(count - len(chosen), 1) + 1).astype(int)
-    for low, high in zip(edges, edges[1:]):
-        part = [pair for pair in inner or pairs if low <= pair[0] < high and pair not in chosen]
-        chosen |= {max(part, key=lambda pair: turn_of(_motion(poses, *pair)))} if part else set()
-    return sorted(chosen)
+    changes = [partial(_change, poses, -1), partial(_change, poses, 1)] if inner else []
+    criteria = (partial(_turn, poses), partial(_speed, poses), *changes)
+    return sorted({max(inner or pairs, key=lambda pair: criterion(*pair)) for criterion in criteria})
 
 
 def _partner(poses: np.ndarray, first: int) -> int:
@@ -79,27 +71,40 @@ def _motion(poses: np.ndarray, first: int, second: int) -> np.ndarray:
     return np.linalg.inv(poses[second]) @ poses[first]
 
 
-def _change(poses: np.ndarray, first: int, second: int, step: int) -> float:
+def _speed(poses: np.ndarray, first: int, second: int) -> float:
+    """Return the metres that the vehicle moves in a sweep interval of a pair."""
+    return float(np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3])) / (second - first)
+
+
+def _turn(poses: np.ndarray, first: int, second: int) -> float:
+    return turn_of(_motion(poses, first, second))
+
+
+def _change(poses: np.ndarray, step: int, first: int, second: int) -> float:
     """Return how much the motion of a pair differs from that of the pair `step` sweeps later, metres."""
     return difference(_motion(poses, first, second), _motion(poses, first + step, second + step))
 
 
-def judge_log(log: Log, count: int = 3) -> Judgement:
-    """Compare the readings of the poses of a log over `count` pairs. Cost: reads two sweeps per pair, 0.1 s each."""
+def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: Sequence[str] = (OFF,)) -> Judgement:
+    """Compare the readings of a log over up to four pairs of sweeps.
+
+    Args:
+        log: the log, as given.
+        deskew: returns points at the instant of their sweep, from its index, the sweep, rows, and the scan.
+        scans: the scans that are compared where the vehicle is fast enough; the first one is that as given.
+
+    Cost: reads two sweeps per pair, and 0.1 s each.
+    """
     poses = known_poses(log)
-    judgement = _judge_pairs(log, poses, count)
-    if poses is not None and not judgement.has_motion and judgement.given < CERTAIN and not judgement.best:
-        return _judge_pairs(log, None, count)  # the sensor may move although the poses do not: neighbouring sweeps
-    return judgement
-
-
-def _judge_pairs(log: Log, poses: np.ndarray | None, count: int) -> Judgement:
     in_world = None if poses is None else _surrounds_poses(log, poses)
     pairs = []
-    for first, second in choose_pairs(len(log.timestamps), poses, count):
+    for first, second in choose_pairs(len(log.timestamps), poses):
         before = None if poses is None or first == 0 else poses[[first - 1, second - 1]]
         after = None if poses is None or second + 1 == len(poses) else poses[[first + 1, second + 1]]
-        pairs.append(make_pair(log.sweep(first), log.sweep(second), before, after, in_world))
+        is_fast = poses is not None and _speed(poses, first, second) >= _LEAST_SPEED
+        how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}
+        shown = scans if is_fast else scans[:1]
+        pairs.append(make_pair(log.sweep(first), log.sweep(second), before, after, in_world, scans=shown, **how))
     return judge(pairs)
 
 
@@ -166,5 +171,4 @@ def _contradicted(log: Log, index: int, step: np.ndarray, usual: np.ndarray) -> 
     pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
     if pair is None:
         return False
-    target = Structure(pair.target)
-    return target.share(pair.source, usual) > _CONFIRMED * target.share(pair.source, step)
+    return bool(judge([replace(pair, transforms={GIVEN: step, "as around it": usual}, has_motion=True)]).best)

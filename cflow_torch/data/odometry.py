@@ -10,8 +10,8 @@ from tqdm import tqdm
 
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import Sweep
-from cflow_torch.windows.ego_motion import rigid_transform
 
 # KISS-ICP first assumes a static vehicle: its first steps are off by up to 14 cm at 6 m/s, later ones by 1 to 3 cm.
 _RUN_IN = 5  # sweeps

@@ -9,10 +9,10 @@ import numpy as np
 
 from cflow_torch.data.log import FlowLabels, LogWrapper
 from cflow_torch.data.log_motion import known_poses
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.errors import CFlowError
+from cflow_torch.ground.segmentation import find_ground
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.ground import find_ground
 from cflow_torch.windows.stillness import REACH, Structure
 
 _NEAR, _CELL = 2.7, 0.25  # metres from the origin along x and y, and side of a cell

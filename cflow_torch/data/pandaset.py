@@ -10,7 +10,7 @@ from typing import Sequence
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, upright_poses
+from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes
 from cflow_torch.data.camera import Camera, intrinsic_matrix
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.file_errors import check_columns, file_errors
@@ -18,7 +18,7 @@ from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes, remote_errors
 from cflow_torch.data.pickles import load_columns
-from cflow_torch.data.rigid_motion import poses_from_json, transform_points
+from cflow_torch.transforms import poses_from_json, transform_points, upright_poses
 from cflow_torch.types import CFlowError, Sweep
 
 _GZIP = b"\x1f\x8b"  # first bytes of a compressed file

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Mapping
+from typing import Any
 
 import numpy as np
 
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper
 from cflow_torch.data.log_motion import is_in_world
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.errors import CFlowError
+from cflow_torch.transforms import as_matrix, rigid_transform, transform_points
 from cflow_torch.types import Sweep
-from cflow_torch.windows.ego_motion import rigid_transform
-from cflow_torch.windows.readings import AXES, CAMERA, EARLY, INVERTED, LATE, STILL, WORLD, as_matrix
+from cflow_torch.windows.readings import AXES, CAMERA, EARLY, LATE, MOUNT, OF_POSES, WORLD
 
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}  # metres
 _OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
 _OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}  # axes of points and poses
-_OF_POSES = {name: AXES[name] for name in (CAMERA, "left", "back", "right")}
+_OF_POSES = [name for name in OF_POSES if not name.startswith(MOUNT)]
 CHANGES_POINTS = frozenset({*_OF_BOTH, *_OF_POINTS})
 """Readings under which the numbers of the points are others than those in the files."""
-READ_AS = (
-    *("auto", None, WORLD, INVERTED, STILL, LATE, EARLY),
-    *(*_OF_POSES, *_UNITS, *_OF_BOTH, *_OF_POINTS),
-)
+READ_AS = ("auto", None, WORLD, LATE, EARLY, *_OF_POSES, *_OF_BOTH, *_OF_POINTS)
 
 
 def read_as(log: Log, reading: str | None = "auto") -> Log:
@@ -41,6 +36,7 @@ def read_as(log: Log, reading: str | None = "auto") -> Log:
             - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; the first, or last, is extrapolated;
             - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
               camera's, or the x axis points to the left, backward or to the right of that of the points;
+            - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
             - "millimetres", "centimetres": unit of the poses; "points_millimetres", "points_centimetres": of points;
             - "points_camera", "points_upside_down": points and poses have a camera's axes (x right, y down, z
               forward), or z points down and y to the right.
@@ -99,17 +95,14 @@ class ReadAs(LogWrapper):
 
     def _pose(self, index: int, pose: Any) -> np.ndarray | None:
         """Convert the pose of sweep `index`."""
-        if pose is None or self.read_as == STILL:
-            return None if pose is None else np.eye(4)
-        given = self._given(index, pose)
-        if self.read_as == INVERTED:
-            return np.linalg.inv(given)
+        if pose is None:
+            return None
         if self.read_as in (LATE, EARLY):
             return self._neighbour(index, 1 if self.read_as == LATE else -1)
-        if self.read_as in _UNITS:
-            return as_matrix(given[:3, :3], given[:3, 3] * _UNITS[self.read_as])
-        axes: Mapping[str, np.ndarray] = {**_OF_POSES, **_OF_BOTH}
-        return given @ as_matrix(axes[self.read_as]).T if self.read_as in axes else given
+        given = self._given(index, pose)
+        if self.read_as in _OF_BOTH:
+            return given @ as_matrix(_OF_BOTH[self.read_as]).T
+        return OF_POSES[self.read_as](given) if self.read_as in OF_POSES else given
 
     def _neighbour(self, index: int, step: int) -> np.ndarray:
         """Return the pose of the next or last sweep; beyond the end the vehicle moves as between the two before."""

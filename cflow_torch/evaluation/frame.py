@@ -10,7 +10,7 @@ import torch
 
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_pose_flow, residual_for_harness
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import Array, CFlowError, FlowResult, Window, as_numpy, point_rows
 
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.evaluation.definitions import Definition, interval_of
 from cflow_torch.evaluation.frame import EvalFrame
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, as_numpy
 
 CLOSE_RANGE = 35.0  # metres, half side of the square that Argoverse 2 calls "close"

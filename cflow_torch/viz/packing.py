@@ -13,8 +13,8 @@ import numpy as np
 
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
-from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_ERROR, MOVING
-from cflow_torch.viz.scene import Scene, ViewerFrame
+from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_DRAWN, MIN_ERROR
+from cflow_torch.viz.scene import ViewedPair, ViewerFrame
 from cflow_torch.viz.wheel import flow_to_rgb
 
 _UNIT = 0.01  # metres; 16 bits reach to 327 m
@@ -49,7 +49,7 @@ class PackedDrive:
         self.num_given = 0
         self.floor: list[float] = []
 
-    def add(self, scene: Scene) -> None:
+    def add(self, scene: ViewedPair) -> None:
         """Thin one pair and choose its colours."""
         ground = scene.is_ground
         cluster = np.where(ground, -1, scene.cluster)
@@ -75,12 +75,12 @@ class PackedDrive:
             }
         )
 
-    def _entries(self, scene: Scene, cluster: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    def _entries(self, scene: ViewedPair, cluster: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Choose the colours of all points, and return which points must not be thinned, (N,) bool."""
         ground = scene.is_ground
         speed = np.linalg.norm(scene.residual, axis=1)
         static = np.where(ground, GROUND, STATIC)
-        moving = ~ground & (speed > MOVING)
+        moving = ~ground & (speed > MIN_DRAWN)
         entries = {
             "flow": np.where(moving, _wheel_entry(scene.residual, self.max_flow), static),
             "speed": np.where(moving, _ramp_entry(speed, self.max_flow), static),
@@ -97,14 +97,14 @@ class PackedDrive:
         error = np.linalg.norm(scene.residual - scene.truth, axis=1)
         unknown = np.where(ground, GROUND, UNKNOWN)
         known = ~ground & np.isfinite(length)
-        moves = known & (length > MOVING)
+        moves = known & (length > MIN_DRAWN)
         wrong = known & (error > MIN_ERROR)
         true_entry = np.where(moves, _wheel_entry(scene.truth, self.max_flow), STATIC)
         entries["truth"] = np.where(known, true_entry, unknown)
         entries["error"] = np.where(known, np.where(wrong, _ramp_entry(error, MAX_ERROR), STATIC), unknown)
         return entries, moving | moves | wrong
 
-    def _arrows(self, scene: Scene) -> list[dict[str, Any]]:
+    def _arrows(self, scene: ViewedPair) -> list[dict[str, Any]]:
         """List the arrows: one per cluster with enough moving points."""
         number, start, flow = scene.arrows()
         columns = {

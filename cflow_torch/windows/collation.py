@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
+from cflow_torch.ground.heights import GroundHeights
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.types import Window
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.ground_heights import GroundHeights
 from cflow_torch.windows.pieces import read_pieces
 from cflow_torch.windows.timeline import Timeline
 
@@ -109,7 +109,7 @@ def make_batch(
     """
     timeline = Timeline.of(windows, config, grid, needs_times)
     num_windows, num_steps = timeline.table.shape[1:]
-    ground = GroundHeights(num_windows, grid, device) if needs_ground else None
+    ground = GroundHeights(num_windows, grid.lower, grid.upper, device) if needs_ground else None
     pieces = list(read_pieces(timeline, config, grid, device, num_axes, ground))
     point_times = [piece.point_times for piece in pieces if piece.point_times is not None]
     num_newest = sum(piece.image.numel() for piece in pieces if piece.step == 0)

@@ -2,61 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.types import Array, CFlowError, as_numpy, last_row
-from cflow_torch.windows.validation import resolution
-
-# A pose moves all points, so its type must resolve this distance, metres.
-_COARSEST_POSE = 0.01
-# Largest allowed |R R^T - I|. Poses stored in float32 are within 1e-6.
-_ORTHOGONALITY = 1e-3
-
-
-def rigid_transform(matrix: Any, name: str, reach: float = 0.0) -> np.ndarray:
-    """Check a rigid transform and convert it to (4, 4) float64. Any other matrix is a `CFlowError` with the `name`.
-
-    The dtype must resolve a centimetre at the translation of the transform, and at `reach`, the distance of the
-    farthest point in metres.
-    """
-    dtype = getattr(matrix, "dtype", None)
-    try:
-        result = as_numpy(matrix, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise CFlowError(f"{name} is {type(matrix).__name__}: give a (4, 4) matrix of numbers") from None
-    if result.shape != (4, 4):
-        wanted = f"give one (4, 4) matrix (no batch dimension){last_row(result.shape)}"
-        raise CFlowError(f"{name} has shape {result.shape}: {wanted}")
-    if not np.isfinite(result).all():
-        raise CFlowError(f"{name} holds NaN or infinite values: give a finite rigid transform")
-    rotation = result[:3, :3]
-    bottom = result[3]
-    with np.errstate(over="ignore", invalid="ignore"):  # values that are far from a rotation may overflow
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        determinant = np.linalg.det(rotation)
-    wrong_row = np.abs(bottom - (0, 0, 0, 1)).max()
-    if not (error <= _ORTHOGONALITY and wrong_row <= _ORTHOGONALITY and determinant > 0):
-        raise CFlowError(
-            f"{name} is not rigid (|R R^T - I| up to {error:.3g}, det {determinant:.3g}, last row "
-            f"{bottom.tolist()}): give [R t; 0 0 0 1] with a rotation R, row-major"
-        )
-    farthest = max(reach, float(np.abs(result[:3, 3]).max()))
-    step = max(resolution(kind, farthest) for kind in (np.dtype(np.float64), dtype) if kind is not None)
-    if step > _COARSEST_POSE:
-        raise CFlowError(
-            f"{name} is {dtype or 'float64'}, which at {farthest:.9g} m only holds multiples of {step:g} m (at most "
-            f"{_COARSEST_POSE} m): give it as float64, never rounded to less, or poses in a nearer frame"
-        )
-    return result
-
-
-def relative_transform(pose1: Any, pose: Any) -> np.ndarray:
-    """Return T_ego1_ego, (4, 4) float64, from two poses T_world_ego. Errors as in `rigid_transform`."""
-    return np.linalg.inv(rigid_transform(pose1, "pose1")) @ rigid_transform(pose, "pose")
+from cflow_torch.types import Array
 
 
 def compensate(positions: Tensor, T_ego1_ego: Array | None, num_axes: int = 3) -> Tensor:

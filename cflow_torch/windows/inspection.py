@@ -11,8 +11,8 @@ import torch
 
 from cflow_torch.config import Config
 from cflow_torch.errors import CFlowError, NoActivePoints, warn
+from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
-from cflow_torch.windows.ground import has_ground
 from cflow_torch.windows.point_frame import frame_problem
 from cflow_torch.windows.readings import INVERTED, NO_READING, STILL, UNKNOWN, WORLD, judge, make_pair
 from cflow_torch.windows.returns import MISSING, without_missing
@@ -21,8 +21,8 @@ from cflow_torch.windows.validation import have_same_points
 REPEATED = "pc1 has the same points as pc0, so everything seems to move with the sensor: give two different sweeps"
 _GROUND = (
     "a sweep without a ground mask contains ground, which joins the objects on it into one cluster, so moving objects "
-    "are missed: give masks (Sweep.is_ground, see cflow_torch.windows.ground.find_ground), all False if this is not "
-    "ground"
+    "are missed: give masks (Sweep.is_ground, see cflow_torch.ground.find_ground), all False if this is "
+    "not ground"
 )
 # What to do about a `Judgement` of two sweeps, by the first of its best readings.
 _ADVICE = {

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import Config
+from cflow_torch.ground.heights import GroundHeights
 from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero, take_columns
+from cflow_torch.tensors import read_ground, read_point_times, read_positions
 from cflow_torch.types import Sweep
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.ego_motion import compensate
-from cflow_torch.windows.ground_heights import GroundHeights
 from cflow_torch.windows.timeline import Entry, Timeline
-from cflow_torch.windows.validation import read_ground, read_point_times, read_positions
 
 
 class Piece(NamedTuple):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from cflow_torch.ground.plane import REACH
+from cflow_torch.ground.segmentation import has_ground, is_upside_down
 from cflow_torch.types import Array, as_numpy
-from cflow_torch.windows.ground import has_ground, is_upside_down
-from cflow_torch.windows.ground_plane import REACH
 from cflow_torch.windows.readings import AXES, CAMERA
 
 _FEWEST = 100  # points

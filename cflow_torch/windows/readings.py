@@ -1,58 +1,27 @@
 """Under which reading of poses and points does the static world stand still? One comparison for all such mistakes.
 
-Idea: (1) Take the static structure of two sweeps. (2) Each reading ("the poses are inverted") gives a transform between
-them. (3) Measure the share of the structure that is in place under each transform. (4) The reading that is clearly best
-is named. If the reading as given is as good, nothing is named.
+Idea: (1) Take the static structure of two sweeps. (2) Each reading ("the poses are inverted", "the LiDAR turns
+clockwise") places it: by a transform between the sweeps, and by the instants of the points. (3) Measure the share of
+the structure that is in place. (4) Name the reading that is clearly best, unless that as given is as good.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any, Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, to_quaternions, to_rotations
 from cflow_torch.types import Array, Sweep, as_numpy
-from cflow_torch.windows.ego_motion import rigid_transform
-from cflow_torch.windows.stillness import Structure, static_rows, thinned_rows
+from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS
+from cflow_torch.windows.stillness import Structure, structure_rows
 
 GIVEN = "as given"
+OFF, TIMES = "off", "times"  # scans: the points stay, or move by their times
 STILL, WORLD, INVERTED, LATE, EARLY, CAMERA = "still", "world", "inverted", "late", "early", "camera"
 MOUNT, UNKNOWN, NO_READING = "mount", "unknown", "none"
-# Points of the source. All readings are compared by the first few, those that are about as good as given by more.
-_FEW_POINTS, _MOST_POINTS = 300, 1500
-_NEAR_GIVEN = 0.95  # share of a reading over that as given
-CERTAIN = 0.6  # share as given; other readings are not compared
-_FEWEST_POINTS = 150  # of source and target; fewer do not show anything
-_BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
-# A sweep shows only readings that move points 20 m away by at least this.
-_LEAST_MOTION, _ARM = 0.2, 20.0  # metres
-# The best share must exceed the share as given by this factor, and be at least `_LEAST_SHARE`. Right poses gave at most
-# 1.09 for a neighbour's pose (KITTI), 1.25 for no motion (highway, vehicles of the same speed), else 1.03.
-_BETTER = {STILL: 1.6, WORLD: 1.15, MOUNT: 1.12, UNKNOWN: 1.4, "millimetres": 3.0, "centimetres": 3.0}
-_BETTER_ELSE = 1.3
-_LEAST_SHARE = 0.15
-_EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
-# Nothing fits if the best share is below this. Right poses gave at least .17 over 10 m, .26 over one sweep.
-_HOPELESS = 0.08
-_COLUMN, _TALL = 0.8, 0.35  # metres, side and least height of the columns of structure; ground is flatter
-_LEAST_GROUND = 0.02  # share of points
-_LEAST_TURN = np.radians(2.0)  # between two sweeps, to see where the LiDAR is mounted
-_MOUNTS = (-4.0, -2.7, -1.4, -0.7, 0.7, 1.4, 2.7, 4.0)  # metres along x
-_LEAST_SCALED = 20.0  # between two sweeps; a vehicle does not move so far, so the unit may be another one
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}  # metres
-# ego_T_stored of frames with other axes: x, y and z of the stored frame, as columns.
-AXES = {
-    CAMERA: np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float),  # x right, y down, z forward
-    "left": np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], float),  # x to the left of the vehicle
-    "back": np.diag([-1.0, -1.0, 1.0]),
-    "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
-    "upside_down": np.diag([1.0, -1.0, -1.0]),
-}
-# The search for an unknown motion correlates occupied cells of a square.
-_CELL, _CELLS = 0.1, 640  # metres, and cells along a side
-_TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4])
-_FARTHEST_SHIFT = 5.0  # metres
 # What each reading says. The settings are values of `read_as` in `cflow_torch.data.catalog.open_log`.
 CAUSES = {
     WORLD: "the points are in the world's frame",
@@ -64,39 +33,139 @@ CAUSES = {
     "left": "the poses are of a frame whose x axis points to the left of the points' x axis",
     "back": "the poses are of a frame whose x axis points backward",
     "right": "the poses are of a frame whose x axis points to the right of the points' x axis",
+    "w_first": "the quaternions of the poses begin with w, but were read with w last",
+    "w_last": "the quaternions of the poses end with w, but were read with w first",
     "millimetres": "the poses are in millimetres",
     "centimetres": "the poses are in centimetres",
 }
+# ego_T_stored of frames with other axes: x, y and z of the stored frame, as columns.
+AXES = {
+    CAMERA: np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float),  # x right, y down, z forward
+    "left": np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], float),  # x to the left of the vehicle
+    "back": np.diag([-1.0, -1.0, 1.0]),
+    "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
+    "upside_down": np.diag([1.0, -1.0, -1.0]),
+}
+
+_FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
+_NEAR_GIVEN = 0.7  # share of a reading over that as given
+_FEWEST_POINTS = 150  # of source and target; fewer do not show anything
+_BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
+_LEAST_MOTION, _ARM = 0.2, 20.0  # metres; poses that move points 20 m away by less do not show anything
+_LEAST_DIFFERENCE = 0.05  # metres; a pair shows only the readings that move these points otherwise by this
+# The best share must exceed the share as given by this factor (`_MARGINS` has others), and be at least `_LEAST_SHARE`.
+_MARGIN = 1.3
+_LEAST_SHARE = 0.1
+_OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most
+# After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
+_SHIFT, _PEAK = 0.15, 1.2
+_EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
+_HOPELESS = 0.04  # nothing fits if the share as given is below this
+_SEARCHED = 0.4  # share as given, below which we look for an unknown motion
+# The search for an unknown motion correlates occupied cells of a square.
+_CELL, _CELLS = 0.1, 640  # metres, and cells along a side
+_TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4])
+_FARTHEST_SHIFT = 5.0  # metres
+
+
+def _scaled(unit: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda pose: as_matrix(pose[:3, :3], unit * pose[:3, 3])
+
+
+def _reordered(order: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda pose: as_matrix(to_rotations(to_quaternions(pose[None, :3, :3])[:, order])[0], pose[:3, 3])
+
+
+def _moved(stored_T_ego: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda pose: pose @ stored_T_ego
+
+
+_MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, metres
+    f"{MOUNT} {x:g} {y:g}": (x, y)
+    for size in (0.7, 1.4, 2.7, 4.0)
+    for x, y in ((size, 0), (-size, 0), (0, size), (0, -size))
+}
+# Reading -> what converts a pose as given, (4, 4) float64, to `T_world_ego`.
+OF_POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    STILL: lambda pose: np.eye(4),
+    INVERTED: np.linalg.inv,
+    **{name: _moved(as_matrix(AXES[name].T)) for name in (CAMERA, "left", "back", "right")},
+    **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
+    **{name: _scaled(unit) for name, unit in (("millimetres", 1e-3), ("centimetres", 1e-2))},
+    **{name: _moved(as_matrix(np.eye(3), (*offset, 0))) for name, offset in _MOUNTS.items()},
+}
+# Readings that differ little from another one, and the opposite mistakes: if the one is right, the other doubles it.
+_OPPOSITES = {
+    LATE: EARLY,
+    EARLY: LATE,
+    **{name: f"{MOUNT} {0 - x:g} {0 - y:g}" for name, (x, y) in _MOUNTS.items()},
+    **{scan: next(other for other in DIRECTIONS if not scan.startswith(other)) for scan in SCANS},
+}
+# Small mistakes make a small difference. Vehicles of the same speed stand still without the ego motion: up to 1.56.
+_MARGINS = {
+    **dict.fromkeys((WORLD, OFF, TIMES, *SCANS, *_MOUNTS), 1.1),
+    **dict.fromkeys((STILL, "millimetres", "centimetres"), 1.7),
+}
+
+
+class Cloud:
+    """The static structure of a sweep, thinned: `points` gives it at the instant of the sweep, for each scan."""
+
+    def __init__(self, points: Callable[[str], np.ndarray]) -> None:
+        self.points = lru_cache(None)(points)
+        self.structure = lru_cache(None)(lambda scan: Structure(points(scan)))
 
 
 @dataclass(frozen=True)
 class Pair:
-    """The static structure of two sweeps, and the transforms between them under each reading.
+    """The static structure of two sweeps, and how it may be read.
 
-    Points are relative to `centre`, the position of the vehicle in the frame of the points: 0, or that of the pose if
-    the points are in the world's frame.
+    Points are relative to the position of the vehicle in the frame of the points: 0, or that of the pose if the points
+    are in the world's frame.
     """
 
-    source: np.ndarray  # (N, 3) float64, metres
-    target: np.ndarray  # (M, 3) float64, metres
-    transforms: dict[str, np.ndarray]  # reading -> (4, 4) float64, source to target
-    has_poses: bool
+    source: Cloud
+    target: Cloud
+    transforms: dict[str, np.ndarray]  # reading of the poses -> (4, 4) float64, source to target
+    scans: tuple[str, ...]  # how points may move to the instant of their sweep, as `deskew`; the first one is expected
+    has_motion: bool  # the poses move the structure enough to tell readings apart
+
+    def share(self, reading: str, scan: str, count: int = _MOST_POINTS, shift: float = 0.0) -> float:
+        """Return the share of the first `count` points that are in place, moved by `shift` metres along the path."""
+        path = self.transforms[GIVEN][:3, 3]
+        T = self.transforms[reading].copy()
+        T[:3, 3] += shift * path / max(float(np.linalg.norm(path)), 1e-9)
+        return self.target.structure(scan).share(self.source.points(scan)[:count], T)
+
+    def shares_of_scans(self, scans: Sequence[str]) -> dict[str, float]:
+        return {scan: self.share(GIVEN, scan) for scan in scans}
+
+    def shares_of_poses(self, scan: str) -> dict[str, float]:
+        """Return the share of each reading of the poses, by few points if it is much worse than as given."""
+        shares = {name: self.share(name, scan, _FEW_POINTS) for name in self.transforms}
+        rivals = [name for name, share in shares.items() if share >= _NEAR_GIVEN * shares[GIVEN]]
+        return {**shares, **{name: self.share(name, scan) for name in rivals}}
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """The shares of structure in place, means of all pairs, and the readings that are clearly best."""
+    """The shares of structure in place, means of all pairs that show the reading, and the readings that are best."""
 
     shares: dict[str, float]  # reading -> 0 ... 1; empty = nothing could be compared
-    best: tuple[str, ...] = ()  # readings that fit clearly better than as given; equal ones together
-    offset: float = 0.0  # metres, of `MOUNT`: x of the LiDAR in the frame of the poses
+    best: tuple[str, ...] = ()  # readings of the poses that fit clearly better than as given; equal ones together
     motion: np.ndarray | None = None  # of `UNKNOWN`: T_target_source of the first pair
-    has_motion: bool = True  # False: the poses of no pair differ, so only an unknown motion can be found
+    scan: str = ""  # the scan under which this holds; "" = not compared
+    shares_of_scans: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def given(self) -> float:
         """Share of structure in place as given, NaN = nothing could be compared."""
         return self.shares.get(GIVEN, float("nan"))
+
+    @property
+    def offset(self) -> tuple[float, float] | None:
+        """x and y of the points' origin in the frame of the poses, metres, if another mounting is best; else None."""
+        return _MOUNTS.get(self.best[0]) if self.best else None
 
     def __str__(self) -> str:
         """What is wrong, "" = nothing."""
@@ -106,13 +175,17 @@ class Judgement:
         share = f"({self.given:.2f} of the static structure is in place as given, {self.shares.get(name, 0):.2f} then)"
         if name == NO_READING:
             return f"the sweeps fit under no reading of the poses (only {self.given:.2f} of the structure is in place)"
-        if name == UNKNOWN:
-            x, y, _ = (0.0, 0.0, 0.0) if self.motion is None else self.motion[:3, 3]
-            return f"the sensor moves by about {np.hypot(x, y):.1f} m between two sweeps {share}"
-        if name == MOUNT:
-            where = "behind" if self.offset < 0 else "ahead of"
-            return f"the points' origin is about {abs(self.offset):g} m {where} that of the poses {share}"
+        if self.motion is not None:
+            return f"the sensor moves by about {np.hypot(*self.motion[:2, 3]):.1f} m between two sweeps {share}"
+        if self.offset is not None:
+            x, y = self.offset
+            where = f"{abs(x):g} m {'behind' if x < 0 else 'ahead of'}" if x else f"{abs(y):g} m beside"
+            return f"the points' origin is about {where} that of the poses {share}"
         return f"{', or '.join(CAUSES[each] for each in self.best)} {share}"
+
+
+def _as_it_is(sweep: Sweep, rows: np.ndarray, scan: str) -> np.ndarray:
+    return as_numpy(sweep.points)[rows, :3].astype(np.float64)
 
 
 def make_pair(
@@ -121,6 +194,8 @@ def make_pair(
     before: np.ndarray | None = None,
     after: np.ndarray | None = None,
     in_world: bool | None = None,
+    deskew: Sequence[Callable[[Sweep, np.ndarray, str], np.ndarray]] = (_as_it_is, _as_it_is),
+    scans: Sequence[str] = (OFF,),
 ) -> Pair | None:
     """Prepare two sweeps for `judge`. None if they have too little structure.
 
@@ -128,111 +203,126 @@ def make_pair(
         pc0, pc1: the sweeps, in the order of time.
         before, after: poses of the sweeps before, and after, `pc0` and `pc1`, (2, 4, 4) float64; None = unknown.
         in_world: the points lie around the positions of the poses, see `is_around`; None = test it.
+        deskew: for each sweep, a function that returns some of its rows, (K, 3), at its instant, for one of the scans.
+        scans: the scans that are compared, values of `deskew`; the first one is that as given.
     """
     has_poses = pc0.pose is not None and pc1.pose is not None
-    pose0, pose1 = (rigid_transform(each.pose, "pose") if has_poses else np.eye(4) for each in (pc0, pc1))
+    poses = np.stack([rigid_transform(each.pose, "pose") if has_poses else np.eye(4) for each in (pc0, pc1)])
     if in_world is None:
-        in_world = has_poses and is_around(pc1.points, pose1)
-    centre = pose1[:3, 3] if in_world else np.zeros(3)
-    source, target = (_structure(each, centre) for each in (pc0, pc1))
-    if min(len(source), len(target)) < _FEWEST_POINTS or _num_blocks(source) < _FEWEST_BLOCKS:
+        in_world = has_poses and is_around(pc1.points, poses[1])
+    centre = poses[1, :3, 3] if in_world else np.zeros(3)
+    clouds = [_cloud(sweep, centre, move) for sweep, move in zip((pc0, pc1), deskew)]
+    num_points = [len(cloud.points(OFF)) for cloud in clouds]
+    if min(num_points) < _FEWEST_POINTS or _num_blocks(clouds[0].points(OFF)) < _FEWEST_BLOCKS:
         return None
-    source = source[thinned_rows(source)]
-    source = source[np.random.default_rng(0).permutation(len(source))[:_MOST_POINTS]]
-    transforms = _transforms(pose0, pose1, before, after) if has_poses else {GIVEN: np.eye(4)}
+    transforms = _transforms(poses, before, after) if has_poses else {GIVEN: np.eye(4)}
     if in_world:
         transforms = {name: _about(centre, T) for name, T in transforms.items()}
         transforms[WORLD] = transforms.pop(STILL)
-    return Pair(source, target, transforms, has_poses)
+    has_motion = has_poses and (in_world or difference(transforms[GIVEN], np.eye(4)) >= _LEAST_MOTION)
+    return Pair(clouds[0], clouds[1], transforms, tuple(scans), has_motion)
 
 
-def _transforms(
-    pose0: np.ndarray, pose1: np.ndarray, before: np.ndarray | None, after: np.ndarray | None
-) -> dict[str, np.ndarray]:
-    """Return T_1_0 under each reading of the poses."""
-    T = np.linalg.inv(pose1) @ pose0
-    found = {GIVEN: T, STILL: np.eye(4), INVERTED: pose1 @ np.linalg.inv(pose0)}
-    for name, poses in ((LATE, after), (EARLY, before)):
-        shifted = T if poses is None else np.linalg.inv(poses[1]) @ poses[0]
-        if difference(T, shifted) >= _LEAST_MOTION:
-            found[name] = shifted
-    for name in (CAMERA, "left", "back", "right"):
-        axes = as_matrix(AXES[name])
-        found[name] = axes @ T @ axes.T
-    if np.linalg.norm(T[:3, 3]) >= _LEAST_SCALED:
-        found.update({name: as_matrix(T[:3, :3], unit * T[:3, 3]) for name, unit in _UNITS.items()})
-    if turn_of(T) >= _LEAST_TURN:
-        for x in _MOUNTS:
-            mount = as_matrix(np.eye(3), (x, 0, 0))
-            found[f"{MOUNT} {x}"] = np.linalg.inv(mount) @ T @ mount
-    return found
+def _cloud(sweep: Sweep, centre: np.ndarray, move: Callable[[Sweep, np.ndarray, str], np.ndarray]) -> Cloud:
+    rows = structure_rows(sweep, centre)
+    return Cloud(lambda scan: (_as_it_is if scan == OFF else move)(sweep, rows, scan) - centre)
+
+
+def _transforms(poses: np.ndarray, before: np.ndarray | None, after: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return T_1_0 under each reading of the poses, (2, 4, 4), that moves points otherwise than as given."""
+    T = _between(poses)
+    read = {name: _between([convert(pose) for pose in poses]) for name, convert in OF_POSES.items()}
+    read.update({name: _between(other) for name, other in ((LATE, after), (EARLY, before)) if other is not None})
+    shown = {name: other for name, other in read.items() if name == STILL or difference(T, other) >= _LEAST_DIFFERENCE}
+    return {GIVEN: T, **shown}
+
+
+def _between(poses: Any) -> np.ndarray:
+    return np.linalg.inv(poses[1]) @ poses[0]  # type: ignore[no-any-return]
 
 
 def judge(pairs: Iterable[Pair | None]) -> Judgement:
-    """Compare all readings over all pairs, and name those that are clearly better than as given.
+    """Compare the scans, then the readings of the poses, over all pairs, and name those that are clearly best.
 
-    Pairs are ignored if no reading moves the structure. Cost: 0.1 s per pair.
+    Pairs whose poses do not move the structure do not show anything. If all are such pairs, we look for an unknown
+    motion. Cost: 0.1 s per pair.
     """
     usable = [pair for pair in pairs if pair is not None]
-    moving = [pair for pair in usable if _moves(pair)]
-    if moving:
-        return _judge(moving)
-    found = [_search(pair) for pair in usable]
-    return max(found, key=lambda each: len(each.best), default=Judgement({}))
-
-
-def _judge(pairs: Sequence[Pair]) -> Judgement:
-    """Compare the readings of pairs whose poses differ."""
-    of_pairs = [_shares(pair) for pair in pairs]
-    names = list(dict.fromkeys(name for shares in of_pairs for name in shares))
-    mean: dict[str, float] = {}
-    clear = []  # readings that fit clearly better in the pairs that show them: only a turn shows another mounting
-    for name in names:
-        shown = [shares for shares in of_pairs if name in shares]
-        mean[name] = float(np.mean([shares[name] for shares in shown]))
-        given = float(np.mean([shares[GIVEN] for shares in shown]))
-        is_always_better = all(shares[name] > shares[GIVEN] for shares in shown)
-        if is_always_better and mean[name] > max(_margin(name) * given, _LEAST_SHARE):
-            clear.append(name)
-    if any(len(shares) == 1 for shares in of_pairs):  # as given is certain there, so what all pairs show is refuted
-        clear = [name for name in clear if name in (LATE, EARLY) or name.startswith(MOUNT)]
-    if not clear:
-        # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
-        is_hopeless = mean[GIVEN] < _HOPELESS and (len(pairs) > 1 or bool(_search(pairs[0]).best))
-        return Judgement(mean, (NO_READING,) if is_hopeless else ())
+    moving = [pair for pair in usable if pair.has_motion]
+    if not moving:
+        return _judge_motion(usable)
+    fast = [pair for pair in moving if len(pair.scans) > 1]
+    scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
+    shares, clear = _compare([pair.shares_of_poses(scan) for pair in moving])
+    equal = [name for name in clear if shares[name] >= _EQUAL * shares[clear[0]] and name not in _OPPOSITES]
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
-        return Judgement(mean, (WORLD,))
-    best = max(clear, key=mean.__getitem__)
-    if best.startswith(MOUNT):
-        return Judgement({**mean, MOUNT: mean[best]}, (MOUNT,), float(best.split()[-1]))
-    equal = [name for name in clear if mean[name] >= _EQUAL * mean[best] and not name.startswith(MOUNT)]
-    return Judgement(mean, tuple(equal))
+        best = [WORLD]
+    elif clear:
+        best = clear[:1] if clear[0] in _OPPOSITES else equal
+    else:
+        # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
+        is_hopeless = shares[GIVEN] < _HOPELESS and (len(moving) > 1 or bool(_judge_motion(moving).best))
+        best = [NO_READING] if is_hopeless else []
+    return Judgement(shares, tuple(best), None, scan, shares_of_scans)
 
 
-def _shares(pair: Pair) -> dict[str, float]:
-    """Return the share of structure in place under each reading, from few points if it is worse than given."""
-    target = Structure(pair.target)
-    few = pair.source[:_FEW_POINTS]
-    given = target.share(few, pair.transforms[GIVEN])
-    if given >= CERTAIN:
-        return {GIVEN: given}
-    shares = {name: target.share(few, T) for name, T in pair.transforms.items()}
-    rivals = [name for name, share in shares.items() if share >= _NEAR_GIVEN * shares[GIVEN]]
-    if len(rivals) > 1:
-        shares.update({name: target.share(pair.source, pair.transforms[name]) for name in rivals})
-    return shares
+def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
+    """Return the scan under which the world stands still, and the shares of all.
+
+    If it is a direction, the turns begin behind the vehicle, unless another start is clearly better. If the structure
+    is shifted along the path, less of it must be in place: along smooth walls this is not so.
+    """
+    expected, *_ = pairs[0].scans
+    shares, clear = _compare([pair.shares_of_scans(pair.scans) for pair in pairs], expected)
+    if not clear:
+        return expected, shares
+    at_place, beside = (np.mean([pair.share(GIVEN, clear[0], shift=by) for pair in pairs]) for by in (0, _SHIFT))
+    if at_place < _PEAK * beside:
+        return expected, shares
+    starts = [clear[0] + start for start in STARTS] if clear[0] in DIRECTIONS else clear[:1]
+    _, better = _compare([pair.shares_of_scans(starts) for pair in pairs], clear[0])
+    return (better or clear)[0], shares
 
 
-def _search(pair: Pair) -> Judgement:
-    """Look for a motion in the plane under which the sweeps fit clearly better than in place."""
-    target = Structure(pair.target)
-    given = target.share(pair.source, pair.transforms[GIVEN])
-    if given * _margin(UNKNOWN) >= 1:
-        return Judgement({GIVEN: given}, has_motion=False)
-    motion = find_motion(pair.source, pair.target)
-    shares = {GIVEN: given, UNKNOWN: target.share(pair.source, motion)}
-    is_better = shares[UNKNOWN] > max(_margin(UNKNOWN) * given, _LEAST_SHARE)
-    return Judgement(shares, (UNKNOWN,) if is_better else (), motion=motion, has_motion=False)
+def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
+    """Look for an unknown motion in the plane, under which sweeps fit clearly better than as given."""
+    motions = []
+    of_pairs = []
+    for pair in pairs:
+        given = {GIVEN: pair.transforms[GIVEN]}
+        if pair.share(GIVEN, OFF) < _SEARCHED:
+            motion = find_motion(pair.source.points(OFF)[:_MOST_POINTS], pair.target.points(OFF))
+            if difference(motion, given[GIVEN]) >= _LEAST_MOTION:
+                motions.append(motion)
+                given[UNKNOWN] = motion
+        of_pairs.append(replace(pair, transforms=given).shares_of_poses(OFF))
+    shares, clear = _compare(of_pairs)
+    return Judgement(shares, tuple(clear), motions[0] if clear else None)
+
+
+def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tuple[dict[str, float], list[str]]:
+    """Compare the shares of readings over the pairs that show them.
+
+    A reading is clearly better than as given if it is so in the mean, and better in each pair. It may be a small
+    mistake, such as the direction of the scan or another mounting: then a smaller margin is enough, but the opposite
+    mistake must be worse than as given.
+
+    Returns:
+        The mean share of each reading, and those that are clearly better than as given, best first.
+    """
+    shares: dict[str, float] = {}
+    gains: dict[str, float] = {}
+    better = []
+    for name in dict.fromkeys(name for each in of_pairs for name in each):
+        shown = [(each[name], each[given]) for each in of_pairs if name in each]
+        share, as_given = np.mean(shown, axis=0)
+        shares[name] = float(share)
+        gains[name] = float(share / max(as_given, 1e-9))
+        if share >= _LEAST_SHARE and all(ours > theirs for ours, theirs in shown):
+            better.append(name)
+    clear = [name for name in better if gains[name] >= _MARGINS.get(name, _MARGIN)]
+    clear = [name for name in clear if gains.get(_OPPOSITES.get(name, ""), 0) <= _OPPOSITE]
+    return shares, sorted(clear, key=gains.__getitem__, reverse=True)
 
 
 def find_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -246,7 +336,7 @@ def find_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     most = -1.0
     found = np.eye(4)
     for turn in _TURNS:
-        T = as_matrix(rotation_about_z(turn))
+        T = as_matrix(rotations_about(2, turn))
         turned = np.fft.rfft2(_image(source @ T[:3, :3].T, 0))
         counts = np.fft.irfft2(image * np.conj(turned), (_CELLS, _CELLS))[np.ix_(steps, steps)]
         row, column = np.unravel_index(int(counts.argmax()), counts.shape)
@@ -285,51 +375,10 @@ def is_around(points: Array, pose: np.ndarray) -> bool:
     return bool(near_pose < near_origin)
 
 
-def as_matrix(rotation: np.ndarray, shift: Sequence[float] | np.ndarray = (0, 0, 0)) -> np.ndarray:
-    """Return the (4, 4) float64 rigid transform of a (3, 3) rotation and a shift, metres."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, shift
-    return matrix
-
-
-def rotation_about_z(angle: float) -> np.ndarray:
-    """Return the (3, 3) rotation by an angle, radians, about z."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-
-
-def turn_of(T: np.ndarray) -> float:
-    """Return the angle of the rotation of a rigid transform, radians."""
-    return float(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
-
-
 def difference(T: np.ndarray, other: np.ndarray) -> float:
     """Return about how far apart two rigid transforms move points 20 m away, metres."""
     rotation = np.linalg.norm(T[:3, :3] - other[:3, :3]) / np.sqrt(2)
     return float(np.linalg.norm(T[:3, 3] - other[:3, 3]) + _ARM * rotation)
-
-
-def _structure(sweep: Sweep, centre: np.ndarray) -> np.ndarray:
-    """Return the points of static structure, (N, 3) float64, metres, relative to `centre`.
-
-    Only points in columns with different heights count, because flat ground without a mask looks the same everywhere.
-    """
-    points = as_numpy(sweep.points)[:, :3].astype(np.float64) - centre
-    if len(points) == 0:
-        return points
-    mask = sweep.is_ground  # without ground, one is not believed: clouds may contain what it does not say
-    is_found = mask is None or as_numpy(mask).mean() < _LEAST_GROUND
-    points = points[static_rows(replace(sweep, points=points, is_ground=None if is_found else mask))]
-    if len(points) == 0:
-        return points
-    column, row = np.floor(points[:, :2] / _COLUMN).astype(np.int64).T
-    cell = column * (1 << 20) + row
-    order = np.lexsort((points[:, 2], cell))
-    start = np.flatnonzero(np.diff(cell[order], prepend=cell[order[0]] - 1))  # of each column
-    count = np.diff(start, append=len(order))
-    height = points[order, 2]
-    is_tall = height[start + count - 1] - height[start] >= _TALL
-    return points[np.sort(order[np.repeat(is_tall, count)])]
 
 
 def _num_blocks(points: np.ndarray) -> int:
@@ -341,15 +390,3 @@ def _num_blocks(points: np.ndarray) -> int:
 def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Return a transform for points relative to `centre`."""
     return as_matrix(T[:3, :3], T[:3, :3] @ centre + T[:3, 3] - centre)
-
-
-def _moves(pair: Pair) -> bool:
-    """Test whether the poses move the structure enough to tell readings apart."""
-    if not pair.has_poses:
-        return False
-    T = pair.transforms[GIVEN]
-    return WORLD in pair.transforms or difference(T, np.eye(4)) >= _LEAST_MOTION
-
-
-def _margin(reading: str) -> float:
-    return _BETTER.get(reading.split()[0], _BETTER_ELSE)

@@ -9,9 +9,9 @@ from typing import Iterator, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.config import Config
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, Sweep, Window, as_numpy, named_sweeps
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.ego_motion import rigid_transform
 from cflow_torch.windows.validation import have_same_points, keep_nearest
 
 # Largest plausible distance of an ego position from the one at t+1, metres: 2 s at 50 m/s.

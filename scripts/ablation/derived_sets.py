@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, Window
 
 # Points (N, 3), instance (N,) with 0 = background, total flow (N, 3), usable (N,) bool; all of one sweep.

@@ -24,8 +24,8 @@ from cflow_torch.data.log import CachedLog, FlowLabels, window
 from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
 from cflow_torch.simulator.benchmark import benchmark_logs
 from cflow_torch.simulator.drive import make_drive
+from cflow_torch.transforms import relative_transform
 from cflow_torch.types import CFlowError, Window
-from cflow_torch.windows.ego_motion import relative_transform
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "figures"))
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))

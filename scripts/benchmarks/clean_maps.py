@@ -35,13 +35,13 @@ from cflow_torch import make_config, make_model
 from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.data.catalog import GroundSegmentedLog
 from cflow_torch.data.log import CachedLog, Log, windows
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator import objects
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.trajectories import Route
+from cflow_torch.transforms import transform_points
 
 SEED = 300
 DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}

@@ -32,8 +32,8 @@ from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import CachedLog, Log, window, windows
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator.benchmark import benchmark_logs
+from cflow_torch.transforms import transform_points
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 from writers import FORMATS  # noqa: E402

@@ -21,16 +21,16 @@ import torch
 from matplotlib.patches import Rectangle
 
 from cflow_torch import CleanLog, FlowResult, FlowStream, make_config, make_model, static_map, track
-from cflow_torch.applications.deskewing import deskew
 from cflow_torch.applications.labels import label_scene
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_scene
 from cflow_torch.data.log import Log, window, windows
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import transform_points
 from cflow_torch.viz.clusters import PALETTE
 from cflow_torch.viz.style import FAINT, GROUND, INK, STATIC, add_panel, blank_figure
+from cflow_torch.windows.deskewing import deskew_objects
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -159,7 +159,9 @@ def deskewed(file: Path) -> None:
     given, times = np.asarray(sweeps.pc0.points), np.asarray(sweeps.pc0.point_times)
     shown = result.is_valid.numpy() & (np.abs(given[:, 1]) < 7)
     figure, axes = plt.subplots(2, 1, figsize=(8, 4.6), sharex=True, layout="constrained")
-    for panel, points, title in zip(axes, (given, deskew(sweeps, result).numpy()), ("as measured", "de-skewed")):
+    for panel, points, title in zip(
+        axes, (given, deskew_objects(sweeps, result).numpy()), ("as measured", "de-skewed")
+    ):
         dots = panel.scatter(*points[shown, :2].T, s=1.5, c=1000 * times[shown], cmap="viridis", linewidths=0)
         panel.set(title=title, aspect="equal", xlim=(-30, 26), ylim=(-7, 7))
     figure.colorbar(dots, ax=axes, label="measured, ms after the time stamp of the sweep", shrink=0.8)

@@ -27,9 +27,9 @@ from PIL import Image
 from cflow_torch import Sweep, Window, make_config, make_model
 from cflow_torch.data.log import window
 from cflow_torch.evaluation.frame import ego_motion_flow
+from cflow_torch.ground import find_ground
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.viz import plot_flow
-from cflow_torch.windows.ground import find_ground
 
 SEEDS = range(5)
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"

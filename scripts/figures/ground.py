@@ -19,10 +19,10 @@ import torch
 
 from cflow_torch.data.av2 import AV2Log, read_ground_raster
 from cflow_torch.data.hdf5.reader import HDF5Log
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.ground import find_ground
 from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.ground import find_ground
 
 SEEDS = (410, 411, 412)  # the settings were tuned on 400 ... 409
 DATA = Path(os.environ.get("CFLOW_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")

@@ -22,7 +22,7 @@ from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.street import build_street
 from cflow_torch.types import CFlowError, CFlowWarning, Sweep
 from cflow_torch.windows.deskewing import scan_fractions
-from cflow_torch.windows.stillness import share_in_place, static_rows, thinned_rows
+from cflow_torch.windows.stillness import Structure, static_rows, thinned_rows
 
 LIDAR = PROFILES["demo"].units[0]
 
@@ -108,7 +108,7 @@ def test_a_turn_may_begin_elsewhere(start: float, deskew: str, reading: str) -> 
         sweeps = [given.sweep(index) for index in (2, 6)]
         source, target = (np.asarray(sweep.points)[static_rows(sweep)] for sweep in sweeps)
         T = np.linalg.inv(sweeps[1].pose) @ sweeps[0].pose
-        shares.append(share_in_place(source[thinned_rows(source)], target, T))
+        shares.append(Structure(target).share(source[thinned_rows(source)], T))
     assert shares[0] < 0.85 * shares[2] and shares[1] > 0.95 * shares[2]
 
 

@@ -12,8 +12,8 @@ from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.writer import write_hdf5_scene
 from cflow_torch.data.log import window
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import transform_points
 
 h5py = pytest.importorskip("h5py")
 

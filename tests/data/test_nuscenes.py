@@ -16,7 +16,7 @@ from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes
 from cflow_torch.data.nuscenes.tables import Annotations, Tracks
-from cflow_torch.data.rigid_motion import poses_from_quaternions, to_quaternions, transform_points
+from cflow_torch.transforms import poses_from_quaternions, to_quaternions, transform_points
 from cflow_torch.types import CFlowError
 
 VERSION = "v1.0-mini"

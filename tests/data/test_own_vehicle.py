@@ -12,8 +12,8 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.log_check import FOUND, RIGHT, examine
 from cflow_torch.data.own_vehicle import OwnVehicleLog
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, CFlowWarning, Sweep
 
 

@@ -18,7 +18,7 @@ from cflow_torch import CFlowError
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.pandaset import PandaSetLog
 from cflow_torch.data.pickles import load_columns
-from cflow_torch.data.rigid_motion import to_quaternions
+from cflow_torch.transforms import to_quaternions
 
 # Two points (x, y, d, label) by pandas 1.0.5 in protocol 4, the layout of the released files.
 OLD_FRAME = (

@@ -16,7 +16,7 @@ from writers.waymo import BOX_TYPE, write_waymo_segment
 
 from cflow_torch.data.aevascenes import CATEGORY_NAME, AevaScenesLog
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.data.boxes import Boxes, flow_from_boxes, upright_poses
+from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import window
 from cflow_torch.data.nuscenes.reader import NuScenesLog, find_nuscenes_scenes
@@ -24,6 +24,7 @@ from cflow_torch.data.waymo.reader import BOX_CATEGORY, WaymoLog
 from cflow_torch.simulator.drive import Drive, make_drive
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.writers.av2 import write_av2_log
+from cflow_torch.transforms import upright_poses
 
 
 class Format(NamedTuple):

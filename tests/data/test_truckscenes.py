@@ -15,8 +15,8 @@ from writers.truckscenes import write_truckscenes
 from cflow_torch.data.arrays.cloud_file import read_cloud, write_cloud
 from cflow_torch.data.arrays.pcd import pcd_fields
 from cflow_torch.data.nuscenes.reader import find_nuscenes_scenes
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.data.truckscenes import TruckScenesLog, find_truckscenes_scenes
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError
 
 VERSION = "v1.2-mini"

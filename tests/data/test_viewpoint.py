@@ -9,8 +9,8 @@ from cflow_torch import CFlowError
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import read_cloud, write_cloud
 from cflow_torch.data.catalog import open_log
-from cflow_torch.data.rigid_motion import to_quaternions, transform_points
 from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import to_quaternions, transform_points
 from cflow_torch.types import CFlowWarning
 
 pytest.importorskip("pypcd4", reason="needs the extra clouds: pip install pypcd4")

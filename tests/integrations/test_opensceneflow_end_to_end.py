@@ -37,9 +37,9 @@ from pyarrow import feather
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5 import write_hdf5_scene
 from cflow_torch.data.hdf5.writer import write_index_files
-from cflow_torch.data.rigid_motion import poses_from_quaternions
 from cflow_torch.integrations.opensceneflow import write_null_checkpoint
 from cflow_torch.simulator import make_drive
+from cflow_torch.transforms import poses_from_quaternions
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCHER = Path(__file__).with_name("opensceneflow_launcher.py")

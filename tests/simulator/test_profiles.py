@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.drive import SCENES, Drive
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.raycast import BOX
+from cflow_torch.transforms import transform_points
 
 KIND = {"nuscenes": "crossing", "truckscenes": "highway", "aevascenes": "highway"}
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.simulator import make_drive, raycast
 from cflow_torch.simulator.drive import SCENES, Drive
 from cflow_torch.simulator.ground import Ground
@@ -20,6 +19,7 @@ from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID, Solids, cast
 from cflow_torch.simulator.rolling import Shots
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.trajectories import Route, Towed
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError
 
 

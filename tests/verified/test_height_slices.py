@@ -18,10 +18,9 @@ from scenes import RANGE, config, same_bits, scene, sweeps_of
 from turning_car import MODEL, REGION, turning_car
 
 from cflow_torch import Sweep, VerifiedFlow, Window
+from cflow_torch.ground.heights import GroundHeights
 from cflow_torch.verified.columns import OWN, REACH, count_slices
 from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, pack_bits, slice_of
-from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.ground_heights import GroundHeights
 
 SIZE = 0.25
 PLAIN = config("verified", min_height=None, num_history=3)
@@ -137,9 +136,9 @@ def test_ground_residue_equals_the_oracle_in_a_batch(seed):
 
 
 def test_ground_heights_do_not_depend_on_the_order_of_points_nor_overflow():
-    rng, grid = np.random.default_rng(5), Grid(SIZE, RANGE[:3], RANGE[3:])
+    rng = np.random.default_rng(5)
     points = torch.from_numpy(rng.uniform(RANGE[:3], RANGE[3:], (400, 3)).T.copy())
-    sums = [GroundHeights(1, grid, torch.device("cpu")) for _ in range(3)]
+    sums = [GroundHeights(1, RANGE[:3], RANGE[3:], torch.device("cpu")) for _ in range(3)]
     sums[0].add(0, points)
     for part in points[:, torch.from_numpy(rng.permutation(400))].split(70, 1):
         sums[1].add(0, part)
@@ -160,7 +159,7 @@ def slopes(points: np.ndarray, centres: np.ndarray) -> torch.Tensor:
     """(5, 2), which are the oracle's, whatever the order of the points."""
     found, window = [], torch.zeros(len(centres), dtype=torch.int64)
     for order in (slice(None), slice(None, None, -1)):
-        heights = GroundHeights(1, Grid(0.1, REGION[:3], REGION[3:]), torch.device("cpu"))
+        heights = GroundHeights(1, REGION[:3], REGION[3:], torch.device("cpu"))
         heights.add(0, torch.from_numpy(points[order].T.copy()))
         found.append(heights.slopes(torch.from_numpy(centres), window))
     assert torch.equal(*found)

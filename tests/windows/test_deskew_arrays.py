@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cflow_torch.data.rigid_motion import interpolate_poses, transform_each
+from cflow_torch.transforms import interpolate_poses, transform_each
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.deskewing import deskew_points, scan_fractions
 

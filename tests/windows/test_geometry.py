@@ -11,8 +11,9 @@ from oracle.pixels import bev_dims, project_bev
 from scenes import config, pose
 
 from cflow_torch import CFlowError
+from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.ego_motion import compensate, relative_transform, rigid_transform
+from cflow_torch.windows.ego_motion import compensate
 
 INF = math.inf
 

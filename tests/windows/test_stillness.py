@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep
-from cflow_torch.windows.stillness import REACH, share_in_place, static_rows, thinned_rows
+from cflow_torch.windows.stillness import REACH, Structure, static_rows, thinned_rows
 
 
 def test_the_share_equals_that_of_all_pairwise_distances():
@@ -17,16 +17,16 @@ def test_the_share_equals_that_of_all_pairwise_distances():
     distances = np.linalg.norm(transform_points(source, T)[:, None] - target[None], axis=2)
     expected = (distances.min(axis=1) <= REACH).mean()
     assert 0.05 < expected < 0.95
-    assert share_in_place(source, target, T) == expected
+    assert Structure(target).share(source, T) == expected
 
 
 def test_empty_and_absurd_inputs_have_a_share():
     points = np.ones((3, 3))
     far = np.eye(4)
     far[:3, 3] = 1e12
-    assert np.isnan(share_in_place(points[:0], points, np.eye(4)))
-    assert share_in_place(points, points[:0], np.eye(4)) == 0
-    assert share_in_place(points, points, far) == 0
+    assert np.isnan(Structure(points).share(points[:0], np.eye(4)))
+    assert Structure(points[:0]).share(points, np.eye(4)) == 0
+    assert Structure(points).share(points, far) == 0
 
 
 def test_thinning_keeps_one_point_of_each_voxel():

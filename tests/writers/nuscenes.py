@@ -14,8 +14,8 @@ import numpy as np
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES
 from cflow_torch.data.paths import safe_name
-from cflow_torch.data.rigid_motion import to_quaternions
 from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import CFlowError
 
 # A PNG of one pixel: the devkit requires a map file, which it opens only to draw it.

@@ -11,9 +11,8 @@ import numpy as np
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.data.rigid_motion import interpolate_poses, poses_from_quaternions
+from cflow_torch.transforms import interpolate_poses, poses_from_quaternions, rigid_transform
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.ego_motion import rigid_transform
 
 CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets
 # Names of columns without punctuation, as odometry programs and exports of ROS messages write them.

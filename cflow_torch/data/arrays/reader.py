@@ -19,9 +19,8 @@ from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes, read_start
 from cflow_torch.data.point_times import TIME_FIELDS, PointTimes, seconds_after
-from cflow_torch.data.rigid_motion import poses_from_quaternions, transform_points
+from cflow_torch.transforms import poses_from_quaternions, rigid_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep
-from cflow_torch.windows.ego_motion import rigid_transform
 from cflow_torch.windows.returns import missing_returns
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder

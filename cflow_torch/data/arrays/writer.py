@@ -12,7 +12,7 @@ from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
 from cflow_torch.data.arrays.reader import GROUND_FOLDER
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
-from cflow_torch.data.rigid_motion import to_quaternions, transform_points
+from cflow_torch.transforms import to_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 POINTS_FOLDER = "points"

@@ -8,7 +8,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.bin_layout import are_plausible
 from cflow_torch.data.file_errors import shortened
-from cflow_torch.data.rigid_motion import poses_at, poses_from_quaternions
+from cflow_torch.transforms import poses_at, poses_from_quaternions
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.returns import missing_returns
 

@@ -16,10 +16,9 @@ from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import TIME_FIELDS, seconds_after
-from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
 from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.transforms import poses_at, rigid_transform, transform_each, transform_points
 from cflow_torch.types import Sweep
-from cflow_torch.windows.ego_motion import rigid_transform
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _ACTIVE = ".active"  # of a recording that was not finished

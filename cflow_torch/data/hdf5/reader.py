@@ -15,8 +15,8 @@ from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argove
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
 from cflow_torch.errors import CFlowError, import_optional
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import Sweep
-from cflow_torch.windows.ego_motion import rigid_transform
 
 # Time stamps count from 1970 or 1980: smaller ones are microseconds (16 digits), others nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17

@@ -9,8 +9,8 @@ import numpy as np
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes, read_start
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.ego_motion import rigid_transform
 
 _EARTH = 6378137.0  # metres, radius of the Mercator projection
 _NUM_OXTS = 30  # numbers per measurement: latitude, longitude, altitude, roll, pitch, yaw, ...
@@ -73,21 +73,9 @@ def poses_from_oxts(table: np.ndarray, file: Any) -> np.ndarray:
     scale = _EARTH * np.cos(latitude[0])
     north = np.log(np.tan(np.pi / 4 + latitude / 2))
     position = np.stack([scale * longitude, scale * north, table[:, 2]], axis=1)
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, 3] = position - position[0]
     roll, pitch, yaw = table[:, 3:6].T
-    poses[:, :3, :3] = _rotations(yaw, 2) @ _rotations(pitch, 1) @ _rotations(roll, 0)
-    return poses
-
-
-def _rotations(angle: np.ndarray, axis: int) -> np.ndarray:
-    """Return (K, 3, 3) rotations about axis 0, 1 or 2."""
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    result = np.tile(np.eye(3), (len(angle), 1, 1))
-    result[:, first, first] = result[:, second, second] = np.cos(angle)
-    result[:, second, first] = np.sin(angle)
-    result[:, first, second] = -np.sin(angle)
-    return result
+    rotation = rotations_about(2, yaw) @ rotations_about(1, pitch) @ rotations_about(0, roll)
+    return as_matrix(rotation, position - position[0])
 
 
 def in_image(points: np.ndarray, projection: np.ndarray, regions: np.ndarray) -> np.ndarray:

@@ -8,10 +8,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from cflow_torch.data.boxes import Boxes, category_indices, upright_poses
+from cflow_torch.data.boxes import Boxes, category_indices
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
+from cflow_torch.transforms import upright_poses
 from cflow_torch.types import CFlowError
 
 CATEGORY_NAME = {

@@ -20,8 +20,8 @@ from cflow_torch.data.kitti.geometry import IMAGE_SIZE, in_image, png_size, pose
 from cflow_torch.data.kitti.labels import FrameBoxes
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, read_bytes, remote_errors
-from cflow_torch.data.rigid_motion import transform_points
 from cflow_torch.errors import CFlowError, warn
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep
 
 _UNKNOWN_VIEW = np.radians(40.0)  # of the left colour camera, to each side, where its calibration is missing

@@ -14,7 +14,7 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import CameraChain, LidarChain, SceneSource, Tables, Tracks, find_scenes
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes, remote_errors
-from cflow_torch.data.rigid_motion import poses_at, transform_each, transform_points
+from cflow_torch.transforms import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 

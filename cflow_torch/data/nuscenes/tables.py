@@ -14,7 +14,7 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.paths import PathLike, as_path, safe_name
-from cflow_torch.data.rigid_motion import interpolate_poses, poses_from_quaternions
+from cflow_torch.transforms import interpolate_poses, poses_from_quaternions
 from cflow_torch.types import CFlowError
 
 SEARCH_DEPTH = 3  # levels of folders that are searched for a scene.json

@@ -7,7 +7,7 @@ from typing import NamedTuple, Sequence
 import numpy as np
 import torch
 
-from cflow_torch.data.rigid_motion import to_rotations, transform_points
+from cflow_torch.transforms import to_rotations, transform_points
 from cflow_torch.types import CFlowError
 
 LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}

@@ -11,14 +11,14 @@ from typing import Any, Sequence, Tuple
 import numpy as np
 import pyarrow.parquet as pq
 
-from cflow_torch.data.boxes import Boxes, BoxLog, category_indices, upright_poses
+from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, as_path, remote_errors, source_for_mmap, source_for_random_access
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
+from cflow_torch.transforms import rigid_transform, upright_poses
 from cflow_torch.types import CFlowError, Sweep
-from cflow_torch.windows.ego_motion import rigid_transform
 
 TIME, LASER, TRACK = "key.frame_timestamp_micros", "key.laser_name", "key.laser_object_id"
 """Key columns."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -10,7 +10,6 @@ from torch import Tensor
 
 from cflow_torch.ops.indices import constant
 from cflow_torch.ops.linear import adjugate, full, matvec, upper
-from cflow_torch.windows.bev_grid import Grid
 
 # Side of the blocks, metres. A block and the eight around it cover 6 m x 6 m.
 _BLOCK = 2.0
@@ -33,9 +32,10 @@ _UNKNOWN = -(1 << 40)
 class GroundHeights:
     """Sums of the heights of ground points in blocks of 2 m x 2 m: integers, so the order of points does not matter."""
 
-    def __init__(self, num_windows: int, grid: Grid, device: torch.device) -> None:
-        self._lower = grid.lower
-        shape = tuple(int((grid.upper[axis] - grid.lower[axis]) / _BLOCK) + 1 for axis in (1, 0))
+    def __init__(self, num_windows: int, lower: Sequence[float], upper: Sequence[float], device: torch.device) -> None:
+        """`lower` and `upper` are the bounds of the region, metres."""
+        self._lower = tuple(lower)
+        shape = tuple(int((upper[axis] - lower[axis]) / _BLOCK) + 1 for axis in (1, 0))
         # Of each block: the sum of the heights of its points, centimetres, and their number.
         self._sums = torch.zeros((2, num_windows, *shape), dtype=torch.int64, device=device)
 

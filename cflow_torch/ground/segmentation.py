@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from cflow_torch.errors import import_optional
+from cflow_torch.ground.plane import REACH, millimetres, near_plane, order_statistics
 from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
 from cflow_torch.ops.threads import one_thread
+from cflow_torch.tensors import choose_device, read_positions
 from cflow_torch.types import Array, CFlowError, Sweep, Window, check_points
-from cflow_torch.windows.ground_plane import REACH, millimetres, near_plane, order_statistics
-from cflow_torch.windows.validation import choose_device, read_positions
 
 CHOICES = (None, "auto", "grid", "patchwork")  # None = do not look for ground; "auto" = "grid" where there is no mask
 THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster

@@ -10,7 +10,7 @@ import torch
 from scenes import pose
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window
-from cflow_torch.applications.deskewing import deskew
+from cflow_torch.windows.deskewing import deskew_objects
 
 LENGTH, STEP = 4.5, 2.0  # metres, metres per sweep
 
@@ -40,7 +40,7 @@ def in_world(points: np.ndarray, sweep: Sweep) -> np.ndarray:
 def test_a_torn_car_is_put_together(yaw: float) -> None:
     window = torn_car(yaw)
     (result,) = VerifiedFlow.from_preset("default", device="cpu")([window])
-    whole = in_world(deskew(window, result).numpy(), window.pc0)
+    whole = in_world(deskew_objects(window, result).numpy(), window.pc0)
     given = in_world(window.pc0.points, window.pc0)
     assert np.ptp(given[:800, 0]) > LENGTH + 0.9 and abs(np.ptp(whole[:800, 0]) - LENGTH) < 0.1
     assert abs(whole[:800, 0].min() + STEP) < 0.05, "its position at the time stamp of the sweep"
@@ -50,11 +50,11 @@ def test_a_torn_car_is_put_together(yaw: float) -> None:
 def test_each_point_moves_back_by_its_share_of_the_flow() -> None:
     window = torn_car(0.3)
     flow = torch.rand(1600, 3, generator=torch.Generator().manual_seed(0))
-    moved = deskew(window, FlowResult.of({"residual_flow": flow})).numpy() - window.pc0.points
+    moved = deskew_objects(window, FlowResult.of({"residual_flow": flow})).numpy() - window.pc0.points
     rotation = window.pc0.pose[:3, :3].T @ window.pc1.pose[:3, :3]
     assert np.allclose(moved, -(flow.numpy() @ rotation.T) * (window.pc0.point_times / 0.1)[:, None], atol=1e-12)
     still = replace(window, pc0=replace(window.pc0, point_times=np.zeros(1600)))
-    assert np.array_equal(deskew(still, FlowResult.of({"residual_flow": flow})), window.pc0.points)
+    assert np.array_equal(deskew_objects(still, FlowResult.of({"residual_flow": flow})), window.pc0.points)
 
 
 @pytest.mark.parametrize(
@@ -69,4 +69,4 @@ def test_unusable_inputs_are_refused(change: dict, rows: int, message: str) -> N
     window = torn_car(0.0)
     window = replace(window, pc0=replace(window.pc0, **change))
     with pytest.raises(CFlowError, match=message):
-        deskew(window, FlowResult.of({"residual_flow": torch.zeros(rows, 3)}))
+        deskew_objects(window, FlowResult.of({"residual_flow": torch.zeros(rows, 3)}))

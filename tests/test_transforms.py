@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cflow_torch.data.rigid_motion import to_quaternions, to_rotations
+from cflow_torch.transforms import to_quaternions, to_rotations
 
 
 def test_quaternions_of_half_turns_are_exact() -> None:
