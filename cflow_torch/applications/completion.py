@@ -11,7 +11,7 @@ from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_state import Times
 from cflow_torch.applications.track_table import Table
 from cflow_torch.applications.whole_boxes import KINDS, Sightings, whole_boxes
-from cflow_torch.data.rigid_motion import transform_points
+from cflow_torch.transforms import transform_points
 from cflow_torch.types import FlowResult, Window, as_numpy
 
 
@@ -52,7 +52,7 @@ class SeenPoints(NamedTuple):
     velocity: np.ndarray  # (T, 3) float64 m/s, mean flow of each track, in the world
     sensor: np.ndarray  # (3,) float64 metres, position of the vehicle in the world
     offset: np.ndarray  # (M, 3) float32 metres, from the vehicle to each point, axes of the world
-    index: np.ndarray  # (M,) int32 index in `id` of each point's track
+    number: np.ndarray  # (M,) int32 index in `id` of each point's track
 
     @classmethod
     def of(cls, sweeps: Window, result: FlowResult, points: TrackedPoints, times: Times) -> SeenPoints:
@@ -62,11 +62,11 @@ class SeenPoints(NamedTuple):
         sensor = T_world_ego0[:3, 3]
         position = transform_points(as_numpy(sweeps.pc0.points)[points.row, :3], T_world_ego0)
         step = as_numpy(result.residual_flow)[points.row].astype(np.float64) @ T_world_ego1[:3, :3].T
-        ids, index, count = np.unique(points.id, return_inverse=True, return_counts=True)
-        total = [np.bincount(index, step[:, axis], len(ids)) for axis in range(3)]
+        ids, number, count = np.unique(points.id, return_inverse=True, return_counts=True)
+        total = [np.bincount(number, step[:, axis], len(ids)) for axis in range(3)]
         velocity = np.stack(total, 1) / count[:, None] / times.interval
         offset = (position - sensor).astype(np.float32)
-        return cls(points.sweep, times.now, ids, velocity, sensor, offset, index.astype(np.int32))
+        return cls(points.sweep, times.now, ids, velocity, sensor, offset, number.astype(np.int32))
 
 
 def complete(table: Table, seen: Sequence[SeenPoints]) -> Table:
@@ -111,7 +111,7 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
         is_in_table = np.isin(each.id, table["id"][now])
         row_of_id = np.full(len(each.id), -1)
         row_of_id[is_in_table] = rank[now]  # both are sorted by id
-        row = row_of_id[each.index]
+        row = row_of_id[each.number]
         points.append(each.sensor + each.offset[row >= 0])
         rows.append(row[row >= 0])
         velocity[rank[now]] = each.velocity[is_in_table] * table["is_moving"][now, None]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, Dict, List, NamedTuple
+from typing import Any, Dict, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from cflow_torch.data.boxes import Boxes
 from cflow_torch.data.catalog import GroundSegmentedLog
 from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.log import Log, windows
-from cflow_torch.data.pandaset import PandaSetLog
+from cflow_torch.data.pandaset import _POSITION, _SIZE, PandaSetLog, _columns
 
 DRIVES = ((300, "street"), (301, "crossing"))
 SPEED, POINTS, RANGE = 0.5, 20, 50.0  # m/s, points and metres: least speed and points, most distance of a scored object
@@ -43,8 +43,8 @@ Row = Dict[str, Any]
 class TrueBoxes(NamedTuple):
     """The K scored objects of one sweep, in the world."""
 
-    name: List[str]
-    kind: List[str]  # pedestrian, cyclist, car, truck
+    name: list[str]
+    kind: list[str]  # pedestrian, cyclist, car, truck
     size: np.ndarray  # (K, 3) metres
     pose: np.ndarray  # (K, 4, 4) `T_world_box`
     velocity: np.ndarray  # (K, 3) m/s
@@ -55,7 +55,7 @@ class TrueBoxes(NamedTuple):
 
 
 def scored(
-    boxes: Boxes, pose: np.ndarray, later: Dict[str, np.ndarray], seconds: float, points: np.ndarray
+    boxes: Boxes, pose: np.ndarray, later: dict[str, np.ndarray], seconds: float, points: np.ndarray
 ) -> TrueBoxes:
     """Keep the boxes that are scored.
 
@@ -126,8 +126,6 @@ class PandaSetBoxes(PandaSetLog):
 
     def cuboids(self, index: int) -> Boxes:
         """Cuboids of a sweep in its ego frame."""
-        from cflow_torch.data.pandaset import _POSITION, _SIZE, _columns
-
         file = self.folder / "annotations" / "cuboids" / self._files[index].name
         columns = _columns(file, ("uuid", "label", "yaw", "cuboids.sensor_id", *_POSITION, *_SIZE))
         return self._boxes(columns, file, index, LIDAR)
@@ -222,7 +220,7 @@ def area(polygon: np.ndarray) -> float:
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2 if len(polygon) else 0.0
 
 
-def score(log: Any, table: Dict[str, np.ndarray], sweeps: range) -> list[Row]:
+def score(log: Any, table: dict[str, np.ndarray], sweeps: range) -> list[Row]:
     """A row for each scored object and sweep."""
     rows: list[Row] = []
     for index in sweeps:
@@ -273,14 +271,14 @@ def summary(name: str, rows: list[Row]) -> Row:
 
 def constancy(hits: list[Row]) -> float:
     """Share of the boxes whose length and width are within 2 % of the median of their track."""
-    tracks: Dict[Any, list[np.ndarray]] = {}
+    tracks: dict[Any, list[np.ndarray]] = {}
     for row in hits:
         tracks.setdefault((row["log"], row["track"]), []).append(row["size"][:2])
     off = [np.abs(np.array(sizes) / np.median(sizes, 0) - 1).max(1) for sizes in tracks.values()]
     return float(100 * (np.concatenate(off) <= 0.02).mean()) if off else np.nan
 
 
-def boxes_of(log: Log, model: VerifiedFlow) -> tuple[Dict[str, np.ndarray], range]:
+def boxes_of(log: Log, model: VerifiedFlow) -> tuple[dict[str, np.ndarray], range]:
     """Track a drive."""
     seen = windows(GroundSegmentedLog(log), model.config.num_history, model.config.num_future)
     results = [(index, model([given])[0]) for index, given in enumerate(seen)]

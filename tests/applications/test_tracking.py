@@ -18,7 +18,6 @@ from staged_cars import SIZE, Staged, straight
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
 from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
 from cflow_torch.applications.instance_files import write_drivestudio
-from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import find_sources, open_log

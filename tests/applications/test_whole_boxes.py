@@ -45,7 +45,8 @@ def seen(
     """Sightings of objects on paths, (T, 3) x, y, heading; `visible` chooses their points in each sweep."""
     parts = []
     for number, path in enumerate(paths):
-        velocity = np.gradient(path[:, :2], INTERVAL, axis=0)
+        speed = np.linalg.norm(np.gradient(path[:, :2], INTERVAL, axis=0), axis=1)
+        velocity = speed[:, None] * np.stack([np.cos(path[:, 2]), np.sin(path[:, 2])], 1)
         for index, (x, y, heading) in enumerate(path):
             local = visible(index, shell(size))
             turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
