@@ -52,7 +52,7 @@ class SeenPoints(NamedTuple):
     velocity: np.ndarray  # (T, 3) float64 m/s, mean flow of each track, in the world
     sensor: np.ndarray  # (3,) float64 metres, position of the vehicle in the world
     offset: np.ndarray  # (M, 3) float32 metres, from the vehicle to each point, axes of the world
-    number: np.ndarray  # (M,) int32 index in `id` of each point's track
+    track: np.ndarray  # (M,) int32 index in `id` of each point's track
 
     @classmethod
     def of(cls, sweeps: Window, result: FlowResult, points: TrackedPoints, times: Times) -> SeenPoints:
@@ -111,7 +111,7 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
         is_in_table = np.isin(each.id, table["id"][now])
         row_of_id = np.full(len(each.id), -1)
         row_of_id[is_in_table] = rank[now]  # both are sorted by id
-        row = row_of_id[each.number]
+        row = row_of_id[each.track]
         points.append(each.sensor + each.offset[row >= 0])
         rows.append(row[row >= 0])
         velocity[rank[now]] = each.velocity[is_in_table] * table["is_moving"][now, None]

@@ -1,4 +1,4 @@
-"""Smooth the motion of tracks forward and backward: a constant-velocity Kalman filter, and Rauch-Tung-Striebel."""
+"""Smooth tracks forward and backward: a constant-velocity Kalman filter, and a Rauch-Tung-Striebel pass."""
 
 from __future__ import annotations
 

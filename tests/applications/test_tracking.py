@@ -305,6 +305,9 @@ def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> No
     write_drivestudio(tmp_path / "instances", table, log, "vehicle.car")
     poses, sizes, classes = read_instances(tmp_path / "instances")
     assert poses.shape[:2] == (12, 2) and classes == ["vehicle.car"] * 2
+    person = {**table, "class": np.where(table["id"] == table["id"].max(), "pedestrian", "truck")}
+    write_drivestudio(tmp_path / "people", person, log, "vehicle.car", "vehicle.bicycle")
+    assert read_instances(tmp_path / "people")[2] == ["vehicle.car", "vehicle.bicycle"]
     assert np.isfinite(poses[:, :, 0, 0]).sum(0).tolist() == [11, 7] and np.isnan(poses[11]).all()
     middle = np.stack([log.middle(car) for car in range(2)], 1)
     assert np.allclose(poses[4:11, :, :2, 3], middle[4:11], atol=0.1), "the middle of the box"
@@ -359,13 +362,18 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert call("flow", "whole", *run[:3], "tracks=drivestudio") == 0
     poses, _, classes = read_instances(file.parent)
     assert np.isfinite(poses[:, :, 0, 0]).sum() == len(whole["id"]) and set(classes) == {"REGULAR_VEHICLE"}
+    assert call("flow", "whole", *run[:3], "tracks=nuscenes") == 0
+    detections = json.loads((file.parent / "nuscenes_detection.json").read_text())["results"]
+    assert sum(map(len, detections.values())) == len(whole["id"]) and len(detections) == 5
+    assert call("flow", "whole", *run[:3], "tracks=openpcdet") == 0 and (file.parent / "result.pkl").exists()
     for lost in (file, sorted(file.parent.glob("*.feather"))[2]):
         lost.unlink()
         assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
         tables = [feather.read_table(each) for each in file.parent.glob("*.feather")]
         assert [table.column_names.count("track_id") for table in tables] == [1] * 4, "also in a frame that was missing"
     assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
-    assert [other.name for other in file.parent.glob("*.json")] == ["manifest.json"], "nor their other forms"
+    others = [other.name for other in file.parent.iterdir() if other.suffix != ".feather"]
+    assert others == ["manifest.json"], "nor their other forms"
     capsys.readouterr()
     assert call("flow", "small", *run, "contents=[residual,cluster_id,is_valid]") == 2
     assert "add confidence" in capsys.readouterr().err
