@@ -37,7 +37,7 @@ _CLASSES = {
     "truck": ("BUS", "BOX_TRUCK", "TRUCK", "TRUCK_CAB", "LARGE_VEHICLE", "VEHICULAR_TRAILER", "ARTICULATED_BUS"),
 }
 CLASS_OF = {name: kind for kind, names in _CLASSES.items() for name in names}
-Row = dict[str, Any]
+Row = Dict[str, Any]
 
 
 class TrueBoxes(NamedTuple):
