@@ -89,6 +89,7 @@ class Tracker:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds from one sweep to the next")
         self._interval = sweep_interval
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
+        self.times = Times(0.0, sweep_interval, 0.0, 0.0)  # of the last sweep
         self._num_sweeps = 0
         self._num_tracks = 0
         self._tracks = Tracks()
