@@ -89,6 +89,7 @@ class Tracker:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds from one sweep to the next")
         self._interval = sweep_interval
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
+        self.times = Times(0.0, sweep_interval, 0.0, 0.0)  # of the last sweep
         self._num_sweeps = 0
         self._num_tracks = 0
         self._tracks = Tracks()
@@ -302,10 +303,11 @@ def track(
         Column -> (R,) array, which `pandas.DataFrame(table)` takes. There is a row for each track and sweep in which it
         is seen, sorted by sweep, then id. The columns are:
         `sweep`, `timestamp_ns`, `id`;
-        x, y, z: filtered centre of the box, metres in the world; vx, vy, vz: filtered velocity over ground, m/s;
+        x, y, z: smoothed centre of the whole box, metres in the world; vx, vy, vz: its velocity over ground, m/s;
         `velocity_std`: m/s, standard deviation of each of vx, vy and vz, if errors are independent;
-        length (along the heading), width, height: metres, of the visible part of the object;
-        `heading`: radians in the world from +x to the left;
+        length (along the heading), width, height: metres, of the whole box, the same in all rows of a track;
+        `heading`: radians in the world from +x to the left, from the motion, kept at rest;
+        `class`: pedestrian, cyclist, car or truck, by size and speed alone;
         `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved;
         `is_moving`: False = the track moved before, and is static now;
         `cluster_id`: of this sweep's flow, -1 while it is static; `num_points`;

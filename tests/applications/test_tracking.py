@@ -259,8 +259,7 @@ def test_tracks_are_written_as_text(tmp_path: Path) -> None:
 
     write_kitti(tmp_path / "kitti.txt", table, log)
     lines = [line.split() for line in (tmp_path / "kitti.txt").read_text().splitlines()]
-    kind = "Car" if "class" in table else "Misc"
-    assert [line[:5] for line in lines] == [[str(index), "0", kind, "-1", "-1"] for index in range(11)]
+    assert [line[:5] for line in lines] == [[str(index), "0", "Car", "-1", "-1"] for index in range(11)]
     height, width, length, x, y, z, rotation, score = np.array([line[10:] for line in lines], float).T
     assert np.allclose(height, 1.2) and np.allclose(score, 0.9, atol=1e-6)
     assert np.allclose(width, 1.9, atol=1e-5) and np.allclose(length, 4.5, atol=1e-5), "a whole car"
