@@ -61,7 +61,7 @@ class CleanLog(Log):
             raise CFlowError("standing= is now remove_stopped=")
         self.log_id = log.log_id
         self.timestamps = log.timestamps
-        self.gaps = getattr(log, "gaps", frozenset())
+        self.gaps = log.gaps
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
         if flow is None and model is None:

@@ -122,9 +122,9 @@ def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog])
 
 def _viewpoint(log: Log, suffix: str) -> str | None:
     """Return the frame of the points in `.pcd` files whose VIEWPOINT has the pose, as the log has it; None = none."""
-    if suffix != ".pcd" or not getattr(log.unwrapped, "has_viewpoints", False):
+    if suffix != ".pcd" or not log.unwrapped.has_viewpoints:
         return None
-    return "world" if getattr(log, "read_as", None) == WORLD else "sensor"
+    return "world" if log.read_as == WORLD else "sensor"
 
 
 def _draw(points: np.ndarray, file: Path) -> str:

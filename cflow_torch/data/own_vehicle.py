@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, LogWrapper
 from cflow_torch.data.log_motion import known_poses
 from cflow_torch.errors import CFlowError
@@ -54,6 +55,12 @@ class OwnVehicleLog(LogWrapper):
         is_valid = labels.is_valid.copy()
         is_valid[self._own_rows(as_numpy(self.log.sweep(index).points))] = False
         return replace(labels, is_valid=is_valid)
+
+    def findings(self) -> list[Finding]:
+        count = len(self.own_cells)
+        text = f"returns in {count} cells near the origin ride along, so we leave them out"
+        own = Finding("own vehicle", *((FOUND, text) if count else (RIGHT, "no returns are seen")))
+        return [*self.log.findings(), own]
 
     def _own_rows(self, points: np.ndarray) -> np.ndarray:
         near = np.flatnonzero(_are_near(points))

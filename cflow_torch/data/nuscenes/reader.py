@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal, Mapping, NamedTuple, Sequence
 
@@ -133,7 +134,7 @@ class NuScenesLog(Log):
         self._poses = reference.ego[kept]
         self._T_ego_world = np.linalg.inv(self._poses)
 
-    @property
+    @cached_property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_ego` of every sweep."""
         return self._poses
