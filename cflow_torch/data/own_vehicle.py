@@ -14,7 +14,7 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.stillness import REACH, Structure
+from cflow_torch.windows.stillness import REACH, Structure, cell_keys
 
 _NEAR, _CELL = 2.7, 0.25  # metres from the origin along x and y, and side of a cell
 _LEAST_MOTION, _FEWEST_SWEEPS, _MOST_SWEEPS = 2.0, 3, 4  # metres between the compared sweeps, and their number
@@ -126,16 +126,12 @@ def _are_near(points: np.ndarray) -> np.ndarray:
 
 def _cells_of(points: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
-        return np.floor(np.nan_to_num(points[:, :3].astype(np.float64)) / _CELL).astype(np.int64)
-
-
-def _key(cells: np.ndarray) -> np.ndarray:
-    x, y, z = cells.clip(-(1 << 19), 1 << 19).T + (1 << 20)
-    return (x << 42) + (y << 21) + z  # type: ignore[no-any-return]
+        cell = np.floor(np.nan_to_num(points[:, :3].astype(np.float64)) / _CELL)
+    return cell.clip(-(1 << 19), 1 << 19).astype(np.int64)
 
 
 def _contains(cells: np.ndarray, of_points: np.ndarray) -> np.ndarray:
-    return np.isin(_key(of_points), _key(cells))
+    return np.isin(cell_keys(of_points), cell_keys(cells))
 
 
 def _dilated(cells: np.ndarray) -> np.ndarray:
