@@ -16,9 +16,25 @@ def _method(name: str) -> Any:
     return setting(name, "dense | keypoints | verified; a preset chooses it", choices=(name,))
 
 
+def _check_space(sizes: tuple[float, ...], box: tuple[float, ...], own: tuple[float, ...] | None) -> None:
+    if not sizes or any(not 0 < s < math.inf for s in sizes) or any(a <= b for a, b in zip(sizes, sizes[1:])):
+        raise CFlowError(
+            f"pixel_sizes={sizes}: give at least one positive size in metres, strictly coarse to fine, "
+            "for example (0.4, 0.2, 0.1)"
+        )
+    if len(box) != 6 or any(math.isnan(v) for v in box) or any(a >= b for a, b in zip(box[:3], box[3:])):
+        raise CFlowError(
+            f"point_cloud_range={box}: give (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, z0 < z1"
+        )
+    if any(math.isinf(v) for v in (box[0], box[1], box[3], box[4])):
+        raise CFlowError(f"point_cloud_range={box}: give finite x and y bounds; only z may be infinite")
+    if own is not None and (len(own) != 4 or not all(map(math.isfinite, own)) or own[0] >= own[2] or own[1] >= own[3]):
+        raise CFlowError(f"ego_box={own}: give (x0, y0, x1, y1) in metres, finite, with x0 < x1 and y0 < y1, or None")
+
+
 @dataclass(frozen=True)
 class Config(Settings):
-    """Settings that all methods have. Each method adds its own ones (`CONFIGS`). `make_config` makes all from a preset.
+    """Settings that all methods have. Each method adds its own ones (`METHODS`). `make_config` makes all from a preset.
 
     An invalid value raises `CFlowError`. `cflow settings` lists the meaning and the bounds of every field.
     """
@@ -199,91 +215,68 @@ class VerifiedConfig(_WithHistory):
 
 WINDOW = ("num_history", "num_future")  # the settings that choose the sweeps of a window
 
-CONFIGS: dict[str, type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
+METHODS: dict[str, type[Config]] = {"dense": DenseConfig, "keypoints": KeypointsConfig, "verified": VerifiedConfig}
 
 _REGION = (-76.8, -76.8, -math.inf, 76.8, 76.8, math.inf)
 _HARNESS_REGION = (-51.2, -51.2, -math.inf, 51.2, 51.2, math.inf)
-_DEFAULT = {
+_DEFAULT: dict[str, Any] = {
     "num_history": 4,
     "pixel_sizes": (0.4, 0.2, 0.1),
     "point_cloud_range": _REGION,
     "max_speed": 60.0,
 }
-# The method of each preset, and the changes of the preset to the defaults of the method.
-PRESETS: dict[str, tuple[str, dict[str, Any]]] = {
-    "default": ("verified", _DEFAULT),
-    "offline": ("verified", {**_DEFAULT, "num_future": 4}),
-    "live": ("verified", {**_DEFAULT, "num_history": 2, "point_cloud_range": _HARNESS_REGION}),
-    "paper": ("dense", {}),
+PRESETS: dict[str, Config] = {
+    "default": VerifiedConfig(**_DEFAULT),
+    "offline": VerifiedConfig(**{**_DEFAULT, "num_future": 4}),
+    "live": VerifiedConfig(**{**_DEFAULT, "num_history": 2, "point_cloud_range": _HARNESS_REGION}),
+    "paper": DenseConfig(),
     # Chosen on the simulated seeds 200 ... 209: docs/method.md.
-    "keypoints": (
-        "keypoints",
-        {
-            "densify": "clusters",
-            "patch_size": 41,
-            "ratio_threshold": 1.02,
-            "gate_radius": 2.0,
-            "point_cloud_range": _HARNESS_REGION,
-        },
+    "keypoints": KeypointsConfig(
+        densify="clusters",
+        patch_size=41,
+        ratio_threshold=1.02,
+        gate_radius=2.0,
+        point_cloud_range=_HARNESS_REGION,
     ),
-}
-_PRESET_OF_METHOD = {"dense": "paper", "keypoints": "keypoints", "verified": "default"}
-
-# Presets and settings of the version before this one, and what to use instead.
-REMOVED_PRESETS = {"fast": "use default with num_history=2"}
-REMOVED = {
-    "thorough": "leave it out, every step of the method is always on",
-    "max_object": "use max_object_length",
+    "paper_keypoints": KeypointsConfig(),
 }
 
 
-def make_config(preset: str | None = None, method: str | None = None, **overrides: Any) -> Config:
+def make_config(preset: str | Config = "default", **settings: Any) -> Config:
     """Make the settings of a preset, with some fields replaced.
 
     Args:
-        preset: "default", "offline", "live", "paper" or "keypoints"; None = the preset of the method, or "default".
-        method: "dense" (preset "paper"), "keypoints" or "verified" (presets "default", "offline", "live"); None = the
-            method of the preset. Method "keypoints" with preset "paper" gives the paper's key-point settings.
-        **overrides: any field of the method's settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
+        preset: a name of `PRESETS`: "default", "offline" or "live" (`VerifiedFlow`), "paper" (`CorrelationFlow`),
+            "keypoints" or "paper_keypoints" (`CorrelationFlowKeypoints`). Or a `Config`, whose fields are replaced.
+        **settings: any field of the settings; `pixel_size=0.1` is short for `pixel_sizes=(0.1,)`.
 
     Returns:
         A checked `DenseConfig`, `KeypointsConfig` or `VerifiedConfig`.
 
     Raises:
-        CFlowError: an unknown preset or field (the message lists the fields), an invalid value, or a preset of another
-            method.
+        CFlowError: an unknown preset or field (the message lists the fields), or an invalid value.
     """
-    if method is not None:
-        _class_of(method)  # raises the error
-    if preset is None:
-        preset = _PRESET_OF_METHOD[method] if method is not None else "default"
-    if preset in REMOVED_PRESETS:
-        raise CFlowError(removed_preset(preset))
-    if preset not in PRESETS:
-        raise CFlowError(f"preset={preset!r}: give one of {', '.join(map(repr, PRESETS))}")
-    own, changes = PRESETS[preset]
-    if method == "keypoints" and preset == "paper":
-        own = method
-        changes = {}
-    if method not in (None, own):
-        raise CFlowError(f"preset={preset!r} is of method={own!r}, not of method={method!r}: leave one of them out")
-    return CONFIGS[own](**changes).replace(**overrides)
-
-
-def removed_preset(name: str) -> str:
-    """The message for a preset of `REMOVED_PRESETS`."""
-    return f"preset {name!r} was removed in 0.4.0: {REMOVED_PRESETS[name]}"
+    for name in ("method", "config"):
+        if name in settings:
+            raise CFlowError(
+                f"there is no {name}=: preset= says the method, too: give one of {', '.join(map(repr, PRESETS))}, or "
+                "the result of make_config"
+            )
+    if not isinstance(preset, Config):
+        if not isinstance(preset, str) or preset not in PRESETS:
+            raise CFlowError(
+                f"preset={preset!r}: give one of {', '.join(map(repr, PRESETS))}, or the result of make_config"
+            )
+        preset = PRESETS[preset]
+    return preset.replace(**settings)
 
 
 def config_from(settings: dict[str, Any]) -> Config:
     """Make settings from `Config.as_dict`. Missing fields get their defaults. A wrong field is a `CFlowError`."""
-    return _class_of(settings.get("method"))().replace(**settings)
-
-
-def _class_of(method: str | None) -> type[Config]:
-    if method not in CONFIGS:
-        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CONFIGS))}")
-    return CONFIGS[method]
+    method = settings.get("method")
+    if method not in METHODS:
+        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, METHODS))}")
+    return METHODS[method]().replace(**settings)
 
 
 def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
@@ -295,9 +288,7 @@ def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
     names = [f.name for f in fields(kind)]
     unknown = sorted(set(overrides) - set(names))
     for name in unknown:
-        if name in REMOVED:
-            raise CFlowError(f"setting {name} was removed: {REMOVED[name]}")
-        methods = [method for method, other in CONFIGS.items() if name in (f.name for f in fields(other))]
+        methods = [method for method, other in METHODS.items() if name in (f.name for f in fields(other))]
         if methods:
             raise CFlowError(
                 f"{name} is a setting of method {' and '.join(methods)}, not of {fields(kind)[0].default}: "
@@ -306,19 +297,3 @@ def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
     if unknown:
         raise CFlowError(f"unknown setting {', '.join(unknown)}: the fields are {', '.join(['pixel_size', *names])}")
     return overrides
-
-
-def _check_space(sizes: tuple[float, ...], box: tuple[float, ...], own: tuple[float, ...] | None) -> None:
-    if not sizes or any(not 0 < s < math.inf for s in sizes) or any(a <= b for a, b in zip(sizes, sizes[1:])):
-        raise CFlowError(
-            f"pixel_sizes={sizes}: give at least one positive size in metres, strictly coarse to fine, "
-            "for example (0.4, 0.2, 0.1)"
-        )
-    if len(box) != 6 or any(math.isnan(v) for v in box) or any(a >= b for a, b in zip(box[:3], box[3:])):
-        raise CFlowError(
-            f"point_cloud_range={box}: give (x0, y0, z0, x1, y1, z1) in metres with x0 < x1, y0 < y1, z0 < z1"
-        )
-    if any(math.isinf(v) for v in (box[0], box[1], box[3], box[4])):
-        raise CFlowError(f"point_cloud_range={box}: give finite x and y bounds; only z may be infinite")
-    if own is not None and (len(own) != 4 or not all(map(math.isfinite, own)) or own[0] >= own[2] or own[1] >= own[3]):
-        raise CFlowError(f"ego_box={own}: give (x0, y0, x1, y1) in metres, finite, with x0 < x1 and y0 < y1, or None")

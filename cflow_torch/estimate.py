@@ -19,58 +19,41 @@ from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import keep_nearest
 
-# Arguments of `estimate_flow` that a `Sweep` contains.
-_NOT_WITH_SWEEPS = ("T_ego1_ego0", "gm0", "gm1", "dt0", "dt1", "T_ego1_egoh", "gmh", "dth", "T_ego1_egof", "gmf", "dtf")
+# Arguments that a `Sweep` contains.
+_IN_SWEEPS = {"dt0", "dt1", "pch", "gmh", "dth", "T_ego1_egoh", "pcf", "gmf", "dtf", "T_ego1_egof"}
 
 
 def estimate_flow(
     pc0: Array | Sweep,  # (N0, 3+), metres, ego frame of sweep t
     pc1: Array | Sweep,  # (N1, 3+), metres, ego frame of sweep t+1
-    *,
     T_ego1_ego0: Array | None = None,  # (4, 4)
+    *,
     gm0: Array | None = None,  # (N0,) bool
     gm1: Array | None = None,  # (N1,) bool
-    pch: Sequence[Array | Sweep] = (),  # (Nh, 3+) each, nearest first
-    T_ego1_egoh: Sequence[Array | None] = (),
-    gmh: Sequence[Array | None] = (),
-    dt0: Array | None = None,  # (N0,), seconds
-    dt1: Array | None = None,  # (N1,), seconds
-    dth: Sequence[Array | None] = (),
-    pcf: Sequence[Array | Sweep] = (),  # (Nf, 3+) each, nearest first
-    T_ego1_egof: Sequence[Array | None] = (),
-    gmf: Sequence[Array | None] = (),
-    dtf: Sequence[Array | None] = (),
-    method: str | None = None,
-    preset: str | None = None,
-    config: Config | None = None,
+    history: Sequence[Sweep] = (),
+    future: Sequence[Sweep] = (),
     ground: str | None = "auto",
+    preset: str | Config = "default",
     device: Any = "auto",
-    **overrides: Any,
+    **settings: Any,
 ) -> FlowResult:
     """Estimate the scene flow from sweep t to sweep t+1.
 
     Args:
         pc0: points of sweep t, (N0, 3+) float of any width, array or tensor. Columns after z are ignored. Or a `Sweep`,
-            which also contains mask, pose and times; then all of `pc0`, `pc1`, `pch` and `pcf` must be sweeps.
+            which also contains mask, pose and times of points; then `pc1` is a `Sweep`, too.
         pc1: points of sweep t+1, (N1, 3+).
         T_ego1_ego0: (4, 4), maps the ego frame at t to the ego frame at t+1 (pose1^-1 pose0). None = pc0 is already in
-            the frame of t+1.
-        gm0, gm1: ground masks, (N,) bool, True = ground; None = see `ground`.
-        pch: older sweeps t-1, t-2, ...; we use the nearest `num_history` of them.
-        T_ego1_egoh: (4, 4) for each of `pch`; may be left out only if `T_ego1_ego0` is left out too.
-        gmh: ground mask of each of `pch`, or empty.
-        dt0, dt1: times of the points, seconds after the instant of their sweep, see `Sweep.point_times`. The presets
-            `default`, `offline` and `live` use them if every sweep has them.
-        dth: times of the points of each of `pch`.
-        pcf, T_ego1_egof, gmf, dtf: sweeps t+2, t+3, ..., at most `num_future`, with their transforms, masks and times;
-            for the preset "offline".
-        method: "dense", "keypoints" or "verified"; None = the method of the preset.
-        preset: "default", "offline", "live", "keypoints" or "paper"; None = the preset of the method, or "default".
-        config: settings from `make_config`, instead of `method` and `preset`.
+            the frame of t+1. Sweeps have poses instead.
+        gm0, gm1: ground masks, (N,) bool, True = ground; None = see `ground`. Sweeps have `is_ground` instead.
+        history: sweeps t-1, t-2, ..., nearest first; we use the nearest `num_history` of them. `pc0` and `pc1` are
+            sweeps, too.
+        future: sweeps t+2, t+3, ..., nearest first, at most `num_future`; for the preset "offline".
         ground: what to do with sweeps without a mask. "grid" = find their ground (`find_ground`); "auto" = the same,
             with a warning; "patchwork" = use Patchwork++ (`pip install pypatchworkpp`); None = no point is ground.
+        preset: "default", "offline", "live", "keypoints", "paper" or "paper_keypoints"; or the result of `make_config`.
         device: "auto" = the device of the tensors, else a GPU if there is one, else the CPU.
-        **overrides: any field of `Config`, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
+        **settings: any field of the settings, for example `pixel_sizes=(0.4, 0.2, 0.1)`.
 
     Returns:
         Flow for every row of pc0, in the axes of the ego frame at t+1, on the device of the computation.
@@ -95,43 +78,38 @@ def estimate_flow(
 
     Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
-    arguments = dict(locals())
     if ground not in CHOICES:
         raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
-    if config is None:
-        config = make_config(preset, method, **overrides)
-    elif not isinstance(config, Config) or (preset, method) != (None, None):
-        raise CFlowError("config is the result of make_config, and replaces preset and method: leave these out")
-    elif overrides:
-        config = config.replace(**overrides)
-    given = None if T_ego1_ego0 is None else "T_ego1_ego0"  # name of a transform that is given
-    if given is None and any(transform is not None for transform in (*T_ego1_egoh, *T_ego1_egof)):
-        given = "another transform"
-    if isinstance(pc0, Sweep) or isinstance(pc1, Sweep):
-        extra = [name for name in _NOT_WITH_SWEEPS if arguments[name] is not None and len(arguments[name]) > 0]
-        if extra:
-            raise CFlowError(f"{', '.join(extra)} and a Sweep are given: put masks, poses and times into the Sweep")
-        window = Window(pc0, pc1, tuple(pch), tuple(pcf))  # type: ignore[arg-type]  # it refuses arrays
-    else:
-        window = Window(
-            pc0=_sweep("0", given, pc0, gm0, T_ego1_ego0, dt0),
-            pc1=_sweep("1", given, pc1, gm1, None, dt1),
-            pch=_sweeps(given, "h", pch, gm=gmh, T_ego1_ego=T_ego1_egoh, dt=dth),
-            pcf=_sweeps(given, "f", pcf, gm=gmf, T_ego1_ego=T_ego1_egof, dt=dtf),
+    moved = sorted(_IN_SWEEPS & settings.keys())
+    if moved:
+        raise CFlowError(
+            f"estimate_flow has no {', '.join(moved)}: give estimate_flow(Sweep(pc0, gm0, pose0, point_times=dt0), "
+            "Sweep(pc1, ...), history=[Sweep(...), ...], future=[...])"
         )
+    for name, sweeps in (("history", history), ("future", future)):
+        if not isinstance(sweeps, (list, tuple)) or not all(isinstance(sweep, Sweep) for sweep in sweeps):
+            raise CFlowError(f"{name}: give a list of cflow_torch.Sweep, nearest first")
+    config = make_config(preset, **settings)
+    if isinstance(pc0, Sweep) or isinstance(pc1, Sweep):
+        if any(value is not None for value in (T_ego1_ego0, gm0, gm1)):
+            raise CFlowError("T_ego1_ego0, gm0 or gm1 is given with a Sweep: put poses and masks into the sweeps")
+    else:
+        if len(history) > 0 or len(future) > 0:
+            raise CFlowError("history and future need sweeps: give pc0 and pc1 as cflow_torch.Sweep, too")
+        pc0, pc1 = _sweeps_of_arrays(pc0, pc1, T_ego1_ego0, gm0, gm1)
+    window = Window(pc0, pc1, tuple(history), tuple(future))  # type: ignore[arg-type]  # it refuses arrays
     window = _leave_out_missing(keep_nearest(window, config.num_history))
     window = _find_ground(window, ground, device)
     return make_model(config, device)([window])[0]
 
 
-def make_model(config: Config, device: Any = "auto") -> SceneFlowModel:
-    """Make the method of a config: `CorrelationFlow`, `CorrelationFlowKeypoints` or `VerifiedFlow`.
+def make_model(preset: str | Config = "default", device: Any = "auto", **settings: Any) -> SceneFlowModel:
+    """Make the method of a preset: `CorrelationFlow`, `CorrelationFlowKeypoints` or `VerifiedFlow`.
 
-    `make_config` makes the config. `device` is as for `estimate_flow`.
+    `preset` and `settings` are as for `make_config`, `device` is as for `estimate_flow`.
     """
     methods = {method.method: method for method in (CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow)}
-    if not isinstance(config, Config):
-        raise CFlowError(f"config is {type(config).__name__}: give the result of make_config")
+    config = make_config(preset, **settings)
     return methods[config.method](config, device)
 
 
@@ -170,27 +148,10 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
     return _window(sweeps, len(window.pch))
 
 
-def _sweep(
-    name: str, given: str | None, points: Array, is_ground: Any, transform: Array | None, times: Array | None
-) -> Sweep:
-    """Make a sweep in a world that is the ego frame at t+1: its pose is `transform`, or None if none is given."""
-    pose = None if given is None else np.eye(4) if transform is None else transform
-    names = [f"{argument}{name}" for argument in ("pc", "gm", "T_ego1_ego", "dt")]
-    check_sweep(names, points, is_ground, pose, times)
-    return Sweep(points, is_ground, pose, point_times=times)
-
-
-def _sweeps(given: str | None, side: str, clouds: Sequence[Any], **others: Sequence[Any]) -> tuple[Sweep, ...]:
-    """The sweeps of one side, "h" (history) or "f" (future), from lists that are empty or have an entry per sweep."""
-    if given is not None and len(clouds) > 0 and len(others["T_ego1_ego"]) == 0:
-        raise CFlowError(
-            f"{given} is given but T_ego1_ego{side} is not: give one transform per sweep of pc{side} "
-            "(None for a sweep that is already in the frame of t+1)"
-        )
-    for name, values in others.items():
-        if len(values) not in (0, len(clouds)):
-            raise CFlowError(
-                f"{name}{side} has {len(values)} entries for {len(clouds)} sweeps of pc{side}: give one per sweep"
-            )
-    columns = (values if len(values) > 0 else [None] * len(clouds) for values in others.values())
-    return tuple(_sweep(f"{side}[{i}]", given, *row) for i, row in enumerate(zip(clouds, *columns)))
+def _sweeps_of_arrays(
+    pc0: Array, pc1: Array, T_ego1_ego0: Array | None, gm0: Array | None, gm1: Array | None
+) -> tuple[Sweep, Sweep]:
+    """Make sweeps in a world that is the ego frame at t+1. Without a transform they have no poses."""
+    check_sweep(("pc0", "gm0", "T_ego1_ego0", "dt0"), pc0, gm0, T_ego1_ego0, None)
+    check_sweep(("pc1", "gm1", "T_ego1_ego0", "dt1"), pc1, gm1, None, None)
+    return Sweep(pc0, gm0, T_ego1_ego0), Sweep(pc1, gm1, None if T_ego1_ego0 is None else np.eye(4))

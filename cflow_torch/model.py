@@ -9,7 +9,7 @@ from typing import Any, Sequence, TypeVar
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.config import CONFIGS, Config, make_config
+from cflow_torch.config import METHODS, PRESETS, Config, make_config
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.stages import stage
 from cflow_torch.tensors import choose_device
@@ -87,7 +87,7 @@ class SceneFlowModel(nn.Module):
             raise CFlowError(
                 f"config is {type(config).__name__}: give the result of make_config, or {name}.from_preset"
             )
-        if not isinstance(config, CONFIGS[self.method]):
+        if not isinstance(config, METHODS[self.method]):
             raise CFlowError(
                 f"{name} is method={self.method!r}, but the config is for {config.method!r}: use make_model"
             )
@@ -96,13 +96,17 @@ class SceneFlowModel(nn.Module):
         self.inspect: Any = Inspection()  # None = do not warn of likely mistakes in the windows
 
     @classmethod
-    def from_preset(cls: type[_Model], preset: str | None = None, device: Any = "auto", **overrides: Any) -> _Model:
+    def from_preset(
+        cls: type[_Model], preset: str | Config | None = None, device: Any = "auto", **settings: Any
+    ) -> _Model:
         """Make the method with the settings of a preset, with some fields replaced.
 
-        `preset` is a preset of this method; None = "default", "paper" or "keypoints". `overrides` are settings of the
-        method. An unknown preset or field, a preset of another method or an invalid value is a `CFlowError`.
+        `preset` is a preset of this method, or the result of `make_config`; None = "default", "paper" or "keypoints".
+        An unknown preset or field, a preset of another method or an invalid value is a `CFlowError`.
         """
-        return cls(make_config(preset, cls.method, **overrides), device)
+        if preset is None:
+            preset = next(name for name, config in PRESETS.items() if config.method == cls.method)
+        return cls(make_config(preset, **settings), device)
 
     def extra_repr(self) -> str:
         """Settings, for `print`."""

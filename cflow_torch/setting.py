@@ -12,6 +12,7 @@ from cflow_torch.errors import CFlowError
 
 # Whole numbers stay below this, because they are compared with tensors of int64 and of float64.
 LIMIT = 2**53
+AUTO = "auto"  # a value that we choose
 # Names of types in error messages.
 _NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers", str: "text"}
 
@@ -68,7 +69,7 @@ def bounds(
     }
 
 
-def describe(limits: Mapping[str, Any]) -> str:
+def describe_limits(limits: Mapping[str, Any]) -> str:
     """The allowed values in words: "a number of at least 1 and of at most 2, or None"."""
     low = limits["low"]
     above = limits["above"]
@@ -104,4 +105,4 @@ def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
             is_allowed &= value in limits["choices"]
         if is_allowed:
             return value if kind is object else kind(value)
-    raise CFlowError(f"{name}={value!r}: give {describe(limits)}")
+    raise CFlowError(f"{name}={value!r}: give {describe_limits(limits)}")

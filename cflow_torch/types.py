@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import zipfile
 from dataclasses import MISSING, dataclass, fields
+from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple, Sequence, Union
+from typing import Any, Mapping, NamedTuple, Sequence, Union
 
 import numpy as np
 import torch
@@ -188,6 +189,34 @@ class Window:
         for name, sweep in named_sweeps(self):
             if not isinstance(sweep, Sweep):
                 raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
+
+    @classmethod
+    def from_dict(cls, sample: Mapping[str, Any]) -> Window:
+        """Make a window of the dictionary of a data loader, such as SeFlow's and OpenSceneFlow's.
+
+        Args:
+            sample: "pc0" and "pc1", (N, 3+) points of t and t+1; for t-1, t-2, ... "pch1", "pch2", ...; for t+2, ...
+                "pcf1", ... For each of them, if there is a value: "gm0" (N,) bool, True = ground; "pose0" (4, 4),
+                ego coordinates to world; "dt0" (N,) seconds, see `Sweep`. Other keys are ignored.
+
+        Raises:
+            CFlowError: a missing cloud, a wrong shape or dtype. The message names the key.
+        """
+        for key in ("pc0", "pc1"):
+            if key not in sample:
+                raise CFlowError(f"the dictionary has no {key!r}; it has {', '.join(map(str, sample))}")
+
+        def sweep(name: str) -> Sweep:
+            keys = [f"{prefix}{name}" for prefix in ("pc", "gm", "pose", "dt")]
+            points, is_ground, pose, times = (sample.get(key) for key in keys)
+            check_sweep(keys, points, is_ground, pose, times)
+            return Sweep(points, is_ground, pose, point_times=times)  # type: ignore[arg-type]  # points are checked
+
+        def numbered(side: str) -> tuple[Sweep, ...]:
+            names = takewhile(lambda name: f"pc{name}" in sample, (f"{side}{i}" for i in range(1, len(sample))))
+            return tuple(map(sweep, names))
+
+        return cls(sweep("0"), sweep("1"), numbered("h"), numbered("f"))
 
 
 def named_sweeps(window: Window) -> list[tuple[str, Sweep]]:

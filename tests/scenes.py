@@ -12,7 +12,7 @@ import torch
 from kornia import contrib
 from oracle import reference_flow
 
-from cflow_torch.config import CONFIGS, Config, VerifiedConfig
+from cflow_torch.config import METHODS, Config, VerifiedConfig
 from cflow_torch.estimate import make_model
 from cflow_torch.types import FlowResult, Sweep, Window
 from cflow_torch.verified.component_tree import Objects
@@ -28,7 +28,7 @@ RANGE = (-8.0, -7.0, -2.0, 8.0, 7.0, 3.0)
 def config(method: str = "dense", **overrides) -> Config:
     """Settings for the small scenes: 0.25 m pixels, 16 m x 14 m; the paper's components are split beyond 5 m."""
     of_method = {} if method == "verified" else {"max_extent": 5.0}
-    return CONFIGS[method](pixel_sizes=(0.25,), point_cloud_range=RANGE, **of_method).replace(**overrides)
+    return METHODS[method](pixel_sizes=(0.25,), point_cloud_range=RANGE, **of_method).replace(**overrides)
 
 
 def pose(x: float, y: float, yaw: float, z: float = 0.0) -> np.ndarray:

@@ -12,7 +12,7 @@ from cflow_torch import make_config
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.fleet.job import Job, Shard
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.manifest import check_logs, claim_run, make_identity
+from cflow_torch.fleet.manifest import check_logs, clear_log, make_identity
 from cflow_torch.fleet.run import run_fleet
 
 SWEEPS = (4, 6, 3)  # of the logs
@@ -27,9 +27,8 @@ TWO = Layout(("cpu", "cpu"), 2)
 def make_job(output: Path, **settings: Any) -> Job:
     """A job with `CONFIG` on Argoverse 2 logs."""
     values: dict[str, Any] = {"config": CONFIG, "settings": {"check": False}, "batch": 2, **settings}
-    job = Job(identity="", reader="av2", output=str(output), **values)
-    identity = make_identity(job.config, job.reader, job.settings, job.contents)
-    return replace(job, identity=identity["hash"])
+    job = Job(identity={}, reader="av2", output=str(output), **values)
+    return replace(job, identity=make_identity(job.config, job.reader, job.settings, job.contents))
 
 
 def run(
@@ -45,11 +44,11 @@ def run(
 ) -> dict[str, Any]:
     """Run `cflow flow` without the command line; returns the report. `settings` replace those of `make_job`."""
     job = make_job(output, batch=layout.batch, redo=overwrite, **settings)
-    identity = make_identity(job.config, "av2", job.settings, job.contents)
     sources = find_sources("av2", root)
     names = [source.name for source in sources]
-    check_logs(output, names, identity, resume, overwrite, shard.count == 1)
-    claim_run(output, identity, names if overwrite and shard.count == 1 else ())
+    check_logs(output, names, job.identity, resume, overwrite, shard.count == 1)
+    for name in names if overwrite and shard.count == 1 else ():
+        clear_log(output / name)
     return run_fleet(job, sources, layout, shard, engine, **engine_settings)
 
 

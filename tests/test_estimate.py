@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from preset_windows import changed
-from scenes import assert_same_bits, assert_zeros, config, scene
+from scenes import assert_same, assert_same_bits, assert_zeros, config, scene
 
 from cflow_torch import CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow, estimate_flow, make_config, make_model
 from cflow_torch.errors import CFlowError, CFlowWarning, NoActivePoints
@@ -30,23 +30,19 @@ EYE, SWEEPS = np.eye(4), {"pc0": Sweep(P0), "pc1": Sweep(P1)}
 @pytest.mark.parametrize(
     "arguments, complaint",
     [
-        ({"pcf": [P1, P0], "preset": "paper"}, "2 future sweeps.*num_future=0"),
-        ({"config": make_config("paper"), "method": "dense"}, "replaces preset and method"),
-        ({"pch": [P1], "gmh": [None, None]}, "gmh has 2 entries for 1"),
-        ({"pch": [P1], "T_ego1_egoh": [EYE, EYE]}, "T_ego1_egoh has 2 entries for 1"),
-        ({"pch": [P1], "T_ego1_ego0": EYE}, "T_ego1_ego0 is given but T_ego1_egoh is not"),
-        ({"pch": [P1], "dth": [None, None]}, "dth has 2 entries"),
-        ({"pcf": [P1], "T_ego1_ego0": EYE, "preset": "offline"}, "T_ego1_ego0 is given but T_ego1_egof is not"),
-        ({"pcf": [P1], "T_ego1_egof": [EYE] * 2, "preset": "offline"}, "T_ego1_egof has 2 entries for 1 sweeps of pcf"),
-        ({"pcf": [P1], "gmf": [None, None], "preset": "offline"}, "gmf has 2 entries for 1 sweeps of pcf"),
+        ({**SWEEPS, "future": [Sweep(P1), Sweep(P0)], "preset": "paper"}, "2 future sweeps.*num_future=0"),
+        ({"config": make_config("paper")}, "there is no config=: preset= says the method, too"),
+        ({"method": "dense"}, "there is no method=.*'paper', 'keypoints'"),
+        ({"history": [Sweep(P1)]}, "give pc0 and pc1 as cflow_torch.Sweep"),
+        ({**SWEEPS, "history": [P1]}, "history: give a list of cflow_torch.Sweep"),
+        ({**SWEEPS, "future": Sweep(P1), "preset": "offline"}, "future: give a list of cflow_torch.Sweep"),
         ({"T_ego1_ego0": EYE[None]}, r"T_ego1_ego0 has shape \(1, 4, 4\)"),
-        ({"T_ego1_ego0": EYE, "pch": [P1], "T_ego1_egoh": [np.diag([1, 1, -1, 1.0])]}, "pch1 is not rigid"),
+        ({"T_ego1_ego0": np.diag([1, 1, -1, 1.0])}, "pc0 is not rigid"),
         ({"max_hight": 3}, "unknown setting max_hight: the fields are pixel_size"),
         ({"ground": "yes"}, "ground='yes'.*'auto'"),
         ({"pixel_size": 1e-5}, "point_cloud_range"),
-        ({**SWEEPS, "gm0": np.zeros(50, bool), "T_ego1_ego0": EYE}, "T_ego1_ego0, gm0 and a Sweep are given"),
+        ({**SWEEPS, "gm0": np.zeros(50, bool), "T_ego1_ego0": EYE}, "T_ego1_ego0, gm0 or gm1 is given with a Sweep"),
         ({"pc0": Sweep(P0)}, "pc1 is ndarray: give cflow_torch.Sweep"),
-        ({**SWEEPS, "pch": [P1]}, "pch1 is ndarray"),
         ({**SWEEPS, "pc1": Sweep(P1, pose=EYE)}, "pose"),
     ],
 )
@@ -56,6 +52,14 @@ def test_invalid_arguments_are_refused(arguments, complaint):
     assert isinstance(caught.value, ValueError)
 
 
+@pytest.mark.parametrize(
+    "name", ["dt0", "dt1"] + [f"{name}{side}" for name in ("pc", "gm", "dt", "T_ego1_ego") for side in "hf"]
+)
+def test_an_argument_of_earlier_versions_says_the_new_form(name):
+    with pytest.raises(CFlowError, match=rf"has no {name}: give estimate_flow\(Sweep\(pc0, .*history="):
+        estimate_flow(P0, P1, **{name: None})
+
+
 @pytest.mark.parametrize("method, num_future", [("dense", 0), ("verified", 2)])
 def test_estimate_flow_equals_the_module(method, num_future):
     """With history, sweeps after t+1 and the times of points."""
@@ -63,16 +67,20 @@ def test_estimate_flow_equals_the_module(method, num_future):
     settings = settings.replace(num_future=num_future) if num_future else settings
     window = scene(6, num_history=1, num_future=num_future)
     window = changed(window, lambda sweep: replace(sweep, point_times=rng.uniform(0, 0.1, len(sweep.points))))
-    arguments = {"T_ego1_ego0": np.linalg.inv(window.pc1.pose) @ window.pc0.pose}
-    for prefix, column in (("gm", "is_ground"), ("dt", "point_times"), ("pc", "points")):
-        arguments.update({f"{prefix}{k}": getattr(sweep, column) for k, sweep in enumerate((window.pc0, window.pc1))})
-        for side, sweeps in (("h", window.pch), ("f", window.pcf)):
-            arguments[f"{prefix}{side}"] = [getattr(sweep, column) for sweep in sweeps]
-            arguments[f"T_ego1_ego{side}"] = [np.linalg.inv(window.pc1.pose) @ sweep.pose for sweep in sweeps]
+    names = ["0", "1", *(f"h{k}" for k in range(1, 1 + len(window.pch))), *(f"f{k}" for k in range(1, 1 + num_future))]
+    columns = {"pc": "points", "gm": "is_ground", "pose": "pose", "dt": "point_times"}
+    sample = {"scene_id": "a", "pc3": P0, "pch9": P0}  # others are ignored
+    for name, sweep in zip(names, (window.pc0, window.pc1, *window.pch, *window.pcf)):
+        sample.update({f"{prefix}{name}": getattr(sweep, column) for prefix, column in columns.items()})
     (expected,) = make_model(settings)([window])
-    assert_same_bits(estimate_flow(**arguments, **settings.as_dict()), expected)
-    of_sweeps = estimate_flow(window.pc0, window.pc1, pch=window.pch, pcf=window.pcf, config=settings)
+    assert_same_bits(make_model(settings)([Window.from_dict(sample)])[0], expected)
+    of_sweeps = estimate_flow(window.pc0, window.pc1, history=window.pch, future=list(window.pcf), preset=settings)
     assert_same_bits(of_sweeps, expected)
+    if not num_future:
+        T_ego1_ego0 = np.linalg.inv(window.pc1.pose) @ window.pc0.pose
+        masks = {"gm0": window.pc0.is_ground, "gm1": window.pc1.is_ground}
+        of_arrays = estimate_flow(window.pc0.points, window.pc1.points, T_ego1_ego0, preset=settings, **masks)
+        assert_same(of_arrays, make_model(settings)([replace(window, pch=())])[0])
     if num_future:
         for less in (replace(window, pcf=()), replace(window, pc1=replace(window.pc1, point_times=None))):
             assert not torch.equal(make_model(settings)([less])[0].residual_flow, expected.residual_flow)
@@ -167,18 +175,23 @@ def test_ground_left_in_is_warned_of_once(street):
         model([Window(now, later)])
 
 
+OF_METHOD = {"dense": "paper", "keypoints": "keypoints", "verified": "default"}
+
+
 def test_a_class_refuses_the_settings_of_another_method():
     classes = {"dense": CorrelationFlow, "keypoints": CorrelationFlowKeypoints, "verified": VerifiedFlow}
     for method, kind in classes.items():
-        assert type(make_model(config(method))) is kind and kind.from_preset().config == make_config(method=method)
+        assert type(make_model(config(method))) is kind and kind.from_preset().config == make_config(OF_METHOD[method])
         for other in set(classes) - {method}:
             with pytest.raises(CFlowError, match=f"{kind.__name__} is .*'{method}', but the config is for '{other}'"):
                 kind(config(other))
     for wrong in (None, {"pixel_sizes": (0.1,)}, "paper"):
         with pytest.raises(CFlowError, match="give the result of make_config"):
             CorrelationFlow(wrong)
-        with pytest.raises(CFlowError, match="give the result of make_config"):
+    for wrong in (None, {"pixel_sizes": (0.1,)}, "papr"):
+        with pytest.raises(CFlowError, match="preset=.*or the result of make_config"):
             make_model(wrong)
+    assert make_model("paper", pixel_size=0.2).config == make_config("paper", pixel_size=0.2)
     assert "pixel_sizes=(0.25,)" in repr(make_model(config())) and make_model(config())([]) == []
 
 

@@ -6,7 +6,7 @@ from typing import Sequence
 
 import numpy as np
 
-from cflow_torch.simulator.recording import Boxes, UnitReturns
+from cflow_torch.simulator.recording import AnnotationBoxes, UnitReturns
 from cflow_torch.types import Sweep
 
 START_NS = 1_533_279_682_000_000_000
@@ -115,9 +115,9 @@ class TinyRecording:
     def elevations(self, unit: str) -> np.ndarray:
         return np.linspace(-0.5, 0.2, 32)
 
-    def boxes(self, index: int) -> Boxes:
+    def boxes(self, index: int) -> AnnotationBoxes:
         world = np.stack([self.car_at(self.timestamps[index]), self.parked()])
-        return Boxes(
+        return AnnotationBoxes(
             track_id=TRACKS,
             category=("REGULAR_VEHICLE", "TRUCK_CAB"),
             size=np.tile(CAR_SIZE, (2, 1)),

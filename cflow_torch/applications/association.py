@@ -123,7 +123,9 @@ def _by_overlap(
         return []
     both = torch.cat([points0, points1])
     cell = (both / both.new_tensor((side, side, _HEIGHT * side))).floor().long()
-    voxel = torch.unique(cell, dim=0, return_inverse=True)[1]
+    count = cell.amax(0) - cell.amin(0) + 1
+    x, y, z = (cell - cell.amin(0)).unbind(1)
+    voxel = (x * count[1] + y) * count[2] + z
     voxel0, group0 = _distinct(voxel[: len(points0)], group0)
     voxel1, group1 = _distinct(voxel[len(points0) :], group1)
     begin = torch.searchsorted(voxel1, voxel0)

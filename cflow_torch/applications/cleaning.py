@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any, Callable
+from typing import Any, Callable, Mapping
 
 import numpy as np
 import torch
 
 from cflow_torch.applications.association import box_of_point, boxes
-from cflow_torch.applications.moving_groups import MOVING, pose_of
+from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
@@ -23,26 +23,67 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_arr
 _MARGIN = 0.2  # metres, added to the sides of the box around the visible part of an object
 _SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
 _MAX_DISTANCE = 100.0  # metres from the vehicle to a box, at most
+_INTENSITIES = ("intensity", "reflectance", "reflectivity", "remission", "i", "column_3")
 _MAX_VOXELS = 1 << 20  # voxels in x, y and z from the first sweep to a point of a map, at most
 
 
-class CleanLog(Log):
-    """A log without its moving points. Every command, writer and loader accepts it like any other log.
+class MaskedLog(Log):
+    """A log without some rows of its sweeps. Every command, writer and loader accepts it like any other log.
 
-    A point moves if its residual flow is at least 0.05 m per sweep. The last sweep, and one before a gap of the log,
+    Args:
+        log: any log. Its sweeps are read when they are asked for.
+        mask: index -> (N,) bool, True for the rows of sweep `index` that are removed.
+
+    Attributes:
+        log_id, timestamps, gaps: those of the log.
+    """
+
+    def __init__(self, log: Log, mask: Callable[[int], np.ndarray]) -> None:
+        self.log_id = log.log_id
+        self.timestamps = log.timestamps
+        self.gaps = log.gaps
+        self._log = log
+        self._mask = mask
+
+    def removed(self, index: int) -> np.ndarray:
+        """(N,) bool, True for the rows of sweep `index` of the log that this log does not have."""
+        return self._mask(index)
+
+    def sweep(self, index: int) -> Sweep:
+        """Sweep number `index` without the removed rows; pose and time as in the log."""
+        sweep = self._log.sweep(index)
+        is_kept = ~self.removed(index)
+        given = {name: getattr(sweep, name) for name in ("points", "is_ground", "point_times")}
+        kept = {name: as_numpy(values)[is_kept] for name, values in given.items() if values is not None}
+        return replace(sweep, **kept)
+
+    def columns(self, index: int) -> dict[str, np.ndarray]:
+        """Other columns of sweep `index`, such as intensity, without the removed rows."""
+        is_kept = ~self.removed(index)
+        columns = self._log.columns(index)
+        for name, values in columns.items():
+            what = f"column {name} of sweep {index}"
+            check_array(values, what, is_kept.shape, "biuf", f"({len(is_kept)},) numbers, one per point")
+        return {name: values[is_kept] for name, values in columns.items()}
+
+
+class CleanLog(MaskedLog):
+    """A log without its moving points, and without points that have no position (NaN).
+
+    A point moves by `FlowResult.is_moving`. The last sweep, and one before a gap of the log,
     have no flow. There, we take the boxes of the objects that move in the sweep before, shift them by the flow, and
     remove the points inside.
 
     Args:
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
         model: the method; None = preset `offline`.
-        flow: index -> flow of that pair, in place of a model. We use residual_flow and cluster_id, and with
-            `remove_stopped` also is_valid.
+        flow: index -> flow of that pair, in place of a model. We use residual_flow, cluster_id and, if it
+            has it, moving, and with `remove_stopped` also is_valid.
         remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
             finds them. It takes a pass over the log before the first sweep is returned, and 1 bit of memory per point.
 
     Attributes:
-        log_id, timestamps: those of the log.
+        log_id, timestamps, gaps: those of the log.
         num_stopped: number of points that only `remove_stopped` removes; None if it is False or no sweep was read.
 
     Examples:
@@ -59,38 +100,22 @@ class CleanLog(Log):
     ) -> None:
         if standing is not None:
             raise CFlowError("standing= is now remove_stopped=")
-        self.log_id = log.log_id
-        self.timestamps = log.timestamps
-        self.gaps = log.gaps
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
         if flow is None and model is None:
             model = make_model(make_config("offline"))
-        self._log = CachedLog(log, 2 if model is None else model.config.num_sweeps)
+        super().__init__(CachedLog(log, 2 if model is None else model.config.num_sweeps), self._moving_or_missing)
         self._flow: Any = lru_cache(2)(flow or partial(self._estimate, model))
         self._bits: list[np.ndarray] | None = None
         self.num_stopped: int | None = None
         self._tracks_objects = remove_stopped
 
-    def sweep(self, index: int) -> Sweep:
-        """Sweep number `index` without its moving points; pose and time as in the log."""
-        sweep = self._log.sweep(index)
-        is_kept = ~self.moving(index)
-        given = {name: getattr(sweep, name) for name in ("points", "is_ground", "point_times")}
-        kept = {name: as_numpy(values)[is_kept] for name, values in given.items() if values is not None}
-        return replace(sweep, **kept)
-
-    def columns(self, index: int) -> dict[str, np.ndarray]:
-        """Other columns of sweep `index`, such as intensity, without the rows of moving points."""
-        is_kept = ~self.moving(index)
-        columns = self._log.columns(index)
-        for name, values in columns.items():
-            what = f"column {name} of sweep {index}"
-            check_array(values, what, is_kept.shape, "biuf", f"({len(is_kept)},) numbers, one per point")
-        return {name: values[is_kept] for name, values in columns.items()}
+    def _moving_or_missing(self, index: int) -> np.ndarray:
+        points = as_numpy(self._log.sweep(index).points)[:, :3]
+        return self.moving(index) | ~np.isfinite(points).all(axis=1)
 
     def moving(self, index: int) -> np.ndarray:
-        """(N,) bool, True for the points of sweep `index` of the log that are removed.
+        """(N,) bool, True for the points of sweep `index` of the log that are removed because they move.
 
         Raises:
             CFlowError: a sweep cannot be read, or its flow has another number of rows.
@@ -110,7 +135,7 @@ class CleanLog(Log):
         sweep = self._log.sweep(index)
         if not self._has_flow(index):
             return self._reached(sweep, index) if self._has_flow(index - 1) else np.zeros(len(sweep.points), bool)
-        moves = (self._flow(index).residual_flow.norm(dim=1) >= MOVING).cpu().numpy()
+        moves = as_numpy(self._flow(index).is_moving)
         if len(moves) != len(sweep.points):
             raise CFlowError(
                 f"sweep {index} has {len(sweep.points)} points, but its flow {len(moves)} rows: give both of one log"
@@ -180,6 +205,7 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
 
     Returns:
         (M, 3) float64, metres in the world: the first point of each voxel, in the order of the sweeps.
+        `static_map_with_intensity` also returns the intensities.
 
     Raises:
         CFlowError: a sweep has no pose, the voxel size is not positive, or a point is more than a million voxels from
@@ -187,17 +213,27 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
 
     Cost: memory for the map and one sweep. Each sweep takes a pass over the voxels of the map.
     """
+    return static_map_with_intensity(log, voxel_size)[0]
+
+
+def static_map_with_intensity(log: Log, voxel_size: float = 0.1) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the map of `static_map`, and the (M,) intensities of its points; None if a sweep has no such column.
+
+    The column is called intensity, reflectance, reflectivity, remission or i. In files without names, it is the fourth.
+    """
     if not voxel_size > 0:
         raise CFlowError(f"voxel_size={voxel_size}: give a positive length in metres")
     known: Any = np.zeros(0, np.int64)
     clouds: list[Any] = [np.zeros((0, 3))]
+    intensities: list[np.ndarray | None] = []
     origin: Any = None
     for index in range(len(log.timestamps)):
         sweep = log.sweep(index)
         if sweep.pose is None:
             raise CFlowError(f"log {log.log_id} has no poses, and a map needs them: data.odometry=true estimates them")
         points = _world(sweep)
-        points = points[np.isfinite(points).all(1)]
+        is_known = np.isfinite(points).all(1)
+        points = points[is_known]
         origin = np.floor(pose_of(sweep)[:3, 3] / voxel_size) if origin is None else origin
         voxel = (np.floor(points / voxel_size) - origin).astype(np.int64) + _MAX_VOXELS
         if ((voxel < 0) | (voxel >= 2 * _MAX_VOXELS)).any():
@@ -208,9 +244,24 @@ def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:
         key, first = np.unique((voxel[:, 0] << 42) | (voxel[:, 1] << 21) | voxel[:, 2], return_index=True)
         position: Any = np.searchsorted(known, key)
         is_new = np.append(known, -1)[position] != key
-        clouds.append(points[np.sort(first[is_new])])
+        rows = np.sort(first[is_new])
+        clouds.append(points[rows])
+        intensity = _intensity(log.columns(index))
+        intensities.append(None if intensity is None else intensity[is_known][rows])
         known = np.insert(known, position[is_new], key[is_new])
-    return np.concatenate(clouds)
+    known_intensities = [values for values in intensities if values is not None]
+    if len(known_intensities) < len(intensities):
+        return np.concatenate(clouds), None
+    return np.concatenate(clouds), np.concatenate([np.zeros(0, np.float32), *known_intensities])
+
+
+def _intensity(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Return the intensity of each point, (N,) float32; None = it is unknown."""
+    names = {name.lower(): name for name in columns}
+    for name in _INTENSITIES:
+        if name in names:
+            return columns[names[name]].astype(np.float32)
+    return None
 
 
 def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: torch.Tensor) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.applications.track_table import Table
+from cflow_torch.applications.track_table import Table, class_of
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
@@ -16,11 +16,18 @@ INSTANCES_FILE = "instances_info.json"
 FRAMES_FILE = "frame_instances.json"
 CAR = "Car"
 """Class of KITTI and PandaSet in DriveStudio, which reconstructs it as a rigid object."""
-CLASS_OF_READER = {"av2": "REGULAR_VEHICLE", "nuscenes": "vehicle.car", "waymo": "Vehicle"}
-"""Data set -> class in DriveStudio. Each of its loaders knows only the classes of its own data set."""
+CLASSES_OF_READER = {
+    "av2": ("REGULAR_VEHICLE", "BICYCLIST"),
+    "nuscenes": ("vehicle.car", "vehicle.bicycle"),
+    "waymo": ("Vehicle", "Cyclist"),
+}
+"""Data set -> classes of rigid and of deformable objects in DriveStudio, whose loaders know only those of their set."""
+_DEFORMABLE = ("pedestrian", "cyclist")  # classes of tracks
 
 
-def write_drivestudio(folder: PathLike, table: Table, log: Log, class_name: str = CAR) -> None:
+def write_drivestudio(
+    folder: PathLike, table: Table, log: Log, class_name: str = CAR, deformable_class: str | None = None
+) -> None:
     """Write `folder/instances_info.json` and `folder/frame_instances.json`.
 
     The first has, for each track, the sweeps in which it is seen, `T_world_box` (4, 4) and length, width, height in
@@ -30,7 +37,9 @@ def write_drivestudio(folder: PathLike, table: Table, log: Log, class_name: str 
         folder: created if it does not exist. DriveStudio reads `<scene>/instances`.
         table: tracks, see `track`.
         log: the drive. Frames are numbered by its sweeps, and boxes are in the world of its poses.
-        class_name: class of all objects, because tracks have none. DriveStudio chooses the kind of model by it.
+        class_name: class of the objects. DriveStudio chooses the kind of model by it.
+        deformable_class: class of pedestrians and cyclists; None = `class_name`. We do not use a class of pedestrians,
+            for which DriveStudio needs poses of their bodies.
 
     Convention: instances are numbered 0, 1, 2, ... without gaps, in the order of the ids of their tracks. `id` is the
         id of the track. A box has x along its length, y to the left and z up.
@@ -47,7 +56,9 @@ def write_drivestudio(folder: PathLike, table: Table, log: Log, class_name: str 
             "obj_to_world": boxes[rows].tolist(),
             "box_size": sizes[rows].tolist(),
         }
-        infos[str(number)] = {"id": str(track_id), "class_name": class_name, "frame_annotations": annotations}
+        is_deformable = class_of(table, int(rows[0])) in _DEFORMABLE
+        name = deformable_class if is_deformable and deformable_class is not None else class_name
+        infos[str(number)] = {"id": str(track_id), "class_name": name, "frame_annotations": annotations}
     frames = {str(sweep): instance[table["sweep"] == sweep].tolist() for sweep in range(len(log.timestamps))}
     write_json(folder / FRAMES_FILE, frames)
     write_json(folder / INSTANCES_FILE, infos)

@@ -7,7 +7,6 @@ from typing import Iterable
 
 import numpy as np
 
-from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
@@ -21,10 +20,9 @@ MOVING_CLASS = 251
 def moving_classes(result: FlowResult) -> np.ndarray:
     """Return the class of each point of sweep t, (N,) int32.
 
-    251 = its residual flow is at least `MOVING`, 9 = static. Points without an estimate, such as ground, are static.
+    251 = it moves (`FlowResult.is_moving`), 9 = static. Points without an estimate, such as ground, are static.
     """
-    speed = np.linalg.norm(as_numpy(result.residual_flow, np.float64), axis=1)
-    return np.where(speed >= MOVING, MOVING_CLASS, STATIC_CLASS).astype(np.int32)
+    return np.where(as_numpy(result.is_moving), MOVING_CLASS, STATIC_CLASS).astype(np.int32)
 
 
 def write_moving_labels(folder: PathLike, log: Log, results: Iterable[tuple[int, FlowResult]]) -> None:

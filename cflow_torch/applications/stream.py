@@ -30,13 +30,13 @@ class FlowStream:
     estimates poses. A result is equal, bit for bit, to that of `make_model(config)([window])` with these sweeps.
 
     Args:
-        preset: "live", "default", "keypoints" or "paper"; `offline` needs later sweeps and is refused.
-        config: settings, from `make_config`, in place of a preset.
+        preset: "live", "default", "keypoints" or "paper", or the result of `make_config`; `offline` needs later sweeps
+            and is refused.
         device: "auto" = that of the given tensors, else a GPU if available, else the CPU.
         ground: what to do with a sweep without a mask. "auto" = find its ground, with a warning; "grid" = the same,
             without one; "patchwork" = use Patchwork++ (`pip install pypatchworkpp`); None = no point is ground.
         max_gap: seconds; sweeps that are further apart are not compared, and the stream starts again.
-        **overrides: any field of the settings.
+        **settings: any field of the settings.
 
     Attributes:
         config: the settings of the method.
@@ -60,19 +60,18 @@ class FlowStream:
 
     def __init__(
         self,
-        preset: str | None = None,
+        preset: str | Config = "default",
         *,
-        config: Config | None = None,
         device: Any = "auto",
         ground: str | None = "auto",
         max_gap: float = 0.5,
-        **overrides: Any,
+        **settings: Any,
     ) -> None:
         if ground not in CHOICES:
             raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
         if not max_gap > 0:
             raise CFlowError(f"max_gap={max_gap}: give seconds above 0")
-        config = (config or make_config(preset)).replace(**overrides)
+        config = make_config(preset, **settings)
         if config.num_future > 0:
             raise CFlowError(f"num_future={config.num_future}: a stream does not know later sweeps; give num_future=0")
         self.config = config

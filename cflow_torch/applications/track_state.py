@@ -1,4 +1,4 @@
-"""State of the tracks of a drive, and the Kalman filter of their motion."""
+"""State of the tracks of a drive."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any, Callable, NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from cflow_torch.applications.smoothing import Motion
 
 # A track must show motion to be confirmed, because most short-lived groups are noise of the static world.
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
@@ -21,23 +23,30 @@ _JUMP, _SMALL = 1.5, 1.5  # if length + _SMALL (metres) changes by the factor _J
 
 _NUMBER, _FLAG = torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool)
 _SCALAR = torch.zeros(0, dtype=torch.float64)
-_VECTOR, _MATRIX = _SCALAR.new_zeros(0, 3), _SCALAR.new_zeros(0, 2, 2)
+_VECTOR, _MATRIX, _PAIR = _SCALAR.new_zeros(0, 3), _SCALAR.new_zeros(0, 2, 2), _SCALAR.new_zeros(0, 2, 3)
+
+
+class Times(NamedTuple):
+    """Times of a pair of sweeps, seconds."""
+
+    now: float  # time of t
+    interval: float  # from t to t+1
+    elapsed: float  # from the last sweep to t
+    late: float  # from the end of the last flow to t; more than 0 if a sweep is missing
 
 
 class Tracks(NamedTuple):
-    """K tracks in the world frame; float64 unless another type is named. `Tracks()` has no tracks.
-
-    Position and velocity are states of a constant-velocity Kalman filter. The noise is equal along all axes, so one 2x2
-    covariance of (position, velocity) serves all three.
-    """
+    """K tracks in the world frame; float64 unless another type is named. `Tracks()` has no tracks."""
 
     id: Tensor = _NUMBER  # (K,) int64
-    position: Tensor = _VECTOR  # (K, 3) metres, filtered
-    velocity: Tensor = _VECTOR  # (K, 3) m/s, filtered
-    covariance: Tensor = _MATRIX  # (K, 2, 2) of position and velocity
-    box: Tensor = _VECTOR  # (K, 3) centre of the box; after a sweep, predicted for the next one
-    size: Tensor = _VECTOR  # (K, 3) length, width, height of the box
-    heading: Tensor = _SCALAR  # (K,) radians, of the box
+    state: Tensor = _PAIR  # (K, 2, 3) filtered position of the centre of the whole box, metres, and velocity, m/s
+    covariance: Tensor = _MATRIX  # (K, 2, 2) of the state
+    whole: Tensor = _VECTOR  # (K, 3) length, width, height of the whole box, metres
+    kind: Tensor = _NUMBER  # (K,) int64, index in `KINDS`
+    path: Tensor = _VECTOR  # (K, 3) a point that the flow has moved since the track began
+    box: Tensor = _VECTOR  # (K, 3) centre of the visible box; after a sweep, predicted for the next one
+    size: Tensor = _VECTOR  # (K, 3) length, width, height of the visible box
+    heading: Tensor = _SCALAR  # (K,) radians, of both boxes
     begin: Tensor = _SCALAR  # (K,) seconds, time of the first sweep
     start: Tensor = _VECTOR  # (K, 3) centre of the box where we began to measure `travel`
     start_length: Tensor = _SCALAR  # (K,) length of that box
@@ -73,23 +82,25 @@ class Tracks(NamedTuple):
         for name, values in columns.items():
             getattr(self, name)[index] = values
 
-    def predict(self, seconds: float, acceleration: float) -> Tracks:
-        """Predict position and covariance after `seconds`; `acceleration`, m/s², is the process noise."""
-        transition = self.covariance.new_tensor([[1.0, seconds], [0.0, 1.0]])
-        push = self.covariance.new_tensor([seconds**2 / 2, seconds]) * acceleration
-        covariance = transition @ self.covariance @ transition.T + torch.outer(push, push)
-        return self._replace(position=self.position + seconds * self.velocity, covariance=covariance)
+    @property
+    def position(self) -> Tensor:
+        """(K, 3) metres."""
+        return self.state[:, 0]
 
-    def measure(self, index: Tensor, position: Tensor, velocity: Tensor, noise: Tensor) -> None:
-        """Update the indexed tracks by measured position and velocity, (K, 3) each, with standard deviations (2,)."""
-        before = self.covariance[index]
-        residual = torch.stack([position - self.position[index], velocity - self.velocity[index]], 1)  # (K, 2, 3)
-        gain = torch.linalg.solve(before + torch.diag(noise**2), before).transpose(1, 2)  # both are symmetric
-        change = gain @ residual
-        covariance = (torch.eye(2, dtype=gain.dtype, device=gain.device) - gain) @ before
-        self.covariance[index] = (covariance + covariance.transpose(1, 2)) / 2  # symmetric despite rounding
-        self.position[index] += change[:, 0]
-        self.velocity[index] += change[:, 1]
+    @property
+    def velocity(self) -> Tensor:
+        """(K, 3) m/s."""
+        return self.state[:, 1]
+
+    def predict(self, seconds: float) -> Tracks:
+        """Predict the state after `seconds`."""
+        motion, _ = Motion(self.state, self.covariance).predict(self.state.new_full((len(self.id),), seconds))
+        return self._replace(state=motion.state, covariance=motion.covariance)
+
+    def measure(self, index: Tensor, measured: Tensor, noise: Tensor) -> None:
+        """Update the indexed tracks by measured states, (K, 2, 3), with standard deviations (K, 2)."""
+        motion = Motion(self.state[index], self.covariance[index]).update(measured, noise)
+        self.write(index, state=motion.state, covariance=motion.covariance)
 
     def start_again(self, index: Tensor, length: Tensor) -> None:
         """Restart the evidence of motion of the indexed tracks whose box is now much longer or shorter.

@@ -14,6 +14,7 @@ from cflow_torch.data.atomic import atomic_file, write_text
 from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.transforms import transform_each
 
 Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # next to the flow files of a log
@@ -24,7 +25,12 @@ COLUMNS = {
     **dict.fromkeys(_FLOATS, np.float64),
     "is_moving": np.bool_,
     "is_confirmed": np.bool_,
+    "class": np.str_,
 }
+
+
+KITTI_NAMES = {"car": "Car", "pedestrian": "Pedestrian", "cyclist": "Cyclist", "truck": "Truck"}
+"""Class of a track -> name in KITTI and OpenPCDet, in the order of OpenPCDet's labels 1, 2, 3, 4."""
 
 
 def join_tables(tables: Sequence[Table]) -> Table:
@@ -63,32 +69,52 @@ def write_mot(path: PathLike, table: Table, log: Log) -> None:
     Frames and ids count from 1; x, y, z is the centre of the box, metres in the world; confidence is 1 where the method
     has none. The log is not used.
     """
-    columns = (table["sweep"] + 1, table["id"] + 1, np.nan_to_num(table["confidence"], nan=1.0))
+    columns = (table["sweep"] + 1, table["id"] + 1, score_of(table))
     _write_lines(path, "%d,%d,-1,-1,-1,-1,%.3f,%.3f,%.3f,%.3f", *columns, table["x"], table["y"], table["z"])
 
 
 def write_kitti(path: PathLike, table: Table, log: Log) -> None:
     """Write tracks as text of KITTI's tracking benchmark, with poses from the log: a line of 18 columns per row.
 
-    Frames and ids count from 0; the type is Misc, because tracks have no class; unknown columns are -1. The camera is
+    Frames and ids count from 0; the type is Misc in tables without classes; unknown columns are -1. The camera is
     at the origin of the ego frame of the sweep, looks to +x, and has KITTI's axes: x to the right, y down, z ahead. The
     position is the middle of the lower face of the box.
 
     Source: development kit of the KITTI tracking benchmark (2012).
     """
-    sweeps, row = np.unique(table["sweep"], return_inverse=True)
-    T_ego_world = np.reshape([np.linalg.inv(pose_of(log.sweep(k))) for k in sweeps.tolist()], (-1, 4, 4))[row]
-    place = np.stack([table["x"], table["y"], table["z"], np.ones(len(row))], 1)
-    direction = np.stack([np.cos(table["heading"]), np.sin(table["heading"])], 1)
-    centre = np.einsum("nij,nj->ni", T_ego_world, place)
-    ahead = np.einsum("nij,nj->ni", T_ego_world[:, :2, :2], direction)
+    centre, heading = boxes_in_sweeps(table, log)
     x, y, z = -centre[:, 1], table["height"] / 2 - centre[:, 2], centre[:, 0]
-    rotation = _wrapped(-np.arctan2(ahead[:, 1], ahead[:, 0]) - np.pi / 2)
+    rotation = _wrapped(-heading - np.pi / 2)
     alpha = _wrapped(rotation - np.arctan2(x, z))
-    score = np.nan_to_num(table["confidence"], nan=1.0)
-    columns = (table["sweep"], table["id"], alpha, table["height"], table["width"], table["length"])
-    form = "%d %d Misc -1 -1 %.6f -1 -1 -1 -1" + 8 * " %.6f"
-    _write_lines(path, form, *columns, x, y, z, rotation, score)
+    size = (table["height"], table["width"], table["length"])
+    numbers = np.stack([alpha, *size, x, y, z, rotation, score_of(table)], 1)
+    lines = []
+    for row, values in enumerate(numbers.tolist()):
+        kind = KITTI_NAMES[class_of(table, row)] if "class" in table else "Misc"
+        first = f"{table['sweep'][row]} {table['id'][row]} {kind} -1 -1 {values[0]:.6f} -1 -1 -1 -1"
+        lines.append(" ".join([first, *(f"{value:.6f}" for value in values[1:])]) + "\n")
+    write_text(as_path(path), "".join(lines))
+
+
+def class_of(table: Table, row: int) -> str:
+    """Return the class of a row; in tables without classes, everything is a car."""
+    return str(table["class"][row]) if "class" in table else "car"
+
+
+def score_of(table: Table) -> np.ndarray:
+    """Return the confidence of each row, (R,) float64; 1 where the method has none."""
+    return np.nan_to_num(table["confidence"], nan=1.0)
+
+
+def boxes_in_sweeps(table: Table, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Return centres, (R, 3) metres, and headings, (R,) radians, in the frame of the points of each row's sweep."""
+    sweeps, row = np.unique(table["sweep"], return_inverse=True)
+    poses = [np.linalg.inv(pose_of(log.sweep(sweep))) for sweep in sweeps.tolist()]
+    T_ego_world = np.reshape(poses, (-1, 4, 4))[row]
+    centre = np.stack([table["x"], table["y"], table["z"]], 1)
+    direction = np.stack([np.cos(table["heading"]), np.sin(table["heading"])], 1)
+    ahead = np.einsum("nij,nj->ni", T_ego_world[:, :2, :2], direction)
+    return transform_each(centre, T_ego_world), np.arctan2(ahead[:, 1], ahead[:, 0])
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any, Iterable, NamedTuple
 
 import numpy as np
@@ -9,17 +10,20 @@ import torch
 from torch import Tensor
 
 from cflow_torch.applications.association import Matches, boxes, match, regroup
-from cflow_torch.applications.moving_groups import MOVING, MovingGroups
-from cflow_torch.applications.track_state import Tracks
+from cflow_torch.applications.completion import SeenPoints, TrackedPoints, complete
+from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
+from cflow_torch.applications.track_state import Times, Tracks
 from cflow_torch.applications.track_table import confirmed, join_tables
+from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds_and_sizes, turned
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, window, windows
 from cflow_torch.estimate import make_model
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 
 _MAX_MISSED = 3  # sweeps that a track survives unseen
-_ACCELERATION = 3.0  # m/s², standard deviation
-_BOX_NOISE, _FLOW_NOISE = 0.4, 0.02  # standard deviations: metres of a box's centre, metres per sweep of a group's flow
+_REST_NOISE = 0.1  # metres, standard deviation of the place of a stopped object
+_UNKNOWN = 1e6  # variance of a new track, before its first measurement
+_RECENT = 16  # sweeps whose visible edges decide the size of a track
 
 
 class Tracked(NamedTuple):
@@ -32,43 +36,6 @@ class Tracked(NamedTuple):
 
     table: dict[str, np.ndarray]
     track_id: np.ndarray
-
-
-class TrackedPoints(NamedTuple):
-    """The points of a sweep that belong to tracks.
-
-    Args:
-        sweep: index of the sweep in its log.
-        num_points: N, all points of the sweep.
-        row: (M,) int64 rows of the points that have a track.
-        id: (M,) int64 ids of their tracks.
-    """
-
-    sweep: int
-    num_points: int
-    row: np.ndarray
-    id: np.ndarray
-
-    @classmethod
-    def of(cls, sweep: int, track_id: np.ndarray) -> TrackedPoints:
-        """Keep the points with an id, of (N,) ids where -1 = no track."""
-        row = np.flatnonzero(track_id >= 0)
-        return cls(sweep, len(track_id), row, track_id[row])
-
-    def track_id(self, kept: np.ndarray) -> np.ndarray:
-        """Return the id of every point, (N,) int64; -1 = no track, or one that is not among the ids `kept`."""
-        ids = np.full(self.num_points, -1)
-        ids[self.row] = np.where(np.isin(self.id, kept), self.id, -1)
-        return ids
-
-
-class _Times(NamedTuple):
-    """Times of a pair of sweeps, seconds."""
-
-    now: float  # time of t
-    interval: float  # from t to t+1
-    elapsed: float  # from the last sweep to t
-    late: float  # from the end of the last flow to t; more than 0 if a sweep is missing
 
 
 class _TrackPoints(NamedTuple):
@@ -85,6 +52,20 @@ class _TrackPoints(NamedTuple):
         """Give the tracks other numbers, (K,) int64, and drop the points of those with -1."""
         track = number[self.track]
         return _TrackPoints(self.position[track >= 0], track[track >= 0])
+
+
+class _SeenEdges(NamedTuple):
+    """Visible edges of tracks in one sweep, relative to their paths."""
+
+    id: Tensor  # (G,) int64
+    edges: Edges
+
+    @classmethod
+    def join(cls, sweeps: Iterable[_SeenEdges], device: torch.device) -> _SeenEdges:
+        """Concatenate those of several sweeps."""
+        ids = [each.id for each in sweeps]
+        edges = zip(*(each.edges for each in sweeps))
+        return cls(torch.cat(ids).to(device), Edges(*(torch.cat(values).to(device) for values in edges)))
 
 
 class Tracker:
@@ -111,6 +92,7 @@ class Tracker:
         self._num_sweeps = 0
         self._num_tracks = 0
         self._tracks = Tracks()
+        self._recent: deque[_SeenEdges] = deque(maxlen=_RECENT)
         # Points of the tracks, at their predicted positions in the next sweep.
         self._points = _TrackPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64))
 
@@ -132,12 +114,14 @@ class Tracker:
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
         times = self._times(sweeps)
+        self.times = times
         groups = MovingGroups.of(sweeps, result)
         tracks, points = self._predict(times, groups.point.device)
         groups = regroup(groups, tracks)
         matches = match(tracks, points.position, points.track, groups)
         flow = groups.mean(groups.step)
-        tracks, track_of_group = self._update(tracks, groups, flow, matches, times)
+        sensor = groups.point.new_tensor(pose_of(sweeps.pc0)[:3, 3])
+        tracks, track_of_group = self._update(tracks, groups, flow, matches, times, sensor)
         track_of_point = _track_of_point(groups, matches, track_of_group)
         has_track = track_of_point >= 0
         track_id = torch.full((len(result.residual_flow),), -1, device=track_of_point.device)
@@ -148,12 +132,12 @@ class Tracker:
         step[track_of_group] = flow
         points = _missing_points(points, tracks, step).followed_by(_seen_points(groups, track_of_point, step))
         is_kept = tracks.missed <= _MAX_MISSED
-        self._tracks = tracks._replace(box=tracks.box + step).take(is_kept)
+        self._tracks = tracks._replace(box=tracks.box + step, path=tracks.path + step).take(is_kept)
         self._points = points.renumber(torch.where(is_kept, is_kept.cumsum(0) - 1, -1))
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
 
-    def _times(self, sweeps: Window) -> _Times:
+    def _times(self, sweeps: Window) -> Times:
         """Return the times of the pair t, t+1, and note them for the next one."""
         begin = sweeps.pc0.timestamp_ns
         end = sweeps.pc1.timestamp_ns
@@ -165,24 +149,25 @@ class Tracker:
             interval = (end - begin) * 1e-9
         self._clock = now, now + interval
         if last is None:
-            return _Times(now, interval, elapsed=interval, late=0.0)
+            return Times(now, interval, elapsed=interval, late=0.0)
         if now <= last:
             raise CFlowError(f"this sweep is {last - now:.3f} s before the last one: push sweeps in the order of time")
-        return _Times(now, interval, elapsed=now - last, late=now - due)
+        return Times(now, interval, elapsed=now - last, late=now - due)
 
-    def _predict(self, times: _Times, device: torch.device) -> tuple[Tracks, _TrackPoints]:
+    def _predict(self, times: Times, device: torch.device) -> tuple[Tracks, _TrackPoints]:
         """Move the tracks and their points to t.
 
         The last flow has already moved boxes and points. If the sweep is late, their velocity moves them further.
         """
         tracks = self._tracks.map(lambda values: values.to(device))
         position, track = (values.to(device) for values in self._points)
-        points = _TrackPoints(position + times.late * tracks.velocity[track], track)
-        tracks = tracks._replace(box=tracks.box + times.late * tracks.velocity)
-        return tracks.predict(times.elapsed, _ACCELERATION), points
+        late = times.late * tracks.velocity
+        points = _TrackPoints(position + late[track], track)
+        tracks = tracks._replace(box=tracks.box + late, path=tracks.path + late)
+        return tracks.predict(times.elapsed), points
 
     def _update(
-        self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: _Times
+        self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: Times, sensor: Tensor
     ) -> tuple[Tracks, Tensor]:
         """Begin tracks for groups without a match, and update all tracks by the mean flow (G, 3) of each group.
 
@@ -192,10 +177,9 @@ class Tracker:
         is_fast = velocity[:, :2].norm(dim=1) >= MOVING / times.interval
         heading = torch.atan2(flow[:, 1], flow[:, 0])
         track_heading = torch.atan2(velocity[:, 1], velocity[:, 0])
-        heading[matches.group] = torch.where(is_fast, track_heading, heading[matches.group])
+        heading[matches.group] = torch.where(is_fast, track_heading, tracks.heading[matches.track])
         moves = groups.group >= 0
         box, size = boxes(groups.point[moves], groups.group[moves], heading)
-        noise = box.new_tensor([_BOX_NOISE, _FLOW_NOISE / times.interval])
 
         is_new = torch.ones_like(groups.count, dtype=torch.bool)
         is_new[matches.group] = False
@@ -204,9 +188,10 @@ class Tracker:
         track_of_group[matches.group] = matches.track
         new = track_of_group[is_new]
         tracks = tracks.extend(len(new))
-        tracks.write(new, id=self._num_tracks + number[is_new], begin=times.now, covariance=torch.diag(noise**2))
-        tracks.write(new, position=box[is_new], velocity=flow[is_new] / times.interval)
+        tracks.write(new, id=self._num_tracks + number[is_new], begin=times.now, path=box[is_new])
         tracks.write(new, start=box[is_new], start_length=size[is_new, 0])
+        state = torch.stack([box, flow / times.interval], 1)
+        tracks.write(new, state=state[is_new], covariance=_UNKNOWN * torch.eye(2, dtype=box.dtype, device=box.device))
         self._num_tracks += len(new)
 
         length = tracks.size[matches.track, 0]
@@ -223,11 +208,38 @@ class Tracker:
         tracks.is_confirmed.logical_or_(tracks.have_shown_motion())
         tracks.travel[track_of_group] += flow  # to the next sweep
 
-        measured = torch.cat([matches.track, stopped])
-        step = torch.zeros_like(tracks.box)
-        step[track_of_group] = flow
-        tracks.measure(measured, tracks.box[measured], step[measured] / times.interval, noise)
+        self._measure(tracks, track_of_group, groups, flow / times.interval, sensor)
+        at_rest = torch.stack([tracks.position[stopped], torch.zeros_like(tracks.position[stopped])], 1)
+        tracks.measure(stopped, at_rest, at_rest.new_tensor([_REST_NOISE, FLOW_NOISE]).expand(len(stopped), 2))
         return tracks, track_of_group
+
+    def _measure(
+        self, tracks: Tracks, track_of_group: Tensor, groups: MovingGroups, velocity: Tensor, sensor: Tensor
+    ) -> None:
+        """Update the whole boxes of moving tracks by the visible edges and the mean velocity (G, 3) of their groups."""
+        heading = tracks.heading[track_of_group]
+        moves = groups.group >= 0
+        edges = Edges.of(groups.point[moves], groups.group[moves], sensor.expand_as(velocity), heading)
+        kind, whole = self._whole_sizes(tracks, track_of_group, edges, velocity)
+        centre, deviation = edges.anchor(whole, kind)
+        measured = torch.stack([turned(centre, heading), velocity], 1)
+        noise = torch.stack([deviation, torch.full_like(deviation, FLOW_NOISE)], 1)
+        tracks.write(track_of_group, whole=whole, kind=kind)
+        tracks.measure(track_of_group, measured, noise)
+
+    def _whole_sizes(
+        self, tracks: Tracks, track_of_group: Tensor, edges: Edges, velocity: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Estimate kind (G,) and whole size (G, 3) of each group from what was seen of its track in recent sweeps."""
+        count = len(track_of_group)
+        path = turned(tracks.path[track_of_group], -tracks.heading[track_of_group])
+        self._recent.append(_SeenEdges(tracks.id[track_of_group], edges.relative_to(path)))
+        recent = _SeenEdges.join(self._recent, path.device)
+        group_of_id = torch.full((self._num_tracks,), -1, device=path.device)
+        group_of_id[tracks.id[track_of_group]] = torch.arange(count, device=path.device)
+        group = group_of_id[recent.id]
+        is_seen = group >= 0
+        return kinds_and_sizes(recent.edges.at(is_seen), group[is_seen], count, velocity[:, :2].norm(dim=1))
 
     def _table(self, tracks: Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:
         rows: Any = tracks.take(tracks.missed == 0).map(lambda values: values.cpu().numpy())
@@ -235,11 +247,12 @@ class Tracker:
             "sweep": np.full(len(rows.id), self._num_sweeps),
             "timestamp_ns": np.full(len(rows.id), self._num_sweeps if stamp is None else stamp),
             "id": rows.id,
-            **dict(zip("xyz", rows.position.T)),
-            **dict(zip(("vx", "vy", "vz"), rows.velocity.T)),
+            **dict(zip("xyz", rows.state[:, 0].T)),
+            **dict(zip(("vx", "vy", "vz"), rows.state[:, 1].T)),
             "velocity_std": np.sqrt(rows.covariance[:, 1, 1]),
-            **dict(zip(("length", "width", "height"), rows.size.T)),
+            **dict(zip(("length", "width", "height"), rows.whole.T)),
             "heading": rows.heading,
+            "class": np.array(KINDS)[rows.kind],
             "age": now - rows.begin,
             "num_moving": rows.num_moving,
             "is_moving": rows.is_moving,
@@ -324,9 +337,12 @@ def track_points(
     tracker = Tracker(sweep_interval)
     tables = []
     points = []
+    seen = []
     for index, result in results:
-        table, track_id = tracker.push(window(recent, index), result)
+        sweeps = window(recent, index)
+        table, track_id = tracker.push(sweeps, result)
         points.append(TrackedPoints.of(index, track_id))
         where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}
         tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
-    return confirmed(join_tables(tables)), points
+        seen.append(SeenPoints.of(sweeps, result, points[-1], tracker.times))
+    return complete(confirmed(join_tables(tables)), seen), points

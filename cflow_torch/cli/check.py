@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+import sys
+from typing import Any, TextIO
 
 from cflow_torch.cli.commands import Check
-from cflow_torch.cli.logs import Sources, find_logs
+from cflow_torch.cli.logs import Sources, complete_data, find_logs, paths_of
 from cflow_torch.data.log_check import WRONG, Finding, examine
 from cflow_torch.types import CFlowError
 
 
 def task(cfg: Check) -> None:
-    sources = find_logs(cfg.data)
+    """Print the pages of each path, whatever its format is."""
+    statuses = [0]
+    for path in paths_of(cfg.data) or [None]:
+        try:
+            pages = _pages({**cfg.data, "root": path}, sys.stderr if cfg.json else sys.stdout)
+        except CFlowError as error:
+            print(f"error: {error}", file=sys.stderr)
+            statuses.append(2)
+            continue
+        print(json.dumps(pages, indent=2, ensure_ascii=False) if cfg.json else "\n\n".join(map(_text, pages)))
+        statuses += [1 for page in pages for finding in page["findings"] if finding["status"] == WRONG]
+    if max(statuses):
+        raise SystemExit(max(statuses))
+
+
+def _pages(data: dict[str, Any], out: TextIO) -> list[dict[str, Any]]:
+    """Return the pages of the logs of one path."""
+    data = complete_data(data, out)
+    sources = find_logs(data)
     sources.settings["check"] = False  # `examine` says more
-    pages = [_page(sources, source, str(cfg.data["label"])) for source in sources.logs]
-    if cfg.json:
-        print(json.dumps(pages, indent=2, ensure_ascii=False))
-    else:
-        print("\n\n".join(map(_text, pages)))
-    if any(finding["status"] == WRONG for page in pages for finding in page["findings"]):
-        raise SystemExit(1)
+    return [_page(sources, source, str(data["label"])) for source in sources.logs]
 
 
 def _page(sources: Sources, source: Any, label: str) -> dict[str, Any]:

@@ -9,11 +9,10 @@ from typing import Any, Iterable, Iterator
 
 import cflow_torch.configs
 from cflow_torch.cli.commands import ENGINES, PICTURES, Command
-from cflow_torch.config import CONFIGS as METHODS
 from cflow_torch.config import PRESETS
 from cflow_torch.setting import Settings
 
-CONFIGS = Path(cflow_torch.configs.__path__[0])  # YAML files of data sets and experiments
+FOLDER = Path(cflow_torch.configs.__path__[0])  # YAML files of data sets and experiments
 _KINDS: dict[str, Iterable[str]] = {"model": PRESETS, "engine": ENGINES, "picture": PICTURES}
 
 
@@ -22,7 +21,7 @@ def choices(group: str) -> list[str]:
 
 
 def files(group: str) -> list[Path]:
-    return sorted((CONFIGS / group).glob("*.yaml"))
+    return sorted((FOLDER / group).glob("*.yaml"))
 
 
 def setting_names(command: type[Command]) -> dict[str, list[str]]:
@@ -47,8 +46,8 @@ def own_names(kind: type[Settings], prefix: str = "") -> Iterator[str]:
 
 def _names_of_choices() -> Iterator[tuple[str, str]]:
     """Yield (choice, dotted name of one of its settings)."""
-    for preset, (method, _) in PRESETS.items():
-        yield from ((f"model={preset}", f"model.{f.name}") for f in fields(METHODS[method]))
+    for preset, config in PRESETS.items():
+        yield from ((f"model={preset}", f"model.{f.name}") for f in fields(config))
     for engine, kind in ENGINES.items():
         yield from ((f"engine={engine}", name) for name in own_names(kind, "engine."))
     for picture, kind in PICTURES.items():

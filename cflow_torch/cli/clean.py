@@ -9,25 +9,24 @@ from typing import Any, Callable
 
 import numpy as np
 
-from cflow_torch.applications.cleaning import CleanLog, static_map
+from cflow_torch.applications.clean_files import own_suffix, stored_masks, write_clean_log
+from cflow_torch.applications.cleaning import CleanLog, MaskedLog, static_map_with_intensity
 from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
-from cflow_torch.cli.flows import make_model, stored_flow
+from cflow_torch.cli.flows import make_log_model, stored_flow
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import local_folder, settings_record, versions, write_config
-from cflow_torch.data.arrays import ArraysLog, write_array_log
+from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
-from cflow_torch.data.read_as import read_as
 from cflow_torch.errors import import_optional
-from cflow_torch.fleet.changes import describe_changes
+from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
-from cflow_torch.windows.readings import WORLD
 
 # Settings that do not change the points of a log.
 _FREE = ("output", "overwrite", "resume", "device", "map", "data.root", "data.label", "data.check", "model.max_memory")
@@ -54,7 +53,7 @@ def task(cfg: Clean) -> None:
 def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
     """Return a function that makes the clean log, by the flow of earlier files or by the method."""
     if cfg.flow is None:
-        model = make_model(cfg.model, cfg.device)
+        model = make_log_model(cfg.model, cfg.device)
         return lambda log: CleanLog(log, model, None, cfg.remove_stopped)
     stored = stored_flow(cfg.flow, _NEEDED)
     return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped)
@@ -67,10 +66,9 @@ def _is_new(cfg: Clean, log: Log, output: Path) -> bool:
         return True
     file = _record_file(folder)
     before: dict[str, Any] = read_json(file) if file.exists() else {}
-    changes = describe_changes(before, json_ready(_record(cfg, log)), _FREE)
-    if changes or not cfg.resume:
-        why = changes or "with the same settings; resume=true continues it"
-        raise CFlowError(f"{folder} has results of another run ({why}): give overwrite=true, or output=FOLDER")
+    check_same_run(folder, before, json_ready(_record(cfg, log)), _FREE)
+    if not cfg.resume:
+        raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
     return False
 
 
@@ -90,7 +88,7 @@ def _record(cfg: Clean, log: Log) -> dict[str, Any]:
     """Return what the clean points follow from: settings, versions and the sweeps of the log."""
     settings = settings_record(cfg)
     settings["data"].pop("root", None)  # several logs, which may be elsewhere tomorrow
-    return {**settings, "versions": versions(), "log": describe_log(log, "")}
+    return {**settings, "versions": versions(), "log": describe_log(log)}
 
 
 def _record_file(folder: Path) -> Path:
@@ -101,30 +99,30 @@ def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog])
     """Write the folder and the map of a log, if they do not exist, and print them."""
     folder = output / log.log_id
     file = output / f"{log.log_id}.ply"
-    own = log.unwrapped
-    suffix = cfg.suffix or (own.files[0].suffix.lower() if isinstance(own, ArraysLog) else ".npy")
-    viewpoint = _viewpoint(log, suffix)
+    removed: Any = "it is complete"
     stopped = ""
     if not folder.exists():
         clean_log = clean(log)
-        write_array_log(clean_log, output, suffix, viewpoint)
+        removed = write_clean_log(clean_log, log, output, cfg.suffix)
         if clean_log.num_stopped is not None:
-            stopped = f"; remove_stopped removed {clean_log.num_stopped} more points"
-    bin_columns = max(3 + len(log.columns(0)), KITTI_COLUMNS) if suffix == ".bin" else KITTI_COLUMNS
-    to_read = "" if bin_columns == KITTI_COLUMNS else f", read them with data.bin_columns={bin_columns}"
-    print(f"{folder}: {len(log.timestamps)} sweeps{to_read}{stopped}")
+            stopped = f"; remove_stopped removed {clean_log.num_stopped:,} of them"
+    print(f"{folder}: {len(log.timestamps)} sweeps, {removed}{stopped}{_how_to_read(log, cfg.suffix)}")
     if cfg.map and not file.exists():
-        written = ArraysLog(folder, ground=None, bin_columns=bin_columns)
-        points = static_map(read_as(written, WORLD if viewpoint == "world" else None), cfg.voxel_size)
-        write_cloud(file, points)
-        print(f"{file}: {len(points)} points{_draw(points, file.with_suffix('.png'))}")
+        points, intensity = static_map_with_intensity(MaskedLog(log, stored_masks(folder, log)), cfg.voxel_size)
+        write_cloud(file, points, None if intensity is None else {"intensity": intensity})
+        print(f"{file}: {len(points):,} points{_draw(points, file.with_suffix('.png'))}")
 
 
-def _viewpoint(log: Log, suffix: str) -> str | None:
-    """Return the frame of the points in `.pcd` files whose VIEWPOINT has the pose, as the log has it; None = none."""
-    if suffix != ".pcd" or not log.unwrapped.has_viewpoints:
-        return None
-    return "world" if log.read_as == WORLD else "sensor"
+def _how_to_read(log: Log, suffix: str | None) -> str:
+    """Return the setting that reads `.bin` files of several columns."""
+    own = log.unwrapped
+    if (suffix or own_suffix(log)).lower() != ".bin":
+        return ""
+    if own_suffix(log).lower() == ".bin" and isinstance(own, ArraysLog) and own.bin_layout is not None:
+        columns = own.bin_layout.columns
+    else:
+        columns = max(3 + len(log.columns(0)), KITTI_COLUMNS)
+    return "" if columns == KITTI_COLUMNS else f"; read them with data.bin_columns={columns}"
 
 
 def _draw(points: np.ndarray, file: Path) -> str:

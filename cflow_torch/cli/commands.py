@@ -11,9 +11,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Iterator, Union
 
 from cflow_torch.config import Config
-from cflow_torch.setting import Settings, bounds, setting
+from cflow_torch.setting import AUTO, Settings, bounds, setting
 
-AUTO = "auto"
 # Settings of data sets that we check before a reader gets them. configs/data/ has the defaults of all of them.
 DATA_SETTINGS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("first", "seed", "first_seed"), bounds(int, low=0)),
@@ -210,9 +209,14 @@ class Flow(FlowFiles):
     log are complete: one row per moving object and sweep, with id, box and velocity. Its flow files get a column
     track_id, the id of each point, -1 = none. tracks=mot and tracks=kitti add
     OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats. tracks=drivestudio adds instances_info.json and
-    frame_instances.json, which DriveStudio's loaders read. labels=semantickitti writes
-    OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per point of
-    each sweep, 251 = moves at least 0.05 m per sweep, 9 = static, 0 = a sweep without flow, such as the last one.
+    frame_instances.json, which DriveStudio's loaders read, tracks=nuscenes adds nuscenes_detection.json and
+    nuscenes_tracking.json, and tracks=openpcdet adds result.pkl, OpenPCDet's table of boxes. labels=semantickitti
+    writes OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per
+    point of each sweep, 251 = moves (flow of 0.05 m per sweep, P(moving) of 0.5), 9 = static, 0 = a sweep without flow,
+    such as the last one.
+
+    masks=true writes OUTPUT/<log id>/masks/<camera>/<image>.png, 255 = dynamic, 0 = static, for the images nearest to
+    the sweeps of Argoverse 2, PandaSet, nuScenes and KITTI (extra `viz`).
 
     examples:
       cflow flow data=av2 data.root=/data/av2/val output=outputs/val
@@ -237,16 +241,20 @@ class Flow(FlowFiles):
     result_name: str | None = _path("key under which the total flow is also written into HDF5 scenes; null = none")
     tracks: bool | str = setting(
         False,
-        "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti, drivestudio "
-        "= and in this format",
+        "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti, "
+        "drivestudio, nuscenes, openpcdet = and in this format",
         kind=object,
-        choices=(True, False, "mot", "kitti", "drivestudio"),
+        choices=(True, False, "mot", "kitti", "drivestudio", "nuscenes", "openpcdet"),
     )
     labels: str | None = setting(
         None,
         "semantickitti = also write the moving points of each complete log to sequences/<log id>/predictions",
         kind=str,
         choices=(None, "semantickitti"),
+    )
+    masks: bool = setting(
+        False,
+        "true = also write masks of dynamic objects for the calibrated cameras of each complete log, and its tracks",
     )
 
 
@@ -451,11 +459,11 @@ class View(Command):
     """Writes a 3-D page per log, OUTPUT/<log id>.html, that any browser opens without a network.
 
     The extra `html` makes pages. A page has a timeline of sweeps. It shows the points of sweep t, coloured by residual
-    flow, speed, object, confidence and, if the log has labels, truth or error. It also shows an arrow per moving
-    cluster, and the boxes, trails, ids and speeds of tracks. flow=FOLDER shows the output of `cflow flow`, and its
-    tracks, instead of new estimates. format=rerun writes a recording OUTPUT/<log id>.rrd for the viewer rerun instead
-    of a page, with all points and sweep t+1 (extra `rerun`). show=true opens the files at the end. OUTPUT/config.yaml
-    contains the settings and versions.
+    flow, speed, object, confidence, P(moving) and, if the log has labels, truth or error. It also shows an arrow per
+    moving cluster, and the boxes, trails, ids and speeds of tracks. Click on an object for more. flow=FOLDER shows the
+    output of `cflow flow`, and its tracks, instead of new estimates. format=rerun writes a recording OUTPUT/<log
+    id>.rrd for the viewer rerun instead of a page, with all points and sweep t+1 (extra `rerun`). show=true opens the
+    files at the end. OUTPUT/config.yaml contains the settings and versions.
 
     examples:
       cflow view                                                   a simulated street, no data needed
@@ -509,13 +517,14 @@ class Stream(Command):
 class Clean(Command):
     """Writes logs without dynamic objects: OUTPUT/<log id>, a folder of point clouds, poses, times and ground masks.
 
-    data=arrays reads such a folder. A point is dynamic if its residual flow is at least 0.05 m per sweep.
-    remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car. map=true
-    also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them, <log id>.png.
-    We keep the other columns of cloud folders, bags, Argoverse 2 and PandaSet, such as intensity, and poses in
-    VIEWPOINT of .pcd files. A log is written as a whole or not at all. Run the command again to write the missing logs.
-    OUTPUT/config.yaml has settings and versions, and OUTPUT/<log id>.json those of the log. Results of other logs in
-    OUTPUT stay.
+    data=arrays reads such a folder. A point is dynamic if its flow is at least 0.05 m per sweep and P(moving) at least
+    0.5. remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car.
+    map=true also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them,
+    <log id>.png. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other
+    columns of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True
+    = not in the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing
+    logs. OUTPUT/config.yaml has settings and versions, and OUTPUT/<log id>.json those of the log. Results of other logs
+    in OUTPUT stay.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag
@@ -573,7 +582,7 @@ class ListSettings(Words):
     With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
 
     --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-    cflow_live.yaml, cflow_paper.yaml and cflow_keypoints.yaml. The package contains the same files.
+    cflow_live.yaml, cflow_paper.yaml, ... The package contains the same files.
 
     examples:
       cflow settings max_speed          default, allowed values and meaning of a setting

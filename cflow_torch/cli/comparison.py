@@ -13,7 +13,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 
 RESULTS = "results.json"
-TABLE = "comparison.csv"
+COMPARISON = "comparison.csv"
 # The scores of a class with fewer dynamic points are uncertain. One pedestrian has about 1000 in ten sweeps.
 _FEW = 1000
 # A setting and its value in the name of a job's folder.
@@ -43,9 +43,9 @@ class Comparison(Callback):
         if rows:
             text = io.StringIO()
             csv.writer(text, lineterminator="\n").writerows([header, *rows])
-            write_text(output / TABLE, text.getvalue())
+            write_text(output / COMPARISON, text.getvalue())
             shown = [[f"{cell:.4g}" if isinstance(cell, float) else cell for cell in row] for row in rows]
-            print("\n".join([f"all jobs in {output}, also in {output / TABLE}:", "", *markdown(header, shown)]))
+            print("\n".join([f"all jobs in {output}, also in {output / COMPARISON}:", "", *markdown(header, shown)]))
 
 
 def compare(output: Path) -> tuple[list[str], list[list[Any]]]:

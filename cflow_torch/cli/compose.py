@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from typing import Any, Callable
 
 import hydra
@@ -15,16 +15,14 @@ from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 
-from cflow_torch.cli.choices import own_names
-from cflow_torch.cli.commands import DATA_SETTINGS, ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
-from cflow_torch.cli.words import Call, check_exists
-from cflow_torch.config import CONFIGS, PRESETS, config_from, make_config
+from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
+from cflow_torch.cli.words import NOT_GIVEN, Call, check_exists, make_settings, text_names
+from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError
-from cflow_torch.setting import Settings, checked
+from cflow_torch.setting import Settings
 
 _PARSER = OverridesParser.create()
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
-_PATHS = ("data.root", "data.cache")  # settings of data sets whose values are text
 
 
 def _register() -> None:
@@ -36,10 +34,8 @@ def _register() -> None:
     for name, command in WITH_SETTINGS.items():
         groups = [{group: choice} for group, choice in command.groups().items()]
         store(name, {"defaults": ["hydra", "_self_", *groups], **_defaults(command)})
-    for method, config in CONFIGS.items():
-        store(f"base_{method}", config().as_dict(), "model")
-    for preset in PRESETS:
-        store(preset, make_config(preset).as_dict(), "model")
+    for name, config in PRESETS.items():
+        store(name, config.as_dict(), "model")
     for name, engine in ENGINES.items():
         store(name, _defaults(engine), "engine")
     for name, picture in PICTURES.items():
@@ -56,15 +52,9 @@ def _picture_node(name: str, picture: type[Plot]) -> dict[str, Any]:
 
 def _defaults(kind: type[Settings]) -> dict[str, Any]:
     """Return the defaults of the settings of a class, in types that OmegaConf has."""
-    defaults: dict[str, Any] = {}
-    for name in own_names(kind):
-        *parents, own = name.split(".")
-        level, default = defaults, kind
-        for parent in parents:
-            level, default = level.setdefault(parent, {}), getattr(default, parent)
-        value = getattr(default, own)
-        level[own] = list(value) if isinstance(value, tuple) else value
-    return defaults
+    own = [f.name for f in fields(kind) if "kind" in f.metadata]  # type: ignore[arg-type]
+    values: dict[str, Any] = asdict(kind())  # type: ignore[call-overload]
+    return {name: list(values[name]) if isinstance(values[name], tuple) else values[name] for name in own}
 
 
 _register()
@@ -85,7 +75,7 @@ def run_with_hydra(name: str, call: Call, job: Callable[[Any], Any]) -> None:
 
 def hydra_overrides(command: type[Command], call: Call) -> list[str]:
     """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
-    texts = {f.name for f in fields(command) if f.metadata.get("kind") is str} | set(_PATHS)
+    texts = text_names(command)
     overrides = []
     for word in call.settings:
         key, _, value = word.partition("=")
@@ -121,42 +111,24 @@ def find_own_modules() -> None:
 def settings_of(name: str, composed: Any) -> Command:
     """Make the settings of a command from those that Hydra has composed. Values are checked before torch is imported.
 
-    data=auto is replaced by the format of the path, which is printed.
+    data=auto is replaced by the format of the path, which is printed; `cflow check` does this for each of its paths.
     """
     values: dict[str, Any] = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
     values.pop("versions", None)  # of the config.yaml of an earlier run
-    command = WITH_SETTINGS[name]
-    if command is Plot:
-        command = PICTURES[values["picture"]]
-    values["model"] = config_from(values["model"])
-    engine = values.get("engine")
-    if engine is not None:
-        if engine["name"] not in ENGINES:
-            raise CFlowError(f"engine={engine['name']!r}: give one of {', '.join(ENGINES)}")
-        values["engine"] = _make(ENGINES[engine["name"]], engine, name)
-    _check_data(values["data"])
-    settings: Any = _make(command, values, name)
+    settings: Any = make_settings(name, values)
+    _check_paths(settings.data)
     from cflow_torch.cli.logs import complete_data  # imports torch, which takes seconds
 
-    choice = str(HydraConfig.get().runtime.choices.get("data"))
-    out = sys.stderr if isinstance(settings, Check) and settings.json else sys.stdout
-    return replace(settings, data=complete_data(settings.data, choice, out))  # type: ignore[no-any-return]
+    if "_target_" in settings.data:  # your own reader
+        choice = str(HydraConfig.get().runtime.choices.get("data"))
+        return replace(settings, data={"label": choice, "first": 0, "step": 1, **settings.data})  # type: ignore[no-any-return]
+    is_completed = isinstance(settings, Check)
+    return settings if is_completed else replace(settings, data=complete_data(settings.data))  # type: ignore[no-any-return]
 
 
-def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Settings:
-    names = kind.__dataclass_fields__  # type: ignore[attr-defined]
-    for name in values:
-        if name not in names:
-            raise CFlowError(f"unknown setting {kind.PREFIX}{name}: `cflow {command} --cfg job` prints all settings")
-    return kind(**values)
-
-
-def _check_data(data: dict[str, Any]) -> None:
-    for name, limits in DATA_SETTINGS.items():
-        if name in data and data[name] != "???":
-            checked(f"data.{name}", data[name], limits)
+def _check_paths(data: dict[str, Any]) -> None:
     root = data.get("root")
-    if root == "???":
+    if root == NOT_GIVEN:
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     for path in root if isinstance(root, list) else [root]:
         if isinstance(path, str) and "_target_" not in data:

@@ -14,7 +14,7 @@ import numpy as np
 from cflow_torch.cli.commands import Demo, Eval
 from cflow_torch.cli.comparison import RESULTS, headline, summary
 from cflow_torch.cli.failures import Failures, UnfinishedJob, finish
-from cflow_torch.cli.flows import make_model
+from cflow_torch.cli.flows import make_log_model
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import machine, output_folder, settings_record, versions, write_config
 from cflow_torch.cli.pairs import for_each_pair
@@ -24,7 +24,7 @@ from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
-from cflow_torch.fleet.changes import describe_changes
+from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.simulator.benchmark import generator_key
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -42,7 +42,7 @@ def task(cfg: Eval) -> float:
         _print_scores(output, record["results"], record["seconds_per_pair"])
         return objective(record["results"])
     scores = Scores(cfg)
-    model = TimedModel(make_model(cfg.model, cfg.device))
+    model = TimedModel(make_log_model(cfg.model, cfg.device))
     logs, failures = open_logs(cfg.data)
     ensure_writable(output)
     first, step = cfg.data["first"], cfg.data["step"]
@@ -122,9 +122,7 @@ def finished_results(cfg: Eval, folder: Path) -> dict[str, Any] | None:
         return None
     record: dict[str, Any] = read_json(file)
     now = _origin(cfg)
-    changed = describe_changes({key: record.get(key) for key in now}, now, _PATHS)
-    if changed:
-        raise CFlowError(f"{folder} has results of another run ({changed}): give output=FOLDER, or overwrite=true")
+    check_same_run(folder, {key: record.get(key) for key in now}, now, _PATHS)
     return record
 
 

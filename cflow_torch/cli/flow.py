@@ -7,12 +7,28 @@ import sys
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
+import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.applications.instance_files import CAR, CLASS_OF_READER, write_drivestudio
+from cflow_torch.applications.detection_files import (
+    DETECTIONS_FILE,
+    OPENPCDET_FILE,
+    TRACKING_FILE,
+    write_nuscenes,
+    write_openpcdet,
+)
+from cflow_torch.applications.instance_files import (
+    CAR,
+    CLASSES_OF_READER,
+    FRAMES_FILE,
+    INSTANCES_FILE,
+    write_drivestudio,
+)
+from cflow_torch.applications.masks import check_cameras, check_pillow, write_masks
 from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
@@ -27,22 +43,28 @@ from cflow_torch.data.hdf5.writer import check_result_name, check_writable, writ
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Part, Shard, find_shard
-from cflow_torch.fleet.machine import AUTO, Layout, choose_layout, frames_per_worker
+from cflow_torch.fleet.machine import Layout, choose_layout, frames_per_worker
 from cflow_torch.fleet.manifest import (
     check_logs,
-    claim_run,
+    clear_log,
     complete_frames,
     frame_file,
     labels_folder,
     make_identity,
-    release_run,
+    masks_folder,
 )
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
 from cflow_torch.fleet.work import source_name
+from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
-_TRACK_FORMATS = {"mot": write_mot, "kitti": write_kitti}
+_FOR_MOVING = {"residual", "moving"}
+_TRACK_FILES = {
+    "mot": ("mot.txt", write_mot),
+    "kitti": ("kitti.txt", write_kitti),
+    "openpcdet": (OPENPCDET_FILE, write_openpcdet),
+}
 
 
 class FlowRun(NamedTuple):
@@ -51,16 +73,19 @@ class FlowRun(NamedTuple):
     sources: Sources
     job: Job
     shard: Shard
-    identity: dict[str, Any]  # whose hash the job has
     parts: list[Part]
 
-    def log_ids(self) -> Iterator[str]:
-        """Open the logs of this shard, and yield their ids, which name their folders."""
+    def logs(self) -> Iterator[Log]:
+        """Open the logs of this shard one by one, without what takes time."""
         cheap = {"check": False, "odometry": False, "read_as": None}
         sources = self.sources._replace(settings={**self.sources.settings, **cheap})
         for part in self.parts:
             with suppress(Exception), sources.open(part.source) as log:  # the worker reports the error
-                yield log.log_id
+                yield log
+
+    def log_ids(self) -> Iterator[str]:
+        """Yield the ids of the logs of this shard, which name their folders."""
+        return (log.log_id for log in self.logs())
 
 
 def task(cfg: Flow) -> None:
@@ -90,16 +115,15 @@ def compute(
     if not cfg.dry_run:
         check(cfg, flow)
         ensure_writable(output)
-    check_logs(output, names, flow.identity, cfg.resume, cfg.overwrite, is_alone)
+    check_logs(output, names, flow.job.identity, cfg.resume, cfg.overwrite, is_alone)
     if cfg.dry_run:
         print(forecast(flow.job, flow.parts))
         return
-    claim_run(output, flow.identity, flow.log_ids() if cfg.overwrite and is_alone else ())
+    if cfg.overwrite and is_alone:
+        for log_id in flow.log_ids():
+            clear_log(output / log_id)
     write_config(cfg, output)
     report = _run(cfg, flow, layout)
-    frames = report["frames"]
-    if is_alone and frames["computed"] + frames["complete_before"] == 0:
-        release_run(output, flow.job.identity)
     failures = [] if report["stopped_by"] else use(cfg, flow, report)  # a signal leaves no time for this
     _finish(cfg, flow, report, failures)
 
@@ -108,10 +132,9 @@ def _plan(cfg: FlowFiles, contents: tuple[str, ...], batch: int) -> FlowRun:
     """Find the logs, and this process's share of them."""
     shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
     sources = find_logs(cfg.data)
-    identity = make_identity(cfg.model, sources.reader, sources.settings, contents)
     job = Job(
         config=cfg.model,
-        identity=identity["hash"],
+        identity=make_identity(cfg.model, sources.reader, sources.settings, contents),
         reader=sources.reader,
         settings=sources.settings,
         output=str(output_folder(cfg)),
@@ -119,7 +142,7 @@ def _plan(cfg: FlowFiles, contents: tuple[str, ...], batch: int) -> FlowRun:
         batch=batch,
         redo=cfg.overwrite,
     )
-    return FlowRun(sources, job, shard, identity, list(shard.parts(sources.logs)))
+    return FlowRun(sources, job, shard, list(shard.parts(sources.logs)))
 
 
 def _run(cfg: FlowFiles, flow: FlowRun, layout: Layout) -> dict[str, Any]:
@@ -158,6 +181,10 @@ def _finish(cfg: FlowFiles, flow: FlowRun, report: dict[str, Any], failures: Fai
 
 
 def _check_results(cfg: Flow, flow: FlowRun) -> None:
+    if cfg.masks:
+        check_pillow()
+        for log in islice(flow.logs(), 1):
+            check_cameras(log, log.cameras(0))
     if cfg.result_name is None:
         return
     if cfg.data.get("name") != "hdf5":
@@ -180,13 +207,13 @@ def _contents(cfg: Flow) -> tuple[str, ...]:
         why = "" if has_confidence else "; only model=default, offline and live have a confidence"
         raise CFlowError(f"contents={given}: give auto, or some of {', '.join(allowed)}{why}")
     needed = set(CONTENTS) if cfg.result_name is not None else set()
-    if cfg.tracks:
+    if cfg.tracks or cfg.masks:
         needed |= _FOR_TRACKS & set(allowed)
-    if cfg.labels is not None:
-        needed.add("residual")
+    if cfg.labels is not None or cfg.masks:
+        needed |= _FOR_MOVING & set(allowed)
     missing = sorted(needed - set(given))
     if missing:
-        readers = "result_name=, tracks= and labels= read the flow files"
+        readers = "result_name=, tracks=, labels= and masks= read the flow files"
         raise CFlowError(f"contents={given}: {readers}: add {', '.join(missing)}")
     return tuple(name for name in allowed if name in given)
 
@@ -196,16 +223,19 @@ def _write_more(cfg: Flow, flow: FlowRun, report: dict[str, Any]) -> Failures:
     output, failures = as_path(flow.job.output), []
     if cfg.result_name is not None:
         failures = _into_scenes(cfg.result_name, flow.sources.logs, output)
-    if cfg.tracks or cfg.labels is not None:
+    if cfg.tracks or cfg.masks or cfg.labels is not None:
         failures += _write_logs(cfg, flow, output)
     return failures
 
 
 def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
-    """Write tracks and labels of each log of this shard. Skip logs with incomplete frames, in this or another shard."""
+    """Write tracks, labels and masks of each log of this shard.
+
+    We skip logs with incomplete frames, in this or another shard.
+    """
     failures: Failures = []
     stored = stored_flow(output, ())
-    wanted = [name for name in ("tracks", "labels") if getattr(cfg, name)]
+    wanted = [name for name in ("tracks", "labels", "masks") if getattr(cfg, name)]
     for part in tqdm(flow.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
             log = flow.sources.open(part.source)
@@ -213,11 +243,18 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
             if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
                 continue
             results = partial(_read_all, stored, log, pairs)
-            if cfg.tracks:
-                class_name = CLASS_OF_READER.get(flow.sources.reader, CAR)
-                _write_tracks(cfg.tracks, log, results, output / log.log_id, class_name)
+            if cfg.tracks or cfg.masks:
+                classes = CLASSES_OF_READER.get(flow.sources.reader, (CAR, None))
+                tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, classes))
+            if cfg.masks:
+                tracks = read_tracks(output / log.log_id / TRACKS_FILE)
+                masks = masks_folder(output, log.log_id)
+                write_masks(masks, log, results(), tracks)
+                tqdm.write(f"{masks}: masks of {len(pairs)} sweeps")
             if cfg.labels is not None:
-                write_moving_labels(labels_folder(output, log.log_id), log, results())
+                labels = labels_folder(output, log.log_id)
+                write_moving_labels(labels, log, results())
+                tqdm.write(f"{labels}: labels of {len(log.timestamps)} sweeps")
     return failures
 
 
@@ -228,22 +265,31 @@ def _read_all(
 
 
 def _write_tracks(
-    kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, class_name: str
-) -> None:
+    kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, classes: Sequence[Any]
+) -> str:
     """Write the tracks of a log and the ids of its points, unless they exist, and then the form `kind`.
 
-    `results` reads the flow files.
+    `results` reads the flow files. Returns a line with the files.
     """
-    files = (frame_file(folder, log.timestamps[index]) for index in chosen_pairs(log, first=0, step=1))
-    if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, files)):
+    frames = (frame_file(folder, log.timestamps[index]) for index in chosen_pairs(log, first=0, step=1))
+    if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, frames)):
         table, points = track_points(log, results())
         for each in points:
             add_track_ids(frame_file(folder, log.timestamps[each.sweep]), each.track_id(table["id"]))
         write_tracks(folder / TRACKS_FILE, table)  # last, so that a killed run begins again
-    if kind in _TRACK_FORMATS:
-        _TRACK_FORMATS[kind](folder / f"{kind}.txt", read_tracks(folder / TRACKS_FILE), log)
+    table = read_tracks(folder / TRACKS_FILE)
+    files = [TRACKS_FILE]
+    if kind in _TRACK_FILES:
+        name, write = _TRACK_FILES[kind]
+        write(folder / name, table, log)
+        files.append(name)
     elif kind == "drivestudio":
-        write_drivestudio(folder, read_tracks(folder / TRACKS_FILE), log, class_name)
+        write_drivestudio(folder, table, log, *classes)
+        files += [INSTANCES_FILE, FRAMES_FILE]
+    elif kind == "nuscenes":
+        write_nuscenes(folder, table, log)
+        files += [DETECTIONS_FILE, TRACKING_FILE]
+    return f"{folder}: {len(np.unique(table['id']))} tracks in {', '.join(files)}"
 
 
 def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:

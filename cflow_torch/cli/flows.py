@@ -15,7 +15,7 @@ from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.windows.memory import keep_freed_memory
 
 
-def make_model(config: Config, device: str, keep_memory: bool = True) -> SceneFlowModel:
+def make_log_model(config: Config, device: str, keep_memory: bool = True) -> SceneFlowModel:
     """Make a method for the windows of logs, which are checked when they are opened, not at each call.
 
     With `keep_memory`, this process keeps the memory that it frees, see `keep_freed_memory`.

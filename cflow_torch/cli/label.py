@@ -12,7 +12,7 @@ from cflow_torch.applications.labels import find_labels
 from cflow_torch.cli.commands import Label
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow import FlowRun, compute
-from cflow_torch.cli.flows import make_model
+from cflow_torch.cli.flows import make_log_model
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
 from cflow_torch.data.json_file import write_json
@@ -40,7 +40,7 @@ def _check(cfg: Label, flow: FlowRun) -> None:
         maker = None
         with suppress(CFlowError):  # a scene that cannot be read is reported later
             maker = labelled_by(scene)
-        if maker not in (None, flow.job.identity) and not cfg.overwrite:
+        if maker not in (None, flow.job.identity["hash"]) and not cfg.overwrite:
             why = "labels of other settings or of another program"
             raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
 
@@ -50,13 +50,13 @@ def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
-    model = make_model(cfg.model, cfg.device)
+    model = make_log_model(cfg.model, cfg.device)
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
     scenes = [part.source for part in flow.parts]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = as_path(flow.job.output) / scene.stem
         with collect_failures(failures, scene.stem):
-            if labelled_by(scene) == flow.job.identity and not flow.job.redo:
+            if labelled_by(scene) == flow.job.identity["hash"] and not flow.job.redo:
                 continue
             log = flow.sources.open(scene)
             stamps = log.timestamps[:-1]
@@ -65,7 +65,7 @@ def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
                 continue
             flows = (read_flow(frame_file(folder, stamp)) for stamp in stamps)
             labels = find_labels(log, flows, model, workers)
-            write_hdf5_labels(scene, labels, flow.job.identity, overwrite=flow.job.redo)
+            write_hdf5_labels(scene, labels, flow.job.identity["hash"], overwrite=flow.job.redo)
             labelled.append(scene.name)
     print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
     file = scenes[0].parent / f"cflow_label-{flow.shard.index}-of-{flow.shard.count}.json"

@@ -5,24 +5,18 @@ from __future__ import annotations
 import os
 from typing import Any, NamedTuple, TextIO
 
-from cflow_torch.cli.choices import CONFIGS, read_settings
-from cflow_torch.cli.commands import AUTO
+from cflow_torch.cli.choices import FOLDER, read_settings
 from cflow_torch.cli.failures import Failures, collect_failures
+from cflow_torch.cli.words import NOT_GIVEN
 from cflow_torch.data.catalog import find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.log import Log
+from cflow_torch.setting import AUTO
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
 from cflow_torch.types import CFlowError
 
-_MISSING = "???"  # a setting of another format
 
-
-def complete_data(data: dict[str, Any], choice: str, out: TextIO) -> dict[str, Any]:
-    """Replace data=auto by the settings of the recognised format, and print it to `out`.
-
-    `choice` is the chosen data set, the label of your own reader.
-    """
-    if "_target_" in data:
-        return {"label": choice, "first": 0, "step": 1, **data}
+def complete_data(data: dict[str, Any], out: TextIO | None = None) -> dict[str, Any]:
+    """Replace data=auto by the settings of the recognised format, and print it to `out`; None = standard output."""
     if data.get("name") != AUTO:
         return data
     formats = {path: recognise(path) for path in paths_of(data)}
@@ -32,14 +26,14 @@ def complete_data(data: dict[str, Any], choice: str, out: TextIO) -> dict[str, A
         several = " and ".join(sorted(set(formats.values())))
         raise CFlowError(f"the paths have several formats, {several}: give one command each")
     name = next(iter(formats.values()), "synthetic")
-    settings = dict(read_settings(CONFIGS / "data" / f"{name}.yaml"))
+    settings = dict(read_settings(FOLDER / "data" / f"{name}.yaml"))
     if "cache" in settings:
         settings["cache"] = os.environ.get("CFLOW_CACHE", "outputs/cache")
-    defaults = read_settings(CONFIGS / "data" / f"{AUTO}.yaml")
+    defaults = read_settings(FOLDER / "data" / f"{AUTO}.yaml")
     for key, value in data.items():
-        if key in settings and value != _MISSING:
+        if key in settings and value != NOT_GIVEN:
             settings[key] = value
-        elif key not in settings and value not in (_MISSING, defaults.get(key, _MISSING)):
+        elif key not in settings and value not in (NOT_GIVEN, defaults.get(key, NOT_GIVEN)):
             raise CFlowError(f"data.{key}={value}: data={name} has no such setting; it has {', '.join(settings)}")
     return {**settings, "name": name, "label": data["label"] or name}
 

@@ -79,23 +79,14 @@ def _run_with_settings(command: str, words: list[str]) -> None:
     from cflow_torch.cli.compose import explain, run_with_hydra  # imports Hydra, which takes half a second
     from cflow_torch.cli.failures import UnfinishedJob
 
-    calls = [call]
-    if command == "check":  # a page for each path, whatever its format is
-        calls = [call._replace(paths=[path]) for path in call.paths] or calls
-    statuses = [0]
-    for one in calls:
-        try:
-            run_with_hydra(command, one, lambda composed: _run_job(command, composed))
-        except SystemExit as end:
-            statuses.append(int(end.code or 0))
-        except UnfinishedJob as error:
-            print(f"error: {error}", file=sys.stderr)
-            statuses.append(1)
-        except Exception as error:
-            _exit_if_refused(error)
-            _exit_wrong(explain(error, command))
-    if max(statuses):
-        raise SystemExit(max(statuses))
+    try:
+        run_with_hydra(command, call, lambda composed: _run_job(command, composed))
+    except UnfinishedJob as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except Exception as error:
+        _exit_if_refused(error)
+        _exit_wrong(explain(error, command))
 
 
 def _run_job(command: str, composed: Any) -> Any:

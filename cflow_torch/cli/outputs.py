@@ -19,7 +19,7 @@ from cflow_torch.cli.failures import is_sweep
 from cflow_torch.cli.info import processor
 from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.fleet.changes import describe_changes
+from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.types import CFlowError
 
 
@@ -86,11 +86,7 @@ def claim_output(cfg: Command, folder: Path, ignored: Sequence[str]) -> None:
     if file.exists() and not getattr(cfg, "overwrite", False):
         before = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
         now = {**settings_record(cfg), "versions": versions()}
-        changed = describe_changes(before, _plain(now), ("output", "overwrite", *ignored))
-        if changed:
-            raise CFlowError(
-                f"{folder} has files of another run ({changed}): give overwrite=true, or give output=FOLDER"
-            )
+        check_same_run(folder, before, _plain(now), ("output", "overwrite", *ignored))
     write_config(cfg, folder)
 
 

@@ -6,10 +6,10 @@ Threads would not help: a window is thousands of small operations, and only one 
 from __future__ import annotations
 
 import os
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from contextlib import closing
+from collections import deque
+from concurrent.futures import BrokenExecutor, Future
 from functools import partial
-from queue import SimpleQueue
+from itertools import cycle
 from typing import Any, Callable, Iterator, Sequence, Tuple
 
 import torch
@@ -17,11 +17,11 @@ import torch
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.fleet.executors import ProcessExecutor, describe
-from cflow_torch.fleet.machine import AUTO, choose_layout, frames_per_worker
+from cflow_torch.fleet.executors import ProcessExecutor, describe_error
+from cflow_torch.fleet.machine import choose_layout, frames_per_worker
 from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
-from cflow_torch.fleet.work import run_ahead
 from cflow_torch.model import SceneFlowModel
+from cflow_torch.setting import AUTO
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.inspection import inactive_is_an_error
@@ -29,12 +29,12 @@ from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # windows per worker that are read ahead
 
-Pair = Tuple[Log, int]  # a log and the index of the first of two sweeps
+LogPair = Tuple[Log, int]  # a log and the index of the first of two sweeps
 Answer = Callable[[], Tuple[Window, FlowResult]]
 
 
 def for_each_pair(
-    pairs: Sequence[Pair], model: TimedModel, use: Callable[[Log, int, Window, FlowResult], None]
+    pairs: Sequence[LogPair], model: TimedModel, use: Callable[[Log, int, Window, FlowResult], None]
 ) -> Failures:
     """Estimate the flow of pairs, and call `use` with the log, index, window and result of each pair, in order.
 
@@ -48,7 +48,7 @@ def for_each_pair(
     return failures
 
 
-def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, Answer]]:
+def _answers(pairs: Sequence[LogPair], model: TimedModel) -> Iterator[tuple[LogPair, Answer]]:
     """Yield each pair and a function that returns its window and flow, or raises the error of that pair."""
     method: Any = model.model
     devices = choose_layout(method.device, AUTO, AUTO, os.environ).devices
@@ -57,14 +57,23 @@ def _answers(pairs: Sequence[Pair], model: TimedModel) -> Iterator[tuple[Pair, A
     if count < 2:
         yield from zip(Progress(pairs), (partial(_estimate, model, sweeps) for sweeps in windows))
         return
-    # At the end, the processes are closed before we wait for the threads, which wait for the processes.
-    with ThreadPoolExecutor(count) as threads, closing(_Processes(model, count)) as processes, closing(
-        run_ahead(threads, processes.estimate, windows, _AHEAD * count)
-    ) as futures:
-        yield from zip(Progress(pairs), (future.result for future in futures))
+    executors = [ProcessExecutor(_Estimator, method) for _ in range(count)]
+    waiting: deque[_Call] = deque()
+    in_order = iter(Progress(pairs))
+    try:
+        for executor, sweeps in zip(cycle(executors), windows):
+            waiting.append(_Call(executor, sweeps, model))
+            if len(waiting) > _AHEAD * count:
+                yield next(in_order), waiting.popleft()
+        yield from zip(in_order, waiting)
+    finally:
+        for call in waiting:
+            call.future.cancel()
+        for executor in executors:
+            executor.close()
 
 
-def _windows(pairs: Sequence[Pair], config: Config) -> Iterator[Window | Exception]:
+def _windows(pairs: Sequence[LogPair], config: Config) -> Iterator[Window | Exception]:
     """Read the window of each pair. An error is yielded, so that the next windows follow."""
     recent: CachedLog | None = None  # the log of the last pair
     for log, index in pairs:
@@ -83,44 +92,30 @@ def _estimate(model: TimedModel, sweeps: Window | Exception) -> tuple[Window, Fl
         return sweeps, model([sweeps])[0]
 
 
-class _Processes:
-    """Worker processes for the threads that call `estimate`: each takes one that is idle."""
+class _Call:
+    """The estimate of one pair in a worker process. If the process ends, another one tries once more."""
 
-    def __init__(self, model: TimedModel, count: int) -> None:
-        self._model, self._is_closed = model, False
-        self._executors = [ProcessExecutor(_Estimator, model.model) for _ in range(count)]
-        self._idle: SimpleQueue[ProcessExecutor] = SimpleQueue()
-        for executor in self._executors:
-            self._idle.put(executor)
-
-    def estimate(self, sweeps: Window | Exception) -> tuple[Window, FlowResult]:
+    def __init__(self, executor: ProcessExecutor, sweeps: Window | Exception, model: TimedModel) -> None:
+        self._executor = executor
+        self._sweeps = sweeps
+        self._model = model
+        self.future: Future[Any] = Future()
         if isinstance(sweeps, Exception):
-            raise sweeps
-        executor = self._idle.get()
+            self.future.set_exception(sweeps)
+        else:
+            self.future = executor.submit("estimate", sweeps)
+
+    def __call__(self) -> tuple[Window, FlowResult]:
         try:
-            arrays, seconds = self._call(executor, sweeps)
-        finally:
-            self._idle.put(executor)
-        self._model.pairs.append(seconds)
-        return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
-
-    def _call(self, executor: ProcessExecutor, sweeps: Window) -> Any:
-        """Estimate in a process. If it ends, try once more in a new one."""
-        how = ""
-        for _ in range(2):
+            arrays, seconds = self.future.result()
+        except BrokenExecutor:
             try:
-                return executor.submit("estimate", sweeps).result()
+                arrays, seconds = self._executor.submit("estimate", self._sweeps).result()
             except BrokenExecutor as error:
-                how = describe(error)
-                executor.close()
-            if self._is_closed:
-                break
-        raise CFlowError(f"2 worker processes died on it, the last one: {how}")
-
-    def close(self) -> None:
-        self._is_closed = True
-        for executor in self._executors:
-            executor.close()
+                raise CFlowError(f"2 worker processes died on it, the last one: {describe_error(error)}") from error
+        self._model.pairs.append(seconds)
+        result = FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+        return self._sweeps, result  # type: ignore[return-value]  # an exception was raised above
 
 
 class _Estimator:

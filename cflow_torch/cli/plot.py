@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from cflow_torch.cli.commands import Animation, CorrelationPicture, FlowPicture, Plot
 from cflow_torch.cli.failures import finish
-from cflow_torch.cli.flows import make_model
+from cflow_torch.cli.flows import make_log_model
 from cflow_torch.cli.logs import check_pair, chosen_pairs, find_logs, paths_of
 from cflow_torch.cli.outputs import local_folder
 from cflow_torch.cli.pairs import for_each_pair
@@ -23,7 +23,7 @@ from cflow_torch.fleet.work import source_name
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.viz.animation import Frame, flow_figures, save_animation
+from cflow_torch.viz.animation import AnimatedPair, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.clusters import plot_clusters
 from cflow_torch.viz.stage_pictures import plot_correlation, plot_keypoints, plot_scales
@@ -36,7 +36,7 @@ def task(cfg: Plot) -> None:
     blank_figure((1, 1), 100)  # fails now if matplotlib is missing, not after the work
     if isinstance(cfg, Animation) and cfg.format == "mp4":
         import_optional("imageio_ffmpeg", "format=mp4 needs imageio-ffmpeg (extra video): pip install imageio-ffmpeg")
-    model = make_model(cfg.model, cfg.device)
+    model = make_log_model(cfg.model, cfg.device)
     log = find_log(cfg)
     if isinstance(cfg, Animation):
         path = _animate(cfg, model, log, output)
@@ -110,13 +110,13 @@ def _animate(cfg: Animation, model: SceneFlowModel, log: Log, output: Path) -> P
     if not pairs:
         raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ensure_writable(output)
-    frames: list[Frame] = []
+    frames: list[AnimatedPair] = []
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         flow = result.residual_flow
         result = replace(result, pose_flow=flow, flow=flow)  # frees the flow that is not drawn
         title = f"{log.log_id}, {(log.timestamps[index] - log.timestamps[pairs[0]]) / 1e9:.1f} s"
-        frames.append(Frame(sweeps.pc0.points, result, sweeps.pc0.is_ground, title))
+        frames.append(AnimatedPair(sweeps.pc0.points, result, sweeps.pc0.is_ground, title))
 
     finish(for_each_pair([(log, index) for index in pairs], TimedModel(model), keep))
     figures = flow_figures(

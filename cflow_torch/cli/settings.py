@@ -9,10 +9,9 @@ from typing import Iterator, NamedTuple
 
 from cflow_torch.cli.choices import files, near, setting_names
 from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Plot, as_yaml, setting_lines
-from cflow_torch.config import CONFIGS as METHODS
-from cflow_torch.config import PRESETS, WINDOW, make_config
+from cflow_torch.config import METHODS, PRESETS, WINDOW
 from cflow_torch.errors import CFlowError
-from cflow_torch.setting import describe
+from cflow_torch.setting import describe_limits
 
 _PAGE = """# Settings
 
@@ -33,6 +32,7 @@ target:
   output: full  # full | valid (by pc0_valid_point_idxes)
   device: auto  # auto = that of the batch
   voxel_size: [0.1, 0.1, 2000.0]  # the harness asks for it; without effect, pixel_sizes counts
+  preset: {preset}
 """
 _IN_FILES = ("data", "experiment", "row")  # groups whose choices are YAML files
 _Z = 1000.0  # metres, replaces infinite bounds of z, because the harness computes with the bounds
@@ -58,7 +58,7 @@ def task(arguments: list[str]) -> None:
 def harness_models() -> dict[str, str]:
     """Name -> YAML of each preset as a model of OpenSceneFlow, except offline: the harness has no sweeps after t+1."""
     models = {}
-    for preset, config in ((preset, make_config(preset)) for preset in PRESETS):
+    for preset, config in PRESETS.items():
         if config.num_future > 0:
             continue
         name = "cflow" if preset == "default" else f"cflow_{preset}"
@@ -66,8 +66,8 @@ def harness_models() -> dict[str, str]:
         region = [min(max(bound, -_Z), _Z) for bound in config.point_cloud_range]
         for f in fields(config):
             value = region if f.name == "point_cloud_range" else getattr(config, f.name)
-            if f.name not in WINDOW:  # num_frames replaces it
-                text += f"  {f.name}: {as_yaml(value)}  # {describe(f.metadata)}\n"
+            if f.name not in ("method", *WINDOW):  # preset and num_frames replace them
+                text += f"  {f.name}: {as_yaml(value)}  # {describe_limits(f.metadata)}\n"
         models[name] = text
     return models
 
@@ -83,7 +83,7 @@ class Section(NamedTuple):
 def _sections() -> Iterator[Section]:
     """Yield the sections of the page: methods, commands, engines, pictures, and the choices in YAML files."""
     for method in METHODS:
-        presets = [preset for preset, (of_preset, _) in PRESETS.items() if of_preset == method]
+        presets = [preset for preset, config in PRESETS.items() if config.method == method]
         chosen = [f"model={preset}" for preset in presets]
         title = f"Method `{method}`: {', '.join(chosen)}"
         yield Section(title, _method_table(method, presets), (method, *presets, *chosen, "model"))
@@ -103,12 +103,11 @@ def _sections() -> Iterator[Section]:
 def _method_table(method: str, presets: list[str]) -> list[str]:
     """Return the rows of a table of all settings of a method."""
     rows = ["| setting | default | presets | allowed | meaning |", "|---|---|---|---|---|"]
-    configs = {preset: make_config(preset) for preset in presets}
     for f in fields(METHODS[method]):
-        values = {preset: getattr(config, f.name) for preset, config in configs.items()}
+        values = {preset: getattr(PRESETS[preset], f.name) for preset in presets}
         changed = [f"{preset} `{as_yaml(value)}`" for preset, value in values.items() if value != f.default]
         default = f"`{as_yaml(f.default)}`"
-        cells = [f"`model.{f.name}`", default, ", ".join(changed), describe(f.metadata), f.metadata["help"]]
+        cells = [f"`model.{f.name}`", default, ", ".join(changed), describe_limits(f.metadata), f.metadata["help"]]
         rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return rows
 

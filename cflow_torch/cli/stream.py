@@ -22,7 +22,7 @@ def task(cfg: Stream) -> None:
     output = output_folder(cfg)
     keep_freed_memory()
     # The log finds the ground, or has none where data.find_ground is null.
-    stream = FlowStream(config=cfg.model, device=cfg.device, ground=None, max_gap=cfg.max_gap)
+    stream = FlowStream(cfg.model, device=cfg.device, ground=None, max_gap=cfg.max_gap)
     log = open_first_log(cfg.data)
     ensure_writable(output)
     report = {"log": log.log_id, **play(stream, log, cfg.pace, cfg.count)}

@@ -8,19 +8,19 @@ from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
 from cflow_torch.cli.commands import Submit
 from cflow_torch.cli.failures import Failures, collect_failures, finish
-from cflow_torch.cli.flows import make_model
+from cflow_torch.cli.flows import make_log_model
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import claim_output, output_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.log import Log
 from cflow_torch.evaluation.submission import archive, frames
 from cflow_torch.evaluation.submission.archive import SubmissionVersion
-from cflow_torch.evaluation.submission.frames import Frame, MaskArchive
+from cflow_torch.evaluation.submission.frames import MaskArchive, SubmittedFrame
 from cflow_torch.fleet.progress import Progress
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
-Plan = List[Tuple[Frame, int]]  # frames with their numbers of rows
+Plan = List[Tuple[SubmittedFrame, int]]  # frames with their numbers of rows
 _Masks = Optional[MaskArchive]
 _Listed = Optional[Mapping[str, Sequence[int]]]
 
@@ -33,7 +33,7 @@ def task(cfg: Submit) -> None:
         raise CFlowError("masks= already lists the frames that are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = frames.read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
-    model = TimedModel(make_model(cfg.model, cfg.device))
+    model = TimedModel(make_log_model(cfg.model, cfg.device))
     logs, failures = open_logs(cfg.data)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
@@ -49,7 +49,7 @@ def task(cfg: Submit) -> None:
     failures += _write(plan, model, version, masks, folder)
     finish(failures)
     _check(folder, version, plan)
-    archive.pack(folder, [frame.name for frame, _ in plan], file)
+    archive.write_zip(folder, [frame.name for frame, _ in plan], file)
     try:
         _check(file, version, plan)
     except BaseException:  # the archive stays only if it passes
@@ -82,7 +82,7 @@ def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Ma
         nonlocal largest, total, count
         mask = frames.point_mask(log, index, sweeps.pc0, masks) if version.is_masked else None
         columns, error = archive.encode(version, result, sweeps.pc0.is_ground, mask)
-        archive.write_frame(folder, Frame(log, index).name, columns)
+        archive.write_frame(folder, SubmittedFrame(log, index).name, columns)
         largest, total, count = max(largest, error.max(initial=0.0)), total + error.sum(), count + len(error)
 
     failures = for_each_pair([(frame.log, frame.index) for frame in todo], model, write)

@@ -6,21 +6,31 @@ We do not import Hydra here, so that a mistyped name is told at once.
 from __future__ import annotations
 
 import glob
+import math
 import os
-from typing import NamedTuple
+from contextlib import suppress
+from dataclasses import fields
+from typing import Any, NamedTuple
 
 from cflow_torch.cli.choices import choices, near, setting_names
-from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
-from cflow_torch.config import REMOVED, REMOVED_PRESETS, removed_preset
+from cflow_torch.cli.commands import (
+    DATA_SETTINGS,
+    ENGINES,
+    PICTURES,
+    WITH_SETTINGS,
+    Command,
+)
+from cflow_torch.config import PRESETS, config_from
 from cflow_torch.errors import CFlowError
+from cflow_torch.setting import Settings, checked
 
 # Options of Hydra that the next word belongs to; the first of them name configurations of your own.
 _OWN_CONFIGS = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path")
 _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
+_LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan": math.nan}
+NOT_GIVEN = "???"  # a setting without a value
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
-# Settings of commands that earlier versions had; for those of the methods, see `config.REMOVED`.
-_REMOVED = {**REMOVED, "standing": "use remove_stopped", "residual_axes": "leave it out"}
 
 
 class Call(NamedTuple):
@@ -42,7 +52,7 @@ def read_call(words: list[str], command: str) -> Call:
         raise CFlowError(f"unknown option {option!r}: give settings as NAME=VALUE; `cflow {command} --help` lists them")
     for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
         check_exists(path)
-    _check_names(call.settings, command, bool(given & set(_OWN_CONFIGS)))
+    _check_settings(call.settings, command, bool(given & set(_OWN_CONFIGS)))
     return call
 
 
@@ -64,19 +74,19 @@ def _is_path(word: str) -> bool:
     return word.startswith(("/", "./", "../", "~/")) or os.path.exists(word)
 
 
-def _check_names(settings: list[str], command: str, has_own: bool) -> None:
+def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
+    """Reject names that do not exist and plain values that are not allowed."""
     kind = WITH_SETTINGS[command]
     chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
     known = setting_names(kind)
+    texts = text_names(kind)
+    values: dict[str, Any] = {}
     for word in settings:
-        key = word.partition("=")[0]
+        key, _, value = word.partition("=")
         if key in chosen or _is_for_hydra(key) or any(name.startswith(f"{key}.") for name in known):
             continue
         if has_own and key.partition(".")[0] in chosen:
             continue
-        own = key.rpartition(".")[2]
-        if key not in known and own in _REMOVED:
-            raise CFlowError(f"setting {own} was removed: {_REMOVED[own]}")
         if key not in known:
             hint = near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
@@ -84,6 +94,77 @@ def _check_names(settings: list[str], command: str, has_own: bool) -> None:
         group = owners[0].partition("=")[0] if owners else ""
         if chosen.get(group) and not {f"{group}={choice}" for choice in chosen[group]} & set(owners):
             raise CFlowError(f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out")
+        with suppress(ValueError):
+            plain = plain_value(value)
+            values[key] = value if key in texts and plain is not None else plain
+    single = {group: names[0] for group, names in chosen.items() if len(names) == 1}
+    make_settings(command, _nested(values, kind, single))
+
+
+def text_names(kind: type[Command]) -> set[str]:
+    """Return the names of settings whose values are text, even if they look like numbers."""
+    return {f.name for f in fields(kind) if f.metadata.get("kind") is str} | {"data.root", "data.cache"}
+
+
+def plain_value(text: str) -> Any:
+    """Return the value that Hydra reads from a text: null, a truth, a number, text, or a list of them.
+
+    A ValueError is raised for a text that is more than this, such as the values of a sweep.
+    """
+    if text[:1] == "[" and text[-1:] == "]":
+        return [plain_value(one.strip()) for one in text[1:-1].split(",")]
+    if not text or set(text) & set(_NOT_PLAIN) or "," in text:
+        raise ValueError(text)
+    if text.lower() in _LITERALS:
+        return _LITERALS[text.lower()]
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def _nested(values: dict[str, Any], kind: type[Command], chosen: dict[str, str]) -> dict[str, Any]:
+    """Nest the values of dotted names, and fill in the groups of which one choice is known. Others are left out."""
+    nested: dict[str, Any] = {}
+    for key, value in values.items():
+        group, _, own = key.rpartition(".")
+        level = nested.setdefault(group, {}) if group else nested
+        level[own] = value
+    model = nested.pop("model", {})
+    if "model" in chosen:
+        nested["model"] = {**PRESETS[chosen["model"]].as_dict(), **model}
+    engine = nested.pop("engine", {})
+    if "engine" in chosen:
+        nested["engine"] = {"name": chosen["engine"], **engine}
+    if "picture" in chosen:
+        return {**nested, "picture": chosen["picture"]}
+    return {name: value for name, value in nested.items() if name in kind.__dataclass_fields__}
+
+
+def make_settings(command: str, values: dict[str, Any]) -> Command:
+    """Make the settings of a command, and check the values. This does not import torch."""
+    kind = WITH_SETTINGS[command]
+    if "picture" in values:
+        kind = PICTURES[values["picture"]]
+    made = dict(values)
+    if "model" in values:
+        made["model"] = config_from(values["model"])
+    engine = values.get("engine")
+    if engine is not None:
+        if engine["name"] not in ENGINES:
+            raise CFlowError(f"engine={engine['name']!r}: give one of {', '.join(ENGINES)}")
+        made["engine"] = _make(ENGINES[engine["name"]], engine, command)
+    for name, value in values.get("data", {}).items():
+        if name in DATA_SETTINGS and value != NOT_GIVEN:
+            checked(f"data.{name}", value, DATA_SETTINGS[name])
+    return _make(kind, made, command)  # type: ignore[return-value]
+
+
+def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Settings:
+    for name in values:
+        if name not in kind.__dataclass_fields__:  # type: ignore[attr-defined]
+            raise CFlowError(f"unknown setting {kind.PREFIX}{name}: `cflow {command} --cfg job` prints all settings")
+    return kind(**values)
 
 
 def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
@@ -94,8 +175,7 @@ def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
         chosen[group] = [default] if default else []
     for group in chosen.keys() & given.keys():
         is_plain = not set(given[group]) & set(_NOT_PLAIN)
-        words = [word.strip() for word in given[group].split(",")] if is_plain else []
-        chosen[group] = [word for word in words if not word.startswith("base_")]  # base_dense: no preset
+        chosen[group] = [word.strip() for word in given[group].split(",")] if is_plain else []
         for choice in chosen[group]:
             _check_choice(group, choice)
     if "experiment" in given or "row" in given:
@@ -117,8 +197,6 @@ def check_exists(path: str) -> None:
 
 
 def _check_choice(group: str, choice: str) -> None:
-    if group == "model" and choice in REMOVED_PRESETS:
-        raise CFlowError(removed_preset(choice))
     known = choices(group)
     if choice not in (*known, "null"):
         raise CFlowError(f"{group}={choice}{near(choice, known)}: give one of {', '.join(sorted(known))}")

@@ -11,13 +11,14 @@ import numpy as np
 from cflow_torch.data.arrays.cloud_file import read_columns
 from cflow_torch.data.arrow_file import FeatherFile
 from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
+from cflow_torch.data.camera import Camera, at_image, intrinsic_matrix
 from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_errors
-from cflow_torch.transforms import poses_from_quaternions, transform_points
+from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_errors, safe_name
+from cflow_torch.transforms import poses_at, poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array, vector_columns
 
 # Rule -> largest distance of a ground point from the surface, metres, and the function that rounds grid positions to
@@ -140,6 +141,65 @@ class AV2Log(BoxLog):
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read intensity, laser_number, offset_ns and any other numeric column of sweep `index`."""
         return read_columns(self._files[self._timestamp(index)])
+
+    def cameras(self, index: int) -> list[Camera]:
+        """Return all cameras of `calibration`; without images in `sensors/cameras`, at the time of the sweep."""
+        time = self._timestamp(index)
+        cameras = []
+        for name, (size, matrix, mount) in self._calibration.items():
+            image_time = min(self._image_times[name], key=lambda each: abs(each - time), default=time)
+            pose = self._poses[index] if image_time == time else self._pose_at(image_time)
+            T_camera_ego = at_image(mount, pose, self._poses[index])
+            cameras.append(Camera(name, str(image_time), size, matrix, T_camera_ego, (image_time - time) * 1e-9))
+        return cameras
+
+    @cached_property
+    def _calibration(self) -> dict[str, tuple[tuple[int, int], np.ndarray, np.ndarray]]:
+        """Camera -> width and height, intrinsic matrix, (4, 4) `T_ego_camera`; {} without files of calibration."""
+        intrinsics, mounts = (
+            self.folder / "calibration" / f"{name}.feather" for name in ("intrinsics", "egovehicle_SE3_sensor")
+        )
+        with remote_errors(self.folder):
+            if not (intrinsics.exists() and mounts.exists()):
+                return {}
+        stored = FeatherFile(mounts)
+        sensors: list[str] = stored.read(("sensor_name",)).column(0).to_pylist()
+        poses = dict(zip(sensors, _poses(stored, np.arange(stored.num_rows), sensors)))
+        stored = FeatherFile(intrinsics)
+        names: list[str] = stored.read(("sensor_name",)).column(0).to_pylist()
+        numbers = stored.matrix(("fx_px", "fy_px", "cx_px", "cy_px"))
+        sizes = stored.matrix(("width_px", "height_px"), np.int64)
+        return {
+            name: ((int(width), int(height)), intrinsic_matrix(*row), poses[name])
+            for name, row, (width, height) in zip(names, numbers, sizes)
+            if name in poses
+        }
+
+    @cached_property
+    def _image_times(self) -> dict[str, list[int]]:
+        """Camera -> times of its images, nanoseconds."""
+        folder = self.folder / "sensors" / "cameras"
+        with remote_errors(self.folder):
+            return {
+                name: [
+                    int(file.stem)
+                    for file in (folder / safe_name(name, "camera")).glob("*.jpg")
+                    if is_timestamp(file.stem)
+                ]
+                for name in self._calibration
+            }
+
+    def _pose_at(self, time: int) -> np.ndarray:
+        """Return the (4, 4) pose of the vehicle at the time of an image."""
+        times, poses = self._trajectory
+        return poses_at(np.array([time]), times, poses)[0]  # type: ignore[no-any-return]
+
+    @cached_property
+    def _trajectory(self) -> tuple[np.ndarray, np.ndarray]:
+        """All poses of the vehicle, (M, 4, 4), and their times, (M,) int64 nanoseconds."""
+        stored = FeatherFile(self.folder / "city_SE3_egovehicle.feather")
+        times, rows = np.unique(stored.vector("timestamp_ns", np.int64), return_index=True)
+        return times, _poses(stored, rows, times.tolist())
 
     def _points(self, index: int) -> np.ndarray:
         return FeatherFile(self._files[self.timestamps[index]]).matrix("xyz", np.float32)

@@ -22,11 +22,11 @@ from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_na
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.ground.segmentation import CHOICES, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
+from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, Sweep, Window
 from cflow_torch.windows.deskewing import SCANS
 
 _OF_ALL = ("find_ground", "odometry", "read_as", "own_vehicle", "deskew", "check")  # settings of every data set
-AUTO = "auto"  # recognise the data set
 _log = logging.getLogger(__name__)
 
 

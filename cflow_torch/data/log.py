@@ -10,6 +10,7 @@ from typing import Any, Iterator, Mapping, Sequence, TypeVar, overload
 import numpy as np
 from torch.utils.data import Dataset
 
+from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
 from cflow_torch.errors import MissingFile, warn
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
@@ -145,6 +146,11 @@ class Log(ABC):
         """
         self._timestamp(index)
         return {}
+
+    def cameras(self, index: int) -> Sequence[Camera]:
+        """Return the calibrated cameras at the time of sweep `index`; () if the log has no calibration of cameras."""
+        self._timestamp(index)
+        return ()
 
     def windows(self, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
         """Iterate over the windows of all pairs, in order; each sweep is read once. See `window`."""
@@ -285,6 +291,9 @@ class LogWrapper(Log):
 
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
         return self.log.columns(index)
+
+    def cameras(self, index: int) -> Sequence[Camera]:
+        return self.log.cameras(index)
 
     @property
     def notes(self) -> list[str]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gzip
 import io
+from functools import cached_property
 from pathlib import Path
 from typing import Sequence
 
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes
+from cflow_torch.data.camera import Camera, intrinsic_matrix
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.json_file import read_json
@@ -20,6 +22,7 @@ from cflow_torch.transforms import poses_from_json, transform_points, upright_po
 from cflow_torch.types import CFlowError, Sweep
 
 _GZIP = b"\x1f\x8b"  # first bytes of a compressed file
+_IMAGE_SIZE = (1920, 1080)  # width, height of all cameras
 _LIDARS = (0, 1)  # Pandar64, which rotates, and PandarGT, which looks forward
 _EVERY_LIDAR = -1  # sensor_id of a cuboid for both LiDARs; an object may instead have one cuboid for each
 _POSITION, _SIZE = ("position.x", "position.y", "position.z"), ("dimensions.y", "dimensions.x", "dimensions.z")
@@ -126,6 +129,41 @@ class PandaSetLog(Log):
         self._timestamp(index)
         columns = _columns(self._files[index])
         return {name: columns[name] for name in ("i", "t", "d") if name in columns}
+
+    def cameras(self, index: int) -> list[Camera]:
+        """Return all cameras of the folder `camera`, which have their own poses."""
+        time = self._timestamp(index) * 1e-9
+        cameras = []
+        for name, (matrix, poses, times) in self._camera_poses.items():
+            image = self._files[index].name.partition(".")[0]
+            T_camera_ego = np.linalg.inv(poses[index]) @ self._poses[index]
+            cameras.append(Camera(name, image, _IMAGE_SIZE, matrix, T_camera_ego, times[index] - time))
+        return cameras
+
+    @cached_property
+    def _camera_poses(self) -> dict[str, tuple[np.ndarray, np.ndarray, list[float]]]:
+        """Camera -> intrinsic matrix, (K, 4, 4) `T_world_camera`, and K unix times in seconds; {} without cameras."""
+        folder = self.folder / "camera"
+        with remote_errors(folder):
+            files = sorted(folder.glob("*/intrinsics.json"))
+        cameras = {}
+        for file in files:
+            with file_errors(file):
+                numbers = read_json(file)
+                matrix = intrinsic_matrix(*(float(numbers[name]) for name in ("fx", "fy", "cx", "cy")))
+            file = file.with_name("poses.json")
+            with file_errors(file):
+                poses = poses_from_json(read_json(file), "position", "heading", f"{file}: pose")
+            file = file.with_name("timestamps.json")
+            with file_errors(file):
+                times = [float(seconds) for seconds in read_json(file)]
+            if not len(poses) == len(times) == len(self._files):
+                raise CFlowError(
+                    f"{file.parent} has {len(poses)} poses and {len(times)} times of images for {len(self._files)} "
+                    "sweeps; copy it again"
+                )
+            cameras[file.parent.name] = (matrix, poses, times)
+        return cameras
 
     def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Read (N, 3) float32 points in the frame of the pose, (N,) float64 unix times in seconds, (N,) LiDAR index."""

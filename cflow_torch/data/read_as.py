@@ -19,6 +19,8 @@ from cflow_torch.windows.readings import AXES, CAMERA, CAUSES, EARLY, LATE, MOUN
 _OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
 _OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}  # axes of points and poses
 _OF_POSES = [name for name in OF_POSES if not name.startswith(MOUNT)]
+CHANGES_POINTS = frozenset({*_OF_BOTH, *_OF_POINTS})
+"""Readings under which the numbers of the points are others than those in the files."""
 READ_AS = ("auto", None, WORLD, LATE, EARLY, *_OF_POSES, *_OF_BOTH, *_OF_POINTS)
 
 

@@ -40,6 +40,8 @@ class EvalFrame:
         eval_mask: (N,) bool, True = scored; None = all.
         moving: (N,) bool, True = the point moves, even if its flow is unknown. Definitions with `truth="motion"` use
             it; None = points move by their true flow.
+        predicted_moving: (N,) bool, True = the point is predicted to move. Definitions with `truth="motion"` use it;
+            None = points move by their predicted flow.
         residual_axes: axes of `residual_flow`, "t+1" or "t". This package predicts in "t+1".
 
     Convention: everything is checked and converted to NumPy in the constructor.
@@ -57,6 +59,7 @@ class EvalFrame:
     is_ground: Array | None = None
     eval_mask: Array | None = None
     moving: Array | None = None
+    predicted_moving: Array | None = None
     residual_axes: str = "t+1"
 
     def __post_init__(self) -> None:
@@ -74,7 +77,7 @@ class EvalFrame:
         self._set("points", points.astype(np.float32))
         for name, dtype, shape in (
             *((name, np.float32, (rows, 3)) for name in ("residual_flow", "flow", "pose_flow")),
-            *((name, np.bool_, (rows,)) for name in ("is_ground", "eval_mask", "moving")),
+            *((name, np.bool_, (rows,)) for name in ("is_ground", "eval_mask", "moving", "predicted_moving")),
             ("T_ego1_ego0", np.float64, (4, 4)),
         ):
             self._set(name, _checked(name, getattr(self, name), dtype, shape))
@@ -108,6 +111,7 @@ class EvalFrame:
         if pose0 is not None and pose1 is not None:
             parts.setdefault("T_ego1_ego0", np.linalg.inv(as_numpy(pose1, np.float64)) @ as_numpy(pose0, np.float64))
         parts.setdefault("is_ground", window.pc0.is_ground)
+        parts.setdefault("predicted_moving", result.is_moving)
         if stored_motion is not None:
             points = torch.as_tensor(as_numpy(window.pc0.points)[:, :3])
             residual = result.residual_flow.cpu()

@@ -13,7 +13,8 @@ from cflow_torch.evaluation.scored_points import Accumulator, ScoredPoints
 class MovingIoU(Accumulator):
     """IoU of the points that truly move and of those that are predicted to move, over all points of all frames.
 
-    A point is predicted to move if its residual flow is at least `dynamic_threshold`.
+    Frames say which points are predicted to move (`FlowResult.is_moving`). Otherwise, these are the points whose
+    residual flow is at least `dynamic_threshold`.
     """
 
     def __init__(self, definition: Definition) -> None:

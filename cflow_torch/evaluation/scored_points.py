@@ -105,6 +105,9 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
     is_dynamic = np.linalg.norm(true_residual, axis=1) >= threshold
     if definition.truth == "motion" and frame.moving is not None:
         is_dynamic |= as_numpy(frame.moving)[keep]
+    predicted_dynamic = np.linalg.norm(flows.total - flows.pose_flow, axis=1) >= threshold
+    if definition.truth == "motion" and frame.predicted_moving is not None:
+        predicted_dynamic = as_numpy(frame.predicted_moving)[keep]
     difference = residual.astype(definition.norm_dtype) - true_residual.astype(definition.norm_dtype)
     return ScoredPoints(
         error=np.linalg.norm(difference, axis=1).astype(np.float64),
@@ -117,7 +120,7 @@ def score_points(frame: EvalFrame, definition: Definition) -> ScoredPoints:
         true_flow=true_flow.astype(np.float64),
         predicted_flow=predicted_flow.astype(np.float64),
         is_dynamic=is_dynamic,
-        predicted_dynamic=np.linalg.norm(flows.total - flows.pose_flow, axis=1) >= threshold,
+        predicted_dynamic=predicted_dynamic,
         num_nan=num_nan,
     )
 

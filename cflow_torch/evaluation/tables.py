@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, Callable, List, Sequence, Tuple
 
-Table = Tuple[List[str], List[List[Any]]]
+TextTable = Tuple[List[str], List[List[Any]]]
 
 
 def format_table(results: dict[str, Any]) -> str:
@@ -23,7 +23,7 @@ def format_table(results: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _static_and_dynamic(of: str, title: str, key: str, scores: dict[str, Any]) -> Table:
+def _static_and_dynamic(of: str, title: str, key: str, scores: dict[str, Any]) -> TextTable:
     rows = []
     for name, row in scores.items():
         counts = [row.get("num_static", ""), row.get("num_dynamic", "")]
@@ -32,7 +32,7 @@ def _static_and_dynamic(of: str, title: str, key: str, scores: dict[str, Any]) -
     return [of, "static EPE [m]", title, "static points", "dynamic points"], rows
 
 
-def _by_range(scores: dict[str, Any]) -> Table:
+def _by_range(scores: dict[str, Any]) -> TextTable:
     classes = next(iter(scores["ranges"].values()))["classes"]
     moving = [name for name in classes if name != "BACKGROUND"]
     rows = []
@@ -43,20 +43,20 @@ def _by_range(scores: dict[str, Any]) -> Table:
     return ["dynamic error, range [m]", *moving, "mean"], rows
 
 
-def _three_way(scores: dict[str, Any]) -> Table:
+def _three_way(scores: dict[str, Any]) -> TextTable:
     keys = ("epe_3way", "epe_fd", "epe_fs", "epe_bs", "dynamic_iou")
     titles = ["EPE 3-way [m]", "EPE FD [m]", "EPE FS [m]", "EPE BS [m]", "dynamic IoU"]
     return titles, [[_number(scores[key]) for key in keys]]
 
 
-def _moving(scores: dict[str, Any]) -> Table:
+def _moving(scores: dict[str, Any]) -> TextTable:
     ratios = [_number(scores[key]) for key in ("iou", "precision", "recall")]
     counts = [scores[key] for key in ("num_moving", "num_predicted", "num_points")]
     titles = ["moving IoU", "precision", "recall", "moving points", "predicted", "points"]
     return titles, [[*ratios, *counts]]
 
 
-_TABLES: dict[str, Callable[[dict[str, Any]], Table]] = {
+_TABLES: dict[str, Callable[[dict[str, Any]], TextTable]] = {
     "bucketed": lambda scores: _static_and_dynamic(
         "class", "dynamic error", "dynamic_error", {**scores["classes"], "mean": scores["mean"]}
     ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from cflow_torch.data.file_errors import shortened
+from cflow_torch.errors import CFlowError
 
 _SHOWN = 5  # changed settings that a message lists
 
@@ -17,6 +18,14 @@ def flatten(value: Any, name: str = "") -> dict[str, Any]:
     for key, member in value.items():
         leaves.update(flatten(member, f"{name}.{key}" if name else str(key)))
     return leaves
+
+
+def check_same_run(folder: Any, before: Any, now: Any, free: Any = ()) -> None:
+    """Raise a `CFlowError`, which lists the changes, if `folder` has results of other settings. `free` may differ."""
+    changes = describe_changes(before, now, free)
+    if changes:
+        why = f"{folder} has results of another run ({changes})"
+        raise CFlowError(f"{why}: give overwrite=true, or output=FOLDER")
 
 
 def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:

@@ -20,7 +20,7 @@ class CannotStart(CFlowError):
 
 
 class Executor(ABC):
-    """A process that holds one object. The first call starts it, and so does the first call after `close`."""
+    """A process that holds one object. A call starts it if it has not begun, has ended or was closed."""
 
     @abstractmethod
     def submit(self, method: str, *arguments: Any) -> Future[Any]:
@@ -69,7 +69,9 @@ class ProcessExecutor(Executor):
             answer, error = pipe.recv()
         except (EOFError, OSError):
             process.join()
-            raise BrokenExecutor(_ending(process.exitcode)) from None
+            how = _ending(process.exitcode)
+            self.close()
+            raise BrokenExecutor(how) from None
         if error is not None:
             raise error
         return answer
@@ -81,7 +83,7 @@ class ProcessExecutor(Executor):
         try:
             process.start()
         except OSError as error:
-            raise BrokenExecutor(f"it could not start: {describe(error)}") from error
+            raise BrokenExecutor(f"it could not start: {describe_error(error)}") from error
         finally:
             pipe.close()
         self._process = process
@@ -113,10 +115,10 @@ def make_object(make: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return make(*arguments)
     except Exception as error:
-        raise CannotStart(describe(error)) from error
+        raise CannotStart(describe_error(error)) from error
 
 
-def describe(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Describe an error in one line; its class is named unless the text says enough."""
     text = " ".join(str(error).split()) or "no message"
     return text if isinstance(error, (CFlowError, OSError, BrokenExecutor)) else f"{type(error).__name__}: {text}"

@@ -7,7 +7,7 @@ from typing import Any, Mapping, NamedTuple, Sequence, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
-from cflow_torch.fleet.machine import AUTO
+from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError
 
 # So that the last part does not keep the other workers waiting for long. A log is divided only if there are too few
@@ -20,7 +20,7 @@ class Job:
     """The settings of a run, which every worker gets. The parts are sent separately."""
 
     config: Config  # settings of the method
-    identity: str  # hash of method, data settings and versions, see `cflow_torch.fleet.manifest`
+    identity: dict[str, Any]  # method, data settings and versions, see `make_identity`
     reader: str  # data set, a key of `catalog.DATA_SETS`
     settings: dict[str, Any]  # of its reader
     output: str  # folder of the results; a path, or the address of an object store
@@ -39,7 +39,7 @@ class Part:
     end: int = 1
     of: int = 1
     only: int | None = None  # time stamp of the only frame to do; None = all of them
-    attempt: int = 1
+    is_retry: bool = False  # a worker has died on it
 
     def frames(self, num_pairs: int) -> range:
         """Indices of the sweeps t, in a log of `num_pairs` pairs."""

@@ -9,10 +9,10 @@ from typing import Any, Mapping, NamedTuple
 import torch
 
 from cflow_torch.config import Config
+from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.memory import available_memory, control_groups
 
-AUTO = "auto"
 # Bytes of one worker: nearly twice the most that we measured with `default`, see docs/fleet.md.
 WORKER_MEMORY = 1_500_000_000
 # Windows that are computed together. On a CPU, up to 4 are faster, because there are fewer small operations; more are

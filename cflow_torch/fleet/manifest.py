@@ -1,7 +1,7 @@
 """The files in an output folder, and the manifests that keep results of different settings or inputs apart.
 
-OUTPUT/runs/<hash>.json           identity of a run: method, data settings, contents, versions
-OUTPUT/<log id>/manifest.json     hash of the run, time stamps of the log, digests of its first, middle and last sweep
+OUTPUT/<log id>/manifest.json     identity of the run: method, data settings, contents, versions; time stamps of the
+                                  log, and digests of its first, middle and last sweep
 OUTPUT/<log id>/<ns>.feather      a frame; its file gets this name when it is complete
 OUTPUT/<log id>/tracks.parquet    moving objects of a log whose frames are all complete
 OUTPUT/sequences/<log id>/predictions/<sweep>.label    moving points of such a log
@@ -23,7 +23,7 @@ import torch
 
 from cflow_torch import __version__
 from cflow_torch.config import Config
-from cflow_torch.data.atomic import remove_stale, write_text
+from cflow_torch.data.atomic import write_text
 from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.data.json_file import json_ready, read_json
 from cflow_torch.data.log import Log
@@ -32,11 +32,11 @@ from cflow_torch.fleet.changes import describe_changes
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
-RUNS = "runs"
-_FORMAT = 1
+_FORMAT = 2
 _ENDING = b"ARROW1"  # last bytes of a feather file
 _TRACKS = r"tracks\.parquet|mot\.txt|kitti\.txt|instances_info\.json|frame_instances\.json"
-_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|\..+\.tmp")
+_DETECTIONS = r"nuscenes_detection\.json|nuscenes_tracking\.json|result\.pkl"
+_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|{_DETECTIONS}|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 _OVERWRITE = "give overwrite=true"
 
@@ -68,55 +68,31 @@ def check_logs(
 
     `resume` continues an earlier run of the same identity. `overwrite` replaces the results of other runs. It is
     allowed only if you are `alone`, that is, if no other shard works on these logs. A worker checks a log again when it
-    has opened it (`claim_log`).
+    has opened it (`claim_log`); in an object store, which takes a while for each log, we leave it to the workers.
     """
     forget_listings(output)
-    runs = output / RUNS
-    with remote_errors(runs):
-        known = {file.name for file in runs.iterdir()} if runs.is_dir() else set()
-    has_others = bool(known - {run_file(output, str(identity["hash"])).name})
-    for name in names if has_others or not resume else ():  # an object store takes a while for each log
-        before = _read(output / name / MANIFEST)
-        if before is None or (overwrite and alone) or not complete_frames(output / name):
+    if (overwrite and alone) or (resume and is_remote(output)):
+        return
+    for folder in (output / name for name in names):
+        before = _read(folder / MANIFEST)
+        if before is None or not complete_frames(folder):
             continue
-        if before.get("run") != identity["hash"]:
-            raise _of_another_run(output / name, before, identity, "remove that folder" if overwrite else _OVERWRITE)
+        _check_run(folder, before, identity, "remove that folder" if overwrite else _OVERWRITE)
         if not (resume or overwrite):
-            raise CFlowError(f"{output / name} has results with the same settings: give resume=true or overwrite=true")
+            raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
 
 
-def claim_run(output: Path, identity: Mapping[str, Any], replaced: Iterable[str] = ()) -> None:
-    """Write the identity of a run, and remove the older results of the logs `replaced`."""
-    for name in replaced:
-        _clear(output / name)
-    remove_stale(output)
-    write_text(run_file(output, str(identity["hash"])), _text(identity))
-
-
-def release_run(output: Path, run: str) -> None:
-    """Remove the manifests of a run that has no frame, so that they keep no other run away."""
-    folders = [path for path in output.iterdir() if path.is_dir()] if output.is_dir() else []
-    for folder in folders:
-        if (_read(folder / MANIFEST) or {}).get("run") == run and not complete_frames(folder):
-            _clear(folder)
-    with suppress(FileNotFoundError):
-        run_file(output, run).unlink()
-    with suppress(OSError):  # another run is there
-        (output / RUNS).rmdir()
-
-
-def claim_log(folder: Path, log: Log, run: str) -> None:
+def claim_log(folder: Path, log: Log, identity: Mapping[str, Any]) -> None:
     """Make sure that the frames in a log's folder were computed from this log, and write its manifest.
 
     A log that has changed since, or another log of its name, is a `CFlowError`. Cost: reads three sweeps.
     """
-    now = describe_log(log, run)
+    now = {"run": dict(identity), **describe_log(log)}
     before = _read(folder / MANIFEST)
-    if before is None or (before.get("run") != run and not complete_frames(folder)):
+    if before is None or (before.get("run") != identity and not complete_frames(folder)):
         write_text(folder / MANIFEST, _text(now))
     before = _read(folder / MANIFEST) or {}  # another process may have been quicker
-    if before.get("run") != run:
-        raise _of_another_run(folder, before, _read(run_file(folder.parent, run)) or {}, _OVERWRITE)
+    _check_run(folder, before, identity, _OVERWRITE)
     is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
     both = now["sweeps"].keys() & (before.get("sweeps") or {}).keys()
     if not is_same or any(before["sweeps"][key] != now["sweeps"][key] for key in both):
@@ -126,24 +102,22 @@ def claim_log(folder: Path, log: Log, run: str) -> None:
         )
 
 
-def _of_another_run(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any], remedy: str) -> CFlowError:
-    """Return the error for a log with results of another run; it lists the changes of settings if they are known."""
-    other = _read(run_file(folder.parent, str(before.get("run"))))
-    changes = describe_changes(other, now, ["hash"]) if other is not None and now else ""
-    if other is not None and now and other["data"]["reader"] != now["data"]["reader"]:
-        changes = f"of data={other['data']['reader']}, not {now['data']['reader']}"
-    return CFlowError(
+def _check_run(folder: Path, manifest: Mapping[str, Any], identity: Mapping[str, Any], remedy: str) -> None:
+    """Raise a `CFlowError`, which lists the changes of settings, if a log has results of another run."""
+    before: Any = manifest.get("run")
+    if before == identity:
+        return
+    is_known = isinstance(before, dict)  # earlier versions stored a hash
+    changes = describe_changes(before, identity, ["hash"]) if is_known else ""
+    if is_known and before["data"]["reader"] != identity["data"]["reader"]:
+        changes = f"of data={before['data']['reader']}, not {identity['data']['reader']}"
+    raise CFlowError(
         f"{folder} has results of another run{f' ({changes})' if changes else ''}: {remedy}, or give output=FOLDER"
     )
 
 
-def run_file(output: Path, run: str) -> Path:
-    """Return the file with the identity of a run, whose hash is `run`; every process of the run sees it."""
-    return output / RUNS / f"{run[:16]}.json"
-
-
-def describe_log(log: Log, run: str) -> dict[str, Any]:
-    """Return the manifest of a log: time stamps, and digests of its first, middle and last sweep.
+def describe_log(log: Log) -> dict[str, Any]:
+    """Describe a log: its id, its time stamps, and digests of its first, middle and last sweep.
 
     A sweep that cannot be read has no digest; its frames fail later.
     """
@@ -152,7 +126,33 @@ def describe_log(log: Log, run: str) -> dict[str, Any]:
     for index in sorted({0, len(stamps) // 2, len(stamps) - 1} & set(range(len(stamps)))):
         with suppress(CFlowError, OSError):
             digests[str(stamps[index])] = _digest(log, index)
-    return {"run": run, "log_id": log.log_id, "timestamps": stamps, "sweeps": digests}
+    return {"log_id": log.log_id, "timestamps": stamps, "sweeps": digests}
+
+
+def clear_log(folder: Path) -> None:
+    """Remove the results of a log and no other files.
+
+    We remove the manifest last, because it marks the folder as ours.
+    """
+    if not (folder / MANIFEST).exists():
+        return
+    labels = labels_folder(folder.parent, folder.name)
+    for file in labels.iterdir() if labels.is_dir() else ():
+        if _LABELS.fullmatch(file.name):
+            file.unlink()
+    masks = masks_folder(folder.parent, folder.name)
+    for camera in masks.iterdir() if masks.is_dir() else ():
+        for file in camera.glob("*.png"):
+            file.unlink()
+        with suppress(OSError):
+            camera.rmdir()
+    with suppress(OSError):
+        masks.rmdir()
+    for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
+        if _OURS.fullmatch(file.name):
+            file.unlink()
+    with suppress(OSError):  # it has other files, or an object store has no folders
+        folder.rmdir()
 
 
 def complete_frames(folder: Path) -> set[int]:
@@ -179,6 +179,11 @@ def labels_folder(output: Path, log_id: str) -> Path:
     return output / "sequences" / log_id / "predictions"
 
 
+def masks_folder(output: Path, log_id: str) -> Path:
+    """Return the folder of the masks of a log's images, which has a folder for each camera."""
+    return output / log_id / "masks"
+
+
 def _is_whole(file: Path) -> bool:
     with suppress(OSError), open(file, "rb") as opened:
         opened.seek(-len(_ENDING), os.SEEK_END)
@@ -192,24 +197,6 @@ def _digest(log: Log, index: int) -> str:
     for values in (sweep.points, sweep.is_ground, sweep.pose):
         digest.update(b"none" if values is None else as_numpy(values).tobytes())
     return digest.hexdigest()
-
-
-def _clear(folder: Path) -> None:
-    """Remove the results of a log and no other files.
-
-    We remove the manifest last, because it marks the folder as ours.
-    """
-    if not (folder / MANIFEST).exists():
-        return
-    labels = labels_folder(folder.parent, folder.name)
-    for file in labels.iterdir() if labels.is_dir() else ():
-        if _LABELS.fullmatch(file.name):
-            file.unlink()
-    for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
-        if _OURS.fullmatch(file.name):
-            file.unlink()
-    with suppress(OSError):  # it has other files, or an object store has no folders
-        folder.rmdir()
 
 
 def _read(file: Path) -> dict[str, Any] | None:

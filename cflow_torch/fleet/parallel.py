@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, wait
 from contextlib import closing
 from dataclasses import replace
-from typing import Any, Callable, Iterator, Sequence
+from typing import Callable, Iterator, Sequence
 
-from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, describe
+from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.progress import log_line
 from cflow_torch.fleet.work import Worker, make_worker, source_name
-from cflow_torch.types import CFlowError
 
 _POLL_S = 0.2  # how soon a signal is noticed
 _GRACE_S = 20.0  # after a signal, time to finish the frames that have begun; schedulers kill after 30 s or more
-_MAX_LOST = 3  # processes in a row that end without an answer; then we give up the worker
 _REMEDY = "if memory is short, give fewer engine.workers"
-_NEVER = float("inf")
 
 
 def run_local(
@@ -48,9 +45,9 @@ def run_local(
 
 
 def run_parallel(
-    executors: Sequence[Executor], parts: Sequence[Part], stop: Callable[[], bool], timeout: float = _NEVER
+    executors: Sequence[Executor], parts: Sequence[Part], stop: Callable[[], bool], timeout: float = math.inf
 ) -> Iterator[Event]:
-    """Do all parts, and yield events as they happen. If no worker can start, that is a `CFlowError`.
+    """Do all parts, and yield events as they happen. A worker that cannot start is a `CFlowError`.
 
     Args:
         executors: of `Worker` objects.
@@ -58,104 +55,87 @@ def run_parallel(
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
         timeout: seconds after which a worker that has not answered is replaced.
     """
-    todo, end = deque(parts), _NEVER
-    workers = [_Worker(executor, todo, timeout) for executor in executors]
+    todo = deque(parts)
+    idle = list(executors)
+    tasks: list[_Task] = []
+    end = math.inf
     try:
         while time.monotonic() < end:
             is_stopped = stop()
-            if is_stopped and end == _NEVER:
-                end = time.monotonic() + _GRACE_S
-            for worker in workers:
-                if todo and worker.part is None and not is_stopped:
-                    worker.begin(todo.popleft())
-            answers = [worker.answer for worker in workers if worker.part is not None]
-            if not answers:
+            if is_stopped:
+                end = min(end, time.monotonic() + _GRACE_S)
+            while todo and idle and not is_stopped:
+                tasks.append(_Task(idle.pop(), todo.popleft(), timeout))
+            if not tasks:
                 break
-            wait(answers, _POLL_S, FIRST_COMPLETED)
-            for worker in workers:
-                yield from worker.follow(is_stopped)
-            workers = _without_broken(workers)
+            wait([task.answer for task in tasks], _POLL_S, FIRST_COMPLETED)
+            for task in tasks:
+                yield from task.follow(is_stopped, todo)
+            idle += [task.executor for task in tasks if task.is_done]
+            tasks = [task for task in tasks if not task.is_done]
     finally:
         for executor in executors:
             executor.close()
 
 
-class _Worker:
-    """A `Worker` in an executor, and the part that it does."""
+class _Task:
+    """A part of a log that a `Worker` in an executor does."""
 
-    def __init__(self, executor: Executor, todo: deque[Part], timeout: float) -> None:
-        self.executor, self.todo, self.timeout = executor, todo, timeout
-        self.part: Part | None = None
-        self.answer: Future[Any] = Future()
-        self.problem = ""  # why it is given up
-        self._deadline = _NEVER
-        self._num_lost = 0  # processes since the last answer
-        self._name = ""  # of the log
-        self._missing: set[int] | None = None  # time stamps of frames without a result; None = the part is not open
-
-    def begin(self, part: Part) -> None:
-        self.part, self._missing = part, None
-        self._name = source_name(part.source)
+    def __init__(self, executor: Executor, part: Part, timeout: float) -> None:
+        self.executor = executor
+        self.is_done = False
+        self._part = part
+        self._timeout = timeout
+        self._name = source_name(part.source)  # of the log
+        self._missing: set[int] | None = None  # time stamps of frames without a result; None = the log is not open
         self._ask(part, False)
 
     def _ask(self, part: Part | None, is_stopped: bool) -> None:
         self.answer = self.executor.submit("next_event", part, is_stopped)
-        self._deadline = time.monotonic() + self.timeout
+        self._deadline = time.monotonic() + self._timeout
 
-    def follow(self, is_stopped: bool) -> Iterator[Event]:
+    def follow(self, is_stopped: bool, todo: deque[Part]) -> Iterator[Event]:
         """Yield the event that the worker has answered, if it has, and ask for the next one."""
-        part, is_late = self.part, time.monotonic() > self._deadline
-        if part is None or not (self.answer.done() or is_late):
+        is_late = time.monotonic() > self._deadline
+        if not (self.answer.done() or is_late):
             return
-        error = self.answer.exception() if self.answer.done() else BrokenExecutor(f"no answer for {self.timeout:g} s")
+        error = self.answer.exception() if self.answer.done() else BrokenExecutor(f"no answer for {self._timeout:g} s")
         if isinstance(error, CannotStart):
-            self.part, self.problem = None, str(error)
-            self.todo.appendleft(part)
-        elif error is not None:
-            how = describe(error)
+            raise error
+        if error is not None:
             self.executor.close()
-            self.part, self._num_lost = None, self._num_lost + 1
-            if self._num_lost == _MAX_LOST:
-                self.problem = f"{_MAX_LOST} workers died before they began, the last one: {how}: {_REMEDY}"
-            yield from self._try_again(part, how)
-        elif self.answer.result() is None:
-            self.part = None
-        else:
-            yield from self._pass_on(part, self.answer.result())
-            self._num_lost = 0
-            self._ask(None, is_stopped)
+            self.is_done = True
+            yield from self._try_again(todo, describe_error(error))
+            return
+        event: Event | None = self.answer.result()
+        if event is None:
+            self.is_done = True
+            return
+        yield from self._pass_on(event)
+        self._ask(None, is_stopped)
 
-    def _pass_on(self, part: Part, event: Event) -> Iterator[Event]:
+    def _pass_on(self, event: Event) -> Iterator[Event]:
         if isinstance(event, Opened):
-            self._name, self._missing = event.log_id, set(event.todo)
-            if part.only is None:
+            self._name = event.log_id
+            self._missing = set(event.todo)
+            if self._part.only is None:
                 yield event
             elif not event.todo:  # its file was written just before the first worker died
-                yield Done(part.number, part.only, {})
+                yield Done(self._part.number, self._part.only, {})
             return
         if isinstance(event, (Done, Failed)) and self._missing is not None:
             self._missing.discard(event.timestamp)  # type: ignore[arg-type]
         yield event
 
-    def _try_again(self, part: Part, how: str) -> Iterator[Event]:
-        """Try each missing frame by itself. A frame, or a log that did not open, is tried once more, then reported."""
-        if part.only is None and self._missing is not None:
-            self.todo.extend(replace(part, only=stamp, attempt=1) for stamp in sorted(self._missing))
-        elif part.attempt == 1:
-            self.todo.append(replace(part, attempt=2))
-        else:
+    def _try_again(self, todo: deque[Part], how: str) -> Iterator[Event]:
+        """Try each frame that has no result once more, alone, or the log if it did not open; then report it."""
+        part = self._part
+        if part.is_retry:
             name = self._name if part.only is None else f"{self._name}/{part.only}"
-            yield Failed(part.number, name, f"2 workers died on it, the last one: {how}", part.only)
+            yield Failed(part.number, name, f"its worker died again ({how}): {_REMEDY}", part.only)
             return
+        if self._missing is None:
+            todo.append(replace(part, is_retry=True))
+        else:
+            todo.extend(replace(part, only=stamp, is_retry=True) for stamp in sorted(self._missing))
         yield Noted(part.number, self._name, f"a worker died ({how}): its frames are tried again, one by one")
-
-
-def _without_broken(workers: Sequence[_Worker]) -> list[_Worker]:
-    """Leave out the workers that have a problem, and print it. If no other is left, it is a `CFlowError`."""
-    left = [worker for worker in workers if not worker.problem]
-    for worker in workers:
-        if worker.problem and not left:
-            raise CFlowError(worker.problem)
-        if worker.problem:
-            log_line(f"{worker.problem}; going on with {len(left)} workers")
-    return left

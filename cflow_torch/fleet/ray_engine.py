@@ -14,12 +14,13 @@ from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.errors import CFlowError, import_optional
-from cflow_torch.fleet.executors import Executor, describe, make_object
+from cflow_torch.fleet.executors import Executor, describe_error, make_object
 from cflow_torch.fleet.job import Event, Job, Part
-from cflow_torch.fleet.machine import AUTO, Layout
-from cflow_torch.fleet.manifest import make_identity, run_file
+from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.manifest import make_identity
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.work import Worker, make_worker
+from cflow_torch.setting import AUTO
 
 _OBJECT_STORE_BYTES = 200 * 2**20  # it holds names and events only; Ray's default is 30 % of the memory
 
@@ -79,9 +80,9 @@ def make_worker_on_node(folder: str, job: Job, device: str) -> Worker:
     import ray
 
     node = ray.util.get_node_ip_address()
-    if make_identity(job.config, job.reader, job.settings, job.contents)["hash"] != job.identity:
+    if make_identity(job.config, job.reader, job.settings, job.contents) != job.identity:
         raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than the driver")
-    if not run_file(as_path(job.output), job.identity).exists():
+    if not as_path(job.output).is_dir():
         raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")
     with suppress(OSError):  # relative paths of data must mean the same as in the driver
         os.chdir(folder)
@@ -137,7 +138,7 @@ def _connect(ray: ModuleType, settings: dict[str, Any]) -> None:
         ray.init(logging_level=logging.ERROR, **settings)
     except Exception as error:
         where = f"engine.address={settings['address']}"
-        raise CFlowError(f"{where}: cannot connect to a Ray cluster: {describe(error)}") from error
+        raise CFlowError(f"{where}: cannot connect to a Ray cluster: {describe_error(error)}") from error
     finally:
         with suppress(ValueError):  # in another thread
             signal.signal(signal.SIGTERM, before)

@@ -13,7 +13,7 @@ from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.executors import describe
+from cflow_torch.fleet.executors import describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import complete_frames
@@ -26,7 +26,7 @@ from cflow_torch.types import CFlowError
 
 _SHOWN_NOTES = 3  # how often a message is shown; the report names every log with this message
 _SHOWN_FAILURES = 20  # that are listed at the end; the report has them all
-ENGINES: dict[str, Any] = {"local": run_local, "ray": run_ray}
+_ENGINES: dict[str, Any] = {"local": run_local, "ray": run_ray}
 
 
 def run_fleet(
@@ -40,19 +40,19 @@ def run_fleet(
 ) -> dict[str, Any]:
     """Compute the frames of a shard that are not complete, and write a report.
 
-    Call `manifest.check_logs` and `manifest.claim_run` first. `sources` are the logs of all shards.
+    Call `manifest.check_logs` first. `sources` are the logs of all shards.
 
     Returns:
         The report of `Counters.report` with the entries of `about`. It is also written to OUTPUT/reports/<shard>.json.
         "exit_status" is 0 if every frame of the shard is on disk, 1 if not or if the report could not be written. It is
         130 after Ctrl-C, 143 after SIGTERM and 129 after SIGHUP.
     """
-    if engine not in ENGINES:
-        raise CFlowError(f"engine={engine!r}: give one of {', '.join(ENGINES)}")
+    if engine not in _ENGINES:
+        raise CFlowError(f"engine={engine!r}: give one of {', '.join(_ENGINES)}")
     parts = shard.parts(sources, len(layout.devices))
     counters = Counters(parts)
     start = time.perf_counter()
-    with StopSignal() as stop, closing(ENGINES[engine](job, parts, layout, stop, **engine_settings)) as events:
+    with StopSignal() as stop, closing(_ENGINES[engine](job, parts, layout, stop, **engine_settings)) as events:
         try:
             _follow(events, counters, len(parts))
         except KeyboardInterrupt:
@@ -107,7 +107,7 @@ def count_frames(job: Job, parts: Iterable[Part]) -> Iterator[tuple[str, int, in
                 complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
                 yield log.log_id, len(stamps), len(stamps - complete)
         except Exception as error:
-            yield f"{source_name(part.source)}: cannot be opened: {describe(error)}", 0, 0
+            yield f"{source_name(part.source)}: cannot be opened: {describe_error(error)}", 0, 0
 
 
 def forecast(job: Job, parts: Sequence[Part]) -> str:

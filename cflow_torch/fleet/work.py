@@ -22,7 +22,7 @@ from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.paths import as_path, safe_name
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.executors import describe
+from cflow_torch.fleet.executors import describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
 from cflow_torch.fleet.progress import show_warnings_as_lines
@@ -52,7 +52,7 @@ class Worker:
         try:
             torch.zeros(1, device=device)  # fails now, not at every frame
         except (RuntimeError, AssertionError) as error:
-            raise CFlowError(f"no worker can start on {device}: {describe(error)}") from error
+            raise CFlowError(f"no worker can start on {device}: {describe_error(error)}") from error
         self._job, self._device, self._ahead = job, device, _AHEAD
         self._model: Any = make_model(job.config, device)
         self._model.inspect = None  # the log is checked instead
@@ -83,7 +83,7 @@ class Worker:
         except BrokenExecutor:
             raise
         except Exception as error:
-            yield Failed(part.number, source_name(part.source), describe(error))
+            yield Failed(part.number, source_name(part.source), describe_error(error))
 
     def _run(self, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
         log = self._open(part.source)
@@ -107,7 +107,7 @@ class Worker:
             if checks and frame.is_repetition:
                 yield Noted(part.number, name, "the next sweep has the same points")
             if isinstance(frame.content, Exception):
-                yield Failed(part.number, name, describe(frame.content), frame.timestamp)
+                yield Failed(part.number, name, describe_error(frame.content), frame.timestamp)
             else:
                 yield Done(part.number, frame.timestamp, frame.seconds)
 
@@ -173,7 +173,7 @@ class Worker:
         try:
             torch.zeros(1, device=self._device).item()
         except RuntimeError as error:
-            raise BrokenExecutor(f"{self._device} can no longer be used: {describe(error)}") from error
+            raise BrokenExecutor(f"{self._device} can no longer be used: {describe_error(error)}") from error
 
     def _write(self, folder: Path, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):

@@ -8,7 +8,7 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.errors import import_optional
-from cflow_torch.integrations.sequence import Frame, SequenceFlow, times_in_ns
+from cflow_torch.integrations.sequence import SequenceFlow, SequenceSweep, times_in_ns
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, check_array
 
@@ -73,7 +73,7 @@ class CorrelationFlowEstimator(SequenceFlow):
 
 
 @dataclass(frozen=True)
-class _LogFrame(Frame):
+class _LogFrame(SequenceSweep):
     """A frame with the id of its log and its index in this log."""
 
     log_id: str = ""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.errors import import_optional
-from cflow_torch.integrations.sequence import Frame, SequenceFlow
+from cflow_torch.integrations.sequence import SequenceFlow, SequenceSweep
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, check_array
 
@@ -60,7 +60,7 @@ def register(name: str = "CorrelationFlow") -> None:
     import_optional("models", _NEED, "name_to_class_lookup")[name.lower()] = CorrelationFlowModel
 
 
-def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
+def _read_sequence(sequence: Any, name: str) -> tuple[list[SequenceSweep], int, Tensor]:
     """Return sweeps without padding, the index of the first one to estimate, and the (K, PadN) mask (1, 0, NaN)."""
     points = sequence.full_pc
     mask = sequence.full_pc_mask
@@ -76,7 +76,7 @@ def _read_sequence(sequence: Any, name: str) -> tuple[list[Frame], int, Tensor]:
         check_array(pose, f"{name}.{side}", (len(points), 4, 4), "f", f"({len(points)}, 4, 4) floats, one per sweep")
         poses.append([rigid_transform(matrix, f"{name}.{side}[{k}]") for k, matrix in enumerate(pose.detach().cpu())])
     frames = [
-        Frame(cloud[rows], flags[rows] > 0, sensor_to_ego, ego_to_global)
+        SequenceSweep(cloud[rows], flags[rows] > 0, sensor_to_ego, ego_to_global)
         for cloud, flags, rows, sensor_to_ego, ego_to_global in zip(points, mask, is_row, *poses)
     ]
     valid = (mask > 0).float().masked_fill(~is_row, torch.nan)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cflow_torch.config import make_config
+from cflow_torch.config import Config
 from cflow_torch.data.log import window
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
@@ -24,7 +24,7 @@ from cflow_torch.windows.ego_motion import compensate
 
 
 @dataclass(frozen=True)
-class Frame:
+class SequenceSweep:
     """One sweep of a sequence."""
 
     points: Array  # (N, 3) float, metres, in the frame of the sensor
@@ -47,22 +47,24 @@ class SequenceFlow(nn.Module):
     """Base class of models that estimate residual flow from frames. They have no parameters and no buffers.
 
     Args:
-        preset: "default", "offline", "live", "keypoints" or "paper" (`make_config`).
+        preset: as for `make_config`.
         device: "auto" = that of the given tensors, else a GPU if there is one, else the CPU.
         ground: None = the masks of the frames exclude the ground (`with_ground=False`). Otherwise the `method` of
             `find_ground`, by which we find the ground of every sweep and exclude it, too.
-        **settings: `method`, or any setting of the method.
+        **settings: any setting of the method.
     """
 
-    def __init__(self, preset: str | None = None, device: Any = "auto", ground: str | None = None, **settings: Any):
+    def __init__(
+        self, preset: str | Config = "default", device: Any = "auto", ground: str | None = None, **settings: Any
+    ) -> None:
         super().__init__()
-        self.model = make_model(make_config(preset, **settings), device)
+        self.model = make_model(preset, device, **settings)
         self.num_history: int = self.model.config.num_history
         self.ground = ground
         self._has_checked_ground = False
 
     @torch.no_grad()
-    def flows(self, sequences: Sequence[Sequence[Frame]], firsts: Sequence[int]) -> list[list[Tensor]]:
+    def flows(self, sequences: Sequence[Sequence[SequenceSweep]], firsts: Sequence[int]) -> list[list[Tensor]]:
         """Estimate the residual flow of the pairs (i, i + 1) of several sequences.
 
         Args:
@@ -87,13 +89,13 @@ class SequenceFlow(nn.Module):
                 flows[index].append(in_axes_of_points(result.residual_flow, now, following))
         return flows
 
-    def _windows(self, frames: Sequence[Frame], first: int) -> list[Window]:
+    def _windows(self, frames: Sequence[SequenceSweep], first: int) -> list[Window]:
         sweeps = self._sweeps(frames)
         log: Any = SimpleNamespace(timestamps=sweeps, sweep=sweeps.__getitem__)
         indices = range(first, len(sweeps) - 1)
         return [window(log, i, self.num_history, self.model.config.num_future) for i in indices]
 
-    def _sweeps(self, frames: Sequence[Frame]) -> list[Sweep]:
+    def _sweeps(self, frames: Sequence[SequenceSweep]) -> list[Sweep]:
         points = [frame.ego_points() for frame in frames]
         ignored = [~frame.is_active for frame in frames]
         if self.ground is not None:
@@ -111,7 +113,7 @@ class SequenceFlow(nn.Module):
         ]
 
 
-def in_axes_of_points(residual_flow: Tensor, now: Frame, following: Frame) -> Tensor:
+def in_axes_of_points(residual_flow: Tensor, now: SequenceSweep, following: SequenceSweep) -> Tensor:
     """Rotate (N, 3) residual flow from the ego axes at t+1 (`following`) to the axes of the points at t (`now`).
 
     The rotation is (R_global_ego0 R_ego_sensor)^T R_global_ego1, in float64; flow is a difference of positions,

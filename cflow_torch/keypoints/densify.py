@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.dense.clustering import label_components
-from cflow_torch.keypoints.matching import Matches
+from cflow_torch.keypoints.matching import KeypointMatches
 from cflow_torch.ops.indices import draw, flat_nonzero, index_in_group
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.nearest import nearest_set_pixel
@@ -28,7 +28,7 @@ class DenseShift:
 
 
 def densify(
-    images: Tensor, matched: Tensor, matches: Matches, pixel_size: float, config: KeypointsConfig
+    images: Tensor, matched: Tensor, matches: KeypointMatches, pixel_size: float, config: KeypointsConfig
 ) -> DenseShift:
     """Find the shift of every occupied pixel of sweep t.
 
@@ -70,7 +70,7 @@ def densify(
     )
 
 
-def _by_nearest(images: Tensor, pixel: Tensor, matched: Tensor, matches: Matches) -> DenseShift:
+def _by_nearest(images: Tensor, pixel: Tensor, matched: Tensor, matches: KeypointMatches) -> DenseShift:
     """Give each pixel the shift of the nearest matched key point."""
     seeds = draw(matched, images.numel()).view_as(images)
     nearest = nearest_set_pixel(seeds, pixel)

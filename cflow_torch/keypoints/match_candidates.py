@@ -98,7 +98,7 @@ def detect(occupancy: Tensor) -> Tensor:
     return occupancy & ~erode_cross(occupancy)
 
 
-def describe(images: Tensor, patch_size: int) -> KeyPoints:
+def describe_keypoints(images: Tensor, patch_size: int) -> KeyPoints:
     """Find the key points of one sweep per window, and describe each by the L x L pixels around it (Sec. Descriptor).
 
     The images are (B, H, W) bool; patches are zero outside. Cost: 8 L bytes per key point.
@@ -121,7 +121,7 @@ def match_radius(batch: Batch, pixel_size: float, config: KeypointsConfig) -> Te
 
 
 @dataclass(frozen=True)
-class Blocks:
+class KeypointBlocks:
     """Key points in blocks, in order of window, band of rows and column. A block lies in one band of one window."""
 
     block: Tensor  # (K,) int64, block of each key point
@@ -140,7 +140,7 @@ class Blocks:
         return table
 
 
-def make_blocks(points: KeyPoints) -> Blocks:
+def make_blocks(points: KeyPoints) -> KeypointBlocks:
     """Cut the key points of each band of rows into blocks, by column."""
     band = points.row // _BAND_ROWS
     key, order = _sorting_key(points.window, band, points.col).sort()
@@ -149,7 +149,7 @@ def make_blocks(points: KeyPoints) -> Blocks:
     begin = flat_nonzero(slot == 0)
     end = F.pad(begin[1:], (0, 1), value=len(points))
     block = torch.repeat_interleave(torch.arange(begin.numel(), device=key.device), end - begin)
-    return Blocks(
+    return KeypointBlocks(
         block=block[rank],
         slot=slot[rank],
         first=key[begin],
@@ -158,7 +158,7 @@ def make_blocks(points: KeyPoints) -> Blocks:
     )
 
 
-def near_blocks(points: KeyPoints, order: Tensor, blocks: Blocks, reach: Tensor) -> tuple[Tensor, Tensor]:
+def near_blocks(points: KeyPoints, order: Tensor, blocks: KeypointBlocks, reach: Tensor) -> tuple[Tensor, Tensor]:
     """Find the blocks that may have a key point within reach of each point; `reach` is (B,) float64, pixels.
 
     Returns:

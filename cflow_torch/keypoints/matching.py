@@ -19,7 +19,7 @@ from torch import Tensor
 from cflow_torch.config import KeypointsConfig
 from cflow_torch.keypoints.match_candidates import (
     BLOCK_SIZE,
-    Blocks,
+    KeypointBlocks,
     KeyPoints,
     Patches,
     make_blocks,
@@ -53,7 +53,7 @@ _ENERGY_STEP = 32
 
 
 @dataclass(frozen=True)
-class Matches:
+class KeypointMatches:
     """Accepted matches, in order of the key points of t."""
 
     source: Tensor  # (M,) int64, key point of t
@@ -65,7 +65,7 @@ class Matches:
 class Targets:
     """Key points of t+1 in N blocks of 64. We fill up a block with the first key point."""
 
-    blocks: Blocks
+    blocks: KeypointBlocks
     number: Tensor  # (N, 64) int64, key point; 0 where a block is filled up
     row: Tensor  # (N, 64) int32
     col: Tensor  # (N, 64) int32
@@ -94,7 +94,7 @@ class Pairs(NamedTuple):
         return Pairs(self.source[index], self.target[index], self.shared[index])
 
 
-def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> Matches:
+def match_keypoints(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig) -> KeypointMatches:
     """Find the best match of every key point of t and apply the ratio test (Eq. descriptor_ncc, best_match).
 
     `reach` is (B,) float64, pixels, the longest distance of a match in each window. We compare scores exactly, as
@@ -117,13 +117,13 @@ def match(pc0: KeyPoints, pc1: KeyPoints, reach: Tensor, config: KeypointsConfig
     return _matches(pairs.at(pairs.source.argsort()), pc0, pc1)
 
 
-def _matches(pairs: Pairs, pc0: KeyPoints, pc1: KeyPoints) -> Matches:
+def _matches(pairs: Pairs, pc0: KeyPoints, pc1: KeyPoints) -> KeypointMatches:
     """Return the shifts and scores of accepted pairs."""
     source, target, shared = pairs
     dy = pc1.row[target] - pc0.row[source]
     dx = pc1.col[target] - pc0.col[source]
     energies = pc0.energy[source] * pc1.energy[target]
-    return Matches(
+    return KeypointMatches(
         source=source,
         shift=torch.stack((dy, dx), 1),
         score=shared.double() / energies.double().sqrt(),
@@ -158,7 +158,7 @@ def _pixel_table(patches: Patches, number: Tensor) -> Tensor:
     return table.flatten(0, 1)
 
 
-def make_bags(points: KeyPoints, blocks: Blocks, reach: Tensor, config: KeypointsConfig) -> Iterator[Bags]:
+def make_bags(points: KeyPoints, blocks: KeypointBlocks, reach: Tensor, config: KeypointsConfig) -> Iterator[Bags]:
     """Yield the bags of all key points of t: as many at a time as we compare together."""
     order = (points.energy // _ENERGY_STEP).argsort(stable=True)
     block, num_blocks = near_blocks(points, order, blocks, reach)

@@ -7,8 +7,8 @@ import torch.nn.functional as F
 
 from cflow_torch.dense.coarse_to_fine import CoarseToFine, ProjectedSweeps
 from cflow_torch.keypoints.densify import densify
-from cflow_torch.keypoints.match_candidates import describe, match_radius
-from cflow_torch.keypoints.matching import match
+from cflow_torch.keypoints.match_candidates import describe_keypoints, match_radius
+from cflow_torch.keypoints.matching import match_keypoints
 from cflow_torch.model import Motion
 from cflow_torch.stages import stage
 
@@ -47,10 +47,10 @@ class CorrelationFlowKeypoints(CoarseToFine):
         occupancy = sweeps.occupancy
         pixel_size = sweeps.grid.pixel_size
         with stage("describe"):
-            pc1 = describe(occupancy[:, 0], config.patch_size)
-            pc0 = describe(occupancy[:, 1], config.patch_size)
+            pc1 = describe_keypoints(occupancy[:, 0], config.patch_size)
+            pc0 = describe_keypoints(occupancy[:, 1], config.patch_size)
         with stage("match"):
-            matches = match(pc0, pc1, match_radius(sweeps.batch, pixel_size, config), config)
+            matches = match_keypoints(pc0, pc1, match_radius(sweeps.batch, pixel_size, config), config)
         with stage("densify"):
             dense = densify(occupancy[:, 1], pc0.pixel.index_select(0, matches.source), matches, pixel_size, config)
             size = occupancy.numel() + 1

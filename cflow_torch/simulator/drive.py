@@ -16,11 +16,11 @@ from cflow_torch.simulator.car_park import build_car_park
 from cflow_torch.simulator.crossing import build_crossing
 from cflow_torch.simulator.highway import build_highway
 from cflow_torch.simulator.lidar import Returns, scan, scan_rolling
-from cflow_torch.simulator.motion import Motion
+from cflow_torch.simulator.motion import SceneMotion
 from cflow_torch.simulator.narrow import build_narrow
 from cflow_torch.simulator.objects import own_truck
 from cflow_torch.simulator.profiles import PROFILES, WEATHER, in_weather
-from cflow_torch.simulator.recording import Boxes, GroundRaster, Recording, UnitReturns
+from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid, Recording, UnitReturns
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile
 from cflow_torch.simulator.street import build_street
@@ -71,7 +71,7 @@ class Drive(Recording):
         self._profile = profile
         self._seed = seed
         self._seconds = np.arange(num_sweeps) * (profile.sweep_interval_ns * 1e-9)
-        self._motion = Motion(scene, profile, self._seconds)
+        self._motion = SceneMotion(scene, profile, self._seconds)
         self._body_poses = scene.body_poses(self._seconds)
         self.poses = self._motion.ego_poses(self._seconds)
         self._is_annotated = self._annotated(scene)
@@ -124,7 +124,7 @@ class Drive(Recording):
         category = np.where(now, np.append(self._category, 0), 0).astype(np.uint8)
         return FlowLabels(flow.astype(np.float32), category[body], (now & then)[body])
 
-    def boxes(self, index: int) -> Boxes:
+    def boxes(self, index: int) -> AnnotationBoxes:
         """Annotation boxes of sweep `index`, in its ego frame."""
         returns = self.returns(index)
         chosen = np.flatnonzero(self._is_annotated[index] & (self._category > 0))
@@ -134,7 +134,7 @@ class Drive(Recording):
         if self._profile.is_rolling:
             size = np.maximum(size, self._extent(index, returns)[chosen])
         pose[:, :3, 3] += pose[:, :3, 2] * size[:, 2:] / 2
-        return Boxes(
+        return AnnotationBoxes(
             track_id=tuple(self.track_ids[i] for i in chosen),
             category=tuple(str(body.category) for body in bodies),
             size=size,
@@ -187,14 +187,14 @@ class Drive(Recording):
                 return np.radians(np.sort(np.array(candidate.elevations, np.float64)))
         raise CFlowError(f"log {self.log_id} has no LiDAR {unit!r}; it has {', '.join(self.calibration)}")
 
-    def ground_raster(self) -> GroundRaster:
+    def ground_raster(self) -> GroundGrid:
         """Ground height of the area within the LiDARs' range."""
         reach = self._profile.max_range + 1
         low = np.floor(self.poses[:, :2, 3].min(0) - reach)
         count = np.ceil((self.poses[:, :2, 3].max(0) + reach - low) / _RASTER_STEP).astype(int)
         x, y = (low[k] + _RASTER_STEP * (np.arange(count[k]) + 0.5) for k in (0, 1))
         height = self.scene.ground.height(*np.meshgrid(x, y))
-        return GroundRaster(height, (float(low[0]), float(low[1])), _RASTER_STEP)
+        return GroundGrid(height, (float(low[0]), float(low[1])), _RASTER_STEP)
 
     def returns(self, index: int) -> Returns:
         """Returns of all LiDARs in sweep `index`.

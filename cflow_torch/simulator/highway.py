@@ -15,7 +15,7 @@ from cflow_torch.simulator.trajectories import Route
 
 LANES = (2.9, 6.6, 10.3)  # distance of each lane's middle from the median, fast lane first, metres
 EDGE = 13.5  # distance of the grass from the median, metres
-REACH = 420.0  # rails, signs and trees stand at |x| up to this, metres
+ROAD_END = 420.0  # rails, signs and trees stand at |x| up to this, metres
 
 
 def build_highway(rng: np.random.Generator) -> Scene:
@@ -64,7 +64,7 @@ def _positions(rng: np.random.Generator, low: float, high: float) -> Iterator[fl
 
 def _fixed(rng: np.random.Generator) -> Iterator[Body]:
     """Rails (short pieces that follow the road up and down), posts, signs, a bridge, noise walls, trees."""
-    for x in np.arange(-REACH, REACH, 20.0).tolist():
+    for x in np.arange(-ROAD_END, ROAD_END, 20.0).tolist():
         for y in (-EDGE - 0.5, -0.7, 0.7, EDGE + 0.5):
             yield _rail(x, y)
         if rng.uniform() < 0.5:
@@ -72,7 +72,7 @@ def _fixed(rng: np.random.Generator) -> Iterator[Body]:
             yield objects.tree(rng, x + rng.uniform(0, 20), side * rng.uniform(EDGE + 10, EDGE + 25), num_leaves=60)
         if rng.uniform() < 0.5:
             yield objects.bush(rng, x + rng.uniform(0, 20), rng.uniform(EDGE + 2, EDGE + 6), num_leaves=25)
-    for x in np.arange(-REACH, REACH, 60.0).tolist():
+    for x in np.arange(-ROAD_END, ROAD_END, 60.0).tolist():
         yield objects.pole(x, float(rng.choice((-1, 1))) * (EDGE + 1.2), 2.5, 0.05, sign=0.8)
     begin = rng.uniform(-120, 0)
     for x in np.arange(begin, begin + 160, 20.0).tolist():

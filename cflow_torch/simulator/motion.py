@@ -16,7 +16,7 @@ _NUM_INTERVALS = 4  # per sweep; poses are interpolated within each, element by 
 _DERIVATIVE_STEP = 1e-3  # half the interval of central differences, seconds
 
 
-class Motion:
+class SceneMotion:
     """Motion of a scene, sweep by sweep.
 
     Args:

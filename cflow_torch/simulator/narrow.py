@@ -15,7 +15,7 @@ from cflow_torch.simulator.trajectories import Route
 
 HALF_WIDTH = 3.1  # of the road, metres
 PAVEMENT = 1.5  # width, metres
-REACH = 90.0  # the houses stand at |x| up to this, metres
+ROAD_END = 90.0  # the houses stand at |x| up to this, metres
 
 
 def build_narrow(rng: np.random.Generator) -> Scene:
@@ -63,15 +63,15 @@ def _fixed(rng: np.random.Generator) -> Iterator[Body]:
     front = HALF_WIDTH + PAVEMENT
     depth = 7.0
     for side in (-1, 1):
-        x = -REACH
-        while x < REACH:
+        x = -ROAD_END
+        while x < ROAD_END:
             width = rng.uniform(5, 10)
             back = rng.choice((0.0, 0.0, rng.uniform(0.1, 0.4)))
             if rng.uniform() < 0.92:
                 y = side * (front + back + depth / 2)
                 yield objects.wall(x + width / 2, y, width, depth, rng.uniform(6, 14), rng.uniform(0.3, 0.6))
             x += width
-        for along in np.arange(-REACH, REACH, 18.0).tolist():
+        for along in np.arange(-ROAD_END, ROAD_END, 18.0).tolist():
             yield objects.pole(along, side * (HALF_WIDTH + 0.3), 5.0, 0.07)
             if rng.uniform() < 0.5:
                 yield objects.wall(along + rng.uniform(2, 14), side * (front - 0.3), 0.6, 0.5, 1.1)

@@ -39,7 +39,7 @@ class Solids:
     is_foliage: Tensor
 
 
-class Blocks(NamedTuple):
+class RayBlocks(NamedTuple):
     """E blocks of a range image. Each holds all rays that can meet one solid; a solid may have several blocks.
 
     Args:
@@ -116,7 +116,7 @@ def cast_solids(
 
 def nearest_hits(
     kind: Tensor,
-    blocks: Blocks,
+    blocks: RayBlocks,
     rays_at: Callable[[Tensor, Tensor], UnitRays],
     num_columns: int,
     elevation: Tensor,
@@ -160,7 +160,7 @@ class _Rays(NamedTuple):
 
 
 def _hits(
-    blocks: Blocks, chosen: Tensor, rays: _Rays, intersect: Callable[[Tensor, Tensor], Tensor]
+    blocks: RayBlocks, chosen: Tensor, rays: _Rays, intersect: Callable[[Tensor, Tensor], Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Test all rays of the chosen blocks, whose solids are of one kind.
 
@@ -201,7 +201,7 @@ def take(values: Tensor, index: Tensor) -> Tensor:
 
 def _covered_blocks(
     T_solid_sensor: Tensor, half_size: Tensor, azimuth: Tensor, elevation: Tensor, max_range: float
-) -> Blocks:
+) -> RayBlocks:
     """For each solid, the block of all rays that can meet its bounding box."""
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64, device=azimuth.device)] * 3)
     corners = signs * half_size[:, None] - T_solid_sensor[:, None, :3, 3]
@@ -219,7 +219,7 @@ def _covered_blocks(
         elevation=elevation,
     )
     solid = torch.arange(len(half_size), device=azimuth.device)
-    return Blocks(solid, first_column, num_columns.masked_fill(nearest > max_range, 0), first_beam, end_beam)
+    return RayBlocks(solid, first_column, num_columns.masked_fill(nearest > max_range, 0), first_beam, end_beam)
 
 
 def _covered_columns(x: Tensor, y: Tensor, middle: Tensor, azimuth: Tensor) -> tuple[Tensor, Tensor]:

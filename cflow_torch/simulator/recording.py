@@ -12,7 +12,7 @@ from cflow_torch.data.log import Log
 
 
 @dataclass(frozen=True)
-class Boxes:
+class AnnotationBoxes:
     """Annotation boxes of one sweep.
 
     Args:
@@ -31,7 +31,7 @@ class Boxes:
 
 
 @dataclass(frozen=True)
-class GroundRaster:
+class GroundGrid:
     """Ground height on a grid.
 
     Args:
@@ -91,7 +91,7 @@ class Recording(Log):
         """(num_rings,) float64 radians, elevation of each ring of the LiDAR named `unit`, lowest first."""
 
     @abstractmethod
-    def boxes(self, index: int) -> Boxes:
+    def boxes(self, index: int) -> AnnotationBoxes:
         """Annotation boxes of sweep `index`."""
 
     @abstractmethod
@@ -99,5 +99,5 @@ class Recording(Log):
         """(N,) uint8 intensity, uint8 laser_number, int32 offset_ns of every point; only the av2 writer calls it."""
 
     @abstractmethod
-    def ground_raster(self) -> GroundRaster:
+    def ground_raster(self) -> GroundGrid:
         """Ground height of the whole drive; only the av2 writer calls it."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.simulator.raycast import ELLIPSOID, Blocks, UnitRays, cosine_of_incidence, covered_beams, take
+from cflow_torch.simulator.raycast import ELLIPSOID, RayBlocks, UnitRays, cosine_of_incidence, covered_beams, take
 
 _ROUNDS = 2  # of refining which column meets a solid and where the solid is then; each divides the error by 6 or more
 
@@ -88,7 +88,7 @@ class MovingSolids:
         """(P, 3) float64 centres of the solids at `middle`."""
         count = len(self.kind)
         to_solid = self.at(torch.arange(count), self.middle.expand(count)).to_solid
-        return rotate(to_solid[:, :, :3].transpose(1, 2), -to_solid[:, :, 3])
+        return rotate_each(to_solid[:, :, :3].transpose(1, 2), -to_solid[:, :, 3])
 
     @cached_property
     def speed(self) -> Tensor:
@@ -98,7 +98,7 @@ class MovingSolids:
         arm = self.half_size[moving].norm(dim=1)
         for knot in self.knots[:-1]:  # the velocity differs between intervals, because legs swing
             change = self.dynamic_at(self.row[moving], knot.expand(len(moving))).change
-            at_centre = rotate(change[:, :, :3], self.centre[moving]) + change[:, :, 3]
+            at_centre = rotate_each(change[:, :, :3], self.centre[moving]) + change[:, :, 3]
             rotation = change[:, :, :3].flatten(1).norm(dim=1) * arm
             speed[moving] = torch.maximum(speed[moving], at_centre.norm(dim=1) + rotation)
         return 1.1 * speed
@@ -150,7 +150,7 @@ class Shots:
         return level.T.float()[..., None], R[:, :, 2].T.float()[..., None]
 
 
-def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> Blocks:
+def covered_blocks(solids: MovingSolids, shots: Shots, max_range: float) -> RayBlocks:
     """Find the blocks of all rays that can meet a solid's bounding box (for an ellipsoid, its bounding sphere).
 
     Convention: a solid at the azimuth where the sweep begins and ends has a block at either end of the image.
@@ -217,7 +217,7 @@ def _sector(spheres: _Spheres, shots: Shots) -> _Sector:
     )
 
 
-def _blocks_near(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor, max_range: float) -> Blocks:
+def _blocks_near(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor, max_range: float) -> RayBlocks:
     """One block for each `solid` (E,), which the unit meets near column `guess` (E,)."""
     view = _aim(solids, shots, solid, guess)
     outline = _outline(solids, solid, view)
@@ -239,7 +239,7 @@ def _blocks_near(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tenso
         farthest=view.rho + outline.spread + drift,
         elevation=shots.elevation,
     )
-    return Blocks(solid, first, count.masked_fill(nearest > max_range, 0), first_beam, end_beam)
+    return RayBlocks(solid, first, count.masked_fill(nearest > max_range, 0), first_beam, end_beam)
 
 
 class _View(NamedTuple):
@@ -258,8 +258,8 @@ def _aim(solids: MovingSolids, shots: Shots, solid: Tensor, guess: Tensor) -> _V
         T_world_sensor = shots.T_world_sensor.index_select(0, column)
         to_solid = solids.at(solid, take(shots.seconds, column)).to_solid
         rotation = to_solid[:, :, :3] @ T_world_sensor[:, :3, :3]
-        origin = rotate(to_solid[:, :, :3], T_world_sensor[:, :3, 3]) + to_solid[..., 3]  # of the sensor
-        centre = rotate(rotation.transpose(1, 2), -origin)
+        origin = rotate_each(to_solid[:, :, :3], T_world_sensor[:, :3, 3]) + to_solid[..., 3]  # of the sensor
+        centre = rotate_each(rotation.transpose(1, 2), -origin)
         azimuth = torch.atan2(centre[:, 1], centre[:, 0])
         late = (azimuth - (shots.azimuth[0] + shots.step * guess)) / shots.step  # columns
         guess = guess + torch.remainder(late + 0.5 * shots.revolution, shots.revolution) - 0.5 * shots.revolution
@@ -327,7 +327,7 @@ def _columns(
 class RollingRays:
     """The callable `rays_at` of `raycast.nearest_hits`: rays of a column in unit coordinates of the block's solid."""
 
-    def __init__(self, solids: MovingSolids, shots: Shots, blocks: Blocks) -> None:
+    def __init__(self, solids: MovingSolids, shots: Shots, blocks: RayBlocks) -> None:
         middle = blocks.first_column + blocks.num_columns // 2
         seconds = shots.seconds[middle.clamp(0, len(shots.seconds) - 1)]
         transforms = solids.at(blocks.solid, seconds)
@@ -376,6 +376,6 @@ class RollingRays:
         return cosine_of_incidence(take(self._kind, block), at, direction / inverse_half, inverse_half)
 
 
-def rotate(matrices: Tensor, vectors: Tensor) -> Tensor:
+def rotate_each(matrices: Tensor, vectors: Tensor) -> Tensor:
     """Multiply each matrix (E, 3, 3) by its vector (E, 3)."""
     return (matrices @ vectors[..., None])[..., 0]

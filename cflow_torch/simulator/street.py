@@ -19,7 +19,7 @@ from cflow_torch.simulator.trajectories import Route
 
 EAST, NORTH, WEST, SOUTH = 0.0, math.pi / 2, math.pi, -math.pi / 2
 PAVEMENT = 4.0  # width, metres
-REACH = 110.0  # houses and trees stand up to this far along each street, metres
+ROAD_END = 110.0  # houses and trees stand up to this far along each street, metres
 
 
 def build_street(rng: np.random.Generator) -> Scene:
@@ -112,7 +112,7 @@ def furniture(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
     """Lamps, signs, trees and bushes on the pavements."""
     (main, cross), crossing = ground.half_widths, ground.crossing_x
     for side in (-1, 1):
-        for along in np.arange(-REACH, REACH, 12.0).tolist():
+        for along in np.arange(-ROAD_END, ROAD_END, 12.0).tolist():
             green = along + rng.uniform(4, 8)
             if abs(along - crossing) > cross + PAVEMENT:
                 yield objects.pole(along, side * (main + 0.6), 7.0, 0.09)
@@ -145,11 +145,11 @@ def houses(rng: np.random.Generator, ground: Ground) -> Iterator[Body]:
             begin += width
 
     for side in (-1, 1):
-        for first, last in ((-REACH, crossing - cross_front - 12), (crossing + cross_front, crossing + REACH)):
+        for first, last in ((-ROAD_END, crossing - cross_front - 12), (crossing + cross_front, crossing + ROAD_END)):
             for middle, width, back in row(first, last):
                 y = side * (main_front + back + depth / 2)
                 yield objects.wall(middle, y, width, depth, rng.uniform(5, 12), rng.uniform(0.3, 0.6))
         for corner in (-1, 1):
-            for middle, width, back in row(main_front, REACH):
+            for middle, width, back in row(main_front, ROAD_END):
                 x = crossing + side * (cross_front + back + depth / 2)
                 yield objects.wall(x, corner * middle, depth, width, rng.uniform(5, 12), rng.uniform(0.3, 0.6))

@@ -7,7 +7,7 @@ window tells which column is at a position, and small tables have a row for each
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import torch
@@ -24,6 +24,7 @@ from cflow_torch.ops.indices import (
     nonzero_pairs,
     split_index,
 )
+from cflow_torch.verified.spacing import Spacing
 from cflow_torch.windows.bev_grid import Grid
 
 NUM_SLICES = 4
@@ -34,6 +35,8 @@ _SECOND = 32  # bits; where the second of two counts in one number begins
 _BOTH_COUNTS = tuple(low + (high << _SECOND) for high in _COUNTS for low in _COUNTS)
 _EMPTY = torch.iinfo(torch.int32).max  # where a table of pixels has none
 _WORD = 8  # sweeps whose slices make up one int64
+_OWN_OF_WORD = OWN * 0x0101010101010101  # the bits of the pixels themselves in a word
+SLICE_HEIGHT = 0.5  # metres
 
 
 @dataclass(frozen=True)
@@ -110,13 +113,22 @@ class Columns:
     slices: Tensor  # (C + 1, T) uint8
     # (C + 1, T) int32, position of each occupied pixel in the list of pixels; `_EMPTY` = the pixel is empty
     rank: Tensor
+    reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
+    most_reach: int
+    tall: Tensor | None  # (K,) int64, the tall columns; None = there are none
 
     @classmethod
-    def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int) -> Columns:
+    def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int, spacing: Spacing) -> Columns:
         """Make empty columns at and around the occupied positions, (B * area,) bool. The border must be False."""
         stride = grid.width + 2 * REACH
         device = is_occupied.device
         is_column = _dilate(is_occupied, stride)
+        reach_at = torch.ones(len(is_column) if spacing.most > 1 else 0, dtype=torch.uint8, device=device)
+        for reach in range(2, spacing.most + 1):
+            is_wide = spacing.are_wide(grid, REACH, reach).view(-1)
+            is_column |= _dilate(is_column, stride) & is_wide
+            reach_at += is_wide
+        is_tall = spacing.are_tall(grid, REACH, SLICE_HEIGHT).view(-1) if spacing.has_tall else None
         images = is_column.view(-1, grid.height + 2 * REACH, stride)
         images[:, :REACH] = images[:, -REACH:] = False
         images[:, :, :REACH] = images[:, :, -REACH:] = False
@@ -128,7 +140,9 @@ class Columns:
         shape = (len(position), 2 * _WORD * -(-num_steps // _WORD))
         slices = torch.zeros(shape, dtype=torch.uint8, device=device)
         rank = torch.full(shape, _EMPTY, dtype=torch.int32, device=device)
-        return cls(grid.height, grid.width, image, position, slices, rank)
+        reach_of = reach_at.index_select(0, position) if spacing.most > 1 else None
+        tall = None if is_tall is None else flat_nonzero(is_tall.index_select(0, position))
+        return cls(grid.height, grid.width, image, position, slices, rank, reach_of, spacing.most, tall)
 
     @property
     def stride(self) -> int:
@@ -171,6 +185,13 @@ class Columns:
         index += start
         return self.image.index_select(0, index.view(-1)).view_as(index)
 
+    def are_wide(self, pixels: Pixels, groups: Groups) -> Tensor:
+        """Tell which of M groups of K pixels have one with a reach of more than one pixel, (M,) bool."""
+        if self.reach is None:
+            return torch.zeros(groups.count, dtype=torch.bool, device=self.image.device)
+        reach = self.reach.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
+        return groups.any(reach > 1)
+
     def words(self, pixels: Pixels) -> Tensor:
         """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""
         words = self.slices.view(torch.int64)[:, : self.first_of_copies // _WORD]  # not of copies
@@ -205,6 +226,33 @@ class Columns:
         words = words | words.index_select(0, left) | words.index_select(0, right)
         return words | words.index_select(0, above) | words.index_select(0, below)
 
+    def _or_within_reach(self, words: Tensor) -> Tensor:
+        """Return the slices within the reach of each column, in the bits of those of the pixels, (C + 1, W) int64."""
+        around = self._or_within_pixels(words)
+        if self.tall is None:
+            return around
+        own = around.index_select(0, self.tall)
+        above = own << 1 | own >> (NUM_SLICES - 1)  # the highest slice is below the lowest one
+        below = own >> 1 | own << (NUM_SLICES - 1)
+        return around.index_copy(0, self.tall, own | (above | below) & _OWN_OF_WORD)
+
+    def _or_within_pixels(self, words: Tensor) -> Tensor:
+        around = self.or_around(words)
+        if self.reach is None:
+            return around
+        wide = flat_nonzero(self.reach > 1)
+        reach = self.reach.index_select(0, wide)[:, None]
+        line = range(-1, 2)
+        offsets = tuple((down * self.stride + right,) for down in line for right in line)
+        beside = self.position.index_select(0, wide) + constant(offsets, torch.int64, wide.device)
+        beside = self.image.index_select(0, beside.view(-1))  # [9 wide]
+        for step in range(2, self.most_reach + 1):
+            # The columns beside one of this reach have at least the reach before.
+            near = around.index_select(0, beside).view(9, -1, around.shape[1])
+            wider = reduce(torch.bitwise_or, near.unbind(0))
+            around = around.index_copy(0, wide, torch.where(reach >= step, wider, near[4]))
+        return around
+
     @cached_property
     def _neighbours(self) -> Tensor:
         """(4, C + 1) int32, column to the left and to the right of each column, above and below it; 0 = none."""
@@ -223,7 +271,7 @@ class Columns:
         """
         words = self.as_words(slices)
         half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
-        self.slices.view(torch.int64)[:, half] = words | self.or_around(words) << NUM_SLICES
+        self.slices.view(torch.int64)[:, half] = words | self._or_within_reach(words) << NUM_SLICES
         occupied = self._occupied(slices, num_windows)
         step = occupied.step
         slot = occupied.column * self.num_slots + (step + first)  # counted through all columns

@@ -17,7 +17,7 @@ from torch import Tensor
 from cflow_torch.verified.columns import NUM_SLICES
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 
-_FAR = 2  # pixels in y or in x; for shifts of this length or more, absence is tested in 3 x 3 pixels
+_FAR = 2  # pixels in y or in x; for shifts of this length or more, absence is tested in the pixels around
 
 
 class Shifts:
@@ -26,12 +26,13 @@ class Shifts:
     Args:
         window: (M,) int64.
         motions: (M, C, 2) float64, (y, x) finest pixels per sweep interval.
+        is_wide: (M,) bool, the group has a reach of more than one pixel (`Spacing`).
 
     Attributes:
         count: (M,) int64, the number of distinct shifts of each group.
     """
 
-    def __init__(self, sweeps: HeightSlicedSweeps, window: Tensor, motions: Tensor) -> None:
+    def __init__(self, sweeps: HeightSlicedSweeps, window: Tensor, motions: Tensor, is_wide: Tensor) -> None:
         self._num_steps = sweeps.num_steps
         elapsed = sweeps.elapsed_both_ways.index_select(1, window)  # [2, M, S]
         displacement = motions[:, None] * elapsed[..., None, None]  # [2, M, S, C, 2]
@@ -46,14 +47,15 @@ class Shifts:
         distinct = pair.gather(3, motion_of_number[:, None, 1:].expand_as(pair))
         self._shift = distinct.flatten(0, 2)[..., None].view(torch.int32)  # [2 M S, C, 2]
         is_far = torch.maximum(*self._shift.abs().unbind(2)) >= _FAR  # [2 M S, C]
+        is_far |= is_wide[:, None].expand(2, -1, sweeps.num_steps).reshape(-1, 1)
         self._first_bit = is_far.view(torch.uint8) * NUM_SLICES
 
     def of(self, group: Tensor, from_step: Tensor, to_step: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Return the first c distinct shifts of n pixels, (n, c, 2) int32.
 
-        Also return the first bit that tells absence at the target, (n, c) uint8. For far shifts, we look in the 3 x 3
-        pixels, whose bits follow those of the pixel itself. Either step is 0. Numbers that a group does not have give
-        some shift.
+        Also return the first bit that tells absence at the target, (n, c) uint8. For far shifts and wide groups, we
+        look in the pixels around, whose bits follow those of the pixel itself. Either step is 0. Numbers that a group
+        does not have give some shift.
         """
         direction = (from_step == 0).long()
         row = (direction * len(self.count) + group) * self._num_steps + (from_step + to_step)  # [n]

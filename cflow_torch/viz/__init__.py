@@ -1,6 +1,6 @@
 """Pictures of a flow and of every stage on the way to it (needs matplotlib), and 3-D pages (needs k3d)."""
 
-from cflow_torch.viz.animation import Frame, flow_figures, save_animation
+from cflow_torch.viz.animation import AnimatedPair, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, plot_map, save_picture
 from cflow_torch.viz.clusters import plot_clusters
 from cflow_torch.viz.page import Page, save_page, show
@@ -9,7 +9,7 @@ from cflow_torch.viz.stage_pictures import plot_correlation, plot_keypoints, plo
 from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 
 __all__ = [
-    "Frame",
+    "AnimatedPair",
     "Page",
     "flow_figures",
     "flow_to_rgb",

@@ -21,7 +21,7 @@ _SHORTEST = 2  # hundredths of a second; viewers slow down a .gif with shorter f
 
 
 @dataclass(frozen=True)
-class Frame:
+class AnimatedPair:
     """One pair of an animation."""
 
     points: Array  # (N, 3+), metres, ego frame of sweep t
@@ -31,7 +31,7 @@ class Frame:
 
 
 def flow_figures(
-    frames: Sequence[Frame],
+    frames: Sequence[AnimatedPair],
     *,
     point_cloud_range: Sequence[float] | None = None,
     max_flow: float | None = None,

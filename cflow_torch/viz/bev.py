@@ -11,7 +11,7 @@ from cflow_torch.config import DenseConfig
 from cflow_torch.data.atomic import atomic_name
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy, point_rows
 from cflow_torch.viz import style
-from cflow_torch.viz.panel import MOVING, dot_area, draw_error, draw_flow, draw_ground, new_figure
+from cflow_torch.viz.panel import MIN_DRAWN, dot_area, draw_error, draw_flow, draw_ground, new_figure
 from cflow_torch.viz.style import Figure
 
 _OUTLIERS = 0.2  # per cent of the points on each side that the view may leave out
@@ -48,9 +48,9 @@ def plot_flow(
 
     Convention:
         x (forward) points right, y (left) up, with equal scales; a long thin view gets empty space along its sides. A
-        point is moving if its residual flow is longer than `panel.MOVING`. An arrow starts at the median position of a
-        cluster's moving points and is `panel.ARROW_STEPS` times their median flow long. Without clusters, moving points
-        near each other form one.
+        point is moving if its residual flow is longer than `panel.MIN_DRAWN`. An arrow starts at the median position of
+        a cluster's moving points and is `panel.ARROW_STEPS` times their median flow long. Without clusters, moving
+        points near each other form one.
 
     Raises:
         CFlowError: matplotlib is not installed, or an argument has the wrong shape or value.
@@ -80,7 +80,7 @@ def plot_flow(
         draw_ground(axes, floor)
     draw_flow(panels[0], position, residual, cluster, max_flow)
     style.draw_scale(panels[0])
-    style.draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MOVING, max_flow, legend)
+    style.draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MIN_DRAWN, max_flow, legend)
     if true_flow is not None:
         draw_flow(panels[1], position, true_flow, None, max_flow)
         draw_error(panels[2], position, residual, true_flow)

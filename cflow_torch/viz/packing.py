@@ -13,8 +13,8 @@ import numpy as np
 
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
-from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_ERROR, MOVING
-from cflow_torch.viz.scene import Scene, ViewerFrame
+from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_DRAWN, MIN_ERROR
+from cflow_torch.viz.scene import ViewedPair, ViewerFrame
 from cflow_torch.viz.wheel import flow_to_rgb
 
 _UNIT = 0.01  # metres; 16 bits reach to 327 m
@@ -45,10 +45,11 @@ class PackedDrive:
         self.frame = ViewerFrame()
         self.frames: list[dict[str, Any]] = []
         self.points: list[tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]] = []  # units, colours, cluster
+        self.moving: list[dict[int, float]] = []  # P(moving) of each cluster of each frame, mean of its points
         self.num_given = 0
         self.floor: list[float] = []
 
-    def add(self, scene: Scene) -> None:
+    def add(self, scene: ViewedPair) -> None:
         """Thin one pair and choose its colours."""
         ground = scene.is_ground
         cluster = np.where(ground, -1, scene.cluster)
@@ -58,6 +59,7 @@ class PackedDrive:
         self.points.append(
             (units, {name: entry[kept].astype(np.uint8) for name, entry in entries.items()}, cluster[kept])
         )
+        self.moving.append(_cluster_means(cluster, scene.moving))
         self.num_given += len(scene.position)
         self.floor += _floor_height(scene.position, ground)
         pose = np.eye(4) if scene.pose is None else self.frame.move(scene.pose)
@@ -73,12 +75,12 @@ class PackedDrive:
             }
         )
 
-    def _entries(self, scene: Scene, cluster: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    def _entries(self, scene: ViewedPair, cluster: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Choose the colours of all points, and return which points must not be thinned, (N,) bool."""
         ground = scene.is_ground
         speed = np.linalg.norm(scene.residual, axis=1)
         static = np.where(ground, GROUND, STATIC)
-        moving = ~ground & (speed > MOVING)
+        moving = ~ground & (speed > MIN_DRAWN)
         entries = {
             "flow": np.where(moving, _wheel_entry(scene.residual, self.max_flow), static),
             "speed": np.where(moving, _ramp_entry(speed, self.max_flow), static),
@@ -86,6 +88,8 @@ class PackedDrive:
         }
         if scene.confidence is not None:
             entries["confidence"] = np.where(ground, GROUND, _ramp_entry(1 - scene.confidence, 1.0))
+        if scene.moving is not None:
+            entries["moving"] = np.where(ground, GROUND, _ramp_entry(scene.moving, 1.0))
         if scene.truth is None:
             return entries, moving
 
@@ -93,31 +97,46 @@ class PackedDrive:
         error = np.linalg.norm(scene.residual - scene.truth, axis=1)
         unknown = np.where(ground, GROUND, UNKNOWN)
         known = ~ground & np.isfinite(length)
-        moves = known & (length > MOVING)
+        moves = known & (length > MIN_DRAWN)
         wrong = known & (error > MIN_ERROR)
         true_entry = np.where(moves, _wheel_entry(scene.truth, self.max_flow), STATIC)
         entries["truth"] = np.where(known, true_entry, unknown)
         entries["error"] = np.where(known, np.where(wrong, _ramp_entry(error, MAX_ERROR), STATIC), unknown)
         return entries, moving | moves | wrong
 
-    def _arrows(self, scene: Scene) -> list[Any]:
-        """List cluster, start, vector, colour and speed (m/s) of each arrow."""
+    def _arrows(self, scene: ViewedPair) -> list[dict[str, Any]]:
+        """List the arrows: one per cluster with enough moving points."""
         number, start, flow = scene.arrows()
-        colors = _wheel_entry(flow, self.max_flow).tolist()
-        speeds = np.round(np.linalg.norm(flow, axis=1) / scene.interval, 1).tolist()
-        return list(zip(number.tolist(), _rounded(start), _rounded(ARROW_STEPS * flow), colors, speeds))
+        columns = {
+            "cluster": number.tolist(),
+            "start": _rounded(start),
+            "ahead": _rounded(ARROW_STEPS * flow),
+            "entry": _wheel_entry(flow, self.max_flow).tolist(),
+            "speed": np.round(np.linalg.norm(flow, axis=1) / scene.interval, 1).tolist(),
+            "moving": [self.moving[-1].get(cluster) for cluster in number.tolist()],
+        }
+        return _records(columns)
 
     def add_tracks(self, tracks: Mapping[str, np.ndarray]) -> None:
         """Add the boxes of tracks. The points of a track get the same colour in all sweeps."""
-        for frame, (_, entries, cluster) in zip(self.frames, self.points):
+        for frame, moving, (_, entries, cluster) in zip(self.frames, self.moving, self.points):
             is_now = tracks["sweep"] == frame["sweep"]
             rows = {name: values[is_now] for name, values in tracks.items()}
             centre, heading = self.frame.boxes(rows)
-            size = np.stack([rows[name] for name in ("length", "width", "height")], 1)
-            speed = np.hypot(rows["vx"], rows["vy"])
-            columns = (_rounded(centre), _rounded(size), np.round(heading, 3).tolist(), np.round(speed, 1).tolist())
-            frame["boxes"] = list(zip(rows["id"].tolist(), *columns))
-            for track, number in zip(rows["id"].tolist(), rows["cluster_id"].tolist()):
+            clusters = rows["cluster_id"].tolist()
+            columns = {
+                "id": rows["id"].tolist(),
+                "centre": _rounded(centre),
+                "size": _rounded(np.stack([rows[name] for name in ("length", "width", "height")], 1)),
+                "heading": np.round(heading, 3).tolist(),
+                "speed": np.round(np.hypot(rows["vx"], rows["vy"]), 1).tolist(),
+                "points": rows["num_points"].tolist(),
+                "moving": [moving.get(number) for number in clusters],
+            }
+            if "class" in rows:
+                columns["kind"] = rows["class"].tolist()
+            frame["boxes"] = _records(columns)
+            for track, number in zip(columns["id"], clusters):
                 if number >= 0:
                     entries["object"][cluster == number] = FIRST + track % len(PALETTE)
 
@@ -141,6 +160,7 @@ class PackedDrive:
             "ego": EGO_OUTLINE,
             "north": None if T is None else float(np.arctan2(T[1, 1], T[1, 0])),  # of the world's y axis, viewer frame
             "steps": ARROW_STEPS,
+            "chances": _STEPS if "moving" in present else 0,
             "thinned": f"{shown:,} of {self.num_given:,} points are drawn: all that move, by estimate or truth, all "
             f"with an error above {MIN_ERROR:g} m, and one other point per voxel of {side:g} m ({2 * side:g} m on the "
             f"ground). Positions are rounded to {_UNIT * 100:g} cm.",
@@ -156,6 +176,21 @@ class PackedDrive:
         kept = np.concatenate([np.flatnonzero(in_reach & important), other[np.unique(key, return_index=True)[1]]])
         cell = np.floor(position[kept, :2] / _SORT)
         return kept[np.lexsort((position[kept, 2], cell[:, 1], cell[:, 0]))]
+
+
+def _cluster_means(cluster: np.ndarray, values: np.ndarray | None) -> dict[int, float]:
+    """Return cluster -> mean of the (N,) values of its points, to 2 decimals; {} without values."""
+    if values is None:
+        return {}
+    is_known = (cluster >= 0) & np.isfinite(values)
+    numbers, group = np.unique(cluster[is_known], return_inverse=True)
+    means = np.bincount(group, values[is_known]) / np.bincount(group)
+    return dict(zip(numbers.tolist(), np.round(means, 2).tolist()))
+
+
+def _records(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """Return a dictionary for each row of a table."""
+    return [dict(zip(columns, row)) for row in zip(*columns.values())]
 
 
 def _floor_height(position: np.ndarray, ground: np.ndarray) -> list[float]:
@@ -198,6 +233,7 @@ def _colorings(max_flow: float, interval: float) -> list[dict[str, Any]]:
         ("speed", "speed over ground", ramp, (0, speed, "m/s"), "", ("static", "ground", "")),
         ("object", "object", objects, None, "bright: moving or tracked; pale: static", ("no object", "ground", "")),
         ("confidence", "confidence", ramp, (1, 0, ""), likely, ("", "ground", "unknown")),
+        ("moving", "P(moving)", ramp, (0, 1, ""), "probability that a point moves", ("", "ground", "unknown")),
         ("truth", "true flow", wheel, None, rim, ("static", "ground", "unknown")),
         ("error", "end-point error", ramp, (0, MAX_ERROR, "m"), "", (f"below {MIN_ERROR:g} m", "ground", "unknown")),
     )

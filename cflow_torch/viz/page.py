@@ -17,13 +17,13 @@ from cflow_torch.data.atomic import write_text
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.packing import PackedDrive, packed
-from cflow_torch.viz.scene import MAX_FLOW, Scene
+from cflow_torch.viz.scene import MAX_FLOW, ViewedPair
 from cflow_torch.viz.style import checked_path
 
 VOXEL = 0.1  # metres
 _TEMPLATE = Path(__file__).parent / "page.html"
 
-Tracks = Mapping[str, np.ndarray]
+TrackTable = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,7 +49,7 @@ def show(
     results: FlowResult | Sequence[FlowResult],
     *,
     labels: FlowLabels | None | Sequence[FlowLabels | None] = None,
-    tracks: Tracks | None = None,
+    tracks: TrackTable | None = None,
     title: str = "CorrelationFlow",
     preset: str | None = None,
     max_flow: float = MAX_FLOW,
@@ -74,7 +74,7 @@ def show(
     given: list[Any] = [labels] * len(sweeps) if labels is None or isinstance(labels, FlowLabels) else list(labels)
     if not len(sweeps) == len(flows) == len(given):
         raise CFlowError(f"{len(sweeps)} windows, {len(flows)} results, {len(given)} labels: give one of each per pair")
-    scenes = (Scene.of(i, w.pc0, w.pc1, r, t) for i, (w, r, t) in enumerate(zip(sweeps, flows, given)))
+    scenes = (ViewedPair.of(i, w.pc0, w.pc1, r, t) for i, (w, r, t) in enumerate(zip(sweeps, flows, given)))
     return _page(scenes, PackedDrive(max_flow, voxel), lambda: tracks, title, preset)
 
 
@@ -83,7 +83,7 @@ def save_page(
     results: Iterable[tuple[int, FlowResult]],
     path: str | Path,
     *,
-    tracks: Callable[[], Tracks | None] = lambda: None,
+    tracks: Callable[[], TrackTable | None] = lambda: None,
     preset: str | None = None,
     max_flow: float = MAX_FLOW,
     voxel: float = VOXEL,
@@ -107,7 +107,7 @@ def save_page(
     Cost: on disk about 0.3 MB per sweep of 100,000 points, and 1.2 MB for k3d; 1 MB of memory per sweep.
     """
     checked_path(path, ".html")
-    scenes = (Scene.of(i, log.sweep(i), log.sweep(i + 1), result, log.labels(i)) for i, result in results)
+    scenes = (ViewedPair.of(i, log.sweep(i), log.sweep(i + 1), result, log.labels(i)) for i, result in results)
     page = _page(scenes, PackedDrive(max_flow, voxel), tracks, log.log_id, preset)
     page.save(path)
     return page.num_pairs
@@ -128,7 +128,11 @@ def _packed_file(path: Path) -> str:
 
 
 def _page(
-    scenes: Iterable[Scene], drive: PackedDrive, tracks: Callable[[], Tracks | None], title: str, preset: str | None
+    scenes: Iterable[ViewedPair],
+    drive: PackedDrive,
+    tracks: Callable[[], TrackTable | None],
+    title: str,
+    preset: str | None,
 ) -> Page:
     """Pack the scenes into an empty drive, and fill in the template."""
     library = load_k3d()

@@ -13,14 +13,14 @@ from cflow_torch.viz import style
 from cflow_torch.viz.style import Axes, Figure
 from cflow_torch.viz.wheel import flow_to_rgb
 
-MOVING = 0.08  # metres per sweep; the field's viewers draw slower points in white
+MIN_DRAWN = 0.08  # metres per sweep; the field's viewers draw slower points in white
 MIN_ERROR, MAX_ERROR = 0.05, 0.35  # metres, ends of the viewers' error colours; a smaller error is drawn as 0
 ARROW_STEPS = 5  # length of an arrow, sweeps
 MIN_ARROW_POINTS = 8  # a cluster with fewer moving points gets no arrow
 OBJECT_PIXEL = 0.5  # metres; without clusters, moving points in touching pixels are one object
 _MAX_PIXELS = 2048  # pixels on a side, at most; larger scenes get larger pixels
 FLOW_CAPTION = (
-    f"grey: static   colour: moves more than {MOVING:g} m per sweep   "
+    f"grey: static   colour: moves more than {MIN_DRAWN:g} m per sweep   "
     f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / style.SWEEP_RATE:g} s at {style.SWEEP_RATE} Hz)"
 )
 EGO_OUTLINE = ((2.4, 0.0), (-1.9, 1.15), (-1.0, 0.0), (-1.9, -1.15))  # metres
@@ -91,7 +91,7 @@ def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.nd
     Positions (N, 3) are in metres, residual flow (N, 3) in metres per sweep; NaN is drawn as static. `cluster` is (N,),
     -1 = none. If it is None, moving points near each other form groups. Flow of `max_flow` has full colour.
     """
-    moves = np.linalg.norm(flow, axis=1) > MOVING  # False for NaN
+    moves = np.linalg.norm(flow, axis=1) > MIN_DRAWN  # False for NaN
     dot = dot_area(axes)
     static = position[~moves]
     axes.scatter(static[:, 0], static[:, 1], s=dot, color=style.STATIC, linewidths=0, zorder=2)

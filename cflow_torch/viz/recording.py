@@ -14,8 +14,8 @@ from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 from cflow_torch.viz.clusters import cluster_colors
-from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MOVING
-from cflow_torch.viz.scene import MAX_FLOW, Scene, ViewerFrame
+from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MIN_DRAWN
+from cflow_torch.viz.scene import MAX_FLOW, ViewedPair, ViewerFrame
 from cflow_torch.viz.style import checked_path
 from cflow_torch.viz.wheel import flow_to_rgb
 
@@ -55,7 +55,7 @@ def record_log(
         The frame of `world` is the ego frame at t+1 of the first pair with poses. world/trajectory is the path of the
         vehicle, and world/tracks has the boxes of `tracks`. The frame of world/ego_vehicle is the ego frame at t+1 of
         the current pair. It holds arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long) and these points:
-        - lidar/cflow: points of t, moved by the ego motion and coloured by residual flow, grey up to `panel.MOVING`
+        - lidar/cflow: points of t, moved by the ego motion and coloured by residual flow, grey up to `panel.MIN_DRAWN`
         - lidar/ground_truth: points of t with known truth, coloured by the true residual flow
         - lidar/clusters, lidar/ground: points of t, moved likewise; lidar/next_sweep: points of t+1
         Timelines: `sweep`, the index; `time`, if sweeps have time stamps.
@@ -77,7 +77,7 @@ def record_log(
             for i, result in results:
                 pc0 = log.sweep(i)
                 pc1 = log.sweep(i + 1)
-                drive.add(Scene.of(i, pc0, pc1, result, log.labels(i)), pc1)
+                drive.add(ViewedPair.of(i, pc0, pc1, result, log.labels(i)), pc1)
                 if tracks is not None:
                     drive.add_tracks({name: values[tracks["sweep"] == i] for name, values in tracks.items()})
             drive.end(log.log_id)
@@ -105,7 +105,7 @@ class _Drive:
         self.frame = ViewerFrame()
         self.trajectory: list[np.ndarray] = []
 
-    def add(self, scene: Scene, pc1: Sweep) -> None:
+    def add(self, scene: ViewedPair, pc1: Sweep) -> None:
         """Log one pair; `pc1` is its sweep t+1."""
         rr = self.rr
         position = scene.position
@@ -175,7 +175,7 @@ class _Drive:
 
     def _color(self, flow: np.ndarray) -> np.ndarray:
         color = flow_to_rgb(flow, self.max_flow)
-        color[np.linalg.norm(flow, axis=1) <= MOVING] = _STATIC
+        color[np.linalg.norm(flow, axis=1) <= MIN_DRAWN] = _STATIC
         return color
 
     def _layout(self) -> Any:

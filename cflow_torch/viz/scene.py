@@ -9,14 +9,14 @@ import numpy as np
 
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
-from cflow_torch.viz.panel import MIN_ARROW_POINTS, MOVING, group_medians
+from cflow_torch.viz.panel import MIN_ARROW_POINTS, MIN_DRAWN, group_medians
 from cflow_torch.viz.style import SWEEP_RATE
 
 MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
 
 
 @dataclass(frozen=True)
-class Scene:
+class ViewedPair:
     """One pair, without NaN and infinite points."""
 
     index: int  # of sweep t
@@ -27,11 +27,12 @@ class Scene:
     truth: np.ndarray | None  # (N, 3) float64, true residual flow, NaN where unknown; None = the pair has no labels
     cluster: np.ndarray  # (N,) int64, -1 = none
     confidence: np.ndarray | None  # (N,) float64, or None
+    moving: np.ndarray | None  # (N,) float64, probability that a point moves, or None
     is_ground: np.ndarray  # (N,) bool
     pose: np.ndarray | None  # (4, 4) float64 `T_world_ego` of t+1, or None
 
     @classmethod
-    def of(cls, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> Scene:
+    def of(cls, index: int, pc0: Sweep, pc1: Sweep, result: FlowResult, labels: FlowLabels | None) -> ViewedPair:
         """Make the scene of sweeps t and t+1, from the flow of all points of t and, if there are any, labels."""
         points = as_numpy(pc0.points, np.float64)[:, :3]
         rows = len(result.residual_flow)
@@ -54,13 +55,14 @@ class Scene:
             truth=truth,
             cluster=as_numpy(result.cluster_id)[kept],
             confidence=None if result.confidence is None else as_numpy(result.confidence, np.float64)[kept],
+            moving=None if result.moving is None else as_numpy(result.moving, np.float64)[kept],
             is_ground=ground[kept],
             pose=None if pc1.pose is None else as_numpy(pc1.pose, np.float64),
         )
 
     def arrows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return ids, (A,), median positions and median flows, (A, 3), of clusters with enough moving points."""
-        moving = ~self.is_ground & (np.linalg.norm(self.residual, axis=1) > MOVING)
+        moving = ~self.is_ground & (np.linalg.norm(self.residual, axis=1) > MIN_DRAWN)
         columns = np.concatenate([self.position[moving], self.residual[moving]], axis=1)
         cluster, middle, count = group_medians(self.cluster[moving], columns)
         large = count >= MIN_ARROW_POINTS

@@ -22,8 +22,8 @@ from cflow_torch.dense.coarse_to_fine import ProjectedSweeps, project
 from cflow_torch.dense.correlation import best_shifts
 from cflow_torch.dense.templates import Images, make_pairs
 from cflow_torch.estimate import make_model
-from cflow_torch.keypoints.match_candidates import describe, match_radius
-from cflow_torch.keypoints.matching import match
+from cflow_torch.keypoints.match_candidates import describe_keypoints, match_radius
+from cflow_torch.keypoints.matching import match_keypoints
 from cflow_torch.ops.cross_correlation import cross_correlate
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -177,8 +177,8 @@ def keypoint_matches(window: Window, config: Config) -> KeyPointMatches:
     (*_, last), _ = scales(window, config)
     sweeps = last.sweeps
     pixel_size = sweeps.grid.pixel_size
-    pc1, pc0 = (describe(sweeps.occupancy[:, step], config.patch_size) for step in (0, 1))
-    matches = match(pc0, pc1, match_radius(sweeps.batch, pixel_size, config), config)
+    pc1, pc0 = (describe_keypoints(sweeps.occupancy[:, step], config.patch_size) for step in (0, 1))
+    matches = match_keypoints(pc0, pc1, match_radius(sweeps.batch, pixel_size, config), config)
     images = last.seen()
     key_points = images.lower + (torch.stack((pc0.col, pc0.row), 1).numpy() + 0.5) * pixel_size
     start = key_points[matches.source.numpy()]

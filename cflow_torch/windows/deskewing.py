@@ -73,7 +73,8 @@ def deskew_points(points: Array, fraction: Array, T_ego1_ego0: Any, T_ego0_befor
     Examples:
         >>> fraction = scan_fractions(pc0, "clockwise")
         >>> moved = deskew_points(pc0, fraction, T_ego1_ego0)
-        >>> result = estimate_flow(moved, moved1, T_ego1_ego0=T_ego1_ego0, dt0=0.1 * fraction, dt1=0.1 * fraction1)
+        >>> sweep = Sweep(moved, pose=T_ego1_ego0, point_times=0.1 * fraction)
+        >>> result = estimate_flow(sweep, Sweep(moved1, pose=np.eye(4), point_times=0.1 * fraction1))
     """
     positions = point_rows("points", points)
     check_array(fraction, "fraction", (len(positions),), "f", f"({len(positions)},) floats, in sweep intervals")

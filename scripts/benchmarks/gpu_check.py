@@ -30,7 +30,7 @@ from cflow_torch.stages import stage_seconds
 TOLERANCE = 1e-4  # metres; also of scores and confidences
 EXACT = ("cluster_id", "is_valid")
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
-PAPER, KEYS, DEFAULT = make_config("paper"), make_config("paper", method="keypoints"), make_config("default")
+PAPER, KEYS, DEFAULT = make_config("paper"), make_config("paper_keypoints"), make_config("default")
 TWO = PAPER.replace(num_history=2, pixel_sizes=(0.4, 0.1))
 SMALL = (-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)
 LITTLE = 30_000_000  # bytes, less than a batch needs

@@ -11,7 +11,8 @@ from cflow_torch import FlowResult, Sweep
 from cflow_torch.data.log import Log
 
 INTERVAL_NS = 100_000_000
-_BODY = np.stack(np.meshgrid(np.arange(0, 4, 0.2), np.arange(0, 1.6, 0.2), np.arange(0, 1.4, 0.2)), -1).reshape(-1, 3)
+SIZE = (4.5, 1.9, 1.2)  # metres; cars have the size that is typical, so that it does not matter which sides are seen
+_BODY = np.stack(np.meshgrid(*map(np.linspace, (0, 0, 0), SIZE, (20, 9, 7))), -1).reshape(-1, 3)
 _WALL = np.stack(np.meshgrid(np.arange(-10, 30, 0.2), [12.0], np.arange(0, 3, 0.2)), -1).reshape(-1, 3)
 
 
@@ -32,12 +33,23 @@ class Staged(Log):
         points, flow, car = [_WALL], [np.zeros_like(_WALL)], [np.full(len(_WALL), -1)]
         for number, path in enumerate(self.paths):
             if np.isfinite(path[index]).all():
-                points.append(_BODY + [*path[index], 0])
+                points.append(self._body(number) + [*path[index], 0])
                 after = path[min(index + 1, len(path) - 1)]
                 step = np.nan_to_num(after - path[index]) if np.isfinite(after).all() else path[index] - path[index - 1]
                 flow.append(np.zeros_like(_BODY) + [*step, 0])
                 car.append(np.full(len(_BODY), number))
         return np.concatenate(points), np.concatenate(flow), np.concatenate(car)
+
+    def middle(self, car: int) -> np.ndarray:
+        """(T, 2) x, y of the middle of a car at each sweep."""
+        return self.paths[car] + self._body(car)[:, :2].mean(0)
+
+    def _body(self, car: int) -> np.ndarray:
+        """Points of a car relative to its corner, turned to where it drives."""
+        path = self.paths[car][np.isfinite(self.paths[car]).all(1)]
+        x, y = (path[-1] - path[0]) / max(1e-9, np.linalg.norm(path[-1] - path[0]))
+        turn = np.array([[x, y, 0], [-y, x, 0], [0, 0, 1]])
+        return _BODY @ (turn if x or y else np.eye(3))
 
     def sweep(self, index: int) -> Sweep:
         points = self.world(index)[0]

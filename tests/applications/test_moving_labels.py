@@ -42,9 +42,11 @@ def test_flow_writes_a_label_file_for_every_sweep(
     folder = write_av2_log(make_small_drive(num_sweeps=5), tmp_path / "data")
     log, output = AV2Log(folder), tmp_path / "out"
     call = ("flow", "data=av2", f"data.root={folder}", "data.check=false", f"output={output}")
-    assert cflow(*call, *RUN, "contents=[cluster_id,is_valid]") == 2 and "add residual" in capsys.readouterr().err
+    assert (
+        cflow(*call, *RUN, "contents=[cluster_id,is_valid]") == 2 and "add moving, residual" in capsys.readouterr().err
+    )
     assert cflow(*call, *RUN[:3], "labels=kitti") == 2 and "semantickitti" in capsys.readouterr().err
-    assert cflow(*call, *RUN, "contents=[residual,points]") == 0
+    assert cflow(*call, *RUN, "contents=[residual,moving,points]") == 0
     labels = output / "sequences" / log.log_id / "predictions"
     assert sorted(file.name for file in labels.iterdir()) == [f"{index:06d}.label" for index in range(5)]
     for index, stamp in enumerate(log.timestamps):
@@ -55,10 +57,11 @@ def test_flow_writes_a_label_file_for_every_sweep(
             continue
         file = output / log.log_id / f"{stamp}.feather"
         table = feather.read_table(file)
-        assert table.column_names == ["x", "y", "z", "residual_tx_m", "residual_ty_m", "residual_tz_m"]
+        assert table.column_names == ["x", "y", "z", "residual_tx_m", "residual_ty_m", "residual_tz_m", "moving"]
         assert np.array_equal(np.stack([table[axis] for axis in "xyz"], 1), log.sweep(index).points[:, :3])
-        speed = read_flow(file).residual_flow.norm(dim=1).numpy()
-        assert 0 < (classes == 2).sum() < len(classes) and np.array_equal(classes == 2, speed >= 0.05)
+        flow = read_flow(file)
+        moves = (flow.residual_flow.norm(dim=1).numpy() >= 0.05) & (flow.moving.numpy() >= 0.5)
+        assert 0 < (classes == 2).sum() < len(classes) and np.array_equal(classes == 2, moves)
         assert set(classes) == {1, 2}
 
     (labels / "notes.txt").write_text("mine")

@@ -44,7 +44,7 @@ def expected(sweeps: list[Sweep], index: int, settings: Any) -> FlowResult:
 def test_results_equal_those_of_windows(preset, sweeps):
     settings = small(preset)
     timed = [replace(s, point_times=np.linspace(0, 0.09, len(s.points))) for s in sweeps]
-    stream = FlowStream(config=settings, device="cpu")
+    stream = FlowStream(settings, device="cpu")
     assert push(stream, timed[0]) is None and stream.window is None
     for index, sweep in enumerate(timed[1:]):
         result = push(stream, sweep)
@@ -55,7 +55,7 @@ def test_results_equal_those_of_windows(preset, sweeps):
 
 def test_few_sweeps_are_kept_and_buffers_may_be_reused(sweeps):
     settings, buffer = small("paper", num_history=1), np.empty((2000, 3), np.float32)
-    stream, seen = FlowStream(config=settings), []
+    stream, seen = FlowStream(settings), []
     for index, sweep in enumerate(sweeps):
         count = len(sweep.points)
         buffer[:count] = sweep.points
@@ -70,7 +70,7 @@ def test_few_sweeps_are_kept_and_buffers_may_be_reused(sweeps):
 
 def test_late_and_repeated_sweeps_are_skipped_and_gaps_start_again(sweeps, caplog):
     settings = small("default", num_history=2)
-    stream = FlowStream(config=settings, max_gap=0.5)
+    stream = FlowStream(settings, max_gap=0.5)
     for sweep in sweeps[:3]:
         last = push(stream, sweep)
     assert last is not None
@@ -89,7 +89,7 @@ def test_late_and_repeated_sweeps_are_skipped_and_gaps_start_again(sweeps, caplo
 def test_times_in_seconds_and_missing_times_give_the_same_flow(sweeps):
     settings = small("default", num_history=2, max_speed=8.0)
     regular = [replace(sweep, timestamp_ns=None) for sweep in sweeps]
-    stream, by_second = FlowStream(config=settings), FlowStream(config=settings)
+    stream, by_second = FlowStream(settings), FlowStream(settings)
     for index, sweep in enumerate(regular[:4]):
         result = push(stream, sweep)
         again = by_second.push(sweep.points, sweep.pose, 10.0 + 0.1 * index, sweep.is_ground)
@@ -110,7 +110,7 @@ BAD = [
 @pytest.mark.parametrize("bad, message, first", [*BAD, *(case[:2] + (False,) for case in BAD[:3])])
 def test_a_bad_sweep_is_refused_and_the_stream_goes_on(bad, message, first, sweeps):
     settings = small("default", num_history=2)
-    stream = FlowStream(config=settings)
+    stream = FlowStream(settings)
     good = sweeps[:3]
     for sweep in good[: 0 if first else 2]:
         push(stream, sweep)
@@ -156,7 +156,7 @@ def test_ground_is_found_by_default_but_a_given_mask_wins():
     bare = [replace(sweep, is_ground=None) for sweep in given]
 
     def masks(sweeps: list[Sweep], **arguments: Any) -> list[np.ndarray | None]:
-        stream = FlowStream(config=settings, device="cpu", **arguments)
+        stream = FlowStream(settings, device="cpu", **arguments)
         for sweep in sweeps:
             push(stream, sweep)
         pair = (stream.window.pc0, stream.window.pc1)

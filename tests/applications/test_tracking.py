@@ -13,12 +13,11 @@ from command_line import cflow
 from pyarrow import feather
 from scenes import pose, rows_of
 from small_logs import make_small_drive
-from staged_cars import Staged, straight
+from staged_cars import SIZE, Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
 from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
 from cflow_torch.applications.instance_files import write_drivestudio
-from cflow_torch.applications.track_state import Tracks
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import find_sources, open_log
@@ -31,7 +30,7 @@ def ids_of(log: Staged, table: dict[str, np.ndarray], car: int) -> list[int]:
     """Ids of the rows that lie on a car, in order."""
     ids = []
     for index in range(len(log) - 1):
-        centre = log.paths[car, index] + [1.9, 0.7]
+        centre = log.middle(car)[index]
         here = table["sweep"] == index
         near = np.hypot(table["x"] - centre[0], table["y"] - centre[1]) < 1.0
         ids += table["id"][here & near].tolist()
@@ -68,7 +67,7 @@ def test_a_car_that_stops_keeps_its_id() -> None:
     assert set(table["id"]) == {table["id"][0]} and len(table["id"]) == len(steps)
     is_static = np.isin(table["sweep"], range(9, 17))
     assert np.array_equal(~table["is_moving"], is_static) and np.all(table["cluster_id"][is_static] == -1)
-    assert np.hypot(table["vx"], table["vy"])[table["sweep"] == 16] < 0.1
+    assert np.hypot(table["vx"], table["vy"])[table["sweep"] == 14] < 0.1
     assert np.allclose(table["heading"][is_static], 0, atol=0.01), "the heading it had before"
 
 
@@ -124,7 +123,9 @@ def test_two_cars_in_one_cluster_keep_their_ids() -> None:
     assert len(table["id"]) == 22 and len(set(table["id"])) == 2
     for car in (0, 1):
         assert len(set(ids_of(log, table, car))) == 1
-    assert np.allclose(table["vx"][table["sweep"] > 5], 8, atol=0.05) and np.allclose(table["width"], 1.4, atol=0.01)
+    assert np.allclose(table["vx"][table["sweep"] > 5], 8, atol=0.05) and np.allclose(
+        table["width"], SIZE[1], atol=0.01
+    )
 
 
 def test_a_far_car_of_few_points_has_one_id() -> None:
@@ -141,10 +142,10 @@ def test_a_far_car_of_few_points_has_one_id() -> None:
 
 
 def test_low_confidence_confirms_only_long_motion_that_fits_and_missing_confidence_any() -> None:
-    log = Staged([straight((0, 0), (0.9, 0.0))])
+    log = Staged([straight((0, 0), (0.95, 0.0))])
     unsure = [(index, log.result(index, 0.5)) for index in range(11)]
     table = track(log, unsure)
-    assert np.flatnonzero(table["is_confirmed"])[0] == 5, "it has moved by its own length of 3.8 m"
+    assert np.flatnonzero(table["is_confirmed"])[0] == 5, "it has moved by its own length"
     for _, result in unsure:
         result.residual_flow.mul_(1.4)
     assert len(track(log, unsure)["id"]) == 0
@@ -161,10 +162,10 @@ def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then
 
         def world(self, index: int) -> Any:
             points, flow, car = super().world(index)
-            kept = (car < 0) | (index >= 2) | (points[:, 0] > self.paths[0, index, 0] + 3)
+            kept = (car < 0) | (index >= 2) | (points[:, 0] > self.paths[0, index, 0] + 3.7)
             return points[kept], flow[kept], car[kept]
 
-    log = Hidden([straight((0, 0), (0.15, 0.0), 14)])
+    log = Hidden([straight((0, 0), (0.17, 0.0), 14)])
     table = track(log, log.results())
     assert len(table["id"]) == 13 and len(set(table["id"])) == 1
     assert np.array_equal(table["is_confirmed"], np.arange(13) >= 7)
@@ -237,21 +238,6 @@ def test_boxes_are_tight_around_their_points() -> None:
         assert (inside[group == number] == -1).sum() >= 4, "points on the faces"
 
 
-def test_the_filter_equals_the_textbook_equations() -> None:
-    one = torch.ones(1, 3, dtype=torch.float64)
-    covariance = torch.tensor([[[0.2, 0.05], [0.05, 0.1]]], dtype=torch.float64)
-    before = Tracks()._replace(position=0 * one, velocity=5 * one, covariance=covariance)
-    after = before.predict(0.1, 2.0)
-    after.measure(torch.tensor([0]), 0.55 * one, 5.1 * one, torch.tensor([0.3, 0.2], dtype=torch.float64))
-    F, P = np.array([[1, 0.1], [0, 1]]), covariance[0].numpy()
-    push = 2.0 * np.array([0.005, 0.1])
-    P = F @ P @ F.T + np.outer(push, push)
-    gain = P @ np.linalg.inv(P + np.diag([0.09, 0.04]))
-    expected = np.array([0.5, 5.0]) + gain @ (np.array([0.55, 5.1]) - [0.5, 5.0])
-    assert np.allclose([after.position[0, 0], after.velocity[0, 0]], expected)
-    assert np.allclose(after.covariance[0], (np.eye(2) - gain) @ P)
-
-
 def test_an_empty_table_comes_back_from_disk_and_a_broken_one_is_refused(tmp_path: Path) -> None:
     write_tracks(tmp_path / "none.parquet", join_tables([]))
     assert len(read_tracks(tmp_path / "none.parquet")["id"]) == 0
@@ -276,10 +262,10 @@ def test_tracks_are_written_as_text(tmp_path: Path) -> None:
     assert [line[:5] for line in lines] == [[str(index), "0", "Misc", "-1", "-1"] for index in range(11)]
     height, width, length, x, y, z, rotation, score = np.array([line[10:] for line in lines], float).T
     assert np.allclose(height, 1.2) and np.allclose(score, 0.9, atol=1e-6)
-    assert np.allclose(width, 3.8, atol=1e-5) and np.allclose(length, 1.4, atol=1e-5), "it drives sideways"
-    # It is 8 + 1.9 m to the right, first 5 + 0.7 m ahead, and its lower face is 1 m below the origin.
-    assert np.allclose(x, 9.9, atol=0.01) and np.allclose(y, 1, atol=1e-5)
-    assert np.allclose(z, 5.7 + 0.9 * np.arange(11), atol=0.05)
+    assert np.allclose(width, 1.9, atol=1e-5) and np.allclose(length, 4.5, atol=1e-5), "a whole car"
+    # Its middle is 8 - .95 m to the right, first 5 + 2.25 m ahead, and its lower face is 1 m below the origin.
+    assert np.allclose(x, 7.05, atol=0.01) and np.allclose(y, 1, atol=1e-5)
+    assert np.allclose(z, 7.25 + 0.9 * np.arange(11), atol=0.05)
     assert np.allclose(rotation, -np.pi / 2, atol=1e-5), "KITTI: 0 = along x of the camera, negative to the left"
     alpha = np.array([line[5] for line in lines], float)
     assert np.allclose(alpha, rotation - np.arctan2(x, z), atol=1e-4)
@@ -319,12 +305,15 @@ def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> No
     write_drivestudio(tmp_path / "instances", table, log, "vehicle.car")
     poses, sizes, classes = read_instances(tmp_path / "instances")
     assert poses.shape[:2] == (12, 2) and classes == ["vehicle.car"] * 2
+    person = {**table, "class": np.where(table["id"] == table["id"].max(), "pedestrian", "truck")}
+    write_drivestudio(tmp_path / "people", person, log, "vehicle.car", "vehicle.bicycle")
+    assert read_instances(tmp_path / "people")[2] == ["vehicle.car", "vehicle.bicycle"]
     assert np.isfinite(poses[:, :, 0, 0]).sum(0).tolist() == [11, 7] and np.isnan(poses[11]).all()
-    corner = np.stack([straight((0, -6), (0.8, 0.0)), hidden], 1)
-    assert np.allclose(poses[4:11, :, :2, 3], corner[4:11] + (1.9, 0.7), atol=0.1), "the middle of the box"
+    middle = np.stack([log.middle(car) for car in range(2)], 1)
+    assert np.allclose(poses[4:11, :, :2, 3], middle[4:11], atol=0.1), "the middle of the box"
     assert np.allclose(poses[10, 0, :3, 0], (1, 0, 0), atol=0.01), "x along its length"
     assert np.allclose(poses[10, 1, :3, 0], (0, 1, 0), atol=0.01)
-    assert np.allclose(sizes, [(3.8, 1.4, 1.2), (1.4, 3.8, 1.2)], atol=1e-4)
+    assert np.allclose(sizes, SIZE, atol=1e-4)
 
 
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
@@ -373,13 +362,18 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert call("flow", "whole", *run[:3], "tracks=drivestudio") == 0
     poses, _, classes = read_instances(file.parent)
     assert np.isfinite(poses[:, :, 0, 0]).sum() == len(whole["id"]) and set(classes) == {"REGULAR_VEHICLE"}
+    assert call("flow", "whole", *run[:3], "tracks=nuscenes") == 0
+    detections = json.loads((file.parent / "nuscenes_detection.json").read_text())["results"]
+    assert sum(map(len, detections.values())) == len(whole["id"]) and len(detections) == 5
+    assert call("flow", "whole", *run[:3], "tracks=openpcdet") == 0 and (file.parent / "result.pkl").exists()
     for lost in (file, sorted(file.parent.glob("*.feather"))[2]):
         lost.unlink()
         assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
         tables = [feather.read_table(each) for each in file.parent.glob("*.feather")]
         assert [table.column_names.count("track_id") for table in tables] == [1] * 4, "also in a frame that was missing"
     assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
-    assert [other.name for other in file.parent.glob("*.json")] == ["manifest.json"], "nor their other forms"
+    others = [other.name for other in file.parent.iterdir() if other.suffix != ".feather"]
+    assert others == ["manifest.json"], "nor their other forms"
     capsys.readouterr()
     assert call("flow", "small", *run, "contents=[residual,cluster_id,is_valid]") == 2
     assert "add confidence" in capsys.readouterr().err

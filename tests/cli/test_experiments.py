@@ -13,7 +13,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from cflow_torch.cli.choices import CONFIGS
+from cflow_torch.cli.choices import FOLDER
 from cflow_torch.cli.comparison import compare
 from cflow_torch.cli.eval import objective
 from cflow_torch.config import config_from
@@ -41,7 +41,7 @@ def jobs_of(compose: Callable[..., Any], experiment: str) -> list[tuple[str, ...
     return list(itertools.product(*choices))
 
 
-@pytest.mark.parametrize("experiment", [file.stem for file in CONFIGS.glob("experiment/*.yaml")])
+@pytest.mark.parametrize("experiment", [file.stem for file in FOLDER.glob("experiment/*.yaml")])
 def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment, compose):
     far, jobs = experiment in ("datasets", "range_split"), jobs_of(compose, experiment)
     count, *ends = JOBS[experiment]

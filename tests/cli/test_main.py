@@ -16,7 +16,6 @@ import pytest
 
 import cflow_torch
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS
-from cflow_torch.config import REMOVED
 
 MAIN = [sys.executable, "-m", "cflow_torch.cli.main"]
 needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
@@ -30,7 +29,7 @@ def test_help_explains_a_command_with_examples_and_settings(command, cflow, caps
         text.startswith(f"cflow {command}: {COMMANDS[command].SUMMARY}") and f"\nexamples:\n  cflow {command}" in text
     )
     if command in WITH_SETTINGS:
-        assert "\n  output: outputs/" in text and "\n  model=default|offline|live|paper|keypoints\n" in text
+        assert "\n  output: outputs/" in text and "\n  model=default|offline|live|paper|keypoints|" in text
     assert cflow("help", command) == 0
     assert capsys.readouterr().out == text
 
@@ -40,11 +39,13 @@ CHEAP = (
     ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, check, flow,"),
     ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
     ("flow num_history=2", "(did you mean model.num_history?)"),
-    ("eval model=papr", "model=papr (did you mean paper?): give one of default, keypoints, live, offline, paper"),
-    ("eval model=fast", "preset 'fast' was removed in 0.4.0: use default with num_history=2"),
+    (
+        "eval model=papr",
+        "model=papr (did you mean paper?): give one of default, keypoints, live, offline, paper, paper_keypoints",
+    ),
     (
         "eval model.densify=nearest",
-        "setting 'model.densify' belongs to model=keypoints: give that as well",
+        "setting 'model.densify' belongs to model=keypoints or model=paper_keypoints: give that as well",
     ),
     ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
     ("plot cluster=3", "setting 'cluster' belongs to picture=correlation or picture=scales: give that as well"),
@@ -52,7 +53,6 @@ CHEAP = (
     ("flow paper", "paper: there is no such file or folder; settings are NAME=VALUE"),
     ("flow data=av2 data.root=/no/such/folder", "/no/such/folder"),
     ("info --long", "info takes --short (the default) or --full, got --long"),
-    ("clean standing=true", "setting standing was removed: use remove_stopped"),
     ("eval -m model=default,papr", "model=papr (did you mean paper?)"),
     ("eval model.num_history=1.5", "num_history=1.5: give a whole number of at least 0"),
     ("eval --bogus", "unknown option '--bogus'"),
@@ -68,8 +68,7 @@ CHEAP = (
     ("flow shard.index=one shard.count=3", "shard.index='one': give a whole number of at least 0"),
     ("flow engine.workers=0", "engine.workers=0: give a whole number of at least 1"),
     ("flow engine.memory=true", "engine.memory=True: give a number above 0"),
-    ("eval model.max_object=1", f"setting max_object was removed: {REMOVED['max_object']}"),
-    ("eval +model.thorough=1", f"setting thorough was removed: {REMOVED['thorough']}"),
+    ("eval +model.thorough=1", "unknown setting thorough: the fields are pixel_size"),
 )
 OTHERS = (
     ("submit version=1 masks=none data.num_sweeps=2", "none"),

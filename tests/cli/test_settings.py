@@ -12,13 +12,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch import make_config
-from cflow_torch.cli.choices import CONFIGS, choices, names_in, read_settings
+from cflow_torch.cli.choices import FOLDER, choices, names_in, read_settings
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
 from cflow_torch.cli.compose import hydra_overrides, settings_of
 from cflow_torch.cli.main import HELP
 from cflow_torch.cli.words import read_call, split
-from cflow_torch.config import CONFIGS as METHODS
-from cflow_torch.config import PRESETS, REMOVED, config_from
+from cflow_torch.config import METHODS, PRESETS, config_from
 from cflow_torch.data.catalog import DATA_SETS
 
 
@@ -65,7 +64,7 @@ def test_examples_use_existing_settings_and_choices(compose):
 
 
 def test_names_of_data_settings_are_those_in_yaml():
-    for file in CONFIGS.glob("data/*.yaml"):
+    for file in FOLDER.glob("data/*.yaml"):
         assert set(names_in(file)) == set(read_settings(file)), file
 
 
@@ -73,7 +72,7 @@ def test_names_of_data_settings_are_those_in_yaml():
     "words",
     [
         "data=benchmark_sensors data.profile=waymo",
-        "model=base_keypoints model.densify=nearest",
+        "model=paper_keypoints model.densify=nearest",
         "-m model=paper,default model.connectivity=4",
         "experiment=keypoints model.densify=nearest",
         "model=choice(paper,keypoints) model.connectivity=4",
@@ -86,8 +85,8 @@ def test_settings_of_chosen_groups_are_known(words):
 def test_the_format_of_a_path_may_have_any_setting():
     """data=auto lists the settings of all formats that it recognises."""
     of_formats = {name for name in DATA_SETS if DATA_SETS[name].marks or name == "arrays"}
-    names = {name for one in (*of_formats, "synthetic") for name in read_settings(CONFIGS / "data" / f"{one}.yaml")}
-    assert set(read_settings(CONFIGS / "data" / "auto.yaml")) == names
+    names = {name for one in (*of_formats, "synthetic") for name in read_settings(FOLDER / "data" / f"{one}.yaml")}
+    assert set(read_settings(FOLDER / "data" / "auto.yaml")) == names
 
 
 @pytest.fixture
@@ -103,21 +102,21 @@ def mine(tmp_path: Path) -> Callable[[str], Path]:
 
 
 def test_your_own_preset_contains_only_its_changes(mine, cflow, capsys):
-    folder = mine("defaults: [base_verified, _self_]\nnum_history: 3\n")
+    folder = mine("defaults: [default, _self_]\nnum_history: 3\n")
     call = ("eval", "--config-dir", folder, "model=mine", "model.max_speed=20", "--cfg", "job", "-p", "model")
     assert cflow(*call) == 0
     given = OmegaConf.create(capsys.readouterr().out)
-    assert given == OmegaConf.create(METHODS["verified"](num_history=3, max_speed=20.0).as_dict())
+    assert given == OmegaConf.create(make_config(num_history=3, max_speed=20.0).as_dict())
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("defaults: [base_dense, _self_]\nsignificance: 2\n", "significance is a setting of method verified"),
-        ("defaults: [base_verified, _self_]\nthorough: false\n", REMOVED["thorough"]),
-        ("method: verified\nmax_object: 20\n", REMOVED["max_object"]),
+        ("defaults: [paper, _self_]\nsignificance: 2\n", "significance is a setting of method verified"),
+        ("defaults: [default, _self_]\nthorough: false\n", "unknown setting thorough: the fields are"),
+        ("method: verified\nmax_object: 20\n", "unknown setting max_object: the fields are"),
         (
-            "defaults: [base_dense, _self_]\nnum_history: many\n",
+            "defaults: [paper, _self_]\nnum_history: many\n",
             "num_history='many': give a whole number of at least 0",
         ),
         ("num_history: 3\n", "method=None: give one of"),
@@ -159,7 +158,7 @@ def test_the_page_lists_every_setting(cflow, capsys):
     changed = "default `4`, offline `4`, live `2`"
     assert cells[:3] == ["`0`", changed, "a whole number of at least 0"] and "sweeps" in cells[3]
     assert "dense \\| keypoints" in page, "bars in cells are escaped"
-    for file in CONFIGS.glob("data/*.yaml"):
+    for file in FOLDER.glob("data/*.yaml"):
         assert f"\n## data={file.stem}\n" in page and file.read_text().strip() in page
 
 
@@ -169,7 +168,7 @@ def test_the_page_lists_every_setting(cflow, capsys):
         (
             "max_speed",
             [
-                "Method `dense`: model=paper, Method `keypoints`: model=keypoints:",
+                "Method `dense`: model=paper, Method `keypoints`: model=keypoints, model=paper_keypoints:",
                 "default `60.0`, offline `60.0`, live `60.0`",
             ],
         ),
@@ -189,5 +188,5 @@ def test_settings_explains_one_name(name, expected, cflow, capsys):
 
 def test_the_harness_models_are_those_in_the_package(tmp_path: Path, cflow) -> None:
     assert cflow("settings", "--opensceneflow", tmp_path / "model") == 0
-    committed = {file.name: file.read_text() for file in (CONFIGS / "opensceneflow" / "model").glob("*.yaml")}
+    committed = {file.name: file.read_text() for file in (FOLDER / "opensceneflow" / "model").glob("*.yaml")}
     assert committed == {file.name: file.read_text() for file in (tmp_path / "model").iterdir()}

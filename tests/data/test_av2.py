@@ -208,3 +208,61 @@ def test_a_map_gives_ground_masks(folder: Path) -> None:
     np.save(maps / "x_ground_height_surface____PIT.npy", np.zeros(40))
     with pytest.raises(CFlowError, match="ground_height_surface"):
         AV2Log(folder)
+
+
+def write_calibration(folder: Path) -> None:
+    """Two cameras, one of which looks ahead and the other to the left."""
+    names = ["ring_front_center", "ring_side_left"]
+    columns = {"sensor_name": names, "fx_px": [1700.0, 1600.0], "fy_px": [1710.0, 1610.0], "cx_px": [770.0, 1020.0]}
+    columns.update(cy_px=[1010.0, 760.0], k1=[-0.2, -0.2], width_px=[1550, 2048], height_px=[2048, 1550])
+    write_table(folder / "calibration" / "intrinsics.feather", **columns)
+    rotations = np.array([[0.5, -0.5, 0.5, -0.5], [0.7, -0.7, 0.1, -0.1]])
+    mount: dict[str, Any] = dict(zip(("qw", "qx", "qy", "qz"), rotations.T))
+    mount.update(tx_m=[1.6, 1.3], ty_m=[0.0, 0.3], tz_m=[1.4, 1.4])
+    write_table(folder / "calibration" / "egovehicle_SE3_sensor.feather", sensor_name=names, **mount)
+
+
+def check_cameras(log: AV2Log, index: int, points: np.ndarray) -> None:
+    """Compare the pixels of points with those of av2-api, which reads the same files."""
+    pytest.importorskip("av2", reason="needs av2: scripts/evaluators.txt")
+    from av2.geometry.camera.pinhole_camera import PinholeCamera
+    from av2.utils.io import read_city_SE3_ego
+
+    poses = read_city_SE3_ego(log.folder)
+    for camera in log.cameras(index):
+        theirs = PinholeCamera.from_feather(log.folder, camera.name)
+        pose_of_image = poses[int(camera.image)]
+        pixels, in_camera, _ = theirs.project_ego_to_img_motion_compensated(
+            points, pose_of_image, poses[log.timestamps[index]]
+        )
+        assert camera.size == (theirs.width_px, theirs.height_px)
+        positions = camera.see(points)
+        np.testing.assert_allclose(positions, in_camera[:, :3], atol=1e-6)
+        is_ahead = positions[:, 2] > 0.5
+        np.testing.assert_allclose(camera.project(positions)[is_ahead], pixels[is_ahead], atol=1e-3)
+        assert np.isnan(camera.project(positions)[positions[:, 2] < 0]).all()
+
+
+def test_cameras_of_the_real_log_project_as_those_of_the_api(av2_folder: Path) -> None:
+    log = AV2Log(av2_folder)
+    assert len(log.cameras(0)) == 9 and {camera.seconds for camera in log.cameras(0)} == {0.0}
+    check_cameras(log, 0, log.sweep(0).points.astype(np.float64)[::500])
+
+
+def test_each_camera_has_the_pose_of_its_own_image(folder: Path) -> None:
+    """The vehicle turns and drives while images are taken, 40 and 30 ns after and before the sweep."""
+    assert AV2Log(folder).cameras(0) == []
+    times = (100, 170, 200, 240, 300)
+    columns = pose_columns(times)
+    yaw = np.linspace(0, 1, 5)
+    columns.update(qw=np.cos(yaw / 2), qz=np.sin(yaw / 2))
+    write_table(folder / "city_SE3_egovehicle.feather", **columns)
+    write_calibration(folder)
+    for name, stamps in {"ring_front_center": (100, 240), "ring_side_left": (170, 300)}.items():
+        (folder / "sensors" / "cameras" / name).mkdir(parents=True)
+        for stamp in stamps:
+            (folder / "sensors" / "cameras" / name / f"{stamp}.jpg").touch()
+    log = AV2Log(folder)
+    front, left = log.cameras(1)
+    assert (front.image, front.seconds) == ("240", pytest.approx(40e-9)) and left.image == "170"
+    check_cameras(log, 1, np.random.default_rng(0).uniform(-30, 30, (200, 3)))

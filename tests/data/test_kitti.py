@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.kitti import KITTILog, find_kitti_drives
@@ -220,3 +221,23 @@ def test_a_folder_velodyne_of_other_clouds_is_a_folder_of_clouds(tmp_path: Path)
     assert recognise(tmp_path) == "arrays"
     with pytest.raises(CFlowError, match="no drive of KITTI"):
         find_sources("kitti", tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["raw", "tracking", "sequence"])
+def test_the_colour_cameras_project_by_the_calibration(tmp_path: Path, layout: str) -> None:
+    if layout == "raw":
+        log = KITTILog(write_raw(tmp_path / "2011_09_26" / "2011_09_26_drive_0027_sync"))
+    elif layout == "tracking":
+        log = KITTILog(write_tracking(tmp_path / "training") / "velodyne" / "0003")
+    else:
+        folder = write_sequence(tmp_path / "sequences" / "04")
+        (folder / "calib.txt").write_text(f"P2: {text(PROJECTION)}\nTr: {text(T_CAMERA_LIDAR[:3])}\n")
+        (folder / "image_2").mkdir()
+        Image.new("RGB", (1226, 370)).save(folder / "image_2" / "000000.png")
+        log = KITTILog(folder)
+    (camera,) = log.cameras(1)  # there is no calibration of camera 3
+    assert (camera.name, camera.image, camera.seconds) == ("image_02", log.files[1].stem, 0.0)
+    assert camera.size == ((1226, 370) if layout == "sequence" else (1242, 375))
+    points = cloud(1)[:3, :3]
+    homogeneous = PROJECTION @ T_CAMERA_LIDAR @ np.column_stack([points, np.ones(3)]).T
+    np.testing.assert_allclose(camera.project(camera.see(points)), (homogeneous[:2] / homogeneous[2]).T, atol=1e-6)

@@ -16,7 +16,7 @@ from cflow_torch.data.arrays.cloud_file import read_cloud
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.nuscenes.reader import Footprint, NuScenesLog, find_nuscenes_scenes
 from cflow_torch.data.nuscenes.tables import Annotations, Tracks
-from cflow_torch.transforms import poses_from_quaternions, transform_points
+from cflow_torch.transforms import poses_from_quaternions, to_quaternions, transform_points
 from cflow_torch.types import CFlowError
 
 VERSION = "v1.0-mini"
@@ -218,3 +218,39 @@ def test_a_scene_with_key_frames_only_names_the_setting(tmp_path):
     (folder / "samples").rename(tmp_path / "other")
     with pytest.raises(CFlowError, match="its files are not in"):
         open_log(folder)
+
+
+def test_cameras_have_the_pose_of_their_nearest_image(tiny):
+    """A camera takes images 30 ms after each sweep. The vehicle drives and turns in between."""
+    assert open_log(tiny).cameras(0) == []
+    recording = TinyRecording(("LIDAR_TOP",))
+    T_ego_camera = rigid(turn_z(0.2) @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), [1.5, 0.1, 1.6])
+    matrix = np.array([[1260.0, 0, 816], [0, 1270, 491], [0, 0, 1]])
+    stamps = [stamp + 30_000_000 for stamp in recording.timestamps]
+
+    def row_of(pose):
+        return {"translation": pose[:3, 3].tolist(), "rotation": to_quaternions(pose[None, :3, :3])[0].tolist()}
+
+    mount = {"token": "m", "sensor_token": "c", **row_of(T_ego_camera), "camera_intrinsic": matrix.tolist()}
+    edit(tiny, "sensor", lambda rows: [*rows, {"token": "c", "channel": "CAM_FRONT", "modality": "camera"}])
+    edit(tiny, "calibrated_sensor", lambda rows: [*rows, mount])
+    poses = [{"token": f"p{k}", "timestamp": 0, **row_of(recording.pose_at(t))} for k, t in enumerate(stamps)]
+    edit(tiny, "ego_pose", lambda rows: [*rows, *poses])
+    samples = [row["token"] for row in json.loads((tiny / VERSION / "sample.json").read_text())]
+    same = {"calibrated_sensor_token": "m", "is_key_frame": True, "width": 1600, "height": 900}
+    images = [
+        {"sample_token": sample, "ego_pose_token": f"p{k}", "timestamp": t // 1000, "filename": f"x/a__{k}.jpg", **same}
+        for k, (sample, t) in enumerate(zip(samples, stamps))
+    ]
+    edit(tiny, "sample_data", lambda rows: [*rows, *images])
+    log = open_log(tiny)
+    (camera,) = log.cameras(2)
+    assert (camera.name, camera.image, camera.size) == ("CAM_FRONT", "a__2", (1600, 900))
+    assert camera.seconds == pytest.approx(0.03)
+    sweep = log.sweep(2)
+    in_world = transform_points(sweep.points, sweep.pose)
+    x, y, z = transform_points(in_world, np.linalg.inv(recording.pose_at(stamps[2]) @ T_ego_camera)).T
+    np.testing.assert_allclose(camera.see(sweep.points), np.stack([x, y, z], 1), atol=1e-6)
+    pixels = np.stack([1260 * x / z + 816, 1270 * y / z + 491], 1)
+    ahead = z > 1
+    np.testing.assert_allclose(camera.project(camera.see(sweep.points))[ahead], pixels[ahead], atol=1e-3)

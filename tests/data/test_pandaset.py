@@ -18,6 +18,7 @@ from cflow_torch import CFlowError
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.pandaset import PandaSetLog
 from cflow_torch.data.pickles import load_columns
+from cflow_torch.transforms import to_quaternions
 
 # Two points (x, y, d, label) by pandas 1.0.5 in protocol 4, the layout of the released files.
 OLD_FRAME = (
@@ -160,3 +161,34 @@ def test_files_without_compression_are_read(sequence: Path) -> None:
     log = PandaSetLog(sequence)
     assert all(np.array_equal(log.sweep(k).points, points) for k, points in enumerate(before))
     assert np.array_equal(log.labels(0).flow, flow)
+
+
+def test_cameras_have_the_poses_of_their_images(sequence: Path) -> None:
+    """The camera is 1 m above the vehicle, looks ahead, and takes its image 20 ms after the sweep."""
+    assert PandaSetLog(sequence).cameras(0) == []
+    recording = TinyRecording(num_sweeps=3)
+    folder = sequence / "camera" / "front_camera"
+    folder.mkdir(parents=True)
+    T_ego_camera = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1]])
+    stamps = [stamp + 20_000_000 for stamp in recording.timestamps]
+    poses = [recording.pose_at(stamp) @ T_ego_camera for stamp in stamps]
+    rows = [
+        {"position": dict(zip("xyz", pose[:3, 3])), "heading": dict(zip("wxyz", to_quaternions(pose[None, :3, :3])[0]))}
+        for pose in poses
+    ]
+    (folder / "poses.json").write_text(json.dumps(rows))
+    (folder / "timestamps.json").write_text(json.dumps([stamp * 1e-9 for stamp in stamps]))
+    (folder / "intrinsics.json").write_text(json.dumps({"fx": 1900.0, "fy": 1910.0, "cx": 960.0, "cy": 540.0}))
+    log = PandaSetLog(sequence)
+    (camera,) = log.cameras(1)
+    assert (camera.name, camera.image, camera.size) == ("front_camera", "01", (1920, 1080))
+    assert camera.seconds == pytest.approx(0.02, abs=1e-6)
+    sweep = log.sweep(1)
+    x, y, z = np.linalg.inv(poses[1])[:3] @ np.column_stack([recording.world(1), np.ones(len(sweep.points))]).T
+    np.testing.assert_allclose(camera.see(sweep.points), np.stack([x, y, z], 1), atol=1e-4)
+    ahead = z > 1
+    pixels = np.stack([1900 * x / z + 960, 1910 * y / z + 540], 1)
+    np.testing.assert_allclose(camera.project(camera.see(sweep.points))[ahead], pixels[ahead], rtol=1e-4, atol=0.05)
+    (folder / "poses.json").write_text(json.dumps(rows[:2]))
+    with pytest.raises(CFlowError, match="2 poses and 3 times of images for 3 sweeps"):
+        PandaSetLog(sequence).cameras(0)

@@ -163,3 +163,9 @@ def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
         found = window(log, 7, 4)
     assert [sweep.points[0, 0] for sweep in found.pch] == [7] and isinstance(found.pc0, Sweep)
     assert len(window(log, 1, 4, 4).pcf) == 2 and len(window(log, 10, 4).pch) == 4
+
+
+def test_a_vehicle_that_stands_has_a_pose_in_every_line(tmp_path: Path) -> None:
+    """Lines without times may be equal. Only a line with a time can be a repetition."""
+    np.savetxt(tmp_path / "poses.txt", np.tile(np.eye(4)[:3].reshape(12), (4, 1)))
+    assert poses_text.read_poses(tmp_path / "poses.txt").poses.shape == (4, 4, 4)

@@ -6,12 +6,15 @@ or another repository. Of `cflow` commands with data we compose the settings.
 
 from __future__ import annotations
 
+import ast
 import importlib
+import inspect
 import json
 import re
 import runpy
 import shlex
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -23,11 +26,13 @@ from command_line import cflow
 
 import cflow_torch
 from cflow_torch import evaluation, viz
+from cflow_torch.config import METHODS
 from cflow_torch.data.arrays import write_array_log
-from cflow_torch.data.arrays.cloud_file import read_cloud
+from cflow_torch.data.arrays.cloud_file import read_cloud, read_columns, write_cloud
 from cflow_torch.data.catalog import DATA_SETS
 from cflow_torch.simulator import make_drive
 
+SETTINGS = {"pixel_size", *(f.name for kind in METHODS.values() for f in fields(kind))}
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("README.md", "docs/quick_start.md", "docs/harness.md")
 BLOCK = re.compile(r"^```(bash|python)\n(.*?)^```", re.M | re.S)
@@ -107,6 +112,28 @@ def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: dict
         assert Path("flow.png").is_file() and 0 < len(read_cloud("clean_map.ply")) < len(read_cloud("map.ply"))
 
 
+def test_three_commands_of_the_readme_make_actors_and_a_clean_map(folder: Path, capfd: Any) -> None:
+    """They run one after the other on a folder of .pcd files with poses."""
+    pytest.importorskip("pypcd4", reason="needs the extra clouds: pip install pypcd4")
+    drive = make_drive(seed=4, num_sweeps=7, profile="demo")
+    (folder / "data" / "my_drive").mkdir(parents=True)
+    for index, sweep in enumerate(drive):
+        write_cloud(folder / "data" / "my_drive" / f"scan_{index}.pcd", sweep.points, {"intensity": sweep.points[:, 2]})
+    np.savetxt(folder / "data" / "my_drive" / "poses.txt", drive.poses[:, :3].reshape(-1, 12))
+    commands = [words for kind, words in parts("README.md") if kind == "cflow" and "/data/my_drive" in words]
+    assert [words[0] for words in commands] == ["check", "flow", "clean"]
+    for words in commands:
+        assert cflow(*(word.replace("/data/", "data/") for word in words)) == 0, words
+    printed = capfd.readouterr().out
+    frames = json.loads(Path("outputs/flow/my_drive/frame_instances.json").read_text())
+    actors = json.loads(Path("outputs/flow/my_drive/instances_info.json").read_text())
+    assert list(frames) == [str(index) for index in range(7)] and max(map(len, frames.values())) > 2
+    assert f"{len(actors)} tracks in tracks.parquet, instances_info.json, frame_instances.json" in printed
+    points = read_columns("outputs/clean/my_drive.ply")["intensity"]
+    kept = [read_cloud(f"outputs/clean/my_drive/points/scan_{index}.pcd") for index in range(7)]
+    assert 1000 < len(points) < sum(map(len, kept)) < 0.95 * sum(len(sweep.points) for sweep in drive)
+
+
 EVERY_PAGE = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "notebooks").glob("*.[im][pd]*")]
 CODE = re.compile(r"^ *(```+|~~~+).*?^ *\1|(`+)(?!`).*?(?<!`)\2(?!`)", re.M | re.S)
 LINK = re.compile(r"\]\(\s*<?([^)\s>]+)|<(?:img|a)\b[^>]*?\b(?:src|href)=\"([^\"]+)|^\[[^\]]+\]:\s+(\S+)", re.M)
@@ -139,6 +166,52 @@ def test_links_have_targets_in_this_repository(page: Path) -> None:
         if not file.exists() or ROOT not in (file, *file.parents) or (anchor and anchor not in anchors(file)):
             wrong.append(target)
     assert not wrong
+
+
+PROSE = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+SOURCES = [path for name in ("cflow_torch", "configs", "scripts", "tests") for path in (ROOT / name).rglob("*.*")]
+# Words of other programs and placeholders that our files do not contain.
+OF_OTHERS = {
+    *("TOPIC", "NEW", "aws", "gcloud", "anon", "FSSPEC_S3", "analytics", "load_frame_list", "relative_to_idx"),
+    *("res_name", "run_cflow", "test_pl", "_calib", "counterclockwise_", "submitit_slurm"),
+}
+
+
+@pytest.fixture(scope="module")
+def known_words() -> set[str]:
+    """Return the words of all sources but this file, and their names."""
+    files = [file for file in SOURCES if file.suffix in (".py", ".yaml", ".sh", ".html") and file != Path(__file__)]
+    words = {file.stem for file in files}
+    for file in [*files, ROOT / "pyproject.toml", ROOT / "mkdocs.yml"]:
+        words.update(re.findall(r"\w+", file.read_text(encoding="utf-8")))
+    return words
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.name)
+def test_names_in_sentences_exist(page: Path, known_words: set[str]) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    codes = re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text)
+    names = {name for code in codes for name in re.findall(r"(?<![\w./-])[A-Za-z_][\w.]*\w", code)}
+    assert {word for name in names for word in name.split(".")} <= known_words | OF_OTHERS
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.name)
+def test_python_of_the_pages_imports_and_passes_what_exists(page: Path) -> None:
+    """Also in blocks that are not run: imports from this package, and keywords of calls of what is imported."""
+    objects: dict[str, Any] = {}
+    for language, block in BLOCK.findall(page.read_text(encoding="utf-8")):
+        if language != "python":
+            continue
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("cflow_torch"):
+                module = importlib.import_module(str(node.module))
+                objects.update((name.asname or name.name, getattr(module, name.name)) for name in node.names)
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in objects:
+                parameters = inspect.signature(objects[node.func.id]).parameters
+                takes_settings = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+                allowed = {*parameters, *(SETTINGS if takes_settings else ())}
+                assert {word.arg for word in node.keywords if word.arg} <= allowed, ast.dump(node)
 
 
 def test_the_reference_has_every_public_name() -> None:

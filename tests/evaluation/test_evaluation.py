@@ -374,6 +374,10 @@ def test_the_moving_iou_counts_ground_and_points_of_unknown_flow() -> None:
     by_class = scores("mos", frame(true, **parts, moving=moving))["moving"]
     assert (by_class["num_points"], by_class["num_moving"], by_class["iou"]) == (5, 3, 2 / 4)
     assert scores(OSF, frame(true, **parts, moving=moving))["num_points"] == 3, "other definitions need flow"
+    likely = [False, True, False, False, True, False]
+    by_chance = frame(true, **parts, predicted_moving=likely)
+    assert scores("mos", by_chance)["moving"]["iou"] == 1.0, "what the method itself says"
+    assert str(scores(OSF, by_chance)) == str(scores(OSF, frame(true, **parts))), "flow alone decides elsewhere"
     nothing = scores("mos", frame(np.zeros((2, 3))))
     assert math.isnan(nothing["moving"]["iou"]) and "| -" in format_table(nothing)
     assert "moving IoU nan" in summary(nothing, {"median": 1.0}) and math.isnan(objective(nothing))

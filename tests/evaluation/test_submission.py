@@ -21,7 +21,7 @@ from cflow_torch import CFlowError, CorrelationFlow
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window
-from cflow_torch.evaluation.submission.archive import check_submission, encode, get_version, pack, write_frame
+from cflow_torch.evaluation.submission.archive import check_submission, encode, get_version, write_frame, write_zip
 from cflow_torch.evaluation.submission.frames import MaskArchive, plan_log, point_mask, read_frame_list, require_logs
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
@@ -55,7 +55,7 @@ def archives(log: AV2Log, estimated: dict[int, Any], tmp_path_factory: pytest.Te
             mask = point_mask(log, frame.index, sweeps.pc0) if version.is_masked else None
             write_frame(folder, frame.name, encode(version, flow, sweeps.pc0.is_ground, mask)[0])
             expected[frame.name] = frame.count_rows(version)
-        pack(folder, expected, folder.parent / "a.zip")
+        write_zip(folder, expected, folder.parent / "a.zip")
         result[number] = (folder, folder.parent / "a.zip", expected)
     return result
 
@@ -108,12 +108,12 @@ def test_unsuitable_values_and_versions_are_refused(estimated: dict[int, Any]) -
 def test_the_same_files_make_the_same_zip(archives: dict[int, Any], tmp_path: Path) -> None:
     folder, good, expected = archives[1]
     shutil.copytree(folder, tmp_path / "copy")
-    pack(tmp_path / "copy", reversed(list(expected)), tmp_path / "again.zip")
+    write_zip(tmp_path / "copy", reversed(list(expected)), tmp_path / "again.zip")
     assert (tmp_path / "again.zip").read_bytes() == good.read_bytes()
     first = min(expected)
     (tmp_path / "copy" / first).unlink()
     with pytest.raises(OSError, match=first):
-        pack(tmp_path / "copy", expected, tmp_path / "never.zip")
+        write_zip(tmp_path / "copy", expected, tmp_path / "never.zip")
     assert not (tmp_path / "never.zip").exists()
 
 

@@ -173,9 +173,9 @@ def test_finding_ground_keeps_given_masks_and_adds_those_of_the_history():
     mine = np.arange(len(pc0)) < len(car)  # not ground, but the user's mask counts
     result = estimate_flow(pc0, pc1, gm0=mine, ground="grid", preset="paper")
     assert not result.is_valid[mine].any() and result.is_valid[~mine].any()
-    settings = {"pch": [older], "num_history": 1, "preset": "paper"}
+    settings = {"num_history": 1, "preset": "paper"}
     gm0, gm1, gmh = find_ground_batch([pc0, pc1, older])
-    masked = estimate_flow(pc0, pc1, gm0=gm0, gm1=gm1, gmh=[gmh], **settings)
-    found = estimate_flow(pc0, pc1, ground="grid", **settings)
+    masked = estimate_flow(Sweep(pc0, gm0), Sweep(pc1, gm1), history=[Sweep(older, gmh)], **settings)
+    found = estimate_flow(Sweep(pc0), Sweep(pc1), history=[Sweep(older)], ground="grid", **settings)
     assert_same(found, masked)
     assert np.allclose(found.residual_flow[(mine & ~gm0)], [0.8, 0, 0], atol=1e-6)

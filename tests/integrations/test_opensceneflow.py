@@ -28,10 +28,10 @@ from cflow_torch.transforms import transform_points
 Batch = Dict[str, Any]
 SMALL = {"pixel_sizes": [0.25], "point_cloud_range": list(RANGE)}
 VARIANTS: dict[str, dict[str, Any]] = {
-    "dense": {"method": "dense", "num_frames": 6, **SMALL, "max_extent": 5.0},
+    "dense": {"preset": "paper", "num_frames": 6, **SMALL, "max_extent": 5.0},
     # Batches contain no ground, so no height above ground is known.
     "verified": {"preset": "default", "num_frames": 6, **SMALL, "min_height": None, "significance": 0.0},
-    "keypoints": {**SMALL, "method": "keypoints", "patch_size": 11, "ratio_threshold": 1.0, "pixel_sizes": [0.1]},
+    "keypoints": {**SMALL, "preset": "keypoints", "patch_size": 11, "ratio_threshold": 1.0, "pixel_sizes": [0.1]},
 }
 EGO_T_LIDAR = np.array([[0.8, -0.6, 0, 1.35], [0.6, 0.8, 0, 0.2], [0, 0, 1, 1.6], [0, 0, 0, 1]])
 AV2_STAMP = 315_966_265_259_836_000  # Argoverse 2 has an epoch of its own
@@ -214,15 +214,15 @@ def test_the_error_names_the_bad_key_of_a_batch(what: str, key: str, drive: list
 
 def test_settings_of_the_method_and_others() -> None:
     assert CFlow().config == make_config() and CFlow(preset="paper").config == make_config("paper")
-    assert CFlow(method="dense", num_frames=4).config == make_config("paper", num_history=2)
-    assert CFlow(method="keypoints", num_frames=2).config == make_config("keypoints")
+    assert CFlow(preset="paper", num_frames=4).config == make_config("paper", num_history=2)
+    assert CFlow(preset="keypoints", num_frames=2).config == make_config("keypoints")
     assert CFlow(pixel_size=0.2, voxel_size=[1], grid_feature_size=[1]).config == make_config(pixel_size=0.2)
     names = r"labeling, num_iters, patch_size, proof; .*'verified' has pixel_size"
     with pytest.warns(UserWarning, match=names) as caught:
         model = CFlow(num_iters=4, proof=False, patch_size=11, labeling="kornia", significance=2.0)
     assert len(caught) == 1 and model.config == make_config(significance=2.0)
     wrong: list[dict[str, Any]] = [{"output": "half"}, {"num_frames": 1}, {"num_frames": 2.5}, {"ego_T_lidar": "yes"}]
-    wrong += [{"method": "keypoints", "num_frames": 6}, {"method": "dense", "preset": "default"}]
+    wrong += [{"preset": "keypoints", "num_frames": 6}, {"method": "dense"}]
     for settings in (*wrong, {"pixel_sizes": [0.1, 0.2]}, {"ego_T_lidar": [[1, 2], [3, 4]]}):
         with pytest.raises(CFlowError):
             CFlow(**settings)
@@ -242,7 +242,7 @@ def test_checkpoint_without_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         write_checkpoint()
 
 
-PRESETS = {"cflow": "default", "cflow_live": "live", "cflow_paper": "paper", "cflow_keypoints": "keypoints"}
+PRESETS = {"cflow": "default", **{f"cflow_{name}": name for name in ("live", "paper", "keypoints", "paper_keypoints")}}
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -262,8 +262,10 @@ def test_configuration_has_every_setting_of_the_preset(name: str) -> None:
     target = OmegaConf.to_container(cfg.target, resolve=False)
     assert "${" not in json.dumps(target), "eval.yaml and save.yaml have nothing to refer to"
     expected = make_config(PRESETS[name])
-    ours = {"_target_", "voxel_size", "num_frames", "ego_T_lidar", "output", "device"}
-    assert set(target) == ours | (set(expected.as_dict()) - {"num_history", "num_future"}), "overrides need no +"
+    ours = {"_target_", "preset", "voxel_size", "num_frames", "ego_T_lidar", "output", "device"}
+    assert set(target) == ours | (set(expected.as_dict()) - {"method", "num_history", "num_future"}), (
+        "overrides need no +"
+    )
     x0, y0, _, x1, y1, _ = expected.point_cloud_range
     assert target["point_cloud_range"] == [x0, y0, -1000, x1, y1, 1000], "finite: the harness computes with it"
     expected = expected.replace(point_cloud_range=target["point_cloud_range"])

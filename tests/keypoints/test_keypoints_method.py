@@ -16,7 +16,7 @@ from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
 from cflow_torch.keypoints import matching
 from cflow_torch.keypoints.match_candidates import KeyPoints, Patches
-from cflow_torch.keypoints.matching import match
+from cflow_torch.keypoints.matching import match_keypoints
 
 DENSIFIERS = ("components", "clusters", "nearest")
 
@@ -53,9 +53,9 @@ def test_real_drives_equal_the_oracle(av2_folder, kitti_file):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["keypoints", "paper"])
+@pytest.mark.parametrize("preset", ["keypoints", "paper_keypoints"])
 def test_the_whole_real_pair_equals_the_oracle(av2_folder, preset):
-    flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config(preset, method="keypoints"))
+    flow_as_oracle(window_of(AV2Log(av2_folder), 0), make_config(preset))
 
 
 METRE = config(
@@ -126,7 +126,7 @@ def patches_of(patch: torch.Tensor) -> Patches:
 
 def shifts(pc0: KeyPoints, pc1: KeyPoints, reach: float = 10.0, ratio: float = 1.1) -> dict[int, tuple[int, int]]:
     settings = config("keypoints", patch_size=11, ratio_threshold=ratio)
-    found = match(pc0, pc1, torch.tensor([reach], dtype=torch.float64), settings)
+    found = match_keypoints(pc0, pc1, torch.tensor([reach], dtype=torch.float64), settings)
     return dict(zip(found.source.tolist(), map(tuple, found.shift.tolist())))
 
 

@@ -43,7 +43,9 @@ def find_changed(
     return change
 
 
-def directions(points: np.ndarray, sensor: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+def directions(
+    points: np.ndarray, sensor: np.ndarray, azimuths: int = AZIMUTHS, per_degree: int = 1
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Bin of the range image and distance over ground of points (N, 3), as a sensor sees them; in float32.
 
     Convention: azimuth is y / (|x| + |y|), elevation is height over distance.
@@ -52,9 +54,10 @@ def directions(points: np.ndarray, sensor: np.ndarray) -> tuple[tuple[np.ndarray
     distance = np.sqrt(x * x + y * y)
     around = y / np.maximum(np.abs(x) + np.abs(y), np.float32(1e-3))
     around = np.where(x >= 0, around + np.float32(1), np.float32(3) - around)  # 0 ... 4
-    azimuth = np.minimum((around * np.float32(AZIMUTHS / 4)).astype(int), AZIMUTHS - 1)
-    rise = z / (np.maximum(distance, np.float32(0.1)) * np.float32(RISE)) + np.float32(ELEVATIONS // 2)
-    return (np.clip(np.floor(rise), 0, ELEVATIONS - 1).astype(int), azimuth), distance
+    azimuth = np.minimum((around * np.float32(azimuths / 4)).astype(int), azimuths - 1)
+    elevations = per_degree * ELEVATIONS
+    rise = z / (np.maximum(distance, np.float32(0.1)) * np.float32(RISE / per_degree)) + np.float32(elevations // 2)
+    return (np.clip(np.floor(rise), 0, elevations - 1).astype(int), azimuth), distance
 
 
 def sensor_height(cloud1: np.ndarray) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 import cflow_torch
 from oracle.aperture import principal_axis
 from oracle.height_slices import COUNT, SlicedSweeps, over_squares, value_at
-from oracle.paired_test import count_wins, found_in_place
+from oracle.paired_test import are_wide, count_wins, found_in_place
 from oracle.registration import RigidMotion
 
 FILE = Path(cflow_torch.__file__).parent / "verified" / "confidence.json"
@@ -31,12 +31,20 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
         return 0.0, False
     off, motion = DISPLACEMENT / sweeps.size, motion_of_pixels(sweeps, members, rigid)
     displaced = [motion + shift for shift in ((0, 0), (off, 0), (-off, 0), (0, off), (0, -off))]
-    surplus, *others = (int(np.subtract(*count_wins(sweeps, members, each)).sum()) for each in displaced)
+    is_alone, is_wide = (motion != np.array(rigid.flow)[::-1] / sweeps.size).any(1), are_wide(sweeps, members)
+    is_wide = np.where(is_alone, is_wide, is_wide[~is_alone].any())
+    surplus, *others = (surplus_of(sweeps, members, each, is_wide) for each in displaced)
     gain, stays = surplus - max(others), found_in_place(sweeps, members, sweeps.image)[:, 0].sum()
     z = gain / math.sqrt(surplus + stays) if gain > 0 else 0.0
     is_line = principal_axis(sweeps, members[sweeps.pixels[members, 0] == 0]) is not None
     is_fast = rigid.flow[0] * rigid.flow[0] + rigid.flow[1] * rigid.flow[1] >= (2 * DISPLACEMENT) ** 2
     return z, bool(z >= 1 or ((gain > 0 or is_fast) and surplus > stays and not is_line))
+
+
+def surplus_of(sweeps: SlicedSweeps, members: np.ndarray, motion: np.ndarray, is_wide: np.ndarray) -> int:
+    """Slices won minus those lost; of wide pixels by the near counts, of others by the exact ones."""
+    exact, near = (np.subtract(*count_wins(sweeps, members, motion, is_near, is_wide)) for is_near in (False, True))
+    return int(np.where(is_wide, near, exact).sum())
 
 
 def motion_of_pixels(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> np.ndarray:

@@ -23,8 +23,11 @@ class SlicedSweeps:
         clouds: (N, 3) of each sweep, the points that are drawn.
         elapsed, seconds: from each sweep to t+1, in sweep intervals and in seconds.
 
+        reach: (H, W), pixels around each pixel that the spacing of points covers; None = 1.
+        is_tall: (H, W) bool, the slices above and below those around count as well.
+
     Attributes:
-        image, around: (S, H, W), bit c = a point of slice c lies in the pixel, or in the 3 x 3 pixels around it.
+        image, around: (S, H, W), bit c = a point of slice c lies in the pixel, or within its reach.
         both: (S, H, W), `image`, and `around` in the next four bits.
         pixels: (P, 3), sweep, row and column of the occupied pixels, in this order.
         slices: (P,), of these pixels.
@@ -33,7 +36,13 @@ class SlicedSweeps:
     """
 
     def __init__(
-        self, clouds: Sequence[np.ndarray], elapsed: Sequence[float], seconds: Sequence[float], config: VerifiedConfig
+        self,
+        clouds: Sequence[np.ndarray],
+        elapsed: Sequence[float],
+        seconds: Sequence[float],
+        config: VerifiedConfig,
+        reach: np.ndarray | None = None,
+        is_tall: np.ndarray | bool = False,
     ) -> None:
         self.elapsed, self.seconds, self.config = np.array(elapsed), seconds, config
         self.has_history = len(elapsed) > 2
@@ -45,7 +54,13 @@ class SlicedSweeps:
         )
         self.image = np.zeros((len(clouds), *bev_dims(config, self.size)), dtype=int)
         np.bitwise_or.at(self.image, index, 1 << slice_of(self.points[:, 2]))
-        self.around = over_squares(self.image, 1, np.bitwise_or)
+        self.reach = np.ones(self.image.shape[1:], dtype=int) if reach is None else reach
+        self.around = np.zeros_like(self.image)
+        for pixels in np.unique(self.reach).tolist():
+            around = over_squares(self.image, pixels, np.bitwise_or)
+            self.around = np.where(self.reach == pixels, around, self.around)
+        above, below = (self.around << 1 | self.around >> 3) & 15, (self.around >> 1 | self.around << 3) & 15
+        self.around = np.where(is_tall, self.around | above | below, self.around)
         self.both = self.image | self.around << NUM_SLICES
         self.pixels, self.slices = np.argwhere(self.image), self.image[self.image > 0]
         self.number = np.where(self.image > 0, np.cumsum(self.image > 0).reshape(self.image.shape) - 1, -1)

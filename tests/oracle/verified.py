@@ -19,9 +19,10 @@ from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, select_objects
 from oracle.confidence import TABLE, margin, probabilities
 from oracle.height_slices import SlicedSweeps, Vector, ground_slope, is_residue, over_squares
-from oracle.paired_test import count_wins, evidence_of
+from oracle.paired_test import are_wide, count_wins, evidence_of
 from oracle.pixels import in_range
 from oracle.registration import register
+from oracle.spacing import are_tall, reach_of_pixels, spacing_of
 from oracle.sweeps import Cloud, PointMotion
 from oracle.unlinked import link_unlinked
 
@@ -42,11 +43,14 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
         if config.min_height is not None:
             is_drawn[is_drawn] = ~is_residue(seen[-1], ground, config)
         drawn.append(np.flatnonzero(is_drawn))
+    angle, rise = spacing_of(seen[0])
     sweeps = SlicedSweeps(
         [cloud.points[rows] for cloud, rows in zip(every, drawn)],
         [cloud.intervals for cloud in every],
         [cloud.seconds for cloud in every],
         config,
+        reach_of_pixels(angle, config),
+        are_tall(rise, config),
     )
     change = find_changed(sweeps, seen, [cloud.origin for cloud in every])
     tree = grow(sweeps, change, config)
@@ -80,16 +84,18 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
 
 
 def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_levels: int) -> tuple[Vector, int]:
-    """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations,
-    that of the near counts. Nodes of changed pixels need more standard deviations. All must gain three slices for each
-    sweep besides t and t+1, or one for eight pixels."""
+    """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations
+    (as many for wide fast objects), that of the near counts. Nodes of changed pixels and fast objects need more of
+    them. All must gain three slices for each sweep besides t and t+1, or one for eight pixels."""
     z = {num_levels: CHANGED_Z, num_levels + 1: FAST_Z}.get(node.level, sweeps.config.significance)
+    is_fast = node.level > num_levels
+    near_z = z if is_fast and are_wide(sweeps, node.members).any() else 2 * z
     least = min(16 * 3 * (len(sweeps.elapsed) - 2), 16 * len(node.members) // 8)
     evidence = []
     for motion in candidates:
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))
-        own = evidence_of(*exact, z) + evidence_of(*near, 2 * z)
-        stays = node.level > num_levels and LEAVES * exact[1] > exact[0]
+        own = evidence_of(*exact, z) + evidence_of(*near, near_z)
+        stays = is_fast and LEAVES * exact[1] > exact[0]
         counts = own > least and not stays and (node.travels or not slides_along_itself(sweeps, node.members, motion))
         evidence.append(own if counts else 0)
     best = evidence.index(max(evidence))  # ties: the first
@@ -110,7 +116,9 @@ def add_unchanged(sweeps: SlicedSweeps, nodes: list[Node], motions: Sequence[Vec
         nearest[nodes[i].members] = -1
     for i in growing:
         near = np.flatnonzero(nearest == i)
-        surplus[tuple(sweeps.pixels[near].T)] = np.subtract(*count_wins(sweeps, near, motions[i]))
+        surplus[tuple(sweeps.pixels[near].T)] = np.subtract(
+            *count_wins(sweeps, near, motions[i], False, are_wide(sweeps, near))
+        )
     gains = over_squares(surplus, 1, np.add)[tuple(sweeps.pixels.T)] > 0
     found = list(nodes)
     for i in growing:

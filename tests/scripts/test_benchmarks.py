@@ -228,3 +228,13 @@ def test_a_step_of_a_model_can_be_replaced() -> None:
 def _nothing_may_move(*given: Any) -> Any:
     tree = movable_nodes(*given)
     return tree.only(torch.zeros(tree.count, dtype=torch.bool))
+
+
+def test_beams_are_counted_by_turns_and_by_elevation(script: Any) -> None:
+    beams = script("benchmarks", "beams")
+    azimuth = np.concatenate([np.linspace(-3.1, 3.1, count) for count in (13, 16, 62)])  # once around for each beam
+    points = np.stack([10 * np.cos(azimuth), 10 * np.sin(azimuth), 0 * azimuth], 1)
+    assert beams.beams_of("kitti-0000", points).tolist() == [0] * 13 + [1] * 16 + [2] * 62
+    elevation = np.radians(beams.PANDAR64 + 0.05)
+    points = np.stack([20 * np.cos(elevation), 0 * elevation, 20 * np.sin(elevation) + beams.SENSOR_HEIGHT], 1)
+    assert beams.beams_of("panda-002", points).tolist() == list(range(64))

@@ -14,7 +14,7 @@ from cflow_torch.data.json_file import json_ready
 CLASSES = ("CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU")
 SCALES = [(0.1,), (0.2, 0.1), (0.4, 0.2, 0.1), (0.8, 0.4, 0.2, 0.1), (0.8, 0.4, 0.3, 0.2, 0.1)]
 PAPER = make_config("paper")
-KEYS = make_config("paper", method="keypoints")
+KEYS = make_config("paper_keypoints")
 # Settings of the rows of each table, in the paper's order.
 JOBS: dict[str, list[Config]] = {
     "pixel_size": [PAPER.replace(pixel_size=size) for size in (0.05, 0.1, 0.2, 0.4)],

@@ -78,8 +78,8 @@ def test_far_begins_where_the_table_says(numbered, monkeypatch):
 
 def test_invalid_points_have_confidence_0_and_other_methods_none():
     window = turning_car(0)
-    for method in ("dense", "keypoints"):
-        (result,) = make_model(make_config(method=method), "cpu")([window])
+    for preset in ("paper", "keypoints"):
+        (result,) = make_model(make_config(preset), "cpu")([window])
         assert result.confidence is None and "confidence" not in result.numpy()
     (result,) = VerifiedFlow(MODEL)([window])
     assert result.confidence.dtype == torch.float32 and result.confidence.shape == (len(window.pc0.points),)

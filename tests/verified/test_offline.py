@@ -175,7 +175,8 @@ def test_ground_of_the_future_is_found_too():
     rng = np.random.default_rng(0)
     floor = np.concatenate((rng.uniform(-7, 7, (4000, 2)), np.full((4000, 1), -1.75)), 1)
     clouds = [np.concatenate((sweep.points, floor.astype(np.float32))) for sweep in sweeps]
-    result = estimate_flow(clouds[4], clouds[5], pcf=clouds[6:], ground="auto", preset="offline")
+    now, newest, *future = map(Sweep, clouds[4:])
+    result = estimate_flow(now, newest, future=future, ground="auto", preset="offline")
     assert not result.is_valid[-4000:].any() and result.is_valid[: len(sweeps[4].points)].float().mean() > 0.9
     assert error_of_car(Window(sweeps[4], sweeps[5]), replace(result, residual_flow=result.residual_flow[:-4000])) < 0.1
 

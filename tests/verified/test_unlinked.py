@@ -8,6 +8,8 @@ import torch
 from scenes import assert_same_bits
 
 from cflow_torch import Sweep, VerifiedFlow, Window
+from cflow_torch.verified.component_tree import NodeKind
+from cflow_torch.verified.unlinked import link_unlinked
 
 REGION = (-60.0, -20.0, -3.0, 60.0, 20.0, 3.0)
 MODEL = VerifiedFlow.from_preset("default", point_cloud_range=REGION)
@@ -17,13 +19,38 @@ NUM_SWEEPS = 6  # t+1, t, t-1, ...
 def window(shape: np.ndarray, step: float, seed: int = 0) -> Window:
     """A shape that moves `step` metres along x per sweep, in front of a wall at rest; the wall comes first."""
     rng = np.random.default_rng(seed)
+    places = [shape - (k * step, 0.0, 0.0) for k in range(NUM_SWEEPS)]
+    return with_wall([place + rng.normal(0, 0.01, shape.shape) for place in places], rng)
+
+
+def plants(seed: int) -> Window:
+    """Forty bushes at rest, of which every sweep sees other points."""
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform((5, -15, 0), (45, 8, 0), (40, 1, 3))
+    shapes = [centre + rng.uniform(-0.3, 0.3, (40, 8, 3)) for _ in range(NUM_SWEEPS)]
+    return with_wall([shape.reshape(-1, 3) for shape in shapes], rng)
+
+
+def with_wall(shapes: list[np.ndarray], rng: np.random.Generator) -> Window:
+    """A window of shapes, the newest first."""
     wall = np.stack((rng.uniform(-50, 50, 3000), np.full(3000, 12.03), rng.uniform(-1, 1, 3000)), 1)
-    sweeps = []
-    for k in range(NUM_SWEEPS):
-        moved = shape - (k * step, 0.0, 0.0) + rng.normal(0, 0.01, shape.shape)
-        points = torch.from_numpy(np.concatenate((wall, moved)).astype(np.float32))
-        sweeps.append(Sweep(points, pose=np.eye(4)))
+    clouds = [np.concatenate((wall, shape)).astype(np.float32) for shape in shapes]
+    sweeps = [Sweep(torch.from_numpy(cloud), pose=np.eye(4)) for cloud in clouds]
     return Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))
+
+
+def num_linked(window: Window) -> int:
+    """The number of nodes of fast objects."""
+    trees = []
+
+    class Observed(VerifiedFlow):
+        @staticmethod
+        def link_unlinked(*args):
+            trees.append(link_unlinked(*args))
+            return trees[-1]
+
+    Observed(MODEL.config)([window])
+    return int((trees[0].kind == NodeKind.UNLINKED).sum())
 
 
 def front(seed: int, num_points: int) -> np.ndarray:
@@ -39,6 +66,17 @@ def test_a_far_car_of_few_points_is_found(step, num_points):
     flow = result.residual_flow[3000:]
     assert torch.allclose(flow, torch.tensor([step, 0.0, 0.0]).expand_as(flow), atol=0.05)
     assert len(result.cluster_id[3000:].unique()) == 1 and not result.residual_flow[:3000].any()
+
+
+def test_objects_that_their_pixels_link_are_not_linked_again():
+    """The part is 1.7 m wide. Less than half of that from sweep to sweep leaves the pixels connected."""
+    assert num_linked(window(front(1, 30), 0.7)) == 0
+    assert num_linked(window(front(1, 30), 1.2)) == 1
+
+
+def test_plants_are_not_linked_with_each_other():
+    """Changing pixels of plants confirm many velocities by chance, but their pixels are also found in place."""
+    assert sum(num_linked(plants(seed)) for seed in range(3)) <= 8  # 21 with every velocity
 
 
 def test_a_pair_has_too_little_evidence():

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 
 from cflow_torch import CFlowError, FlowResult
 from cflow_torch.viz import flow_to_rgb, panel, plot_clusters, plot_flow, plot_map, save_picture, wheel_image
-from cflow_torch.viz.animation import Frame, flow_figures
+from cflow_torch.viz.animation import AnimatedPair, flow_figures
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
 
 CAR_FLOW = np.array([-0.6, 0.0, 0.0])
@@ -152,7 +152,10 @@ def test_clusters_next_to_each_other_differ_in_colour() -> None:
 
 def test_frames_of_an_animation_share_view_and_colours(scene: Scene) -> None:
     points, flow, cluster = scene
-    frames = [Frame(points, result_of(flow, cluster)), Frame(1.2 * points, result_of(0.5 * flow, cluster), cluster < 1)]
+    frames = [
+        AnimatedPair(points, result_of(flow, cluster)),
+        AnimatedPair(1.2 * points, result_of(0.5 * flow, cluster), cluster < 1),
+    ]
     for box in (None, OPEN):
         views, rims = [], []
         for figure in flow_figures(frames, point_cloud_range=box, width=400):

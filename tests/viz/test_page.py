@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import zlib
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Iterator
@@ -88,10 +89,10 @@ def test_frames_have_poses_times_and_arrows(street: dict[str, Any]) -> None:
     first, second = street["frames"]
     np.testing.assert_allclose(np.reshape(second["pose"], (3, 4))[:, 3], [STEP, 0, 0], atol=1e-5)
     assert second["time"] - first["time"] == pytest.approx(0.1, abs=1e-4) and first["interval"] == 0.1
-    ((cluster, start, ahead, entry, speed),) = first["arrows"]
-    assert cluster == 3 and speed == 6.7 and not second["arrows"]
-    np.testing.assert_allclose(ahead, 5 * CAR_FLOW, atol=0.01)
-    assert np.abs(color_of(street, "flow", entry) - flow_to_rgb(CAR_FLOW, 1.5)).max() < 40
+    (arrow,) = first["arrows"]
+    assert arrow["cluster"] == 3 and arrow["speed"] == 6.7 and arrow["moving"] is None and not second["arrows"]
+    np.testing.assert_allclose(arrow["ahead"], 5 * CAR_FLOW, atol=0.01)
+    assert np.abs(color_of(street, "flow", arrow["entry"]) - flow_to_rgb(CAR_FLOW, 1.5)).max() < 40
     assert street["north"] == pytest.approx(np.pi / 2)
 
 
@@ -132,10 +133,16 @@ def test_tracks_have_boxes_and_one_colour_in_all_sweeps() -> None:
     columns = ("x", "y", "z", "length", "width", "height", "heading", "vx", "vy")
     table = {name: np.array([1.0, 2.0]) for name in columns}
     table.update(id=np.array([47, 47]), sweep=np.array([0, 1]), cluster_id=np.array([3, 3]))
+    table.update(num_points=np.array([20, 21]))
+    moving = torch.linspace(0, 1, len(results[1].residual_flow))
+    results[1] = replace(results[1], moving=moving)
     data = content_of(show(sweeps, results, tracks=table).html)
     for frame in range(2):
-        ((number, centre, size, heading, speed),) = data["frames"][frame]["boxes"]
-        assert number == 47 and size == [frame + 1.0] * 3 and speed == round(np.hypot(1, 1) * (frame + 1), 1)
+        (box,) = data["frames"][frame]["boxes"]
+        assert box["id"] == 47 and box["size"] == [frame + 1.0] * 3 and box["points"] == 20 + frame
+        assert box["speed"] == round(np.hypot(1, 1) * (frame + 1), 1)
+        cars = moving[CAR].mean().item()
+        assert box["moving"] == (None if frame == 0 else pytest.approx(cars, abs=0.006))
         entries = points_of(data, frame)[1]
         assert set(entries["object"][entries["flow"] >= FIRST]) == {FIRST + 47 % len(PALETTE)}
 
@@ -190,9 +197,13 @@ def picture(tab: Any) -> np.ndarray:
     return np.array(Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(np.int64)
 
 
+def are_of(pixels: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels that have one of (C, 3) colours, within 2 levels."""
+    return (np.abs(pixels[:, :, None] - colors).max(axis=3) <= 2).any(axis=2)
+
+
 def count_of(pixels: np.ndarray, colors: np.ndarray) -> int:
-    """Number of pixels that have one of (C, 3) colours, within 2 levels."""
-    return int((np.abs(pixels[:, :, None] - colors).max(axis=3) <= 2).any(axis=2).sum())
+    return int(are_of(pixels, colors).sum())
 
 
 def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: Path) -> None:
@@ -230,7 +241,7 @@ def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: P
     assert count_of(by_object, colors) < 20 and count_of(by_object, PALETTE.astype(int)) > 1000
     tab.locator("#slider").fill("2")
     tab.evaluate("viewer.go(viewer.state.frame)")
-    assert tab.evaluate("viewer.state.frame") == 2 and "3/3" in tab.locator("#now").inner_text()
+    assert tab.evaluate("viewer.state.frame") == 2 and "sweep 2 of 0 … 2" in tab.locator("#now").inner_text()
     assert (picture(tab) != by_object).any(axis=2).sum() > 500, "the next sweep differs"
     tab.locator("#play").click()
     tab.wait_for_function("viewer.state.frame !== 2", timeout=20_000)
@@ -242,21 +253,91 @@ def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: P
     context.close()
 
 
+def test_an_object_that_is_clicked_is_described_and_followed(browser: Any, drive_page: Path) -> None:
+    context = browser.new_context(viewport={"width": 1000, "height": 700}, color_scheme="light")
+    tab, errors = context.new_page(), []
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.goto(f"{drive_page.as_uri()}#sweep=1")
+    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+    assert tab.evaluate("viewer.state.frame") == 1, "the sweep of the address"
+    boxes = content_of(drive_page.read_text(encoding="utf-8"))["frames"][1]["boxes"]
+    assert tab.locator("#list tbody tr").count() == len(boxes) and all(box["moving"] is not None for box in boxes)
+
+    tab.keyboard.press("t")
+    at = tab.evaluate("boxes => boxes.map(box => viewer.onScreen(box.centre))", boxes)
+    middle = [np.hypot(x - 500, y - 350) for x, y, _ in at]
+    clicked = boxes[int(np.argmin(middle))]
+    x, y, _ = at[int(np.argmin(middle))]
+    tab.mouse.click(x, y)
+    tab.wait_for_function("viewer.state.chosen !== null")
+    tab.evaluate("viewer.go(viewer.state.frame)")
+    assert tab.evaluate("viewer.state.chosen") == clicked["id"]
+    facts = tab.locator("#object").inner_text()
+    assert f"#{clicked['id']}" in facts and f"{clicked['speed']:.1f} m/s" in facts
+    assert " × ".join(f"{side:.1f}" for side in clicked["size"]) in facts and f"{clicked['moving']:.2f}" in facts
+    assert tab.evaluate("location.hash") == f"#sweep=1&object={clicked['id']}"
+    x, y, _ = tab.evaluate("centre => viewer.onScreen(centre)", clicked["centre"])
+    assert np.hypot(x - 500, y - 350) < 5, "the camera looks at it"
+    curve = tab.locator("#plot polyline").get_attribute("points").split()
+    assert len(curve) == 3, "its speed in every sweep"
+    tab.keyboard.press("ArrowRight")
+    tab.wait_for_function("viewer.state.frame === 2")
+    (after,) = (
+        each for each in content_of(drive_page.read_text())["frames"][2]["boxes"] if each["id"] == clicked["id"]
+    )
+    x, y, _ = tab.evaluate("centre => viewer.onScreen(centre)", after["centre"])
+    assert np.hypot(x - 500, y - 350) < 5, "the camera follows it"
+    tab.keyboard.press("Escape")
+    tab.wait_for_function("viewer.state.chosen === null")
+    assert tab.locator("#object").is_hidden() and errors == []
+    context.close()
+
+
+def test_a_map_loses_its_moving_points_and_a_threshold_hides_what_is_unlikely(browser: Any, drive_page: Path) -> None:
+    context = browser.new_context(viewport={"width": 720, "height": 480}, color_scheme="dark")
+    tab = context.new_page()
+    tab.goto(drive_page.as_uri())
+    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+    for name in ("arrows", "boxes", "trails", "labels", "rings"):
+        tab.locator(f"#show-{name}").uncheck()
+    data = content_of(drive_page.read_text(encoding="utf-8"))
+    entries = [points_of(data, frame)[1]["flow"] for frame in range(3)]
+    colors = np.array([color_of(data, "flow", e) for e in np.unique(np.concatenate(entries)) if e >= FIRST])
+    tab.evaluate("document.querySelectorAll('.panel').forEach(panel => { panel.style.opacity = 0; })")
+
+    def moving_pixels() -> np.ndarray:
+        tab.evaluate("viewer.go(viewer.state.frame)")
+        return are_of(picture(tab), colors)
+
+    of_sweep = moving_pixels()
+    tab.locator("#map").select_option("all")
+    assert (moving_pixels() & ~of_sweep).sum() > 500, "objects leave a trace in the map"
+    tab.locator("#map").select_option("clean")
+    assert moving_pixels().sum() < 0.02 * of_sweep.sum()
+    tab.locator("#map").select_option("")
+    tab.locator("#threshold").fill("1")
+    assert moving_pixels().sum() < of_sweep.sum()
+    context.close()
+
+
 def test_a_phone_shows_all_controls(browser: Any, drive_page: Path) -> None:
     context = browser.new_context(viewport={"width": 390, "height": 700}, has_touch=True, color_scheme="light")
     tab = context.new_page()
     tab.goto(drive_page.as_uri())
     tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
-    boxes = [tab.locator(name).bounding_box() for name in ("#head", "#side", "#time")]
+    boxes = [tab.locator(name).bounding_box() for name in ("#head", "#side", "#time", "#objects")]
     for box in boxes:
         assert box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["y"] + box["height"] <= 700
-    head, side, time = boxes
+    head, side, time, objects = boxes
     assert head["y"] + head["height"] <= side["y"] and side["y"] + side["height"] <= time["y"], "nothing overlaps"
+    assert head["y"] + head["height"] <= objects["y"] and objects["x"] + objects["width"] <= side["x"]
+    labels = tab.locator("#labels span:not(.ring)").all_inner_texts()
+    assert labels and all(re.fullmatch(r"#\d+", text) for text in labels), "ids only"
     context.close()
 
 
 def test_a_notebook_shows_the_page_inline(browser: Any) -> None:
     tab = browser.new_page()
     tab.set_content(show(window(Street(), 0), result_of())._repr_html_())
-    tab.frame_locator("iframe").locator("#now:has-text('1/1')").wait_for(timeout=60_000)
+    tab.frame_locator("iframe").locator("#now:has-text('sweep 0 of 0')").wait_for(timeout=60_000)
     tab.close()

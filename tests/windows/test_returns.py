@@ -49,7 +49,7 @@ def test_missing_returns_in_arrays_are_left_out_and_said(fill: float, kind: Any)
     drive = make_drive(seed=1, num_sweeps=2, profile="demo")
     pc0, pc1 = drive.sweep(0), drive.sweep(1)
     T = np.linalg.inv(pc1.pose) @ pc0.pose
-    settings: dict = {"T_ego1_ego0": T, "ground": "grid", "method": "dense"}
+    settings: dict = {"T_ego1_ego0": T, "ground": "grid", "preset": "paper"}
     alone = estimate_flow(pc0.points, pc1.points, **settings)
     filled = [kind(np.concatenate([one.points, np.full((20_000, 3), fill, np.float32)])) for one in (pc0, pc1)]
     with pytest.warns(CFlowWarning, match="up to 20000 points of a sweep are no returns .* we leave them out"):

@@ -43,11 +43,13 @@ def refused(*sweeps: Sweep, match: str) -> None:
 def test_invalid_columns_are_named(column, values, complaint):
     with pytest.raises(CFlowError, match=f"Sweep.{column} .*{complaint}"):
         Sweep(**{"points": P0, column: values})
-    name, older = {"points": ("pc0", "pch"), "is_ground": ("gm0", "gmh"), "point_times": ("dt0", "dth")}[column]
-    with pytest.raises(CFlowError, match=f"{name} .*{complaint}"):
-        estimate_flow(**{"pc0": P0, "pc1": P1, name: values})
-    with pytest.raises(CFlowError, match=rf"{older}\[1\] .*{complaint}"):
-        estimate_flow(P0, P1, **{"pch": [P0, P0], older: [P0 if older == "pch" else None, values]})
+    prefix = {"points": "pc", "is_ground": "gm", "point_times": "dt"}[column]
+    for name in ("0", "1", "h1", "f2"):
+        with pytest.raises(CFlowError, match=f"{prefix}{name} .*{complaint}"):
+            Window.from_dict({"pc0": P0, "pc1": P0, "pch1": P0, "pcf1": P0, "pcf2": P0, f"{prefix}{name}": values})
+    if prefix != "dt":
+        with pytest.raises(CFlowError, match=f"{prefix}0 .*{complaint}"):
+            estimate_flow(**{"pc0": P0, "pc1": P1, f"{prefix}0": values})
 
 
 def test_invalid_windows_are_refused():

@@ -13,7 +13,7 @@ from cflow_torch.data.aevascenes import CATEGORY_NAME, GROUND
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.paths import safe_name
-from cflow_torch.simulator.recording import Boxes, Recording, UnitReturns
+from cflow_torch.simulator.recording import AnnotationBoxes, Recording, UnitReturns
 from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import CFlowError
 
@@ -54,7 +54,7 @@ def write_aevascenes_sequence(log: Recording, root: str | Path, layout: str = "v
         - We write only motion-compensated clouds, because a recording has no others.
         - Every point has a class name: "road" on the ground, the class of the box that holds it, or "other_structure".
           `semantic_labels_idx` is the position of the name in `CATEGORY_NAME`. Aeva's own numbers may differ.
-        - Boxes have no velocities, because the reader does not use them.
+        - AnnotationBoxes have no velocities, because the reader does not use them.
 
     Raises:
         CFlowError: the sequence exists already, the folder name or the layout is not valid, a shot is before its
@@ -128,7 +128,7 @@ def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str)
     )
 
 
-def _classes(log: Recording, index: int, boxes: Boxes) -> np.ndarray:
+def _classes(log: Recording, index: int, boxes: AnnotationBoxes) -> np.ndarray:
     """(N,) int64, class of every point of a sweep, as an index of `_CLASSES`."""
     sweep = log.sweep(index)
     points = np.asarray(sweep.points)[:, :3]
@@ -148,7 +148,7 @@ def _class_of(category: str) -> str:
     return CLASS_OF[category]
 
 
-def _boxes(boxes: Boxes) -> list[dict[str, Any]]:
+def _boxes(boxes: AnnotationBoxes) -> list[dict[str, Any]]:
     """The boxes of a frame."""
     return [
         {

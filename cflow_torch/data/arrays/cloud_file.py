@@ -13,7 +13,7 @@ import pyarrow as pa
 from pyarrow import feather, parquet
 
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bin_layout
-from cflow_torch.data.arrays.pcd import pcd_fields, pypcd4
+from cflow_torch.data.arrays.pcd import pcd_fields, pcd_viewpoint, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors, shortened
@@ -22,6 +22,10 @@ from cflow_torch.types import CFlowError, check_array
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
 _AXES = ("x", "y", "z")
+_TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
+    ".feather": (feather.read_table, feather.write_feather),
+    ".parquet": (parquet.read_table, parquet.write_table),
+}
 _CLOUD_KEYS = ("points", "lidar", "xyz", "pc")  # of an .npz file with more than one table
 
 
@@ -118,11 +122,7 @@ def write_cloud(
         points, named = np.column_stack([points, *named.values()]), {}
     with atomic_file(path) as file:
         if suffix == ".pcd":
-            pcd, kinds = pypcd4(), [values.dtype for values in fields.values()]
-            cloud = pcd.PointCloud.from_points(list(fields.values()), list(fields), kinds)
-            if viewpoint is not None:
-                cloud.metadata.viewpoint = tuple(map(float, viewpoint))
-            cloud.save(file, pcd.Encoding.BINARY)
+            _write_pcd(file, fields, viewpoint)
         elif suffix == ".ply":
             file.write(ply_bytes(fields))
         elif suffix == ".bin":
@@ -135,7 +135,57 @@ def write_cloud(
         elif suffix == ".npz":
             np.savez(file, points=points, **named)
         else:
-            (feather.write_feather if suffix == ".feather" else parquet.write_table)(pa.table(fields), file)
+            _TABLES[suffix][1](pa.table(fields), file)
+
+
+def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: BinLayout | None = None) -> None:
+    """Write some points of a cloud to another file of the same suffix, with names, types and order of its columns.
+
+    Args:
+        source, target: files of one of `SUFFIXES`.
+        is_kept: (N,) bool, for every point of `source`.
+        layout: of `.bin` files; None = see `find_bin_layout`.
+
+    Convention: arrays of another length in `.npz` files are copied as they are. VIEWPOINT of `.pcd` files stays. They
+        become binary, and lose fields of several values. `.ply` files become binary, and keep only their vertices,
+        without lists.
+
+    Raises:
+        CFlowError: the source cannot be read, or has another number of points.
+    """
+    source = as_path(source)
+    suffix = _suffix(source)
+    with file_errors(source, _hint(source)):
+        content = read_bytes(source)
+        number = len(_positions(_read(source, layout))[0])
+        if number != len(is_kept):
+            raise CFlowError(f"it has {number} points, and the mask {len(is_kept)}: give both of one sweep")
+    with atomic_file(target) as file:
+        if suffix in (".feather", ".parquet"):
+            read, write = _TABLES[suffix]
+            write(read(pa.BufferReader(content), use_threads=False).filter(pa.array(is_kept)), file)
+        elif suffix == ".npy":
+            np.save(file, np.load(io.BytesIO(content), allow_pickle=False)[is_kept])
+        elif suffix == ".npz":
+            arrays: Any = _plain_arrays(content).items()
+            np.savez(file, **{k: v[is_kept] if v.shape[:1] == is_kept.shape else v for k, v in arrays})
+        elif suffix == ".bin":
+            step = (layout or find_bin_layout(content)).step
+            file.write(np.frombuffer(content, np.uint8).reshape(-1, step)[is_kept].tobytes())
+        elif suffix == ".ply":
+            file.write(ply_bytes({name: values[is_kept] for name, values in ply_fields(content).items()}))
+        else:
+            fields = {name: values[is_kept] for name, values in pcd_fields(content).items()}
+            _write_pcd(file, fields, pcd_viewpoint(content))
+
+
+def _write_pcd(file: Any, fields: Mapping[str, np.ndarray], viewpoint: Any) -> None:
+    pcd = pypcd4()
+    kinds = [values.dtype for values in fields.values()]
+    cloud = pcd.PointCloud.from_points(list(fields.values()), list(fields), kinds)
+    if viewpoint is not None:
+        cloud.metadata.viewpoint = tuple(map(float, viewpoint))
+    cloud.save(file, pcd.Encoding.BINARY)
 
 
 def _suffix(path: Path) -> str:
@@ -175,7 +225,7 @@ def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.nd
     if suffix in (".pcd", ".ply"):
         return (pcd_fields if suffix == ".pcd" else ply_fields)(content)
     if suffix in (".feather", ".parquet"):
-        return _table_columns((feather if suffix == ".feather" else parquet).read_table, content)
+        return _table_columns(_TABLES[suffix][0], content)
     if suffix == ".npz":
         return _archive_columns(content)
     if suffix == ".npy":
@@ -197,13 +247,19 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip((*_AXES, *(f"column_{k}" for k in range(3, array.shape[1]))), array.T))
 
 
-def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
+def _plain_arrays(content: bytes) -> dict[str, np.ndarray]:
     """Read the arrays of an .npz file. Pickled objects in it stay unread."""
     arrays = {}
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         for name in archive.files:
             with suppress(ValueError):
                 arrays[name] = archive[name]
+    return arrays
+
+
+def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
+    """Return the columns of the cloud in an .npz file."""
+    arrays = _plain_arrays(content)
     if set(_AXES) <= set(arrays):
         return arrays
     tables = {name: array for name, array in arrays.items() if array.ndim == 2 and array.shape[1] >= 3}

@@ -54,8 +54,9 @@ def read_poses(path: PathLike) -> Trajectory:
         matrices = read_npy(path, "pass a .npy file of (K, 4, 4) numbers")
         return Trajectory(checked_poses(matrices, str(path)), None, layout, str(path))
     names, words = _read_table(path)
-    words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]  # programs write a line twice
     roles = _roles(names)
+    if (roles is not None and len(roles) > 7) or words.shape[1] == 8:  # with times; others repeat if the vehicle stands
+        words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]  # programs write a line twice
     if roles is not None:
         time, columns = roles[:-7], roles[-7:]
     elif words.shape[1] == 8:

@@ -71,6 +71,7 @@ class ArraysLog(Log):
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown. Sweeps before the first pose, after the
             last one, or in a gap of the poses of more than half a second are left out.
         gaps: indices of sweeps after which sweeps were left out.
+        bin_layout: numbers of a point of `.bin` files, None for files of another suffix.
         has_viewpoints: whether the poses come from VIEWPOINT. Such clouds are often in the world's frame (`read_as`).
 
     Convention:
@@ -101,7 +102,7 @@ class ArraysLog(Log):
             raise CFlowError(f"bin_columns={bin_columns!r}: pass 'auto' or an integer of at least 3")
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
-        self._bin_layout = self._find_bin_layout(bin_columns)
+        self.bin_layout = self._find_bin_layout(bin_columns)
         self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         self.lidar_position = self.ego_T_lidar[:3, 3]
@@ -120,7 +121,7 @@ class ArraysLog(Log):
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and times where they are known."""
         self._timestamp(index)
-        points, columns = read_table(self.files[index], self._bin_layout)
+        points, columns = read_table(self.files[index], self.bin_layout)
         time = self.timestamps[index] if self._has_times else None
         times = self._point_times(columns, time, points)
         is_missing = missing_returns(points)
@@ -154,7 +155,7 @@ class ArraysLog(Log):
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
         self._timestamp(index)
-        return read_columns(self.files[index], self._bin_layout)
+        return read_columns(self.files[index], self.bin_layout)
 
     def _find_bin_layout(self, columns: Any) -> BinLayout | None:
         """Return the layout of `.bin` files; None = the files have another suffix. We say if it is not KITTI's."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Mapping, NamedTuple
 
 import numpy as np
 
@@ -13,9 +13,22 @@ from cflow_torch.data.arrays.reader import GROUND_FOLDER
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
 from cflow_torch.transforms import to_quaternions, transform_points
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, Sweep
 
+POINTS_FOLDER = "points"
 _FARTHEST = 8000.0  # metres; float32 resolves half a millimetre up to here
+
+
+class SweepSides(NamedTuple):
+    """What a folder has of a sweep besides its cloud, as in `Sweep`."""
+
+    pose: Any
+    timestamp_ns: int | None
+    is_ground: Any
+
+    @classmethod
+    def of(cls, sweep: Sweep) -> SweepSides:
+        return cls(sweep.pose, sweep.timestamp_ns, sweep.is_ground)
 
 
 def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint: str | None = None) -> Path:
@@ -44,29 +57,39 @@ def write_array_log(log: Log, root: str | Path, suffix: str = ".npy", viewpoint:
         raise CFlowError(f"viewpoint={viewpoint!r} with suffix={suffix!r}: pass 'sensor' or 'world' with .pcd, or None")
     if suffix not in SUFFIXES:
         raise CFlowError(f"suffix={suffix!r}: pass one of {', '.join(SUFFIXES)}")
-    kept: list[Any] = []
+    sides = {}
     with new_folder(root, log.log_id) as folder:
         for index in range(len(log.timestamps)):
             sweep = log.sweep(index)
-            points = np.asarray(sweep.points)[:, :3]
-            where = None if viewpoint is None else _viewpoint(sweep.pose, f"log {log.log_id}: sweep {index}")
-            if viewpoint == "world" and sweep.pose is not None:
-                points = _rounded(transform_points(points, np.asarray(sweep.pose)))
-            write_cloud(folder / "points" / f"{index:06d}{suffix}", points, log.columns(index), where)
-            kept.append((sweep.pose, sweep.timestamp_ns, sweep.is_ground))
-        poses, times, masks = zip(*kept)
-        if all(mask is not None for mask in masks):
-            (folder / GROUND_FOLDER).mkdir()
-            for index, mask in enumerate(masks):
-                np.save(folder / GROUND_FOLDER / f"{index:06d}.npy", np.asarray(mask))
-        if all(time is not None for time in times):
-            write_times(folder / "times.txt", times)
-        has_pose = [pose is not None for pose in poses]
-        if any(has_pose) and not all(has_pose):
-            raise CFlowError(f"log {log.log_id} has no pose of sweep {has_pose.index(False)}: give all poses or none")
-        if all(has_pose) and viewpoint is None:
-            write_kitti_poses(folder / "poses.txt", np.stack(poses))
+            write_sweep(folder / POINTS_FOLDER / f"{index:06d}{suffix}", log, index, sweep, viewpoint)
+            sides[f"{index:06d}"] = SweepSides.of(sweep)
+        write_sides(folder, log.log_id, sides, has_viewpoints=viewpoint is not None)
     return Path(root) / log.log_id
+
+
+def write_sweep(file: Path, log: Log, index: int, sweep: Sweep, viewpoint: str | None) -> None:
+    """Write the points and the other columns of sweep `index`; `viewpoint` as in `write_array_log`."""
+    points = np.asarray(sweep.points)[:, :3]
+    where = None if viewpoint is None else _viewpoint(sweep.pose, f"log {log.log_id}: sweep {index}")
+    if viewpoint == "world":
+        points = _rounded(transform_points(points, np.asarray(sweep.pose)))
+    write_cloud(file, points, log.columns(index), where)
+
+
+def write_sides(folder: Path, log_id: str, sides: Mapping[str, SweepSides], has_viewpoints: bool) -> None:
+    """Write ground masks, times and, unless clouds have viewpoints, poses of the sweeps, named as their clouds."""
+    poses, times, masks = zip(*sides.values())
+    if all(mask is not None for mask in masks):
+        (folder / GROUND_FOLDER).mkdir()
+        for name, mask in zip(sides, masks):
+            np.save(folder / GROUND_FOLDER / f"{name}.npy", np.asarray(mask))
+    if all(time is not None for time in times):
+        write_times(folder / "times.txt", times)
+    has_pose = [pose is not None for pose in poses]
+    if any(has_pose) and not all(has_pose):
+        raise CFlowError(f"log {log_id} has no pose of sweep {has_pose.index(False)}: give all poses or none")
+    if all(has_pose) and not has_viewpoints:
+        write_kitti_poses(folder / "poses.txt", np.stack(poses))
 
 
 def _viewpoint(pose: Any, what: str) -> list[float]:

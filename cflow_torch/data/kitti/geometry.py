@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import read_bytes
+from cflow_torch.data.paths import read_bytes, read_start
 from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about
 from cflow_torch.types import CFlowError
 
@@ -28,6 +28,15 @@ def read_calibration(file: Path) -> dict[str, np.ndarray]:
             except ValueError:
                 continue
     return found
+
+
+def png_size(file: Path) -> tuple[int, int]:
+    """Return width and height of a PNG image, pixels."""
+    with file_errors(file, "copy it again"):
+        start = read_start(file, 24)
+        if start[:8] != b"\x89PNG\r\n\x1a\n" or len(start) < 24:
+            raise ValueError("it is not a PNG file")
+        return int.from_bytes(start[16:20], "big"), int.from_bytes(start[20:24], "big")
 
 
 def transform(values: dict[str, np.ndarray], file: Path, *names: str) -> np.ndarray:

@@ -12,10 +12,11 @@ import numpy as np
 from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.boxes import flow_from_boxes
+from cflow_torch.data.camera import Camera
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.kitti import labels as stored_labels
 from cflow_torch.data.kitti.drives import KITTIDrive, find_kitti_drives
-from cflow_torch.data.kitti.geometry import in_image, poses_from_oxts, read_calibration, transform
+from cflow_torch.data.kitti.geometry import IMAGE_SIZE, in_image, png_size, poses_from_oxts, read_calibration, transform
 from cflow_torch.data.kitti.labels import FrameBoxes
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, read_bytes, remote_errors
@@ -24,6 +25,8 @@ from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep
 
 _UNKNOWN_VIEW = np.radians(40.0)  # of the left colour camera, to each side, where its calibration is missing
+_ANNOTATED_CAMERA = "02"
+_COLOUR_CAMERAS = (_ANNOTATED_CAMERA, "03")
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
@@ -198,16 +201,49 @@ class KITTILog(ArraysLog):
         files = [folder / name for folder in (self.drive.root, self.drive.root.resolve().parent)]
         return next((file for file in files if file.exists()), None)
 
-    def _camera(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the (4, 4) `T_camera0_lidar` with rectification, and the (3, 4) projection of camera 2."""
-        if self.drive.layout == "tracking":
-            file: Any = self.drive.root / "calib" / f"{self.drive.clouds.name}.txt"
+    def cameras(self, index: int) -> list[Camera]:
+        """Return the colour cameras, image_02 and image_03, whose images are rectified."""
+        self._timestamp(index)
+        cameras = []
+        for name in _COLOUR_CAMERAS:
+            camera = self._camera(name)
+            if camera is not None:
+                T_camera0_lidar, projection = camera
+                T_camera_camera0 = np.eye(4)
+                T_camera_camera0[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
+                image = self.files[index].stem
+                T_camera_lidar = T_camera_camera0 @ T_camera0_lidar
+                size = self._image_size(name)
+                cameras.append(Camera(f"image_{name}", image, size, projection[:, :3], T_camera_lidar))
+        return cameras
+
+    def _image_size(self, camera: str) -> tuple[int, int]:
+        """Return width and height of the images of a camera, of the drive if it has images."""
+        root = self.drive.root
+        folders = {"raw": f"image_{camera}/data", "sequence": f"image_{int(camera)}"}
+        folder = root / folders.get(self.drive.layout, f"image_{camera}/{self.drive.clouds.name}")
+        with remote_errors(folder):
+            image = next(iter(sorted(folder.glob("*.png"))), None) if folder.is_dir() else None
+        return IMAGE_SIZE if image is None else png_size(image)
+
+    def _camera(self, name: str = _ANNOTATED_CAMERA) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the (4, 4) `T_camera0_lidar` with rectification, and the (3, 4) projection of a camera."""
+        if self.drive.layout == "sequence":
+            file: Any = self.drive.root / "calib.txt"
+            if not file.exists():
+                return None
+            values = read_calibration(file)
+            T_camera_lidar = transform(values, file, "Tr")
+            rectification = np.eye(4)
+            projection = values.get(f"P{int(name)}")
+        elif self.drive.layout == "tracking":
+            file = self.drive.root / "calib" / f"{self.drive.clouds.name}.txt"
             if not file.exists():
                 return None
             values = read_calibration(file)
             T_camera_lidar = transform(values, file, "Tr_velo_cam", "Tr_velo_to_cam")
             rectification = transform(values, file, "R_rect", "R0_rect")
-            projection = values.get("P2")
+            projection = values.get(f"P{int(name)}")
         else:
             file, to_camera = (self._calibration(f"calib_{name}.txt") for name in ("cam_to_cam", "velo_to_cam"))
             if file is None or to_camera is None:
@@ -215,9 +251,11 @@ class KITTILog(ArraysLog):
             values = read_calibration(file)
             T_camera_lidar = transform(read_calibration(to_camera), to_camera, "R T")
             rectification = transform(values, file, "R_rect_00")
-            projection = values.get("P_rect_02")
+            projection = values.get(f"P_rect_{name}")
+        if projection is None and name != _ANNOTATED_CAMERA:
+            return None
         if projection is None or len(projection) != 12:
-            raise CFlowError(f"{file} has no projection of camera 2 with 12 numbers; copy it again")
+            raise CFlowError(f"{file} has no projection of camera {int(name)} with 12 numbers; copy it again")
         return rectification @ T_camera_lidar, projection.reshape(3, 4)
 
     def _projection(self) -> np.ndarray | None:

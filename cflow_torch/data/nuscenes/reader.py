@@ -9,9 +9,10 @@ from typing import ClassVar, Literal, Mapping, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, points_in_box
+from cflow_torch.data.camera import Camera, at_image
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import FlowLabels, Log
-from cflow_torch.data.nuscenes.tables import LidarChain, SceneSource, Tables, Tracks, find_scenes
+from cflow_torch.data.nuscenes.tables import CameraChain, LidarChain, SceneSource, Tables, Tracks, find_scenes
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes, remote_errors
 from cflow_torch.transforms import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
@@ -80,6 +81,7 @@ class NuScenesLog(Log):
     Attributes:
         log_id: name of the scene.
         timestamps: sweep times of the data set, in microseconds; `Sweep.timestamp_ns` is in nanoseconds.
+        sample_tokens: token of each key frame; None = the sweep is not a key frame.
 
     Convention:
         - Points are in the ego frame at the sweep's time stamp (x forward, y left, z up, origin on the ground below the
@@ -105,6 +107,7 @@ class NuScenesLog(Log):
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: pass 1 for all sweeps, 2 for every second one")
         self.log_id = source.name
+        self._source = source
         self._root = as_path(source.root)
         self._deskew = self.moves_by_times = deskew
         self._own_vehicle = self.OWN_VEHICLE if own_vehicle == "auto" else own_vehicle
@@ -132,6 +135,7 @@ class NuScenesLog(Log):
         self._check_count(f"scene {self.log_id} in {folder}")
         self._check_files(reference, kept, int((row - last_key).max()) + 1)
         self._poses = reference.ego[kept]
+        self.sample_tokens = [reference.samples[k] if reference.is_key_frame[k] else None for k in kept.tolist()]
         self._T_ego_world = np.linalg.inv(self._poses)
 
     @cached_property
@@ -169,6 +173,24 @@ class NuScenesLog(Log):
         points, lag = self._cloud(index)
         times = lag * 1e-6 if lag.any() else None
         return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000, times)
+
+    def cameras(self, index: int) -> list[Camera]:
+        """Return all cameras of the scene, each with its image nearest in time."""
+        time = self._timestamp(index)
+        cameras = []
+        for name, chain in self._camera_chains.items():
+            row = int(np.abs(chain.times - time).argmin())
+            image = Path(chain.files[row]).stem
+            width, height = chain.sizes[row].tolist()
+            T_camera_ego = at_image(chain.mount[row], chain.ego[row], self._poses[index])
+            seconds = int(chain.times[row] - time) * 1e-6
+            cameras.append(Camera(name, image, (width, height), chain.matrix[row], T_camera_ego, seconds))
+        return cameras
+
+    @cached_property
+    def _camera_chains(self) -> dict[str, CameraChain]:
+        tables = self._source.tables or Tables(self._root / self._source.version)
+        return tables.cameras(self.log_id)
 
     def _labels(self, index: int) -> FlowLabels | None:
         time0, time1 = self.timestamps[index : index + 2]

@@ -57,6 +57,18 @@ class LidarChain(NamedTuple):
     files: tuple[str, ...]  # relative to the data root
     ego: np.ndarray  # (M, 4, 4) float64 `T_world_ego` at each sweep's own time
     mount: np.ndarray  # (M, 4, 4) float64 `T_ego_sensor`
+    samples: tuple[str, ...]  # token of the sample that each sweep belongs to
+
+
+class CameraChain(NamedTuple):
+    """The M images of one camera in one scene, ordered by time."""
+
+    times: np.ndarray  # (M,) int64, microseconds
+    files: tuple[str, ...]  # relative to the data root
+    sizes: np.ndarray  # (M, 2) int64 width and height, pixels
+    ego: np.ndarray  # (M, 4, 4) float64 `T_world_ego` at each image's own time
+    mount: np.ndarray  # (M, 4, 4) float64 `T_ego_camera`
+    matrix: np.ndarray  # (M, 3, 3) float64 intrinsic matrix
 
 
 class Annotations(NamedTuple):
@@ -91,16 +103,21 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
     return found
 
 
-def read_table(folder: Path, table: str, key: str = "", values: Collection[str] = ()) -> list[Row]:
-    """Read the rows of a table with the fields of `FIELDS`. With a `key`, only rows whose `key` is one of `values`.
+def read_table(
+    folder: Path, table: str, key: str = "", values: Collection[str] = (), more: Sequence[str] = ()
+) -> list[Row]:
+    """Read the rows of a table with the fields of `FIELDS` and `more`.
+
+    With a `key`, we read only rows whose `key` is one of `values`.
 
     Cost: memory of twice the file, and of the rows that are kept.
     """
     file = folder / f"{table}.json"
 
     def use(row: Row) -> Row | None:  # called while parsing, so dropped rows and fields need no memory
-        chosen = {name: row[name] for name in FIELDS[table]}
-        return chosen if not key or row[key] in values else None
+        if key and row[key] not in values:
+            return None
+        return {name: row[name] for name in (*FIELDS[table], *more)}
 
     with file_errors(file, "copy all tables of the version"):
         rows = read_json(file, use)
@@ -119,6 +136,7 @@ class Tables:
         self.folder = as_path(folder)
         self._rows: dict[str, dict[str, list[Row]]] = {}  # table -> token of the scene -> its rows
         self._by_token: dict[str, dict[str, Row]] = {}
+        self._images: dict[str, list[Row]] | None = None  # token of the scene -> its images
 
     @cached_property
     def scenes(self) -> dict[str, str]:
@@ -147,6 +165,44 @@ class Tables:
                 channels[self._by_token["sensor"][mount["sensor_token"]]["channel"]].append(row)
             lidars = {channel: self._chain(sweeps) for channel, sweeps in channels.items() if sweeps}
             return _times(samples), lidars, self._annotations(rows["sample_annotation"])
+
+    def cameras(self, name: str) -> dict[str, CameraChain]:
+        """Read the cameras of a scene, by channel. The tables of images are read when this is first called."""
+        with file_errors(f"{self.folder}, {name}", _COPY):
+            if self._images is None:
+                self._images = self._load_images()
+            channels: dict[str, list[Row]] = defaultdict(list)
+            for row in self._ordered("sample_data", self._images[self.scenes[name]], "calibrated_sensor_token"):
+                sensor = row["mount"]["sensor_token"]
+                channels[self._by_token["sensor"][sensor]["channel"]].append(row)
+            return {channel: self._camera_chain(rows) for channel, rows in sorted(channels.items())}
+
+    def _load_images(self) -> dict[str, list[Row]]:
+        """Return the rows of images of each scene, each with the rows of its mount and its ego pose."""
+        if not self._rows:
+            self._load()
+        cameras = [token for token, row in self._by_token["sensor"].items() if row["modality"] == "camera"]
+        rows = read_table(self.folder, "calibrated_sensor", "sensor_token", cameras, ("camera_intrinsic",))
+        mounts = {row["token"]: row for row in rows}
+        images = read_table(self.folder, "sample_data", "calibrated_sensor_token", mounts, ("width", "height"))
+        poses = read_table(self.folder, "ego_pose", "token", {row["ego_pose_token"] for row in images})
+        pose_of = {row["token"]: row for row in poses}
+        grouped: dict[str, list[Row]] = defaultdict(list)
+        for row in images:
+            row["mount"] = mounts[row["calibrated_sensor_token"]]
+            row["ego"] = pose_of[row["ego_pose_token"]]
+            grouped[self._by_token["sample"][row["sample_token"]]["scene_token"]].append(row)
+        return grouped
+
+    def _camera_chain(self, rows: Sequence[Row]) -> CameraChain:
+        return CameraChain(
+            times=_times(rows),
+            files=tuple(row["filename"] for row in rows),
+            sizes=np.array([(row["width"], row["height"]) for row in rows], dtype=np.int64),
+            ego=self._poses("ego_pose", [row["ego"] for row in rows]),
+            mount=self._poses("calibrated_sensor", [row["mount"] for row in rows]),
+            matrix=np.array([row["mount"]["camera_intrinsic"] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
+        )
 
     def _load(self) -> None:
         by_token = self._by_token
@@ -180,6 +236,7 @@ class Tables:
             files=tuple(row["filename"] for row in rows),
             ego=self._poses("ego_pose", [self._by_token["ego_pose"][row["ego_pose_token"]] for row in rows]),
             mount=self._poses("calibrated_sensor", mounts),
+            samples=tuple(row["sample_token"] for row in rows),
         )
 
     def _annotations(self, rows: Sequence[Row]) -> Annotations:

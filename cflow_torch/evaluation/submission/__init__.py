@@ -1,1 +1,1 @@
-"""Write, pack and check archives for the public leaderboards, versions 1 and 3."""
+"""Write, write_zip and check archives for the public leaderboards, versions 1 and 3."""

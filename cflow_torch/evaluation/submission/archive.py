@@ -1,4 +1,4 @@
-"""Submission formats, versions 1 and 3: encode a flow as a file, and write, pack and check files.
+"""Submission formats, versions 1 and 3: encode a flow as a file, and write, write_zip and check files.
 
 Files are written whole or not at all. The same files give the same bytes (with the same zlib).
 """
@@ -96,7 +96,7 @@ def is_complete(folder: str | Path, name: str, rows: int, version: SubmissionVer
     return not _check_file(name, partial(read_bytes, Path(folder) / name), rows, version)
 
 
-def pack(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
+def write_zip(folder: str | Path, names: Iterable[str], file: str | Path) -> None:
     """Zip the named files of a submission folder, atomically. If one is missing, no zip is written.
 
     Entries are sorted by name, dated 1980-01-01, mode 0644, deflated. So the same files and the same zlib give the same
@@ -116,7 +116,7 @@ def check_submission(path: str | Path, version: SubmissionVersion, expected: Map
 
     Args:
         path: a zip, or the folder that it is made from. Hidden files of a folder are skipped, because an interrupted
-            writer leaves some and `pack` does not pack them.
+            writer leaves some and `write_zip` does not write_zip them.
         version: the format.
         expected: name -> number of rows of each file. The archive must contain exactly these files.
 

@@ -70,7 +70,7 @@ def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = N
 
 
 @dataclass(frozen=True)
-class Frame:
+class SubmittedFrame:
     """A frame to submit: the pair (index, index + 1) of a log."""
 
     log: Log
@@ -87,7 +87,7 @@ class Frame:
         return int(point_mask(self.log, self.index, sweep, masks).sum()) if version.is_masked else len(sweep.points)
 
 
-def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> list[Frame]:
+def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> list[SubmittedFrame]:
     """List the frames of one log that a submission needs, in the order of time.
 
     `listed` maps log ids to the time stamps of exactly the frames to submit. None = the sweeps that have an evaluation
@@ -99,13 +99,13 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> lis
     if listed is None:
         pairs = range(len(stamps))
         masked = [i for i in pairs if log_mask(log, i) is not None]
-        return [Frame(log, i) for i in masked or pairs[::STRIDE]]
+        return [SubmittedFrame(log, i) for i in masked or pairs[::STRIDE]]
     wanted = sorted(set(listed.get(log.log_id, ())))
     for stamp in set(wanted) - set(stamps):
         raise CFlowError(
             f"{log.log_id}/{stamp} is listed, but is not a sweep of the log or is its last one, which has no flow"
         )
-    return [Frame(log, stamps.index(stamp)) for stamp in wanted]
+    return [SubmittedFrame(log, stamps.index(stamp)) for stamp in wanted]
 
 
 def read_frame_list(file: str | Path) -> dict[str, list[int]]:

@@ -13,7 +13,7 @@ from cflow_torch.transforms import relative_transform, rigid_transform
 from cflow_torch.types import CFlowError, Sweep, Window, check_array, check_points
 
 
-class Sample(NamedTuple):
+class BatchSample(NamedTuple):
     """One pair of sweeps of a batch, with its history."""
 
     # Points that are finite and not ground, with the poses of their frame. If the batch has all points of t, as
@@ -25,7 +25,7 @@ class Sample(NamedTuple):
     T_lidar1_lidar0: np.ndarray | None
 
 
-def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = None) -> list[Sample]:
+def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = None) -> list[BatchSample]:
     """Read the samples of a batch. The batch is not modified.
 
     Args:
@@ -47,7 +47,7 @@ def read_batch(batch: Mapping[str, Any], num_history: int, ego_T_lidar: Any = No
     return [_sample(batch, b, history, ego_T_lidar) for b in range(len(batch["pose0"]))]
 
 
-def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: Any) -> Sample:
+def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: Any) -> BatchSample:
     extrinsics = _extrinsics(batch, b, ego_T_lidar)
     names = ("0", "1", *history)
     clouds, rows = zip(*(_points(batch, b, name) for name in names))
@@ -64,7 +64,7 @@ def _sample(batch: Mapping[str, Any], b: int, history: list[str], ego_T_lidar: A
                 sweeps[i] = whole
     T_ego1_ego0 = harness_motion(_entry(batch, "pose0", b), _entry(batch, "pose1", b))
     T_lidar1_lidar0 = None if extrinsics is None else relative_transform(lidar_poses[1], lidar_poses[0])
-    return Sample(Window(sweeps[0], sweeps[1], tuple(sweeps[2:])), rows[0], T_ego1_ego0, T_lidar1_lidar0)
+    return BatchSample(Window(sweeps[0], sweeps[1], tuple(sweeps[2:])), rows[0], T_ego1_ego0, T_lidar1_lidar0)
 
 
 def _points(batch: Mapping[str, Any], b: int, name: str) -> tuple[Tensor, Tensor]:

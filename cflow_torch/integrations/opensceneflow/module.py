@@ -16,7 +16,7 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.hdf5.frames import harness_pose_flow, residual_for_harness
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
-from cflow_torch.integrations.opensceneflow.batch import Sample, read_batch
+from cflow_torch.integrations.opensceneflow.batch import BatchSample, read_batch
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, FlowResult
 
@@ -35,7 +35,7 @@ class CFlow(nn.Module):
             iter_only, which ignores the indices.
         device: "auto" = that of the batch.
         voxel_size, grid_feature_size: ignored. The harness passes them.
-        preset, method: as for `make_config`; "default" if neither is given.
+        preset: as for `make_config`.
         **settings: settings of the method, which replace those of the preset. We ignore `num_history`, `num_future` and
             settings that the method does not have, and name them in a warning.
 
@@ -50,18 +50,17 @@ class CFlow(nn.Module):
         device: Any = "auto",
         voxel_size: Any = None,
         grid_feature_size: Any = None,
-        preset: str | None = None,
-        method: str | None = None,
+        preset: str | Config = "default",
         **settings: Any,
     ) -> None:
         super().__init__()
-        config: Config = make_config(preset, method)
-        names = ["pixel_size", *(f.name for f in fields(config) if f.name not in ("method", *WINDOW))]
+        config: Config = make_config(preset)
+        names = ["pixel_size", *(f.name for f in fields(config) if f.name not in WINDOW)]
         unknown = [name for name in sorted(settings) if name not in names]
         if unknown:
-            known = f"method={config.method!r} has {', '.join(names)} (history is set by num_frames)"
+            known = f"method {config.method!r} has {', '.join(names)} (history is set by num_frames)"
             warn(f"ignored settings: {', '.join(unknown)}; {known}")
-        config = config.replace(**{name: value for name, value in settings.items() if name in names})
+        config = make_config(config, **{name: value for name, value in settings.items() if name in names})
         self.config = _with_history(config, num_frames)
         self.estimator = make_model(self.config, device)
         if output not in ("full", "valid"):
@@ -96,7 +95,7 @@ class CFlow(nn.Module):
             outputs = [self._output(batch, b, *pair) for b, pair in enumerate(zip(samples, results))]
         return {key: [output[key] for output in outputs] for key in outputs[0]}
 
-    def _output(self, batch: Mapping[str, Any], b: int, sample: Sample, result: FlowResult) -> dict[str, Tensor]:
+    def _output(self, batch: Mapping[str, Any], b: int, sample: BatchSample, result: FlowResult) -> dict[str, Tensor]:
         num_points = len(sample.rows0)  # the rows after these are ground points
         residual = result.residual_flow[:num_points]
         is_valid = result.is_valid[:num_points]
@@ -113,7 +112,7 @@ class CFlow(nn.Module):
         pose_flow = harness_pose_flow(points, sample.T_ego1_ego0)
         return {"flow": flow[rows], "pose_flow": pose_flow, "pc0_valid_point_idxes": rows}
 
-    def _check_history(self, samples: list[Sample]) -> None:
+    def _check_history(self, samples: list[BatchSample]) -> None:
         """Warn once if the batches have less history than the settings."""
         num_history = self.config.num_history
         given = min(len(sample.window.pch) for sample in samples)

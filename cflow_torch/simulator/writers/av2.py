@@ -12,7 +12,7 @@ from pyarrow import feather
 
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.simulator.recording import Boxes, GroundRaster, Recording
+from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid, Recording
 from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import Sweep
 
@@ -88,7 +88,7 @@ def _label_columns(sweep: Sweep, labels: FlowLabels, T_ego1_ego0: np.ndarray) ->
     }
 
 
-def _annotations(stamp: int, boxes: Boxes) -> Mapping[str, np.ndarray]:
+def _annotations(stamp: int, boxes: AnnotationBoxes) -> Mapping[str, np.ndarray]:
     return {
         "timestamp_ns": np.full(len(boxes.track_id), stamp, np.int64),
         "track_uuid": np.array(boxes.track_id, dtype=object),
@@ -99,7 +99,7 @@ def _annotations(stamp: int, boxes: Boxes) -> Mapping[str, np.ndarray]:
     }
 
 
-def _write_map(folder: Path, log_id: str, raster: GroundRaster) -> None:
+def _write_map(folder: Path, log_id: str, raster: GroundGrid) -> None:
     """Write the ground raster, its transform, and a vector map with the raster's outline as drivable area."""
     (x0, y0), step = raster.origin, raster.step
     rows, columns = raster.height.shape

@@ -1,0 +1,137 @@
+"""Draw masks of dynamic objects in the images of a log's cameras, for the reconstruction of its static world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Iterable, Sequence
+
+import numpy as np
+
+from cflow_torch.applications.moving_groups import pose_of
+from cflow_torch.applications.track_table import Table, boxes_in_sweeps
+from cflow_torch.data.atomic import atomic_file
+from cflow_torch.data.camera import Camera
+from cflow_torch.data.log import Log
+from cflow_torch.errors import import_optional
+from cflow_torch.transforms import transform_points, upright_poses
+from cflow_torch.types import CFlowError, FlowResult, as_numpy
+
+DYNAMIC, STATIC = 255, 0  # values of pixels
+_RADIUS = 0.15  # metres around a moving point
+_MARGIN = 0.1  # metres, added to each side of a box
+_NEAREST = 0.1  # metres from the camera; we cut off what is nearer
+_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))  # rows of _CORNERS
+
+
+def write_masks(folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]], table: Table) -> None:
+    """Write `folder/CAMERA/IMAGE.png` for each camera of each sweep with a flow: 255 = dynamic, 0 = static.
+
+    Args:
+        folder: created if it does not exist.
+        log: a log whose reader knows the calibration of its cameras (`Log.cameras`).
+        results: (index, flow of sweep `index` to `index + 1`).
+        table: tracks of the log, see `track`.
+
+    Convention: a pixel is dynamic if it shows a disc of 0.15 m around a moving point (`FlowResult.is_moving`), or the
+        box of a track, 0.1 m larger on each side, which may be at rest in this sweep. Points and boxes are moved to the
+        time of the image by their velocities. We do not test whether something hides them.
+
+    Raises:
+        CFlowError: the log has no calibration of cameras, or Pillow is not installed.
+    """
+    for index, result in results:
+        cameras = log.cameras(index)
+        check_cameras(log, cameras)
+        points, point_velocity = _moving_points(log, index, result)
+        corners, box_velocity = _corners(log, {name: values[table["sweep"] == index] for name, values in table.items()})
+        for camera in cameras:
+            shapes = corners + camera.seconds * box_velocity[:, None]
+            mask = dynamic_mask(camera, points + camera.seconds * point_velocity, shapes)
+            with atomic_file(folder / camera.name / f"{camera.image}.png") as file:
+                _pillow().fromarray(mask).save(file, "PNG")
+
+
+def check_cameras(log: Log, cameras: Sequence[Camera]) -> None:
+    """Raise an error if a log has no calibrated cameras."""
+    if not cameras:
+        raise CFlowError(
+            f"log {log.log_id} has no calibration of cameras, which masks need: Argoverse 2, PandaSet, nuScenes and "
+            "KITTI have it in the files of their cameras"
+        )
+
+
+def dynamic_mask(camera: Camera, points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Draw moving points, (P, 3), and boxes, (K, 8, 3) corners, both in metres in the frame of the sweep's points.
+
+    Corners are in the order of x, y and z: the last one changes fastest. Returns (height, width) uint8.
+    """
+    image = _pillow().new("L", camera.size, STATIC)
+    brush = import_optional("PIL.ImageDraw", _NEEDS_PILLOW).Draw(image)
+    width, height = camera.size
+    positions = camera.see(points)
+    pixels = camera.project(positions)
+    radius = _RADIUS * camera.matrix[0, 0] / np.maximum(positions[:, 2], _NEAREST)
+    nearest = np.clip(pixels, 0, (width, height))
+    is_seen = np.abs(pixels - nearest).max(axis=1, initial=0) <= radius  # False for NaN
+    for (x, y), r in zip(pixels[is_seen].tolist(), radius[is_seen].tolist()):
+        brush.ellipse((x - r, y - r, x + r, y + r), fill=DYNAMIC)
+    for box in corners:
+        for face in _FACES:
+            polygon = _in_front(camera.see(box[list(face)]))
+            if len(polygon) > 2:
+                brush.polygon([tuple(pixel) for pixel in camera.project(polygon).tolist()], fill=DYNAMIC)
+    return np.asarray(image)
+
+
+def _in_front(polygon: np.ndarray) -> np.ndarray:
+    """Cut off what is nearer to the camera than `_NEAREST`; (N, 3) vertices in its frame."""
+    kept = []
+    for here, there in zip(polygon, np.roll(polygon, -1, axis=0)):
+        is_near, is_next_near = here[2] <= _NEAREST, there[2] <= _NEAREST
+        if not is_near:
+            kept.append(here)
+        if is_near != is_next_near:
+            share = (1.001 * _NEAREST - here[2]) / (there[2] - here[2])
+            kept.append(here + share * (there - here))
+    return np.array(kept).reshape(-1, 3)
+
+
+def _moving_points(log: Log, index: int, result: FlowResult) -> tuple[np.ndarray, np.ndarray]:
+    """Return moving points, (P, 3) metres, and their velocities, (P, 3) m/s, in the frame of the sweep's points."""
+    sweep, after = log.sweep(index), log.sweep(index + 1)
+    points = as_numpy(sweep.points, np.float64)[:, :3]
+    if len(points) != len(result.residual_flow):
+        rows = len(result.residual_flow)
+        raise CFlowError(f"sweep {index} has {len(points)} points, but its flow {rows} rows: give both of one log")
+    moves = as_numpy(result.is_moving) & np.isfinite(points).all(axis=1)
+    rotation = pose_of(sweep)[:3, :3].T @ pose_of(after)[:3, :3]  # from the axes of t+1 to those of t
+    flow = as_numpy(result.residual_flow, np.float64)[moves] @ rotation.T
+    seconds = 0.1
+    if sweep.timestamp_ns is not None and after.timestamp_ns is not None:
+        seconds = (after.timestamp_ns - sweep.timestamp_ns) * 1e-9
+    return points[moves], flow / seconds
+
+
+def _corners(log: Log, rows: Table) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners, (K, 8, 3) metres, and velocities, (K, 3) m/s, of boxes of a sweep, in the frame of its points."""
+    if not len(rows["sweep"]):
+        return np.zeros((0, 8, 3)), np.zeros((0, 3))
+    centre, heading = boxes_in_sweeps(rows, log)
+    size = np.stack([rows[name] for name in ("length", "width", "height")], 1) + 2 * _MARGIN
+    boxes = upright_poses(np.concatenate([heading[:, None], centre], 1))
+    corners = [transform_points(_CORNERS * sides, box) for sides, box in zip(size, boxes)]
+    velocity = np.stack([rows[name] for name in ("vx", "vy", "vz")], 1)
+    return np.stack(corners), velocity @ pose_of(log.sweep(int(rows["sweep"][0])))[:3, :3]
+
+
+_NEEDS_PILLOW = "masks need Pillow (extra viz): pip install Pillow"
+
+
+def _pillow() -> Any:
+    return import_optional("PIL.Image", _NEEDS_PILLOW)
+
+
+def check_pillow() -> None:
+    """Raise the error of a missing Pillow before anything is computed."""
+    _pillow()

@@ -1,0 +1,224 @@
+"""Whole boxes of tracks: one size from all sweeps, held at the sides that face the sensor, along a smoothed path."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.applications.association import rotate
+from cflow_torch.applications.smoothing import Motion, smooth
+
+PEDESTRIAN, CYCLIST, CAR, TRUCK = range(4)
+KINDS = ("pedestrian", "cyclist", "car", "truck")
+# Length and width of each kind where they are not seen, metres. A walking adult: a step and the arms; a bicycle and its
+# handlebar; a car of the middle class without mirrors; a lorry.
+_TYPICAL = ((0.9, 0.65), (1.8, 0.7), (4.5, 1.9), (8.0, 2.5))
+_LEAST = (3.6, 1.5)  # metres, length and width of the smallest cars; a smaller visible part is not the whole
+_NARROW = (2.6, 1.2)  # metres, length and width below which an object is not a vehicle
+_SHORT, _RUNNING = 1.3, 3.0  # metres, m/s: narrow objects that are longer or faster are cyclists
+_LONG_CAR, _HIGH_CAR = 6.0, 2.6  # metres; larger vehicles are trucks
+
+_SEEN_ANGLE = math.radians(15)  # a side is seen if the view of the sensor meets it at this angle at least
+_SHARE = 0.75  # quantile over the sweeps of where an edge is seen; points of other objects are beyond
+_STRAY = 0.003  # share of the points of one sweep that are beyond an edge
+FLOW_NOISE = 0.2  # m/s, standard deviation
+_ANCHOR_NOISE, _FREE_NOISE = 0.15, 0.3  # standard deviation of a box: metres, plus a share of what is not seen
+_CENTROID_NOISE = 1.0  # metres, standard deviation of the mean of the visible points
+_MIN_SPEED = 0.5  # m/s; slower objects keep their heading
+_ROUNDS, _ROBUST_ROUNDS = 3, 3
+
+
+class Sightings(NamedTuple):
+    """What is seen of the K tracks of a drive: R sightings, sorted by track, then time, each with points; float64."""
+
+    track: Tensor  # (R,) int64, 0 ... K - 1
+    seconds: Tensor  # (R,)
+    sensor: Tensor  # (R, 3) metres, position of the vehicle in the world
+    velocity: Tensor  # (R, 3) m/s, mean flow of the points
+    heading: Tensor  # (R,) radians, where the object never moves fast enough to tell
+    points: Tensor  # (P, 3) metres in the world
+    row: Tensor  # (P,) int64, sighting of each point
+
+
+class WholeBoxes(NamedTuple):
+    """The boxes of R sightings, in the world."""
+
+    motion: Motion  # of the centre
+    size: Tensor  # (R, 3) metres: length, width, height
+    heading: Tensor  # (R,) radians
+    kind: Tensor  # (R,) int64, index in `KINDS`
+
+
+class Edges(NamedTuple):
+    """The visible extent of R objects along the axes of their boxes (ahead, left, up), metres."""
+
+    low: Tensor  # (R, 3)
+    high: Tensor  # (R, 3)
+    sensor: Tensor  # (R, 3)
+
+    @classmethod
+    def of(cls, points: Tensor, row: Tensor, sensor: Tensor, heading: Tensor) -> Edges:
+        """Turn points (P, 3) of R objects into the axes of boxes with (R,) headings; few points are strays."""
+        local = turned(points, -heading[row])
+        count = len(heading)
+        ends = [torch.stack(quantiles(local[:, axis], row, count, _STRAY, 1 - _STRAY)) for axis in range(3)]
+        low, high = torch.stack(ends, 2)
+        return cls(low, high, turned(sensor, -heading))
+
+    @property
+    def middle(self) -> Tensor:
+        """(R, 3)"""
+        return (self.low + self.high) / 2
+
+    @property
+    def view(self) -> Tensor:
+        """(R, 3) from the middle to the sensor."""
+        return self.sensor - self.middle
+
+    def at(self, rows: Tensor) -> Edges:
+        """Select rows."""
+        return Edges(self.low[rows], self.high[rows], self.sensor[rows])
+
+    def relative_to(self, origin: Tensor) -> Edges:
+        """Shift the origin to (R, 3) points, along the axes of the boxes."""
+        return Edges(self.low - origin, self.high - origin, self.sensor - origin)
+
+    def is_seen(self) -> Tensor:
+        """(R, 2) bool: the sensor looks at a long side, which shows the length; at an end, which shows the width."""
+        side = torch.atan2(self.view[:, 1].abs(), self.view[:, 0].abs())
+        return torch.stack([side >= _SEEN_ANGLE, side <= math.pi / 2 - _SEEN_ANGLE], 1)
+
+    def anchor(self, size: Tensor, kind: Tensor) -> tuple[Tensor, Tensor]:
+        """Place boxes of (R, 3) size on the visible points.
+
+        The visible edges of a vehicle are those that face the sensor. What is not seen of its box lies beyond the
+        others. If the sensor is beside it, a part may be missing at either end. People and cyclists are round, so they
+        are in the middle of their points.
+
+        Returns: (R, 3) centres, along the axes of the boxes, and their (R,) standard deviations, metres.
+        """
+        missing = (size - (self.high - self.low)) / 2
+        facing = (self.view / (size / 2)).clamp(-1, 1)
+        shift = -facing * missing.clamp(min=0)
+        shift[:, 2] = 0
+        shift[kind <= CYCLIST] = 0
+        return self.middle + shift, _ANCHOR_NOISE + _FREE_NOISE * missing[:, :2].abs().amax(1)
+
+
+def whole_boxes(sightings: Sightings) -> WholeBoxes:
+    """Estimate the box of each track from all its sightings.
+
+    The flow gives the shape of the path, and the visible edges its position. Along a path, the edges of the object stay
+    where they are in its box, and other points do not. So three quarters of all sightings must agree on an edge.
+    """
+    track = sightings.track
+    count = int(track.max()) + 1 if len(track) else 0
+    centre = _means(sightings.points, sightings.row, len(track))
+    motion = _smoothed(sightings, centre, torch.full_like(sightings.seconds, _CENTROID_NOISE))
+    for _ in range(_ROUNDS):
+        heading = headings(motion.velocity, track, sightings.heading)
+        edges = Edges.of(sightings.points, sightings.row, sightings.sensor, heading)
+        speed = motion.velocity[:, :2].norm(dim=1)
+        along_path = edges.relative_to(turned(motion.position, -heading))
+        (typical_speed,) = quantiles(speed, track, count, _SHARE)
+        kind, size = kinds_and_sizes(along_path, track, count, typical_speed)
+        local, noise = edges.anchor(size[track], kind[track])
+        centre = turned(local, heading)
+        motion = _smoothed(sightings, centre, noise)
+        for _ in range(_ROBUST_ROUNDS - 1):
+            residual = (centre - motion.position)[:, :2].norm(dim=1)
+            motion = _smoothed(sightings, centre, torch.hypot(noise, residual))
+    return WholeBoxes(motion, size[track], heading, kind[track])
+
+
+def _smoothed(sightings: Sightings, centre: Tensor, noise: Tensor) -> Motion:
+    measured = torch.stack([centre, sightings.velocity], 1)
+    deviations = torch.stack([noise, torch.full_like(noise, FLOW_NOISE)], 1)
+    return smooth(sightings.track, sightings.seconds, measured, deviations)
+
+
+def kinds_and_sizes(edges: Edges, track: Tensor, count: int, speed: Tensor) -> tuple[Tensor, Tensor]:
+    """Estimate what the tracks are, and how large.
+
+    Args:
+        edges: of R sightings, relative to a point that moves with the object.
+        track: (R,) int64, track of each sighting, 0 ... count - 1.
+        count: K.
+        speed: (K,) m/s.
+
+    Returns: (K,) int64 kinds and (K, 3) float64 sizes, metres. Lengths and widths that are not seen are typical ones,
+        or what is visible if it is larger.
+    """
+    every = torch.ones_like(track, dtype=torch.bool)
+    size = torch.stack([_extent(edges, axis, track, count, every) for axis in range(3)], 1)
+    kind = _kind(size, speed)
+    typical = size.new_tensor(_TYPICAL)[kind]
+    is_seen = edges.is_seen()
+    is_person = kind <= CYCLIST
+    for axis, least in enumerate(_LEAST):
+        seen = _extent(edges, axis, track, count, is_seen[:, axis])
+        visible = torch.maximum(size[:, axis], typical[:, axis])
+        of_vehicle = torch.where(seen >= least, seen, visible)  # NaN if it is never seen
+        size[:, axis] = torch.where(is_person, typical[:, axis], of_vehicle)
+    return kind, size
+
+
+def _kind(size: Tensor, speed: Tensor) -> Tensor:
+    """Classify objects by their visible (K, 3) size and (K,) speed; (K,) int64."""
+    is_narrow = (size[:, 0] < _NARROW[0]) & (size[:, 1] < _NARROW[1])
+    walks = (size[:, 0] < _SHORT) & (speed < _RUNNING)
+    is_large = (size[:, 0] > _LONG_CAR) | (size[:, 2] > _HIGH_CAR)
+    return torch.where(is_narrow, torch.where(walks, PEDESTRIAN, CYCLIST), torch.where(is_large, TRUCK, CAR))
+
+
+def _extent(edges: Edges, axis: int, track: Tensor, count: int, is_used: Tensor) -> Tensor:
+    """(K,) metres between the edges on which most of the used sightings of each track agree; NaN without one."""
+    (high,) = quantiles(edges.high[is_used, axis], track[is_used], count, _SHARE)
+    (low,) = quantiles(edges.low[is_used, axis], track[is_used], count, 1 - _SHARE)
+    return high - low
+
+
+def headings(velocity: Tensor, track: Tensor, otherwise: Tensor) -> Tensor:
+    """Direction of (R, 3) velocities, sorted by track, then time.
+
+    An object that is slow keeps the direction that it had, or will have if it has not yet moved. If it is always slow,
+    we take (R,) `otherwise`.
+    """
+    direction = torch.atan2(velocity[:, 1], velocity[:, 0])
+    is_fast = velocity[:, :2].norm(dim=1) >= _MIN_SPEED
+    index = torch.arange(len(track), device=track.device)
+    before = torch.where(is_fast, index, -1).cummax(0).values.clamp(min=0)
+    after = torch.where(is_fast, index, len(track)).flip(0).cummin(0).values.flip(0).clamp(max=len(track) - 1)
+    heading = torch.where(is_fast[after] & (track[after] == track), direction[after], otherwise)
+    return torch.where(is_fast[before] & (track[before] == track), direction[before], heading)
+
+
+def turned(values: Tensor, angle: Tensor) -> Tensor:
+    """Rotate (N, 3) vectors by (N,) angles about z, counter-clockwise, radians."""
+    return torch.stack([*rotate(values[:, 0], values[:, 1], angle), values[:, 2]], 1)
+
+
+def quantiles(values: Tensor, group: Tensor, count: int, *shares: float) -> list[Tensor]:
+    """Quantiles of the (N,) values of each group, (count,) for each share; the nearest value. NaN for empty groups."""
+    size = torch.bincount(group, minlength=count)
+    if len(values) == 0:
+        return [values.new_full((count,), torch.nan) for _ in shares]
+    lowest = values.min()
+    span = values.max() - lowest + 1
+    order = (group * span + (values - lowest)).argsort()  # by group, then value
+    first = size.cumsum(0) - size
+    found = []
+    for share in shares:
+        position = first + ((size - 1) * share).round().long()
+        value = values[order[position.clamp(max=len(values) - 1)]]
+        found.append(torch.where(size > 0, value, torch.nan))
+    return found
+
+
+def _means(values: Tensor, group: Tensor, count: int) -> Tensor:
+    """(count, 3) means of the (N, 3) values of each group; none is empty."""
+    total = values.new_zeros(count, values.shape[1]).index_add_(0, group, values)
+    return total / torch.bincount(group, minlength=count)[:, None]

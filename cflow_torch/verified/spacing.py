@@ -1,0 +1,118 @@
+"""The spacing of points: how far apart the beams of a sweep hit a surface, which grows with the distance.
+
+A sparse sensor hits a static surface at other positions in every sweep. So a slice is missing at a position only if no
+point is within the spacing there: in the *reach* around, 3 x 3 pixels where the spacing is less than a pixel. A pixel
+is *wide* if its reach is larger, and *tall* if neighbouring rings are farther apart than a slice is high. There, the
+slices above and below count as well.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cflow_torch.ops.indices import draw, exceeds, flat_nonzero, floor_divide, scatter_count, split_index, take_columns
+from cflow_torch.verified.directions import azimuth_bin, elevation_bin
+from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.collation import Batch
+
+# Bins of directions: fine azimuths in rows of a degree of elevation, and fine elevations in columns of azimuth.
+_AZIMUTHS = 8192  # of 0.04 to 0.09 degrees; four quadrants
+_ELEVATIONS = 120
+_COLUMNS = 1024
+_PER_DEGREE = 16  # fine elevations
+_GAPS = 1024  # bins of gaps, of a 16th of a degree of elevation, or a quarter of the narrowest bin of azimuth
+_NEAREST = 10.0  # metres; nearer to the origin, the position of the sensor would matter
+_FEWEST = 100  # gaps between directions; fewer do not tell the spacing
+_SHARE = 1.5  # reach over spacing; beams are not evenly spaced, and some returns are lost
+_FARTHEST = 6  # pixels, the largest reach
+
+
+class Spacing(NamedTuple):
+    """How far around a position a sweep must have a point, for each of B windows."""
+
+    angle: Tensor  # (B,) float64, radians, between neighbouring beams of a ring
+    rise: Tensor  # (B,) float64, between neighbouring rings, height over distance
+    most: int  # pixels, the largest reach in any window
+    has_tall: bool  # some pixel is tall
+
+    @classmethod
+    def of(cls, batch: Batch, grid: Grid, slice_height: float) -> Spacing:
+        """Measure the spacing in sweep t+1 of each window.
+
+        Convention:
+            We divide the directions of the points, seen from the origin of the ego frame, into rows of one degree of
+            elevation. The angle is the median of the gaps between the directions in a row. In the same way, the rise is
+            measured in columns of azimuth. Both are 0 if there are few gaps.
+
+        Cost: some passes over the points of t+1.
+        """
+        angle, rise = _median_gaps(batch)
+        corner = max(math.hypot(x, y) for x in (grid.lower[0], grid.upper[0]) for y in (grid.lower[1], grid.upper[1]))
+        largest_angle, largest_rise = torch.stack((angle, rise)).amax(1).tolist()
+        most = int(_SHARE * corner / grid.pixel_size * largest_angle + 0.5)
+        return cls(angle, rise, min(max(most, 1), _FARTHEST), corner * largest_rise >= slice_height)
+
+    def are_wide(self, grid: Grid, border: int, reach: int) -> Tensor:
+        """Tell at which pixels the reach is at least `reach` pixels, (B, height, width) bool, with a border.
+
+        Convention: the reach is 1.5 times the spacing, rounded, from 1 to 6 pixels. The spacing is the distance of the
+            middle of the pixel from the origin, times the angle.
+        """
+        return _are_beyond((reach - 0.5) / (_SHARE * self.angle), grid, border)
+
+    def are_tall(self, grid: Grid, border: int, slice_height: float) -> Tensor:
+        """Tell at which pixels rings are farther apart than a slice is high, (B, height, width) bool, with a border."""
+        return _are_beyond(slice_height / grid.pixel_size / self.rise, grid, border)
+
+
+def _are_beyond(distance: Tensor, grid: Grid, border: int) -> Tensor:
+    """Tell which pixels are farther from the origin than a distance, (B, height, width) bool, with a border.
+
+    `distance` is (B,) float64, pixels, to the middle of a pixel; it may be infinite.
+    """
+    device = distance.device
+    row = torch.arange(-border, grid.height + border, device=device) + (grid.lower[1] / grid.pixel_size + 0.5)
+    col = torch.arange(-border, grid.width + border, device=device) + (grid.lower[0] / grid.pixel_size + 0.5)
+    # From row to row, a pixel is beyond if its column is farther than this from the middle.
+    beyond = (distance.square()[:, None] - row.double().square()).clamp_(min=0).sqrt_()
+    return exceeds(col.abs(), beyond.float()[..., None])
+
+
+def _median_gaps(batch: Batch) -> tuple[Tensor, Tensor]:
+    """Return the medians of the gaps between neighbouring directions of t+1, across and up, (B,) float64 each."""
+    x, y, _ = batch.positions[:, : batch.num_newest]
+    far = flat_nonzero(x * x + y * y >= _NEAREST**2)
+    x, y, z = take_columns(batch.positions, far).float()
+    distance = (x * x + y * y).sqrt_()
+    window = floor_divide(batch.image.index_select(0, far).long(), batch.num_steps)
+
+    row = window * _ELEVATIONS + elevation_bin(z, distance, _ELEVATIONS)
+    direction = flat_nonzero(
+        draw(row * _AZIMUTHS + azimuth_bin(x, y, _AZIMUTHS), batch.num_windows * _ELEVATIONS * _AZIMUTHS)
+    )
+    row, azimuth = split_index(direction, _AZIMUTHS)
+    in_quadrant = (azimuth[:-1] % (_AZIMUTHS // 4) + 0.5).double() / (_AZIMUTHS // 4)
+    width = 4 / (in_quadrant.square() + (1 - in_quadrant).square())  # of the bin of azimuth, in bins of gaps
+    across = _median(direction.diff() * width, row, _ELEVATIONS, batch.num_windows)
+
+    levels = _PER_DEGREE * _ELEVATIONS
+    column = window * _COLUMNS + azimuth_bin(x, y, _COLUMNS)
+    direction = column * levels + elevation_bin(z, distance, levels, _PER_DEGREE)
+    direction = flat_nonzero(draw(direction, batch.num_windows * _COLUMNS * levels))
+    up = _median(direction.diff(), floor_divide(direction, levels), _COLUMNS, batch.num_windows)
+    return across / _AZIMUTHS, up / (57.3 * _PER_DEGREE)
+
+
+def _median(gap: Tensor, line: Tensor, lines: int, num_windows: int) -> Tensor:
+    """Return the medians of gaps between neighbouring directions of the same line, (B,) float64, whole bins of gaps.
+
+    `gap` is (K - 1,), `line`, (K,) int64, is that of each direction. Each window has `lines` lines.
+    """
+    gap = gap.long().clamp_(max=_GAPS - 1) + floor_divide(line[:-1], lines) * _GAPS
+    below = scatter_count(gap, num_windows * _GAPS, (line[1:] == line[:-1]).long()).view(-1, _GAPS).cumsum(1)
+    median = (2 * below < below[:, -1:]).sum(1)  # the first bin that reaches half
+    return median.double() * (below[:, -1] >= _FEWEST)

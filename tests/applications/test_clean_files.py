@@ -1,0 +1,169 @@
+"""Clean logs keep the form of their input: names, columns and types of its clouds; masks and counts of the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from command_line import cflow
+from pyarrow import feather, parquet
+from staged_cars import Staged, straight
+
+from cflow_torch import CFlowError, CleanLog
+from cflow_torch.applications.clean_files import stored_masks, write_clean_log
+from cflow_torch.applications.cleaning import MaskedLog, static_map_with_intensity
+from cflow_torch.data.arrays import ArraysLog
+from cflow_torch.data.arrays.cloud_file import copy_rows, read_cloud, write_cloud
+
+DRIVE = Staged([straight((1, 1), (0.9, 0.0), 4)])
+NAMES = [f"scan_{1700000000 + index}.{index}00" for index in range(4)]  # seconds with decimals
+
+
+def write_drive(folder: Path, suffix: str) -> None:
+    """Write the staged drive in types and columns of a user."""
+    folder.mkdir()
+    for index, name in enumerate(NAMES):
+        points = DRIVE.world(index)[0].astype(np.float64)
+        ring = np.arange(len(points), dtype=np.uint16)
+        intensity = np.linspace(0, 1, len(points), dtype=np.float32)
+        file = folder / f"{name}{suffix}"
+        if suffix == ".npy":
+            kinds = [("intensity", "f4"), ("z", "f8"), ("y", "f8"), ("x", "f8"), ("ring", "u2"), ("normal", "f4", 3)]
+            table = np.zeros(len(points), kinds)
+            table["x"], table["y"], table["z"] = points.T
+            table["ring"], table["intensity"], table["normal"][:, 2] = ring, intensity, 1.0
+            np.save(file, table)
+        elif suffix == ".npz":
+            np.savez(file, lidar=points, ring=ring, sensor=np.array([7.0]))
+        elif suffix in (".feather", ".parquet"):
+            names = pa.array(["a"] * len(points))
+            table = pa.table({"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], "ring": ring, "of": names})
+            (feather.write_feather if suffix == ".feather" else parquet.write_table)(table, file)
+        elif suffix == ".bin":
+            np.column_stack([points, intensity, ring]).astype("<f8").tofile(file)
+        else:
+            write_cloud(file, points, {"intensity": intensity, "ring": ring})
+
+
+def content(file: Path) -> Any:
+    """Columns of a file as another library reads them: (N,) records, or a dictionary of arrays."""
+    if file.suffix == ".npy":
+        return np.load(file)
+    if file.suffix == ".npz":
+        return dict(np.load(file))
+    if file.suffix in (".feather", ".parquet"):
+        return (feather if file.suffix == ".feather" else parquet).read_table(file)
+    if file.suffix == ".bin":
+        return np.fromfile(file, "<f8").reshape(-1, 5)
+    if file.suffix == ".pcd":
+        return pytest.importorskip("pypcd4").PointCloud.from_path(file).pc_data
+    header, _, body = file.read_bytes().partition(b"end_header\n")
+    assert b"property double x" in header and b"property ushort ring" in header
+    return np.frombuffer(body, [("xyz", "<f8", 3), ("intensity", "<f4"), ("ring", "<u2")])
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet"])
+def test_the_clouds_of_a_folder_keep_their_names_columns_and_types(tmp_path: Path, suffix: str) -> None:
+    if suffix == ".pcd":
+        pytest.importorskip("pypcd4")
+    write_drive(tmp_path / "drive", suffix)
+    log = ArraysLog(tmp_path / "drive")
+    removed = write_clean_log(CleanLog(log, flow=DRIVE.result), log, tmp_path / "clean")
+    folder = tmp_path / "clean" / "drive"
+    assert sorted(file.name for file in (folder / "points").iterdir()) == [f"{name}{suffix}" for name in NAMES]
+    count = 0
+    for index, name in enumerate(NAMES):
+        mask = np.load(folder / "removed" / f"{name}.npy")
+        assert np.array_equal(mask, DRIVE.world(index)[2] >= 0) and mask.dtype == bool
+        count += int(mask.sum())
+        given = content(tmp_path / "drive" / f"{name}{suffix}")
+        kept = content(folder / "points" / f"{name}{suffix}")
+        if suffix in (".feather", ".parquet"):
+            assert kept.equals(given.filter(pa.array(~mask)))
+        elif suffix == ".npz":
+            assert list(kept) == list(given) and np.array_equal(kept["sensor"], given["sensor"])
+            assert np.array_equal(kept["lidar"], given["lidar"][~mask]) and kept["ring"].dtype == np.uint16
+        else:
+            assert kept.dtype == given.dtype and np.array_equal(kept, given[~mask])
+    assert removed == (sum(len(DRIVE.world(index)[0]) for index in range(4)), count, 0)
+    back = ArraysLog(folder)
+    assert back.timestamps == log.timestamps and len(back[3].points) == (DRIVE.world(3)[2] < 0).sum()
+
+
+def test_points_without_a_position_are_left_out_and_counted(tmp_path: Path) -> None:
+    write_drive(tmp_path / "drive", ".npy")
+    file = tmp_path / "drive" / f"{NAMES[1]}.npy"
+    table = np.load(file)
+    table["x"][:5] = np.nan
+    np.save(file, table)
+    log = ArraysLog(tmp_path / "drive")
+    clean = CleanLog(log, flow=DRIVE.result)
+    removed = write_clean_log(clean, log, tmp_path / "clean")
+    assert removed.without_position == 5 and ", and 5 without a position" in str(removed)
+    assert np.isfinite(read_cloud(tmp_path / "clean" / "drive" / "points" / f"{NAMES[1]}.npy")).all()
+    masked = MaskedLog(log, stored_masks(tmp_path / "clean" / "drive", log))
+    for index in range(4):
+        assert np.array_equal(masked[index].points, clean[index].points)
+    np.save(tmp_path / "clean" / "drive" / "removed" / f"{NAMES[2]}.npy", np.zeros(3, bool))
+    with pytest.raises(CFlowError, match="overwrite=true"):
+        masked.sweep(2)
+
+
+def test_points_of_another_frame_are_written_as_the_log_has_them(tmp_path: Path) -> None:
+    write_drive(tmp_path / "drive", ".npy")
+    T = np.eye(4)
+    T[2, 3] = 1.5
+    log = ArraysLog(tmp_path / "drive", ego_T_lidar=T)
+    write_clean_log(CleanLog(log, flow=DRIVE.result), log, tmp_path / "clean")
+    back = ArraysLog(tmp_path / "clean" / "drive")
+    is_static = DRIVE.world(0)[2] < 0
+    np.testing.assert_allclose(back[0].points, DRIVE.world(0)[0][is_static] + [0, 0, 1.5], atol=1e-6)
+    assert back.files[0].stem == NAMES[0]
+
+
+def test_a_map_has_the_intensities_of_its_points(tmp_path: Path) -> None:
+    write_drive(tmp_path / "drive", ".bin")
+    log = ArraysLog(tmp_path / "drive", poses=np.tile(np.eye(4), (4, 1, 1)))
+    points, intensity = static_map_with_intensity(log, 0.4)
+    first = DRIVE.world(0)[0].astype(np.float32)
+    given = np.linspace(0, 1, len(first), dtype=np.float32)
+    assert intensity is not None and intensity.shape == (len(points),)
+    row = np.abs(points[0] - first).sum(1).argmin()
+    assert intensity[0] == pytest.approx(given[row])
+    without = Staged([straight((0, 0), (0.9, 0.0), 4)], np.tile(np.eye(4), (4, 1, 1)))
+    assert static_map_with_intensity(without, 0.4)[1] is None
+
+
+def test_a_mask_of_another_sweep_is_an_error(tmp_path: Path) -> None:
+    write_drive(tmp_path / "drive", ".npy")
+    with pytest.raises(CFlowError, match="the mask 3"):
+        copy_rows(tmp_path / "drive" / f"{NAMES[0]}.npy", tmp_path / "copy.npy", np.ones(3, bool))
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".bin", ".ply", ".feather", ".parquet"])
+def test_the_command_counts_what_it_removes_and_writes_every_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture, suffix: str
+) -> None:
+    write_drive(tmp_path / "drive", ".npy")
+    np.savetxt(tmp_path / "drive" / "poses.txt", np.tile(np.eye(4)[:3].reshape(12), (4, 1)))
+    more = ("model.num_history=0", "map=true", "voxel_size=0.4", "data.find_ground=null", "data.check=false")
+    call = ("clean", tmp_path / "drive", f"output={tmp_path / 'clean'}", f"suffix={suffix}", *more)
+    assert cflow(*call) == 0
+    text = capsys.readouterr().out
+    log = ArraysLog(tmp_path / "clean" / "drive", ground=None)
+    masks = [np.load(tmp_path / "clean" / "drive" / "removed" / f"{name}.npy") for name in NAMES]
+    total, removed = sum(map(len, masks)), sum(mask.sum() for mask in masks)
+    assert f"4 sweeps, removed {removed:,} of {total:,} points" in text and 0 < removed < total
+    for index, mask in enumerate(masks):
+        assert len(log[index].points) == (~mask).sum()
+    header = (tmp_path / "clean" / "drive.ply").read_bytes()[:300]
+    assert b"property float intensity" in header
+    if suffix == ".bin":
+        assert "data.bin_columns=5" in text
+    (tmp_path / "clean" / "drive.ply").unlink()
+    capsys.readouterr()
+    assert cflow(*call) == 0 and "it is complete" in capsys.readouterr().out
+    assert (tmp_path / "clean" / "drive.ply").read_bytes()[:300] == header
