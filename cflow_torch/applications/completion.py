@@ -62,11 +62,11 @@ class SeenPoints(NamedTuple):
         sensor = T_world_ego0[:3, 3]
         position = transform_points(as_numpy(sweeps.pc0.points)[points.row, :3], T_world_ego0)
         step = as_numpy(result.residual_flow)[points.row].astype(np.float64) @ T_world_ego1[:3, :3].T
-        ids, index, count = np.unique(points.id, return_inverse=True, return_counts=True)
-        total = [np.bincount(index, step[:, axis], len(ids)) for axis in range(3)]
+        ids, number, count = np.unique(points.id, return_inverse=True, return_counts=True)
+        total = [np.bincount(number, step[:, axis], len(ids)) for axis in range(3)]
         velocity = np.stack(total, 1) / count[:, None] / times.interval
         offset = (position - sensor).astype(np.float32)
-        return cls(points.sweep, times.now, ids, velocity, sensor, offset, index.astype(np.int32))
+        return cls(points.sweep, times.now, ids, velocity, sensor, offset, number.astype(np.int32))
 
 
 def complete(table: Table, seen: Sequence[SeenPoints]) -> Table:

@@ -89,6 +89,7 @@ class Tracker:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds from one sweep to the next")
         self._interval = sweep_interval
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
+        self.times = Times(0.0, sweep_interval, 0.0, 0.0)  # of the last sweep
         self._num_sweeps = 0
         self._num_tracks = 0
         self._tracks = Tracks()
@@ -302,10 +303,11 @@ def track(
         Column -> (R,) array, which `pandas.DataFrame(table)` takes. There is a row for each track and sweep in which it
         is seen, sorted by sweep, then id. The columns are:
         `sweep`, `timestamp_ns`, `id`;
-        x, y, z: filtered centre of the box, metres in the world; vx, vy, vz: filtered velocity over ground, m/s;
+        x, y, z: smoothed centre of the whole box, metres in the world; vx, vy, vz: its velocity over ground, m/s;
         `velocity_std`: m/s, standard deviation of each of vx, vy and vz, if errors are independent;
-        length (along the heading), width, height: metres, of the visible part of the object;
-        `heading`: radians in the world from +x to the left;
+        length (along the heading), width, height: metres, of the whole box, the same in all rows of a track;
+        `heading`: radians in the world from +x to the left, from the motion, kept at rest;
+        `class`: pedestrian, cyclist, car or truck, by size and speed alone;
         `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved;
         `is_moving`: False = the track moved before, and is static now;
         `cluster_id`: of this sweep's flow, -1 while it is static; `num_points`;
@@ -333,16 +335,34 @@ def track_points(
         model = make_model(make_config("default"))
         log = CachedLog(log, model.config.num_sweeps)
         results = enumerate(model([sweeps])[0] for sweeps in windows(log, model.config.num_history))
-    recent = CachedLog(log, 2)
-    tracker = Tracker(sweep_interval)
-    tables = []
-    points = []
-    seen = []
+    tracker = LogTracker(CachedLog(log, 2), sweep_interval)
     for index, result in results:
-        sweeps = window(recent, index)
-        table, track_id = tracker.push(sweeps, result)
-        points.append(TrackedPoints.of(index, track_id))
-        where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}
-        tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
-        seen.append(SeenPoints.of(sweeps, result, points[-1], tracker.times))
-    return complete(confirmed(join_tables(tables)), seen), points
+        tracker.push(index, result)
+    return tracker.table(), tracker.points
+
+
+class LogTracker:
+    """Track the moving objects of a log as its flow arrives, and complete their boxes at the end.
+
+    Arguments are those of `track`. `points` has the points of tracks of each sweep that was pushed.
+    """
+
+    def __init__(self, log: Log, sweep_interval: float = 0.1) -> None:
+        self.points: list[TrackedPoints] = []
+        self._log = log
+        self._tracker = Tracker(sweep_interval)
+        self._tables: list[dict[str, np.ndarray]] = []
+        self._seen: list[SeenPoints] = []
+
+    def push(self, index: int, result: FlowResult) -> None:
+        """Continue the tracks by the flow of sweep `index`; indices ascend."""
+        sweeps = window(self._log, index)
+        table, track_id = self._tracker.push(sweeps, result)
+        self.points.append(TrackedPoints.of(index, track_id))
+        where = {"sweep": index, "timestamp_ns": int(self._log.timestamps[index])}
+        self._tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
+        self._seen.append(SeenPoints.of(sweeps, result, self.points[-1], self._tracker.times))
+
+    def table(self) -> dict[str, np.ndarray]:
+        """Return the table of `track`."""
+        return complete(confirmed(join_tables(self._tables)), self._seen)

@@ -98,7 +98,8 @@ class Edges(NamedTuple):
         others. If the sensor is beside it, a part may be missing at either end. People and cyclists are round, so they
         are in the middle of their points.
 
-        Returns: (R, 3) centres, along the axes of the boxes, and their (R,) standard deviations, metres.
+        Returns:
+            (R, 3) centres, along the axes of the boxes, and their (R,) standard deviations, metres.
         """
         missing = (size - (self.high - self.low)) / 2
         facing = (self.view / (size / 2)).clamp(-1, 1)
@@ -149,8 +150,9 @@ def kinds_and_sizes(edges: Edges, track: Tensor, count: int, speed: Tensor) -> t
         count: K.
         speed: (K,) m/s.
 
-    Returns: (K,) int64 kinds and (K, 3) float64 sizes, metres. Lengths and widths that are not seen are typical ones,
-        or what is visible if it is larger.
+    Returns:
+        (K,) int64 kinds and (K, 3) float64 sizes, metres. Lengths and widths that are not seen are typical ones, or
+        what is visible if it is larger.
     """
     every = torch.ones_like(track, dtype=torch.bool)
     size = torch.stack([_extent(edges, axis, track, count, every) for axis in range(3)], 1)

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Callable, Iterable, Iterator, NamedTuple, Sequence
 
 import numpy as np
@@ -40,6 +41,7 @@ from cflow_torch.cli.outputs import output_folder, settings_record, versions, wr
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, has_track_ids, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.job import Job, Part, Shard, find_shard
@@ -124,7 +126,13 @@ def compute(
             clear_log(output / log_id)
     write_config(cfg, output)
     report = _run(cfg, flow, layout)
-    failures = [] if report["stopped_by"] else use(cfg, flow, report)  # a signal leaves no time for this
+    failures: Failures = []
+    if not report["stopped_by"]:  # a signal leaves no time for this
+        begin = perf_counter()
+        failures = use(cfg, flow, report)
+        report["seconds"] += perf_counter() - begin
+        with suppress(OSError):  # the run has reported it
+            write_json(report_file(flow.job.output, flow.shard), report)
     _finish(cfg, flow, report, failures)
 
 
@@ -235,10 +243,13 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
     """
     failures: Failures = []
     stored = stored_flow(output, ())
+    # The flow files say which points are valid, so nothing here needs ground masks, and the log was checked before.
+    cheap = {"check": False, "find_ground": None}
+    sources = flow.sources._replace(settings={**flow.sources.settings, **cheap})
     wanted = [name for name in ("tracks", "labels", "masks") if getattr(cfg, name)]
     for part in tqdm(flow.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
-            log = flow.sources.open(part.source)
+            log = sources.open(part.source)
             pairs = chosen_pairs(log, first=0, step=1)  # the pair over a gap has no flow
             if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
                 continue
@@ -261,7 +272,8 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
 def _read_all(
     stored: Callable[[Log, int], FlowResult], log: Log, pairs: Iterable[int]
 ) -> Iterator[tuple[int, FlowResult]]:
-    return ((index, stored(log, index)) for index in pairs)
+    shown = tqdm(pairs, desc=log.log_id, unit="sweep", leave=False, disable=None)
+    return ((index, stored(log, index)) for index in shown)
 
 
 def _write_tracks(

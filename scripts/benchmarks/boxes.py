@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Dict, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from cflow_torch.data.boxes import Boxes
 from cflow_torch.data.catalog import GroundSegmentedLog
 from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.log import Log, windows
-from cflow_torch.data.pandaset import PandaSetLog
+from cflow_torch.data.pandaset import _POSITION, _SIZE, PandaSetLog, _columns
 
 DRIVES = ((300, "street"), (301, "crossing"))
 SPEED, POINTS, RANGE = 0.5, 20, 50.0  # m/s, points and metres: least speed and points, most distance of a scored object
@@ -37,7 +37,7 @@ _CLASSES = {
     "truck": ("BUS", "BOX_TRUCK", "TRUCK", "TRUCK_CAB", "LARGE_VEHICLE", "VEHICULAR_TRAILER", "ARTICULATED_BUS"),
 }
 CLASS_OF = {name: kind for kind, names in _CLASSES.items() for name in names}
-Row = dict[str, Any]
+Row = Dict[str, Any]
 
 
 class TrueBoxes(NamedTuple):
@@ -126,8 +126,6 @@ class PandaSetBoxes(PandaSetLog):
 
     def cuboids(self, index: int) -> Boxes:
         """Cuboids of a sweep in its ego frame."""
-        from cflow_torch.data.pandaset import _POSITION, _SIZE, _columns
-
         file = self.folder / "annotations" / "cuboids" / self._files[index].name
         columns = _columns(file, ("uuid", "label", "yaw", "cuboids.sensor_id", *_POSITION, *_SIZE))
         return self._boxes(columns, file, index, LIDAR)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scenes import pose
-from staged_cars import Staged, straight
+from staged_cars import SIZE, Staged, straight
 from tiny_recording import CAR_SIZE, CAR_VELOCITY, TinyRecording
 from writers.nuscenes import write_nuscenes as write_scene
 
@@ -123,5 +123,5 @@ def test_openpcdet_reads_boxes_in_the_frame_of_the_points(tmp_path: Path) -> Non
     car = points[log.world(6)[2] == 0]
     box = frames[6]["boxes_lidar"][0]
     np.testing.assert_allclose(box[:3], (car.min(0) + car.max(0)) / 2, atol=0.1)
-    np.testing.assert_allclose(box[3:6], (3.8, 1.4, 1.2), atol=0.01)
+    np.testing.assert_allclose(box[3:6], SIZE, atol=0.01)
     assert box[6] == pytest.approx(-np.pi / 2, abs=0.02), "the car drives to the right of the vehicle"

@@ -45,7 +45,8 @@ def seen(
     """Sightings of objects on paths, (T, 3) x, y, heading; `visible` chooses their points in each sweep."""
     parts = []
     for number, path in enumerate(paths):
-        velocity = np.gradient(path[:, :2], INTERVAL, axis=0)
+        speed = np.linalg.norm(np.gradient(path[:, :2], INTERVAL, axis=0), axis=1)
+        velocity = speed[:, None] * np.stack([np.cos(path[:, 2]), np.sin(path[:, 2])], 1)
         for index, (x, y, heading) in enumerate(path):
             local = visible(index, shell(size))
             turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
@@ -196,7 +197,8 @@ def test_quantiles_of_groups_equal_those_of_plain_loops() -> None:
     generator = np.random.default_rng(2)
     values, group = generator.normal(0, 1000, 200), generator.integers(0, 7, 200)
     group[group == 3] = 2
-    low, high = quantiles(torch.from_numpy(values), torch.from_numpy(group), 8, 0.0, 0.75)
+    ends = quantiles(torch.from_numpy(values), torch.from_numpy(group), 8, 0.0, 0.75)
+    low, high = (each.numpy() for each in ends)
     for number in range(8):
         of_group = np.sort(values[group == number])
         if len(of_group) == 0:
