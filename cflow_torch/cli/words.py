@@ -176,8 +176,10 @@ def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
     for group in chosen.keys() & given.keys():
         is_plain = not set(given[group]) & set(_NOT_PLAIN)
         chosen[group] = [word.strip() for word in given[group].split(",")] if is_plain else []
+        known = choices(group)
         for choice in chosen[group]:
-            _check_choice(group, choice)
+            if choice not in known:
+                raise CFlowError(f"{group}={choice}{near(choice, known)}: give one of {', '.join(sorted(known))}")
     if "experiment" in given or "row" in given:
         return {group: [] for group in chosen}
     if "model" not in given and "picture" in given:
@@ -194,9 +196,3 @@ def check_exists(path: str) -> None:
     """Reject a path that does not exist. The address of an object store is not looked up."""
     if "://" not in path and not os.path.exists(path):
         raise CFlowError(f"{path}: there is no such file or folder; settings are NAME=VALUE")
-
-
-def _check_choice(group: str, choice: str) -> None:
-    known = choices(group)
-    if choice not in (*known, "null"):
-        raise CFlowError(f"{group}={choice}{near(choice, known)}: give one of {', '.join(sorted(known))}")

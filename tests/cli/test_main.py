@@ -47,6 +47,7 @@ CHEAP = (
         "eval model.densify=nearest",
         "setting 'model.densify' belongs to model=keypoints or model=paper_keypoints: give that as well",
     ),
+    ("eval model=null", "model=null: give one of default, keypoints, live,"),
     ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
     ("plot cluster=3", "setting 'cluster' belongs to picture=correlation or picture=scales: give that as well"),
     ("flow data=av2", "the data is missing: give data.root=PATH"),
@@ -90,6 +91,21 @@ def test_a_wrong_call_is_one_line_with_a_hint(call, message, tmp_path, monkeypat
 
 def assert_nothing_was_computed(folder: Path) -> None:
     assert not list(folder.rglob("*results.json")) + list(folder.glob("outputs/flow/**/*.feather"))
+
+
+def test_wrong_names_and_values_are_told_without_hydra(tmp_path):
+    """Hydra takes most of a second."""
+    calls = [call for call, message in CHEAP if "=" in call and ("give a" in message or "did you mean" in message)]
+    assert len(calls) > 10
+    code = f"""
+import sys
+from command_line import cflow
+for call in {calls}:
+    assert cflow(*call.split()) == 2 and "hydra" not in sys.modules, call
+"""
+    path = {"env": {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, "cwd": tmp_path}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, **path)
+    assert done.returncode == 0, done.stderr
 
 
 def test_help_comes_without_torch_and_hydra_and_wrong_calls_without_torch(tmp_path, cflow, capsys):
