@@ -114,9 +114,10 @@ def compare(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
             # New processes for each case, because peak memory never falls.
             earlier, now = Version(given.earlier, paths, False), Version(ROOT, paths, given.keep_memory)
             earlier_preset = "default" if preset == "live" else preset
-            pairs = []
-            for _ in range(given.repeats + 1):
-                pairs.append((earlier.ask(number, earlier_preset, settings), now.ask(number, preset, settings)))
+            pairs = [
+                (earlier.ask(number, earlier_preset, settings), now.ask(number, preset, settings))
+                for _ in range(given.repeats + 1)
+            ]
             old, new = ([pair[side][0] for pair in pairs[1:]] for side in (0, 1))
             yield {
                 "log": Path(path).name,
