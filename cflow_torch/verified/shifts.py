@@ -1,7 +1,7 @@
 """The distinct shifts of candidate motions, from each sweep to t+1 and from t+1 to each sweep, in whole pixels.
 
 Candidates of a group are often alike: after rounding, they have the same shifts in all sweeps. We compare such motions
-once, and motions that shift nothing not at all:
+once, and motions that shift nothing not at all (on a CPU):
 
     motion, pixels per sweep interval     0.0    2.1    0.0    1.9    2.1   -1.0
     distinct shift                         -      0      -      0      0      1
@@ -37,14 +37,8 @@ class Shifts:
         elapsed = sweeps.elapsed_both_ways.index_select(1, window)  # [2, M, S]
         displacement = motions[:, None] * elapsed[..., None, None]  # [2, M, S, C, 2]
         pair = (displacement + 0.5).floor().int().view(torch.int64)[..., 0]  # [2, M, S, C], y and x as one number
-        same = _first_equal(pair)  # [M, C]
-        motion = torch.arange(1, motions.shape[1] + 1, device=motions.device)
-        is_first = same == motion
-        self.count = is_first.sum(1)
-        number = is_first.cumsum(1) * is_first  # from 1 on; 0 = the motion shifts nothing, or another one is equal
-        self._number = F.pad(number, (1, 0)).gather(1, same)  # of the shift of each motion, from 1 on; 0 = none
-        motion_of_number = torch.zeros_like(F.pad(number, (1, 0))).scatter_(1, number, (motion - 1).expand_as(number))
-        distinct = pair.gather(3, motion_of_number[:, None, 1:].expand_as(pair))
+        self.count, self._number, motion = _distinct(pair)
+        distinct = pair if motion is None else pair.gather(3, motion[:, None].expand_as(pair))
         self._shift = distinct.flatten(0, 2)[..., None].view(torch.int32)  # [2 M S, C, 2]
         is_far = torch.maximum(*self._shift.abs().unbind(2)) >= _FAR  # [2 M S, C]
         is_far |= is_wide[:, None].expand(2, -1, sweeps.num_steps).reshape(-1, 1)
@@ -63,7 +57,27 @@ class Shifts:
 
     def of_motions(self, values: Tensor) -> Tensor:
         """Give each motion the value of its shift: (R, M, C) to (R, M, C); 0 for motions that shift nothing."""
-        return F.pad(values, (1, 0)).gather(2, self._number.expand_as(values))
+        return values if self._number is None else F.pad(values, (1, 0)).gather(2, self._number.expand_as(values))
+
+
+def _distinct(shift: Tensor) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Number the distinct shifts of M groups; `shift` is (2, M, S, C) int64.
+
+    Returns:
+        count: (M,) int64, the number of distinct shifts of each group.
+        number: (M, C) int64, the shift of each motion, from 1 on; 0 = the motion shifts nothing. None = motion c has
+            shift c: a single motion, and a GPU, where the launches cost more than the comparisons.
+        motion: (M, C) int64, a motion with each shift; undefined beyond `count`. None = as for `number`.
+    """
+    num_groups, num_motions = shift.shape[1], shift.shape[3]
+    if num_motions == 1 or shift.device.type != "cpu":
+        return shift.new_full((num_groups,), num_motions), None, None
+    same = _first_equal(shift)
+    motion = torch.arange(1, num_motions + 1, device=shift.device).expand_as(same)
+    is_first = same == motion
+    number = is_first.cumsum(1) * is_first  # 0 = the motion shifts nothing, or an earlier one is equal
+    motion_of_number = F.pad(torch.zeros_like(number), (1, 0)).scatter_(1, number, motion - 1)
+    return is_first.sum(1), F.pad(number, (1, 0)).gather(1, same), motion_of_number[:, 1:]
 
 
 def _first_equal(shift: Tensor) -> Tensor:
