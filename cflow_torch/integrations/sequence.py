@@ -91,7 +91,7 @@ class SequenceFlow(nn.Module):
 
     def _windows(self, frames: Sequence[SequenceSweep], first: int) -> list[Window]:
         sweeps = self._sweeps(frames)
-        log: Any = SimpleNamespace(timestamps=sweeps, sweep=sweeps.__getitem__)
+        log: Any = SimpleNamespace(timestamps=sweeps, sweep=sweeps.__getitem__, gaps=frozenset())
         indices = range(first, len(sweeps) - 1)
         return [window(log, i, self.num_history, self.model.config.num_future) for i in indices]
 
