@@ -105,16 +105,11 @@ def _keeps_form(log: Log, suffix: str) -> bool:
     """Test whether the numbers of points in the files of a folder of clouds can stay as they are."""
     own = log.unwrapped
     has_numbers = isinstance(own, ArraysLog) and np.array_equal(own.ego_T_lidar, np.eye(4))
-    return has_numbers and own_suffix(log).lower() == suffix.lower() and _reading(log) not in CHANGES_POINTS
-
-
-def _reading(log: Log) -> str | None:
-    reading: str | None = getattr(log, "read_as", None)
-    return reading
+    return has_numbers and own_suffix(log).lower() == suffix.lower() and log.read_as not in CHANGES_POINTS
 
 
 def _viewpoint(log: Log, suffix: str) -> str | None:
     """Return the frame of the points in `.pcd` files whose VIEWPOINT has the pose, as the log has it; None = none."""
-    if suffix.lower() != ".pcd" or not getattr(log.unwrapped, "has_viewpoints", False):
+    if suffix.lower() != ".pcd" or not log.unwrapped.has_viewpoints:
         return None
-    return "world" if _reading(log) == WORLD else "sensor"
+    return "world" if log.read_as == WORLD else "sensor"

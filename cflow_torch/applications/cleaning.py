@@ -41,7 +41,7 @@ class MaskedLog(Log):
     def __init__(self, log: Log, mask: Callable[[int], np.ndarray]) -> None:
         self.log_id = log.log_id
         self.timestamps = log.timestamps
-        self.gaps = getattr(log, "gaps", frozenset())
+        self.gaps = log.gaps
         self._log = log
         self._mask = mask
 

@@ -335,16 +335,34 @@ def track_points(
         model = make_model(make_config("default"))
         log = CachedLog(log, model.config.num_sweeps)
         results = enumerate(model([sweeps])[0] for sweeps in windows(log, model.config.num_history))
-    recent = CachedLog(log, 2)
-    tracker = Tracker(sweep_interval)
-    tables = []
-    points = []
-    seen = []
+    tracker = LogTracker(CachedLog(log, 2), sweep_interval)
     for index, result in results:
-        sweeps = window(recent, index)
-        table, track_id = tracker.push(sweeps, result)
-        points.append(TrackedPoints.of(index, track_id))
-        where = {"sweep": index, "timestamp_ns": int(log.timestamps[index])}
-        tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
-        seen.append(SeenPoints.of(sweeps, result, points[-1], tracker.times))
-    return complete(confirmed(join_tables(tables)), seen), points
+        tracker.push(index, result)
+    return tracker.table(), tracker.points
+
+
+class LogTracker:
+    """Track the moving objects of a log as its flow arrives, and complete their boxes at the end.
+
+    Arguments are those of `track`. `points` has the points of tracks of each sweep that was pushed.
+    """
+
+    def __init__(self, log: Log, sweep_interval: float = 0.1) -> None:
+        self.points: list[TrackedPoints] = []
+        self._log = log
+        self._tracker = Tracker(sweep_interval)
+        self._tables: list[dict[str, np.ndarray]] = []
+        self._seen: list[SeenPoints] = []
+
+    def push(self, index: int, result: FlowResult) -> None:
+        """Continue the tracks by the flow of sweep `index`; indices ascend."""
+        sweeps = window(self._log, index)
+        table, track_id = self._tracker.push(sweeps, result)
+        self.points.append(TrackedPoints.of(index, track_id))
+        where = {"sweep": index, "timestamp_ns": int(self._log.timestamps[index])}
+        self._tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
+        self._seen.append(SeenPoints.of(sweeps, result, self.points[-1], self._tracker.times))
+
+    def table(self) -> dict[str, np.ndarray]:
+        """Return the table of `track`."""
+        return complete(confirmed(join_tables(self._tables)), self._seen)

@@ -71,8 +71,8 @@ class Scores:
         if labels is None:
             return
         wanted = ("eval_mask", "stored_motion") if self.metrics.definition.ego_motion == "stored" else ("eval_mask",)
-        parts = {name: getattr(log, name)(index) for name in wanted if hasattr(log, name)}
-        if self.metrics.definition.truth == "motion" and hasattr(log, "moving"):
+        parts = {name: getattr(log, name)(index) for name in wanted}
+        if self.metrics.definition.truth == "motion":
             parts["moving"] = log.moving(index)
         self.metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))
         scored = [sweeps.pc0.points, labels.flow, labels.category, labels.is_valid]

@@ -48,8 +48,7 @@ def paths_of(data: dict[str, Any]) -> list[Any]:
 
 def chosen_pairs(log: Log, first: int, step: int, count: int | None = None) -> list[int]:
     """Return the indices of at most `count` pairs of a log, every `step`-th from `first` on, none over a gap."""
-    gaps = getattr(log, "gaps", ())
-    return [index for index in range(first, len(log.timestamps) - 1, step) if index not in gaps][:count]
+    return [index for index in range(first, len(log.timestamps) - 1, step) if index not in log.gaps][:count]
 
 
 def check_pair(pair: int, log: Log) -> None:

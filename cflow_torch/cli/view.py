@@ -8,10 +8,8 @@ import webbrowser
 from pathlib import Path
 from typing import Any, Callable, Iterator, Sequence
 
-import numpy as np
-
-from cflow_torch.applications.track_table import TRACKS_FILE, Table, confirmed, join_tables, read_tracks
-from cflow_torch.applications.tracking import Tracker
+from cflow_torch.applications.track_table import TRACKS_FILE, Table, read_tracks
+from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.cli.commands import View
 from cflow_torch.cli.failures import Failures, collect_failures, finish
 from cflow_torch.cli.flows import make_log_model, stored_flow
@@ -62,19 +60,18 @@ def task(cfg: View) -> None:
 
 def _save_page(cfg: View, log: Log, results: Iterator[tuple[int, FlowResult]], file: Path, table: Table | None) -> int:
     """Save a page. Without a table of tracks, track the objects of the results as they arrive."""
-    tracker, tables = Tracker(), []
+    tracker = LogTracker(log)
 
     def tracked() -> Iterator[tuple[int, FlowResult]]:
         for index, result in results:
-            rows = tracker.push(window(log, index), result).table
-            tables.append({**rows, "sweep": np.full(len(rows["id"]), index)})
+            tracker.push(index, result)
             yield index, result
 
     return save_page(
         log,
         results if table is not None else tracked(),
         file,
-        tracks=lambda: confirmed(join_tables(tables)) if table is None else table,
+        tracks=lambda: tracker.table() if table is None else table,
         preset=chosen_preset() if cfg.flow is None else None,
         max_flow=cfg.max_flow,
         voxel=cfg.voxel,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -103,7 +103,7 @@ class AevaScenesLog(BoxLog):
             raise CFlowError(f"{self._file} has the LiDARs {shortened(known)}, you asked for {shortened(list(chosen))}")
         return chosen
 
-    @property
+    @cached_property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_ego` of every sweep."""
         return self._poses

@@ -13,13 +13,14 @@ from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.file_errors import shortened
+from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import read_as as read_log_as
-from cflow_torch.ground.segmentation import CHOICES
+from cflow_torch.ground.segmentation import CHOICES, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, Sweep, Window
@@ -322,21 +323,30 @@ def open(path: Any, data: str = AUTO, **settings: Any) -> Log | Logs:
 class GroundSegmentedLog(LogWrapper):
     """A log with a ground mask for every sweep: the mask of the log if it has one, otherwise found from the points.
 
-    `method` is the `find_ground` of `open_log`. The attribute `has_found_ground` becomes True when the method "auto"
-    finds ground in a sweep.
+    `method` is the `find_ground` of `open_log`.
     """
 
     def __init__(self, log: Log, method: str = "grid") -> None:
         super().__init__(log)
-        self.method, self.has_found_ground = method, False
+        self.method = method
 
     def sweep(self, index: int) -> Sweep:
         sweep = self.log.sweep(index)
         if sweep.is_ground is not None:
             return sweep
         is_ground: Any = ground_of(sweep.points, self.method)
-        self.has_found_ground |= self.method == "auto" and bool(is_ground.any())
         return replace(sweep, is_ground=is_ground)
+
+    def findings(self) -> list[Finding]:
+        findings = self.log.findings()
+        first = self.log.sweep(0)
+        if self.method != "auto" or first.is_ground is not None or not has_ground(first.points):
+            return findings
+        text = (
+            "it has no ground masks, so we find the ground (find_ground=auto). data.find_ground=grid does the same "
+            "without this line, data.find_ground=null leaves all points in"
+        )
+        return [*findings, Finding("ground", FOUND, text, True)]
 
 
 def _reader(name: str) -> tuple[Any, Any]:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.transforms import relative_transform, transform_points
@@ -72,6 +73,10 @@ class DeskewedLog(LogWrapper):
     def judgement(self) -> Judgement | None:
         return self._judged
 
+    def findings(self) -> list[Finding]:
+        found = [Finding("de-skewing", FOUND, self.reading.note, True)] if self.reading.note else []
+        return [*self.log.findings(), *found]
+
     @cached_property
     def _judged(self) -> Judgement | None:
         """Compare the scans, and the readings of the poses under the best one; None if there is one scan only."""
@@ -87,7 +92,7 @@ class DeskewedLog(LogWrapper):
         `poses`. Times of points are expected to be those of raw points if the reader says so (`Log.has_raw_times`).
         """
         own = self.log.unwrapped
-        if own.is_compensated or self.ego_poses is None or self._has_moved_by_times():
+        if own.is_compensated or self.poses is None or self._has_moved_by_times():
             return ("off",)
         if self._recent.sweep(0).point_times is None:
             return ("off", *DIRECTIONS)
@@ -174,14 +179,9 @@ class DeskewedLog(LogWrapper):
         flow = np.where(np.isfinite(flow), flow, labels.flow)
         return replace(labels, flow=flow.astype(labels.flow.dtype))
 
-    @cached_property
-    def ego_poses(self) -> np.ndarray | None:
-        """(K, 4, 4) float64 `T_world_ego`; None if the log does not have them without reading points."""
-        return getattr(self.log, "poses", None)
-
     def _motion(self, index: int) -> np.ndarray:
         """Return `T_ego1_ego0` of the pair (index, index + 1)."""
-        known = self.ego_poses
+        known = self.poses
         poses = [self._recent.sweep(k).pose if known is None else known[k] for k in (index, index + 1)]
         return relative_transform(poses[1], poses[0])
 

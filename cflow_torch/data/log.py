@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Iterator, Mapping, Sequence, TypeVar, overload
 
 import numpy as np
 from torch.utils.data import Dataset
 
 from cflow_torch.data.camera import Camera
+from cflow_torch.data.finding import Finding
 from cflow_torch.errors import MissingFile, warn
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
+from cflow_torch.windows.readings import Judgement
 
 _Log = TypeVar("_Log", bound="Log")
 
@@ -56,6 +58,7 @@ class Log(ABC):
         moves_by_times: True = the reader compensates ego motion itself in sweeps that have `point_times`.
         has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
         lidar_position: (3,) metres, position of the rotating LiDAR in the frame of the points.
+        has_viewpoints: True = the poses come with the clouds, which are then often in the world's frame.
         turn_seconds: duration of a turn of the LiDAR; None = the median time between two sweeps.
 
     Convention: our readers return float32 points and float64 poses `T_world_ego`. Opening a log reads its poses and
@@ -71,17 +74,13 @@ class Log(ABC):
     log_id: str
     timestamps: Sequence[int]
     gaps: frozenset[int] = frozenset()
+    has_viewpoints: bool = False
     # What `cflow_torch.data.deskewing` must know of a reader.
     is_compensated: bool = False
     moves_by_times: bool = False
     has_raw_times: bool = False
     lidar_position: Any = (0.0, 0.0, 0.0)
     turn_seconds: float | None = None
-
-    @property
-    def judgement(self) -> Any:
-        """How well readings of the poses fit (`cflow_torch.windows.readings.Judgement`); None = not compared yet."""
-        return None
 
     @abstractmethod
     def sweep(self, index: int) -> Sweep:
@@ -94,6 +93,47 @@ class Log(ABC):
 
     def _labels(self, index: int) -> FlowLabels | None:
         """Read the truth of a pair that exists."""
+        return None
+
+    # What a log may have beyond sweeps and labels. None = it does not; readers and wrappers set or override it.
+
+    @cached_property
+    def poses(self) -> np.ndarray | None:
+        """(K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown before the points are read."""
+        return None
+
+    @cached_property
+    def read_as(self) -> str | None:
+        """The reading under which points and poses are converted, see `cflow_torch.data.read_as`."""
+        return None
+
+    @property
+    def judgement(self) -> Judgement | None:
+        """How well readings of the poses fit, if they were compared to read the log."""
+        return None
+
+    def findings(self) -> list[Finding]:
+        """Return what was found, and is used, to read the log."""
+        return []
+
+    def eval_mask(self, index: int) -> np.ndarray | None:
+        """Read which points of sweep `index` are evaluated, (N,) bool."""
+        return None
+
+    def stored_motion(self, index: int) -> Any:
+        """Read the ego motion that the file stores for the pair (index, index + 1)."""
+        return None
+
+    def moving(self, index: int) -> np.ndarray | None:
+        """Read which points of sweep `index` move, (N,) bool, where labels say only that."""
+        return None
+
+    def units(self, index: int) -> Any:
+        """Read the returns of each LiDAR of a simulated sweep."""
+        return None
+
+    def boxes(self, index: int) -> Any:
+        """Read the boxes of a simulated sweep."""
         return None
 
     def columns(self, index: int) -> Mapping[str, np.ndarray]:
@@ -187,9 +227,8 @@ def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> W
 
 def _readable(log: Log, indices: range) -> Iterator[Sweep]:
     """Yield the sweeps of a history or future, up to a gap of the log or a sweep whose file is missing."""
-    gaps = getattr(log, "gaps", ())
     for index in indices:
-        if (index if indices.step < 0 else index - 1) in gaps:
+        if (index if indices.step < 0 else index - 1) in log.gaps:
             return
         try:
             sweep = log.sweep(index)
@@ -220,7 +259,7 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
     """
 
     def __init__(self, logs: Log | Sequence[Log], num_history: int = 0, num_future: int = 0) -> None:
-        several: Any = [logs] if hasattr(logs, "timestamps") else logs
+        several: Any = [logs] if isinstance(logs, Log) else logs
         self._pairs = [(log, index) for log in several for index in range(len(log.timestamps) - 1)]
         self._num_history, self._num_future = num_history, num_future
         self._cached: CachedLog | None = None
@@ -245,7 +284,7 @@ class LogWrapper(Log):
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
-        self.gaps = getattr(log, "gaps", frozenset())
+        self.gaps = log.gaps
 
     def labels(self, index: int) -> FlowLabels | None:
         return self.log.labels(index)
@@ -263,9 +302,35 @@ class LogWrapper(Log):
     def _note(self, text: str, kind: str = "") -> None:
         self.log._note(text, kind)
 
+    @cached_property
+    def poses(self) -> np.ndarray | None:
+        return self.log.poses
+
+    @cached_property
+    def read_as(self) -> str | None:
+        return self.log.read_as
+
     @property
-    def judgement(self) -> Any:
+    def judgement(self) -> Judgement | None:
         return self.log.judgement
+
+    def findings(self) -> list[Finding]:
+        return self.log.findings()
+
+    def eval_mask(self, index: int) -> np.ndarray | None:
+        return self.log.eval_mask(index)
+
+    def stored_motion(self, index: int) -> Any:
+        return self.log.stored_motion(index)
+
+    def moving(self, index: int) -> np.ndarray | None:
+        return self.log.moving(index)
+
+    def units(self, index: int) -> Any:
+        return self.log.units(index)
+
+    def boxes(self, index: int) -> Any:
+        return self.log.boxes(index)
 
     def close(self) -> None:
         self.log.close()

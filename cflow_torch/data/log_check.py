@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable, Iterable, NamedTuple
+from typing import Callable, Iterable, List
 
 import numpy as np
 
+from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log
 from cflow_torch.data.log_motion import find_lapses, judge_log, known_poses
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import CAUSES, NO_READING, STILL, UNKNOWN, WORLD, Judgement
+from cflow_torch.windows.readings import NO_READING, STILL, UNKNOWN, WORLD
 
-RIGHT, FOUND, WRONG = "right", "found and used", "wrong"
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
 _GAP = 2.5  # usual intervals between sweeps; a longer one is a gap
 _LONGEST_GAP = 0.5  # seconds
-
-
-class Finding(NamedTuple):
-    """One line of a check."""
-
-    topic: str  # sensor, points, frame, ground, poses, times, ...
-    status: str  # RIGHT, FOUND or WRONG
-    text: str  # what was found; if it is wrong, with the fix
-    is_quick: bool = False  # commands print it if it is not right
+_TOPICS = (
+    *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
+    *("labels", "reader"),
+)
+_Check = Callable[[Log], List[Finding]]
 
 
 def check_log(log: Log) -> None:
@@ -43,66 +39,53 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    cached = CachedLog(log, _CACHED)
-    findings = _collect(cached, (_frame, _reading, _ground, _mask, _deskew, _repeated, _motion, _lapses))
+    findings = _collect(CachedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _motion, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
 def examine(log: Log) -> list[Finding]:
     """Check everything that `cflow check` shows, in the order of its page.
 
-    Cost: reads up to 20 sweeps, and two of each step between poses that is suspect; 1 to 2 s.
+    Cost: reads up to 16 sweeps, and two of each step between poses that is suspect; 1 to 2 s.
     """
-    cached = CachedLog(log, _CACHED)
-    checks = (
-        *(_sensor, _frame, _reading, _times, _poses, _lapses, _motion, _deskew),
-        *(_repeated, _ground, _mask, _own_vehicle, _labels),
-    )
-    findings = _collect(cached, checks, tells_errors=True)
-    notes = getattr(log, "notes", ())  # complete only now, as readers note what they see in the sweeps
-    return [*findings, *(Finding("reader", FOUND, note) for note in notes)]
+    checks = (_sensor, _found, _frame, _times, _poses, _lapses, _motion, _deskew, _repeated, _mask, _labels)
+    findings = _collect(CachedLog(log, _CACHED), checks, tells_errors=True)
+    # Notes are complete only now, as readers note what they see in the sweeps.
+    return [*findings, *(Finding("reader", FOUND, note) for note in log.notes)]
 
 
-def _collect(log: Log, checks: Iterable[Callable[[Log], Finding | None]], tells_errors: bool = False) -> list[Finding]:
-    """Return what the checks find. A check that cannot read a sweep finds its error, if it `tells_errors`."""
+def _collect(log: Log, checks: Iterable[_Check], tells_errors: bool = False) -> list[Finding]:
+    """Return what the checks find, by topic. One that cannot read a sweep finds its error, if it `tells_errors`."""
     found: list[Finding] = []
     for check in checks:
         try:
-            finding = check(log)
+            findings = check(log)
         except (CFlowError, OSError) as error:
-            finding = Finding("log", WRONG, str(error)) if tells_errors else None
-        if finding is not None and finding not in found:
-            found.append(finding)
-    return found
+            findings = [Finding("log", WRONG, str(error))] if tells_errors else []
+        found += [finding for finding in findings if finding not in found]
+    return sorted(found, key=lambda finding: _TOPICS.index(finding.topic))
 
 
-def _frame(log: Log) -> Finding:
+def _found(log: Log) -> list[Finding]:
+    return log.findings()
+
+
+def _frame(log: Log) -> list[Finding]:
     reading, problem = frame_problem(log.sweep(0).points)
     if not problem:
-        return Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
+        return [Finding("frame", RIGHT, "metres, around the vehicle, z up", True)]
     fix = f"; data.read_as={reading} converts them" if reading else ""
-    return Finding("frame", WRONG, f"in the first sweep {problem}{fix}", True)
+    return [Finding("frame", WRONG, f"in the first sweep {problem}{fix}", True)]
 
 
-def _reading(log: Any) -> Finding | None:
-    reading = getattr(log, "read_as", None)
-    if reading is None:
-        return None
-    what = CAUSES.get(reading, f"the log is read as {reading}")
-    if not getattr(log, "is_reading_found", False):
-        return Finding("frame", RIGHT, f"as you say, {what} (read_as={reading})")
-    fix = f"we move them to that of the vehicle. data.read_as={reading} does the same without this line"
-    return Finding("frame", FOUND, f"{what}, so {fix}", True)
-
-
-def _motion(log: Log) -> Finding | None:
-    judgement: Judgement = log.judgement or judge_log(log)
+def _motion(log: Log) -> list[Finding]:
+    judgement = log.judgement or judge_log(log)
     if not judgement.shares:
-        return None
+        return []
     has_poses = log.sweep(0).pose is not None
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
-        return Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)
+        return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]
     name = judgement.best[0]
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
@@ -117,13 +100,13 @@ def _motion(log: Log) -> Finding | None:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(f"data.read_as={each}" for each in judgement.best)
         fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
-    return Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)
+    return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
 
 
-def _lapses(log: Log) -> Finding | None:
+def _lapses(log: Log) -> list[Finding]:
     lapses = find_lapses(log)
     if not lapses:
-        return None
+        return []
     texts = [
         f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
         if each.is_single
@@ -131,31 +114,20 @@ def _lapses(log: Log) -> Finding | None:
         for each in lapses
     ]
     fix = "correct it, or remove the sweep; for a jump, give poses of a continuous frame (odometry, not the map)"
-    return Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)
+    return [Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)]
 
 
-def _ground(log: Any) -> Finding | None:
-    log.sweep(0)
-    if not getattr(log, "has_found_ground", False):
-        return None
-    text = (
-        "it has no ground masks, so we find the ground (find_ground=auto). data.find_ground=grid does the same without "
-        "this line, data.find_ground=null leaves all points in"
-    )
-    return Finding("ground", FOUND, text, True)
-
-
-def _mask(log: Log) -> Finding:
+def _mask(log: Log) -> list[Finding]:
     sweep = log.sweep(0)
     if sweep.is_ground is None:
-        return Finding("ground", RIGHT, "no masks, so no point is taken for ground (data.find_ground=grid finds it)")
+        return [Finding("ground", RIGHT, "no masks, so no point is taken for ground (data.find_ground=grid finds it)")]
     mask = as_numpy(sweep.is_ground)
     above = _median_height(sweep, ~mask) - _median_height(sweep, mask)
     if above < -_INVERTED_BY:
         text = f"the points masked as ground lie {-above:.1f} m above the others: invert the mask, True = ground"
-        return Finding("ground", WRONG, text, True)
+        return [Finding("ground", WRONG, text, True)]
     share = float(mask.mean()) if len(mask) else 0.0
-    return Finding("ground", RIGHT, f"{100 * share:.0f} % of the points of the first sweep", True)
+    return [Finding("ground", RIGHT, f"{100 * share:.0f} % of the points of the first sweep", True)]
 
 
 def _median_height(sweep: Sweep, rows: np.ndarray) -> float:
@@ -164,25 +136,24 @@ def _median_height(sweep: Sweep, rows: np.ndarray) -> float:
     return float(np.median(heights)) if len(heights) else float("nan")
 
 
-def _deskew(log: Any) -> Finding | None:
-    note = getattr(getattr(log, "reading", None), "note", "")
-    if note:
-        return Finding("de-skewing", FOUND, note, True)
+def _deskew(log: Log) -> list[Finding]:
     sweep = log.sweep(0)
+    if any(finding.topic == "de-skewing" for finding in log.findings()):
+        return []
     if sweep.point_times is not None:
         spread = np.ptp(as_numpy(sweep.point_times)) if len(sweep.point_times) else 0.0
-        return Finding("de-skewing", RIGHT, f"points have times over {spread:.3f} s", True)
-    return Finding("de-skewing", RIGHT, "no times of points, and no other reading fits clearly better than as stored")
+        return [Finding("de-skewing", RIGHT, f"points have times over {spread:.3f} s", True)]
+    return [Finding("de-skewing", RIGHT, "no times of points, and no other reading fits clearly better than as stored")]
 
 
-def _repeated(log: Log) -> Finding | None:
+def _repeated(log: Log) -> list[Finding]:
     first = [log.sweep(index) for index in range(min(3, len(log.timestamps)))]
     if any(repeats(pc0, pc1) for pc0, pc1 in zip(first, first[1:])):
-        return Finding("sweeps", WRONG, REPEATED, True)
-    return None
+        return [Finding("sweeps", WRONG, REPEATED, True)]
+    return []
 
 
-def _sensor(log: Log) -> Finding:
+def _sensor(log: Log) -> list[Finding]:
     sweep = log.sweep(0)
     points = as_numpy(sweep.points)[:, :3].astype(np.float64)
     kept = points[np.isfinite(points).all(1)]
@@ -197,7 +168,7 @@ def _sensor(log: Log) -> Finding:
         parts += [f"{spacing:.2f} degrees between points"] if spacing else []
     columns = sorted(log.columns(0))
     parts += [f"columns {', '.join(columns)}"] if columns else []
-    return Finding("sensor", RIGHT, ", ".join(parts))
+    return [Finding("sensor", RIGHT, ", ".join(parts))]
 
 
 def _beams(points: np.ndarray) -> tuple[int, float]:
@@ -217,54 +188,46 @@ def _beams(points: np.ndarray) -> tuple[int, float]:
     return beams, spacing
 
 
-def _times(log: Log) -> Finding:
+def _times(log: Log) -> list[Finding]:
     if log.sweep(0).timestamp_ns is None:
-        return Finding("times", RIGHT, "the sweeps have no times, so motion is known per sweep, not per second")
+        return [Finding("times", RIGHT, "the sweeps have no times, so motion is known per sweep, not per second")]
     stamps = np.array([int(stamp) for stamp in log.timestamps])
     nanoseconds = log.sweep(0).timestamp_ns or stamps[0]
     unit = 1e-9 * (float(nanoseconds) / float(stamps[0]) if stamps[0] else 1.0)
     interval = np.diff(stamps) * unit
     usual = float(np.median(interval))
     if usual <= 0 or (interval <= 0).any():
-        return Finding("times", WRONG, "times of sweeps do not ascend: give the time of each sweep")
+        return [Finding("times", WRONG, "times of sweeps do not ascend: give the time of each sweep")]
     gaps = np.flatnonzero((interval > _GAP * usual) & (interval > _LONGEST_GAP))
     text = f"{1 / usual:.1f} Hz"
     if len(gaps):
         longest = int(gaps[interval[gaps].argmax()])
         text += f"; {len(gaps)} gaps, the longest of {interval[longest]:.1f} s after sweep {longest}"
-        if set(gaps.tolist()) <= set(getattr(log, "gaps", ())):
-            return Finding("times", FOUND, f"{text}. No window reaches over them")
-        return Finding("times", WRONG, f"{text}: split the log there")
+        if set(gaps.tolist()) <= log.gaps:
+            return [Finding("times", FOUND, f"{text}. No window reaches over them")]
+        return [Finding("times", WRONG, f"{text}: split the log there")]
     if not 0.01 <= usual <= 1:
-        return Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")
-    return Finding("times", RIGHT, text)
+        return [Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")]
+    return [Finding("times", RIGHT, text)]
 
 
-def _poses(log: Log) -> Finding:
+def _poses(log: Log) -> list[Finding]:
     poses = known_poses(log)
     if poses is None:
         pose = log.sweep(0).pose
         if pose is None:
-            return Finding("poses", RIGHT, "none: we take the sensor for static (data.odometry=true estimates them)")
-        return Finding("poses", RIGHT, "of each sweep, read with its points")
+            return [Finding("poses", RIGHT, "none: we take the sensor for static (data.odometry=true estimates them)")]
+        return [Finding("poses", RIGHT, "of each sweep, read with its points")]
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     text = f"of all sweeps; the vehicle moves {steps.sum():.1f} m, up to {steps.max(initial=0):.2f} m a sweep"
-    return Finding("poses", RIGHT, text)
+    return [Finding("poses", RIGHT, text)]
 
 
-def _own_vehicle(log: Any) -> Finding | None:
-    cells = getattr(log, "own_cells", None)
-    if cells is None:
-        return None
-    text = f"returns in {len(cells)} cells near the origin ride along, so we leave them out"
-    return Finding("own vehicle", FOUND, text) if len(cells) else Finding("own vehicle", RIGHT, "no returns are seen")
-
-
-def _labels(log: Log) -> Finding:
+def _labels(log: Log) -> list[Finding]:
     indices = np.unique(np.linspace(0, len(log.timestamps) - 2, 5).astype(int)).tolist()
     labels = next(filter(None, map(log.labels, indices)), None)
     if labels is None:
-        return Finding("labels", RIGHT, "none: `cflow flow` needs none, `cflow eval` does")
+        return [Finding("labels", RIGHT, "none: `cflow flow` needs none, `cflow eval` does")]
     valid = float(labels.is_valid.mean()) if len(labels.is_valid) else 0.0
     longest = float(np.linalg.norm(labels.flow[labels.is_valid], axis=1).max(initial=0))
-    return Finding("labels", RIGHT, f"flow of {100 * valid:.0f} % of the points, up to {longest:.2f} m a sweep")
+    return [Finding("labels", RIGHT, f"flow of {100 * valid:.0f} % of the points, up to {longest:.2f} m a sweep")]

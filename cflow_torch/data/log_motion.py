@@ -34,7 +34,7 @@ class Lapse(NamedTuple):
 def known_poses(log: Log) -> np.ndarray | None:
     """Return the poses that a log knows without reading points, (K, 4, 4) float64; None = it knows none."""
     try:
-        poses = getattr(log, "poses", None)
+        poses = log.poses
     except CFlowError:
         return None
     if poses is None or np.shape(poses) != (len(log.timestamps), 4, 4) or not np.isfinite(poses).all():
@@ -118,7 +118,7 @@ def is_in_world(log: Log) -> bool:
     Cost: reads one sweep, and up to six more if one of the signs is there.
     """
     poses = known_poses(log)
-    has_viewpoints = bool(getattr(log.unwrapped, "has_viewpoints", False))
+    has_viewpoints = log.unwrapped.has_viewpoints
     try:
         if poses is None or not (has_viewpoints or _surrounds_poses(log, poses)):
             return False

@@ -85,10 +85,10 @@ class PosedLog(LogWrapper):
 
     def __init__(self, log: Log, poses: np.ndarray) -> None:
         super().__init__(log)
-        self.poses = poses
+        self.poses = self._given = poses
 
     def sweep(self, index: int) -> Sweep:
-        return replace(self.log.sweep(index), pose=self.poses[index].copy())
+        return replace(self.log.sweep(index), pose=self._given[index].copy())
 
 
 def with_poses(log: Log) -> Log:

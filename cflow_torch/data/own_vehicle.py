@@ -7,13 +7,14 @@ from functools import cached_property
 
 import numpy as np
 
+from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, LogWrapper
 from cflow_torch.data.log_motion import known_poses
 from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.stillness import REACH, Structure
+from cflow_torch.windows.stillness import REACH, Structure, cell_keys
 
 _NEAR, _CELL = 2.7, 0.25  # metres from the origin along x and y, and side of a cell
 _LEAST_MOTION, _FEWEST_SWEEPS, _MOST_SWEEPS = 2.0, 3, 4  # metres between the compared sweeps, and their number
@@ -54,6 +55,12 @@ class OwnVehicleLog(LogWrapper):
         is_valid = labels.is_valid.copy()
         is_valid[self._own_rows(as_numpy(self.log.sweep(index).points))] = False
         return replace(labels, is_valid=is_valid)
+
+    def findings(self) -> list[Finding]:
+        count = len(self.own_cells)
+        text = f"returns in {count} cells near the origin ride along, so we leave them out"
+        own = Finding("own vehicle", *((FOUND, text) if count else (RIGHT, "no returns are seen")))
+        return [*self.log.findings(), own]
 
     def _own_rows(self, points: np.ndarray) -> np.ndarray:
         near = np.flatnonzero(_are_near(points))
@@ -119,16 +126,12 @@ def _are_near(points: np.ndarray) -> np.ndarray:
 
 def _cells_of(points: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
-        return np.floor(np.nan_to_num(points[:, :3].astype(np.float64)) / _CELL).astype(np.int64)
-
-
-def _key(cells: np.ndarray) -> np.ndarray:
-    x, y, z = cells.clip(-(1 << 19), 1 << 19).T + (1 << 20)
-    return (x << 42) + (y << 21) + z  # type: ignore[no-any-return]
+        cell = np.floor(np.nan_to_num(points[:, :3].astype(np.float64)) / _CELL)
+    return cell.clip(-(1 << 19), 1 << 19).astype(np.int64)
 
 
 def _contains(cells: np.ndarray, of_points: np.ndarray) -> np.ndarray:
-    return np.isin(_key(of_points), _key(cells))
+    return np.isin(cell_keys(of_points), cell_keys(cells))
 
 
 def _dilated(cells: np.ndarray) -> np.ndarray:

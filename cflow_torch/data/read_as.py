@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper
 from cflow_torch.data.log_motion import is_in_world
 from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import as_matrix, rigid_transform, transform_points
 from cflow_torch.types import Sweep
-from cflow_torch.windows.readings import AXES, CAMERA, EARLY, LATE, MOUNT, OF_POSES, WORLD
+from cflow_torch.windows.readings import AXES, CAMERA, CAUSES, EARLY, LATE, MOUNT, OF_POSES, WORLD
 
 _OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
 _OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}  # axes of points and poses
@@ -57,7 +59,8 @@ class ReadAs(LogWrapper):
 
     def __init__(self, log: Log, reading: str, is_found: bool = False) -> None:
         super().__init__(log)
-        self.read_as, self.is_reading_found = reading, is_found
+        self.read_as: str = reading
+        self.is_reading_found = is_found
 
     def sweep(self, index: int) -> Sweep:
         sweep = self.log.sweep(index)
@@ -77,13 +80,17 @@ class ReadAs(LogWrapper):
     def labels(self, index: int) -> FlowLabels | None:
         return Log.labels(self, index)
 
-    @property
+    def findings(self) -> list[Finding]:
+        what = CAUSES.get(self.read_as, f"the log is read as {self.read_as}")
+        said = Finding("frame", RIGHT, f"as you say, {what} (read_as={self.read_as})")
+        used = f"we move them to that of the vehicle. data.read_as={self.read_as} does the same without this line"
+        found = Finding("frame", FOUND, f"{what}, so {used}", True)
+        return [*self.log.findings(), found if self.is_reading_found else said]
+
+    @cached_property
     def poses(self) -> np.ndarray | None:
-        """(K, 4, 4) float64 `T_world_ego` of every sweep, None without poses. Logs without `poses` lack it, too."""
-        log: Any = self.log
-        if log.poses is None:
-            return None
-        return np.array([self._pose(index, pose) for index, pose in enumerate(log.poses)])
+        given = self.log.poses
+        return None if given is None else np.array([self._pose(index, pose) for index, pose in enumerate(given)])
 
     def _move(self, points: np.ndarray, index: int, pose: Any) -> np.ndarray:
         """Convert points of sweep `index`, (N, 3+), to metres in the frame of the vehicle."""
@@ -113,8 +120,7 @@ class ReadAs(LogWrapper):
 
     def _given(self, index: int, pose: Any = None) -> np.ndarray:
         if pose is None:
-            poses = getattr(self.log, "poses", None)
-            pose = self.log.sweep(index).pose if poses is None else poses[index]
+            pose = self.log.sweep(index).pose if self.log.poses is None else self.log.poses[index]
         if pose is None:
             raise CFlowError(f"log {self.log_id}: sweep {index} has no pose, which read_as={self.read_as} needs")
         return rigid_transform(pose, f"pose of sweep {index}")

@@ -20,10 +20,10 @@ from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
 # Bins of directions: fine azimuths in rows of a degree of elevation, and fine elevations in columns of azimuth.
-_AZIMUTHS = 8192  # of 0.04 to 0.09 degrees; four quadrants
-_ELEVATIONS = 120
-_COLUMNS = 1024
-_PER_DEGREE = 16  # fine elevations
+_AZIMUTHS = 8192  # fine azimuths, of 0.04 to 0.09 degrees; four quadrants
+_PER_COLUMN = 8  # of them in a column
+_LEVELS = 1920  # fine elevations
+_PER_DEGREE = 16  # of them in a row
 _GAPS = 1024  # bins of gaps, of a 16th of a degree of elevation, or a quarter of the narrowest bin of azimuth
 _NEAREST = 10.0  # metres; nearer to the origin, the position of the sensor would matter
 _FEWEST = 100  # gaps between directions; fewer do not tell the spacing
@@ -87,32 +87,32 @@ def _median_gaps(batch: Batch) -> tuple[Tensor, Tensor]:
     x, y, _ = batch.positions[:, : batch.num_newest]
     far = flat_nonzero(x * x + y * y >= _NEAREST**2)
     x, y, z = take_columns(batch.positions, far).float()
-    distance = (x * x + y * y).sqrt_()
     window = floor_divide(batch.image.index_select(0, far).long(), batch.num_steps)
+    azimuth = azimuth_bin(x, y, _AZIMUTHS)
+    level = elevation_bin(z, (x * x + y * y).sqrt_(), _LEVELS, _PER_DEGREE)
 
-    row = window * _ELEVATIONS + elevation_bin(z, distance, _ELEVATIONS)
-    direction = flat_nonzero(
-        draw(row * _AZIMUTHS + azimuth_bin(x, y, _AZIMUTHS), batch.num_windows * _ELEVATIONS * _AZIMUTHS)
-    )
-    row, azimuth = split_index(direction, _AZIMUTHS)
-    in_quadrant = (azimuth[:-1] % (_AZIMUTHS // 4) + 0.5).double() / (_AZIMUTHS // 4)
+    row = floor_divide(level, _PER_DEGREE).add_(window, alpha=_LEVELS // _PER_DEGREE)
+    row, azimuth_of_row = _neighbours(row, azimuth, batch.num_windows * _LEVELS // _PER_DEGREE, _AZIMUTHS)
+    column = floor_divide(azimuth, _PER_COLUMN).add_(window, alpha=_AZIMUTHS // _PER_COLUMN)
+    column, level = _neighbours(column, level, batch.num_windows * _AZIMUTHS // _PER_COLUMN, _LEVELS)
+
+    in_quadrant = (azimuth_of_row[:-1] % (_AZIMUTHS // 4) + 0.5).double() / (_AZIMUTHS // 4)
     width = 4 / (in_quadrant.square() + (1 - in_quadrant).square())  # of the bin of azimuth, in bins of gaps
-    across = _median(direction.diff() * width, row, _ELEVATIONS, batch.num_windows)
-
-    levels = _PER_DEGREE * _ELEVATIONS
-    column = window * _COLUMNS + azimuth_bin(x, y, _COLUMNS)
-    direction = column * levels + elevation_bin(z, distance, levels, _PER_DEGREE)
-    direction = flat_nonzero(draw(direction, batch.num_windows * _COLUMNS * levels))
-    up = _median(direction.diff(), floor_divide(direction, levels), _COLUMNS, batch.num_windows)
+    gap = torch.cat(((azimuth_of_row.diff() * width).long(), level.diff())).clamp_(0, _GAPS - 1)
+    window = torch.cat(
+        (
+            floor_divide(row[:-1], _LEVELS // _PER_DEGREE),
+            floor_divide(column[:-1], _AZIMUTHS // _PER_COLUMN) + batch.num_windows,
+        )
+    )
+    is_gap = torch.cat((row.diff() == 0, column.diff() == 0)).long()
+    below = scatter_count(window * _GAPS + gap, 2 * batch.num_windows * _GAPS, is_gap).view(-1, _GAPS).cumsum(1)
+    median = (2 * below < below[:, -1:]).sum(1)  # the first bin that reaches half
+    across, up = (median.double() * (below[:, -1] >= _FEWEST)).view(2, -1)
     return across / _AZIMUTHS, up / (57.3 * _PER_DEGREE)
 
 
-def _median(gap: Tensor, line: Tensor, lines: int, num_windows: int) -> Tensor:
-    """Return the medians of gaps between neighbouring directions of the same line, (B,) float64, whole bins of gaps.
-
-    `gap` is (K - 1,), `line`, (K,) int64, is that of each direction. Each window has `lines` lines.
-    """
-    gap = gap.long().clamp_(max=_GAPS - 1) + floor_divide(line[:-1], lines) * _GAPS
-    below = scatter_count(gap, num_windows * _GAPS, (line[1:] == line[:-1]).long()).view(-1, _GAPS).cumsum(1)
-    median = (2 * below < below[:, -1:]).sum(1)  # the first bin that reaches half
-    return median.double() * (below[:, -1] >= _FEWEST)
+def _neighbours(line: Tensor, cell: Tensor, num_lines: int, num_cells: int) -> tuple[Tensor, Tensor]:
+    """Sort directions by their line and cell, and drop equal ones: (K,) int64 each to (L,) each."""
+    occupied = draw(line * num_cells + cell, num_lines * num_cells)
+    return split_index(flat_nonzero(occupied), num_cells)

@@ -383,8 +383,7 @@ def difference(T: np.ndarray, other: np.ndarray) -> float:
 
 def _num_blocks(points: np.ndarray) -> int:
     """Return how many blocks of 5 m in the plane hold points."""
-    column, row = np.floor(points[:, :2] / _BLOCK).astype(np.int64).T
-    return len(np.unique(column * (1 << 20) + row))
+    return len(np.unique(np.floor(points[:, :2] / _BLOCK), axis=0))
 
 
 def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:

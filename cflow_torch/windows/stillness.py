@@ -50,8 +50,7 @@ def static_rows(sweep: Sweep) -> np.ndarray:
 
 def _are_in_tall_columns(points: np.ndarray) -> np.ndarray:
     """Test which points, (N, 3), lie in a column of 0.8 m that holds points 0.35 m above one another, (N,) bool."""
-    column, row = np.floor(points[:, :2] / _COLUMN).astype(np.int64).T
-    cell = column * (1 << 20) + row
+    cell = np.floor(points[:, :2] / _COLUMN).astype(np.int64) @ np.array((1 << 20, 1))
     order = np.lexsort((points[:, 2], cell))
     start = np.flatnonzero(np.diff(cell[order], prepend=np.iinfo(np.int64).min))  # of each column
     count = np.diff(start, append=len(order))
@@ -70,7 +69,7 @@ def thinned_rows(points: np.ndarray) -> np.ndarray:
     """
     voxel = np.floor(np.asarray(points, np.float64) / VOXEL).astype(np.int64)
     order = np.random.default_rng(0).permutation(len(voxel))
-    _, first = np.unique(_keys(voxel)[order], return_index=True)
+    _, first = np.unique(cell_keys(voxel)[order], return_index=True)
     return np.sort(order[first])
 
 
@@ -79,7 +78,7 @@ class Structure:
 
     def __init__(self, points: np.ndarray) -> None:
         points = np.clip(np.asarray(points, np.float64), -_MOST, _MOST)
-        keys = _keys(np.floor(points / REACH).astype(np.int64))
+        keys = cell_keys(np.floor(points / REACH).astype(np.int64))
         order = np.argsort(keys, kind="stable")
         self._points = points[order]
         self._sorted = keys[order]
@@ -103,11 +102,11 @@ class Structure:
         moved = np.clip(moved, -_MOST, _MOST)
         in_place = np.zeros(len(moved), bool)
         cell = np.floor(moved / REACH).astype(np.int64)
-        order = np.argsort(_keys(cell))  # the searches below are several times faster in this order
+        order = np.argsort(cell_keys(cell))  # the searches below are several times faster in this order
         moved = moved[order]
         cell = cell[order]
         for offset in _OFFSETS:  # z varies fastest in a key: the three cells above one another are one range of keys
-            lowest = _keys(cell + (*offset, -1))
+            lowest = cell_keys(cell + (*offset, -1))
             start = np.searchsorted(self._sorted, lowest, "left")
             count = np.searchsorted(self._sorted, lowest + 2, "right") - start
             row = np.repeat(np.arange(len(moved)), count)
@@ -117,7 +116,6 @@ class Structure:
         return in_place
 
 
-def _keys(cell: np.ndarray) -> np.ndarray:
+def cell_keys(cell: np.ndarray) -> np.ndarray:
     """Return one int64 per cell, (N,): 21 bits for each of x, y and z, which varies fastest."""
-    x, y, z = (cell + (1 << 20)).T
-    return (x << 42) + (y << 21) + z  # type: ignore[no-any-return]
+    return (cell + (1 << 20)) @ np.array((1 << 42, 1 << 21, 1))  # type: ignore[no-any-return]

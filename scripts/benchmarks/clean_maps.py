@@ -11,8 +11,8 @@ Times are processor seconds per sweep, one thread, flow included.
 DUFOMap (pip install dufomap; optional): 0.1 m, d_s 0.2, d_p 2 and 1, clusters and propagation, rays from the LiDAR (the
 first one of several), points of 2 ... 50 m (with others it finds no moving point on KITTI).
 
-dynamic-object-removal (pip install dynamic-object-removal; optional): its algorithm `fusion`, its best one, with the
-preset short-window, which it has for about 12 sweeps, and with its defaults, which are for long maps.
+dynamic-object-removal (pip install dynamic-object-removal; optional): its algorithm `fusion`, its best one, with its
+preset short-window. Its defaults are for 100 sweeps or more.
 
 The case "light" has two cars that brake and stop, one of them in reverse; its sensor is av2.
 """
@@ -49,7 +49,6 @@ DUFO = {"d_p 2": (0.1, 0.2, 2), "d_p 1": (0.1, 0.2, 1)}
 
 FUSION: dict[str, dict[str, Any]] = {
     "short-window": {"free_votes_fraction": 0.7, "free_votes_floor": 3, "void_min_scans": 4},
-    "long-map": {},
 }
 
 

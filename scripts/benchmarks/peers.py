@@ -71,7 +71,7 @@ def cases(path: Path, num_history: int, num_windows: int | None = None) -> Itera
         for index in chosen[:num_windows]:
             labels = log.labels(index)
             if labels is not None:
-                eval_mask = log.eval_mask(index) if hasattr(log, "eval_mask") else None
+                eval_mask = log.eval_mask(index)
                 item = make_item(window(log, index, num_history), labels, eval_mask)
                 yield log.log_id, f"{log.log_id}, {index}", make_case(item)
 

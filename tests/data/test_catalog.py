@@ -73,7 +73,7 @@ def test_ground_is_found_where_there_is_no_mask(drive: Drive, arrays: Path) -> N
     assert np.array_equal(default.sweep(1).is_ground, found)
     assert found.dtype == np.bool_ and (found & truth).sum() / (found | truth).sum() > 0.9
     assert log.labels(0) is None and log.log_id == drive.log_id and np.array_equal(log.poses, drive.poses)
-    assert not hasattr(log, "eval_mask") and pickle.loads(pickle.dumps(log)).files == log.files
+    assert log.eval_mask(0) is None and pickle.loads(pickle.dumps(log)).files == log.files
     kept = GroundSegmentedLog(drive).sweep(0).is_ground
     assert np.array_equal(kept, drive.sweep(0).is_ground), "an existing mask is kept"
 

@@ -176,14 +176,15 @@ def _sweep(log: Log, index: int, eval_step: int, object_ids: dict[str, int]) -> 
         if eval_step and index % eval_step == 0:
             ground = values.get("ground_mask", np.zeros(len(points), bool))
             values["eval_mask"] = (labels.is_valid & ~ground)[:, None]
-    if hasattr(log, "units"):
-        units = log.units(index)
+    units = log.units(index)
+    if units is not None:
         number = np.arange(1, len(units) + 1, dtype=np.uint8)
         values["lidar_id"] = np.repeat(number, [len(unit.points) for unit in units])
         values["lidar_dt"] = np.concatenate([unit.offset_ns / 1e9 for unit in units]).astype(np.float32)
         values["lidar_center"] = np.stack([unit.T_ego_sensor for unit in units]).astype(np.float32)
-    if hasattr(log, "boxes"):
-        boxes, instance = log.boxes(index), np.zeros(len(points), np.int16)  # 0 = in no box
+    boxes = log.boxes(index)
+    if boxes is not None:
+        instance = np.zeros(len(points), np.int16)  # 0 = in no box
         for track, size, T_ego_box in zip(boxes.track_id, boxes.size, boxes.pose):
             instance[points_in_box(points, size, T_ego_box)] = object_ids.setdefault(track, len(object_ids) + 1)
         values["flow_instance_id"] = instance

@@ -138,7 +138,7 @@ class NuScenesLog(Log):
         self.sample_tokens = [reference.samples[k] if reference.is_key_frame[k] else None for k in kept.tolist()]
         self._T_ego_world = np.linalg.inv(self._poses)
 
-    @property
+    @cached_property
     def poses(self) -> np.ndarray:
         """(K, 4, 4) float64 `T_world_ego` of every sweep."""
         return self._poses

@@ -48,9 +48,8 @@ class MaskArchive:
 
 
 def log_mask(log: Log, index: int) -> np.ndarray | None:
-    """Read the (N,) bool evaluation mask that a log stores (method `eval_mask`); None if it has none."""
-    read = getattr(log, "eval_mask", None)
-    return None if read is None else read(index)
+    """Read the (N,) bool evaluation mask that a log stores; None if it has none."""
+    return log.eval_mask(index)
 
 
 def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = None) -> np.ndarray:
