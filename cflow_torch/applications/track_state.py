@@ -83,23 +83,18 @@ class Tracks(NamedTuple):
             getattr(self, name)[index] = values
 
     @property
-    def position(self) -> Tensor:
-        """(K, 3) metres."""
-        return self.state[:, 0]
-
-    @property
-    def velocity(self) -> Tensor:
-        """(K, 3) m/s."""
-        return self.state[:, 1]
+    def motion(self) -> Motion:
+        """Position and velocity of the K tracks; a view."""
+        return Motion(self.state, self.covariance)
 
     def predict(self, seconds: float) -> Tracks:
         """Predict the state after `seconds`."""
-        motion, _ = Motion(self.state, self.covariance).predict(self.state.new_full((len(self.id),), seconds))
+        motion, _ = self.motion.predict(self.state.new_full((len(self.id),), seconds))
         return self._replace(state=motion.state, covariance=motion.covariance)
 
     def measure(self, index: Tensor, measured: Tensor, noise: Tensor) -> None:
         """Update the indexed tracks by measured states, (K, 2, 3), with standard deviations (K, 2)."""
-        motion = Motion(self.state[index], self.covariance[index]).update(measured, noise)
+        motion = self.motion.at(index).update(measured, noise)
         self.write(index, state=motion.state, covariance=motion.covariance)
 
     def start_again(self, index: Tensor, length: Tensor) -> None:

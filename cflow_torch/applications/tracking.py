@@ -129,7 +129,7 @@ class Tracker:
         track_id[groups.row[has_track]] = tracks.id[track_of_point[has_track]]
         table = self._table(tracks, times.now, sweeps.pc0.timestamp_ns)
 
-        step = tracks.velocity * times.interval
+        step = tracks.motion.velocity * times.interval
         step[track_of_group] = flow
         points = _missing_points(points, tracks, step).followed_by(_seen_points(groups, track_of_point, step))
         is_kept = tracks.missed <= _MAX_MISSED
@@ -162,7 +162,7 @@ class Tracker:
         """
         tracks = self._tracks.map(lambda values: values.to(device))
         position, track = (values.to(device) for values in self._points)
-        late = times.late * tracks.velocity
+        late = times.late * tracks.motion.velocity
         points = _TrackPoints(position + late[track], track)
         tracks = tracks._replace(box=tracks.box + late, path=tracks.path + late)
         return tracks.predict(times.elapsed), points
@@ -174,7 +174,7 @@ class Tracker:
 
         Returns the tracks, new ones last, and the (G,) int64 track of each group.
         """
-        velocity = tracks.velocity[matches.track]
+        velocity = tracks.motion.velocity[matches.track]
         is_fast = velocity[:, :2].norm(dim=1) >= MOVING / times.interval
         heading = torch.atan2(flow[:, 1], flow[:, 0])
         track_heading = torch.atan2(velocity[:, 1], velocity[:, 0])
@@ -210,7 +210,8 @@ class Tracker:
         tracks.travel[track_of_group] += flow  # to the next sweep
 
         self._measure(tracks, track_of_group, groups, flow / times.interval, sensor)
-        at_rest = torch.stack([tracks.position[stopped], torch.zeros_like(tracks.position[stopped])], 1)
+        position = tracks.motion.position[stopped]
+        at_rest = torch.stack([position, torch.zeros_like(position)], 1)
         tracks.measure(stopped, at_rest, at_rest.new_tensor([_REST_NOISE, FLOW_NOISE]).expand(len(stopped), 2))
         return tracks, track_of_group
 

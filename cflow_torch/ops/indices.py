@@ -99,10 +99,10 @@ def searchsorted(values: Tensor, wanted: Tensor) -> Tensor:
     return torch.searchsorted(values, wanted)
 
 
-def argsort_bytes(values: Tensor) -> Tensor:
-    """Stable `argsort` of (N,) int64, 0 ... 255. On the CPU NumPy counts the bytes: five times as fast as torch."""
+def argsort_small(values: Tensor) -> Tensor:
+    """Stable `argsort` of (N,) int64 below 2^15. On the CPU, NumPy sorts such numbers by their bytes."""
     if values.device.type == "cpu":
-        return torch.from_numpy(values.byte().numpy().argsort(kind="stable"))
+        return torch.from_numpy(values.short().numpy().argsort(kind="stable"))
     return values.sort(stable=True).indices
 
 

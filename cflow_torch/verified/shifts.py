@@ -21,7 +21,7 @@ _FAR = 2  # pixels in y or in x; for shifts of this length or more, absence is t
 
 
 class Shifts:
-    """The shifts of C motions of M groups. Each distinct shift of a group has a number from 0 on.
+    """The shifts of C motions of M groups; C is below 2^15. Each distinct shift of a group has a number from 0 on.
 
     Args:
         window: (M,) int64.
@@ -88,5 +88,5 @@ def _first_equal(shift: Tensor) -> Tensor:
     of_motion = shift.permute(3, 0, 2, 1).flatten(1, 2)  # [C, R, M], because long rows are compared fast
     of_motion = F.pad(of_motion, (0, 0, 0, 0, 1, 0))  # motion 0 shifts nothing
     differs = (of_motion[1:, None] != of_motion).view(torch.uint8).amax(2)  # [C, 1 + C, M]
-    motion = torch.arange(len(of_motion), dtype=torch.uint8, device=shift.device)[:, None]
-    return torch.where(differs == 0, motion, 255).amin(1).t().long()
+    motion = torch.arange(len(of_motion), dtype=torch.int16, device=shift.device)[:, None]
+    return torch.where(differs == 0, motion, len(motion)).amin(1).t().long()

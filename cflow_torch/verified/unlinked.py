@@ -265,8 +265,8 @@ def _are_wide(sweeps: HeightSlicedSweeps, pixels: Pixels, objects: Groups, veloc
 def _are_found(sweeps: HeightSlicedSweeps, pixels: Pixels, objects: Groups, velocity: Tensor) -> Tensor:
     """Tell which objects win at least about half as many slices near their targets as they lose, (N,) bool.
 
-    The exact test of their velocities follows (`verify`). This one rejects nine of ten objects on real drives, most of
-    which are plants, because the correlation of their long boxes would take 6 to 10 % of a window.
+    The exact test of their velocities follows (`verify`). This one rejects most links between plants, whose long boxes
+    would otherwise be correlated: 74 of 91 objects in a window of KITTI, for 4 % of its time.
     """
     member = flat_nonzero(objects.is_member)
     near = count_wins(sweeps, pixels[member], objects[member], velocity[:, None]).near

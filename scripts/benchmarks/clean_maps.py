@@ -22,7 +22,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from typing import Any, Mapping, Sequence
+from typing import Any, Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -98,6 +98,13 @@ def scores(name: str, log: Any, opened: Log, removed: Sequence[np.ndarray], seco
     return {"what": name, **accuracy, "waiting": float(waiting) if total[2, 1] else "", "seconds": seconds}
 
 
+# Function that returns the rows to remove from each sweep, and its modes.
+OTHERS: dict[str, tuple[Callable[..., list[np.ndarray]], Mapping[str, Any]]] = {
+    "DUFOMap": (dufomap_labels, DUFO),
+    "dynamic-object-removal": (fusion_labels, FUSION),
+}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="*", default=("light", "av2", "nuscenes", "waymo"), help="sensors, light, files")
@@ -124,22 +131,15 @@ def main() -> None:
             removed = [clean.moving(index) for index in range(len(flow))]
             spent = (seconds + time.process_time() - begin) / len(flow)
             rows.append(scores(f"{name}: {label}", log, opened, removed, spent))
-        try:
-            for label, settings in DUFO.items():
-                begin = time.process_time()
-                removed = dufomap_labels(opened, T_ego_lidar, settings)
-                spent = (time.process_time() - begin) / len(removed)
-                rows.append(scores(f"{name}: DUFOMap, {label}", log, opened, removed, spent))
-        except ImportError as error:
-            print(f"no DUFOMap: {error}", flush=True)
-        try:
-            for label, settings in FUSION.items():
-                begin = time.process_time()
-                removed = fusion_labels(opened, T_ego_lidar, settings)
-                spent = (time.process_time() - begin) / len(removed)
-                rows.append(scores(f"{name}: dynamic-object-removal, {label}", log, opened, removed, spent))
-        except ImportError as error:
-            print(f"no dynamic-object-removal: {error}", flush=True)
+        for other, (labels_of, modes) in OTHERS.items():
+            try:
+                for label, settings in modes.items():
+                    begin = time.process_time()
+                    removed = labels_of(opened, T_ego_lidar, settings)
+                    spent = (time.process_time() - begin) / len(removed)
+                    rows.append(scores(f"{name}: {other}, {label}", log, opened, removed, spent))
+            except ImportError as error:
+                print(f"no {other}: {error}", flush=True)
     print(markdown(rows))
 
 

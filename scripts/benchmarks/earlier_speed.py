@@ -49,7 +49,8 @@ def serve(paths: list[str], keep_memory: bool) -> None:
         keep_freed_memory()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    logs = [open_log(name, find_sources(name, path)[0], check=False) for path, name in _named(paths, recognise)]
+    names = map(recognise, paths)
+    logs = [open_log(name, find_sources(name, path)[0], check=False) for name, path in zip(names, paths)]
     calls: dict[str, Any] = {}
     print("ready", flush=True)
     for line in sys.stdin:
@@ -66,11 +67,6 @@ def serve(paths: list[str], keep_memory: bool) -> None:
         start = time.thread_time()
         model([sweeps])
         print(time.thread_time() - start, (_peak() - before) / 1024, flush=True)
-
-
-def _named(paths: list[str], recognise: Any) -> Iterator[tuple[str, str]]:
-    for path in paths:
-        yield path, recognise(path)
 
 
 def _peak() -> int:
