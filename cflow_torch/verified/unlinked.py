@@ -91,13 +91,15 @@ class _Parts(NamedTuple):
     step: Tensor  # (Q,) int64
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
     length: Tensor  # (Q,) int64, finest pixels, longer side of the bounding box
+    has_pairs: bool  # some windows have two sweeps only
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
         """Select the parts of at least two pixels that are at most `_LONGEST` long."""
         pixel = components.missing
         parts = components.parts
-        if _has_pairs(sweeps):
+        has_pairs = _has_pairs(sweeps)
+        if has_pairs:
             unmatched, of_pairs = _unmatched_of_pairs(sweeps, components)
             pixel = torch.cat((pixel, unmatched))
             parts = parts.followed_by(of_pairs)
@@ -109,7 +111,7 @@ class _Parts(NamedTuple):
         image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
         window, step = split_index(image, sweeps.num_steps)
         centre = parts.sum(pixels.row_col).double() / parts.size()
-        return cls(pixel, parts, window, step, centre, length.index_select(0, kept))
+        return cls(pixel, parts, window, step, centre, length.index_select(0, kept), has_pairs)
 
     def __len__(self) -> int:
         return len(self.step)
@@ -123,17 +125,14 @@ def _has_pairs(sweeps: HeightSlicedSweeps) -> bool:
 def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> tuple[Tensor, Groups]:
     """Return the pixels of large unmatched components of pairs, (K,) int64, and group them by component and sweep."""
     is_of_pair = ~sweeps.has_history.index_select(0, sweeps.pixels.window)
-    pixels = []
-    parts = []
-    for step, other in ((0, 1), (1, 0)):
-        index = flat_nonzero(is_of_pair & (sweeps.pixels.step == step))
-        component = components_of(components, index)
-        size = sizes_of_unmatched(sweeps, component, index, are_unmatched(sweeps, index, other))
-        large = flat_nonzero(size >= _LEAST_SIZE)
-        pixels.append(index.index_select(0, large))
-        parts.append(component[large])
-    both = parts[0].followed_by(parts[1])
-    return torch.cat(pixels), both.select(flat_nonzero(draw(both.of_item, both.count)))
+    index = flat_nonzero(is_of_pair)
+    pixels = sweeps.pixels[index]  # all of t+1 or t
+    component = components_of(components, index)
+    of_sweep = Groups(2 * component.of_item + pixels.step, 2 * component.count)  # no pixel is of a copy
+    size = sizes_of_unmatched(sweeps, pixels, of_sweep, are_unmatched(sweeps, pixels, 1 - pixels.step))
+    large = flat_nonzero(size >= _LEAST_SIZE)
+    of_sweep = of_sweep[large]
+    return index.index_select(0, large), of_sweep.select(flat_nonzero(draw(of_sweep.of_item, of_sweep.count)))
 
 
 class _Map:
@@ -193,9 +192,10 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
     is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
-    # In a pair, all errors are 0, and the shortest way has the lowest rank.
-    is_pair = ~sweeps.has_history.index_select(0, window)
-    rank = _ranks(error, is_found, is_given) + moved[:, 0] * is_pair
+    rank = _ranks(error, is_found, is_given)
+    if parts.has_pairs:
+        # There, all errors are 0, and the shortest way has the lowest rank.
+        rank += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
     kept = flat_nonzero(_are_best(rank, part, len(parts)))
     part, is_found, before_t = gather(kept, part, is_found, before_t)
     return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
@@ -257,7 +257,9 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
     farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
     nearest = parts.length.index_select(0, of_t) / _LENGTHS
     is_pair = is_part & (distance <= farthest[..., None]) & (distance >= nearest[:, None])
-    pair = flat_nonzero(is_pair & _are_alike(sweeps, parts, of_t, other))
+    if parts.has_pairs:
+        is_pair &= _are_alike(sweeps, parts, of_t, other)
+    pair = flat_nonzero(is_pair)
     at, _ = split_index(pair, other.shape[2])
     return of_t.repeat(len(steps)).index_select(0, at), other.view(-1).index_select(0, pair)
 
