@@ -92,23 +92,20 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
         found = grown(seed, longest, blocks)
         names, none = found.fast_names(), found.nodes.count
         parents = [None if parent == none else names[parent] for parent in found.nodes.children.of_item.tolist()]
-        given = list(zip(names, parents, found.nodes.travels.tolist()))
+        given = list(zip(names, parents))
         for window, tree in enumerate(found.trees):
             mine = found.sweeps.pixels.window == window
             for level, roots in enumerate(found.components.levels):
                 assert same_groups(roots.of_item[mine].numpy(), tree.levels[level])
             own = found.names(window)
-            expected = {
-                (name, None if node.parent < 0 else own[node.parent], node.travels)
-                for name, node in zip(own, tree.nodes)
-            }
+            expected = {(name, None if node.parent < 0 else own[node.parent]) for name, node in zip(own, tree.nodes)}
             of_window = (found.nodes.window == window).tolist()
             assert {node for node, is_mine in zip(given, of_window) if is_mine} == expected
             assert len(expected) == sum(of_window)
             counts += (
                 len(expected),
-                sum(parent is not None for _, parent, _ in expected),
-                sum(level > len(blocks) for (_, level), _, _ in expected),
+                sum(parent is not None for _, parent in expected),
+                sum(level > len(blocks) for (_, level), _ in expected),
             )
     assert counts[0] > 30 and counts[1] > 10 * (len(blocks) > 1) and counts[2] > 5, counts
 
@@ -157,7 +154,7 @@ def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_
     change = ChangedPixels(*torch.zeros((2, sweeps.num_pixels), dtype=torch.bool))
     components = find_components(sweeps, change, (2, 1))
     nodes = movable_nodes(sweeps, components, None)
-    assert nodes.kind.tolist() == [0, 1, 1] and nodes.children.of_item.tolist() == [3, 0, 0]
+    assert nodes.kind.tolist() == [0, 2, 2] and nodes.children.of_item.tolist() == [3, 0, 0]
     objects = select_objects(sweeps, components, nodes, torch.tensor([whole, 100, 100]))
     assert objects.nodes.of_item.tolist() == ([0] if wins else [1, 2])
 
@@ -197,4 +194,4 @@ def test_a_component_of_changed_pixels_is_a_node_only_up_to_3_m(num_pixels, is_n
     every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
     components = find_components(sweeps, ChangedPixels(every, every), (1,))
     levels = movable_nodes(sweeps, components, None).kind
-    assert bool((levels == NodeKind.CHANGED).any()) == is_node and 0 in levels
+    assert bool((levels == NodeKind.CHANGED).any()) == is_node and 1 in levels
