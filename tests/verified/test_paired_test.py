@@ -239,9 +239,15 @@ def test_a_tram_moves():
     assert abs(mean_flow(-SPEED, -SPEED) + SPEED) < 0.05
 
 
+def test_a_bus_that_shows_only_its_side_moves():
+    assert abs(mean_flow(SPEED, SPEED, length=12.0) - SPEED) < 0.05
+    assert abs(mean_flow(-0.5, -0.5, length=12.0) + 0.5) < 0.05
+
+
 def test_a_wall_whose_ends_move_differently_is_static():
     for low, high in ((0.0, 0.0), (SPEED, 0.0), (0.0, SPEED), (SPEED, -SPEED), (SPEED, 0.5 * SPEED)):
         assert mean_flow(low, high) == 0.0
+        assert mean_flow(low, high, length=15.0) == 0.0
 
 
 def test_a_noise_barrier_whose_visible_ends_move_is_static():
