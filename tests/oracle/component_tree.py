@@ -52,8 +52,8 @@ def is_linked(sweeps: SlicedSweeps, members: np.ndarray) -> bool:
 def grow(sweeps: SlicedSweeps, change: np.ndarray, config: VerifiedConfig) -> Tree:
     """Components of all scales, and which of them may move.
 
-    Convention: in windows with history more than 5 % of the pixels of what may move are missing. A component that
-        equals one of the next finer level is not in the list a second time. Lengths are those of the longer side of the
+    Convention: in windows with history more than 5 % of the pixels of what may move are missing. A plain component that
+        equals the dilated one around it is not in the list a second time. Lengths are those of the longer side of the
         box at t+1. Components of changed pixels are at most 3 m long.
     """
     longest, every = config.max_object_length, np.ones(len(sweeps.pixels), dtype=bool)
@@ -74,7 +74,8 @@ def grow(sweeps: SlicedSweeps, change: np.ndarray, config: VerifiedConfig) -> Tr
                 is_node = metres <= LOCAL
             else:
                 is_long = longest is not None and metres > longest
-                is_repeated = level < plain and len(np.unique(tree.levels[level + 1][members])) == 1
+                around = tree.levels[level - 1]
+                is_repeated = level == plain and (around == around[members[0]]).sum() == len(members)
                 is_node = (not is_long or both_ends_move(sweeps, members)) and not is_repeated
             if is_node:
                 number[members] = len(tree.nodes)
