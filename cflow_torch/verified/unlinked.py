@@ -27,7 +27,7 @@ from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.component_tree import Components, NodeKind, Tree
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import count_wins
-from cflow_torch.verified.unmatched import are_unmatched, components_of, sizes_of_unmatched
+from cflow_torch.verified.unmatched import are_unmatched, find_unmatched
 
 # We chose these values on simulated highways, seeds 820 and 821.
 _LONGEST = 8.0  # metres, of a part
@@ -127,12 +127,10 @@ def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> t
     is_of_pair = ~sweeps.has_history.index_select(0, sweeps.pixels.window)
     index = flat_nonzero(is_of_pair)
     pixels = sweeps.pixels[index]  # all of t+1 or t
-    component = components_of(components, index)
-    of_sweep = Groups(2 * component.of_item + pixels.step, 2 * component.count)  # no pixel is of a copy
-    size = sizes_of_unmatched(sweeps, pixels, of_sweep, are_unmatched(sweeps, pixels, 1 - pixels.step))
-    large = flat_nonzero(size >= _LEAST_SIZE)
-    of_sweep = of_sweep[large]
-    return index.index_select(0, large), of_sweep.select(flat_nonzero(draw(of_sweep.of_item, of_sweep.count)))
+    found = find_unmatched(sweeps, components, index, are_unmatched(sweeps, pixels, 1 - pixels.step), 1)
+    large = flat_nonzero(found.size >= _LEAST_SIZE)
+    component = found.component[large]
+    return index.index_select(0, large), component.select(flat_nonzero(draw(component.of_item, component.count)))
 
 
 class _Map:

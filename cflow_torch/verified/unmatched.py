@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -22,27 +24,41 @@ def are_unmatched(sweeps: HeightSlicedSweeps, pixels: Pixels, other: int | Tenso
     return (pixels.slices & ~around) > 0
 
 
-def components_of(components: Components, index: Tensor) -> Groups:
-    """Group K pixels by their dilated component at the second finest scale; copies are in none.
+class Unmatched(NamedTuple):
+    """The unmatched components of K pixels."""
 
-    `index`, (K,) int64, are positions in the list of pixels.
-    """
-    scale = components.levels[-3:][0]
-    num_originals = len(scale.of_item)
-    return scale[index.clamp(max=num_originals - 1)].where(index < num_originals)
+    component: Groups  # the K pixels, grouped by unmatched component and sweep
+    size: Tensor  # (K,) int64, of this component; 0 = none
 
 
-def sizes_of_unmatched(sweeps: HeightSlicedSweeps, pixels: Pixels, component: Groups, is_unmatched: Tensor) -> Tensor:
-    """Return the size of the component of each of K pixels if it is unmatched, else 0, (K,) int64.
+def find_unmatched(
+    sweeps: HeightSlicedSweeps, components: Components, index: Tensor, is_unmatched: Tensor, num_scales: int
+) -> Unmatched:
+    """Find the unmatched components of t, or of t and t+1.
 
     Args:
-        pixels: K pixels, all those of some sweeps.
-        component: these pixels, grouped by component, or by component and sweep.
+        components: of the pixels without those of copies.
+        index: (K,) int64, positions in the list of pixels, all pixels of t, or those of t and t+1. Copies have no
+            component.
         is_unmatched: (K,) bool, `are_unmatched`.
+        num_scales: 1 = dilated components of the second finest scale; 2 = where these are matched, those of the finest
+            scale, because a barrier may touch a car.
 
-    Convention: the size is the sum of the reach of the K pixels, because pixels with a larger reach have fewer
-        neighbours. So a car has a similar size for a sparse sensor as for a dense one.
+    Convention: the size is the sum of the reach of the pixels of a sweep, because pixels with a larger
+        reach have fewer neighbours. So a car has a similar size for a sparse sensor as for a dense one.
     """
+    pixels = sweeps.pixels[index]
+    levels = components.levels[:-1][-2:][:num_scales]
+    num_originals = len(levels[0].of_item)
+    original = index.clamp(max=num_originals - 1)
+    of_level = torch.stack([level.of_item.index_select(0, original) for level in levels])  # [L, K]
+    none = 2 * components.tree.count
+    of_sweep = torch.where(index < num_originals, 2 * of_level + pixels.step, none)
+    component = Groups(of_sweep.view(-1), none)
     reach = sweeps.columns.reach_of(pixels)
-    size, num_unmatched = component.sum(torch.stack((reach, reach * is_unmatched)).long())
-    return component.spread(size * (_MATCHED * (size - num_unmatched) < size))
+    size, unmatched = component.sum(torch.stack((reach, reach * is_unmatched)).long().repeat(1, len(levels)))
+    size = component.spread(size * (_MATCHED * (size - unmatched) < size)).view_as(of_sweep)
+    is_coarse = size[0] > 0
+    size = torch.where(is_coarse, size[0], size[-1])
+    chosen = torch.where(is_coarse, of_sweep[0], of_sweep[-1]).masked_fill_(size == 0, none)
+    return Unmatched(Groups(chosen, none), size)

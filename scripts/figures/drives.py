@@ -141,6 +141,17 @@ def oncoming(seed: int) -> Staged:
     return Staged(drive, "oncoming cars", "three cars at 27 m/s, 37 to 65 m ahead", [0, 1, 2], (20, -24, 80, 16))
 
 
+def sparse(seed: int) -> Staged:
+    """Distant traffic, seen by one LiDAR of 32 rings."""
+    rng = np.random.default_rng(seed)
+    bodies = [objects.car(rng, Route(x, 3.5, WEST, speed=13)) for x in (38, 48, 58)]
+    bodies += [objects.car(rng, Route(x, -3.5, EAST, speed=11)) for x in (36, 50)]
+    posts = [objects.pole(x, side, 6, 0.1) for x in range(0, 80, 15) for side in (-7, 7)]
+    drive = drive_past([*bodies, *posts, objects.wall(40, 11, 80, 0.5, 4)], seed, profile="nuscenes", speed=8)
+    whose = "five cars at 11 and 13 m/s, 32 to 52 m ahead"
+    return Staged(drive, "a sparse sensor", whose, range(len(bodies)), (24, -24, 64, 16))
+
+
 def far(seed: int) -> Staged:
     """Cars and people inside and outside of `point_cloud_range`."""
     rng, bodies = np.random.default_rng(seed), []

@@ -100,6 +100,7 @@ CASES: dict[str, tuple[Callable[[int], Staged], Sequence[Setting], int | None]] 
     "vertical": (drives.vertical, [by("paper", num_history=4, sectional_view=on) for on in (False, True)], None),
     "fast": (drives.fast, (by("default", max_speed=40), by("default")), 2),
     "oncoming": (drives.oncoming, (*_DEFAULT, _PAIR), 0),
+    "sparse": (drives.sparse, (_PAIR, *_DEFAULT), 0),
     "beyond_region": (drives.far, (by("default"), by("default", "`default`, ±100 m", point_cloud_range=WIDE)), None),
     "ground_left_in": (drives.street, (_GROUND_LEFT_IN, _GROUND_FOUND), 1),
     "wrong_frame": (drives.turn, (_WRONG_FRAME, by("default", "`default`, right frame")), 0),

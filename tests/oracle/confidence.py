@@ -63,11 +63,11 @@ def probabilities(
     rigid: Sequence[RigidMotion],
     margins: Sequence[float],
     is_missing: np.ndarray,
-    component: np.ndarray,
+    scales: Sequence[np.ndarray],
 ) -> np.ndarray:
     """(2, P): of every pixel, that its motion is right, and that it moves; undefined for those of sweeps other than t.
-    Given are the object of each pixel, the motion of each object and its margin, the missing pixels, and the component
-    of each pixel at the second finest scale.
+    Given are the object of each pixel, the motion of each object and its margin, the missing pixels, and the dilated
+    component of each pixel at the second finest scale, then at the finest.
 
     The bins of the table: left out; static in an unmatched component, by its size; static, by the share of the
     slices in the block around that is found; static beside something that moves; moving, by the margin. Each but the
@@ -99,12 +99,14 @@ def probabilities(
     kind = 2 * sweeps.has_history + is_missing
     bins = static + kind * (1 + len(share)) + (10 * found[:, None] >= share * total[:, None]).sum(1)
     bins[is_beside] = (beside + kind)[is_beside]
-    for name in np.unique(component[step == 1]):
-        members = np.flatnonzero((component == name) & (step == 1))
-        reach = sweeps.reach[row, col][members]
-        if 8 * reach[~is_unmatched[members]].sum() < reach.sum():
-            lost = members[is_missing[members]]
-            bins[lost] = 1 + sweeps.has_history * (1 + len(sizes)) + (reach.sum() >= sizes).sum()
+    for component in scales[::-1]:  # the coarse ones come last
+        for name in np.unique(component[step == 1]):
+            members = np.flatnonzero((component == name) & (step == 1))
+            reach = sweeps.reach[row, col][members]
+            if 8 * reach[~is_unmatched[members]].sum() < reach.sum():
+                lost = members[is_missing[members]]
+                bins[lost] = 1 + sweeps.has_history * (1 + len(sizes)) + (reach.sum() >= sizes).sum()
+
     is_far = (sweeps.middle(sweeps.pixels) ** 2).sum(1) >= TABLE["far"] ** 2
     is_fast = np.array([*(each.flow[0] ** 2 + each.flow[1] ** 2 >= TABLE["fast"] ** 2 for each in rigid), False])
     reached = (np.array([*margins, 0.0])[object_of, None] >= bounds).sum(1)

@@ -62,7 +62,7 @@ def parts_of_pair(sweeps: SlicedSweeps, component: np.ndarray) -> list[np.ndarra
 def link_unlinked(sweeps: SlicedSweeps, is_missing: np.ndarray, tree: Tree) -> list[Node]:
     """The nodes of fast objects, of level L + 1."""
     is_pair = not sweeps.has_history
-    parts = parts_of_pair(sweeps, tree.levels[-3:][0]) if is_pair else parts_of(sweeps, is_missing)
+    parts = parts_of_pair(sweeps, tree.levels[:-1][-2:][0]) if is_pair else parts_of(sweeps, is_missing)
     step_of = [int(sweeps.pixels[part[0], 0]) for part in parts]
     centres = [sweeps.pixels[part, 1:].sum(0) / len(part) for part in parts]
     cell = max(1, round(CELL / sweeps.size))
