@@ -260,10 +260,10 @@ REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
     ("scene", "reading"),
     [
         ("kitti-raw/kitti-raw-0027-a", "clockwise"),
-        ("kitti-raw/kitti-raw-0027-b2", "clockwise"),
+        pytest.param("kitti-raw/kitti-raw-0027-b2", "clockwise", marks=pytest.mark.slow),
         ("kitti-raw/kitti-raw-0027-empty16", "clockwise"),
         ("kitti-0000/kitti-0000-a", "off"),
-        ("kitti-0000/kitti-0000-c2", "off"),
+        pytest.param("kitti-0000/kitti-0000-c2", "off", marks=pytest.mark.slow),
         ("pandaset-002/panda-002-c", "off"),
     ],
 )
