@@ -146,6 +146,8 @@ def test_times_in_files_are_used(raw: Drive, truth: Drive, tmp_path: Path, suffi
     assert log.reading.name == "times"
     assert max(largest_error(log, truth, index) for index in (3, 7)) < 0.015
     assert np.abs(log.sweep(3).point_times - raw.sweep(3).point_times).max() < 1e-5
+    if suffix != ".npy":
+        return
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         chosen = open_log("arrays", folder, find_ground="grid", deskew="times")
