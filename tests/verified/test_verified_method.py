@@ -47,13 +47,13 @@ def test_the_preset_equals_the_oracle():
     assert flow_as_oracle(turning_car(5, settings.num_history, 0.5), settings).residual_flow.any()
 
 
-@pytest.mark.parametrize("region", [NEAR, pytest.param(WIDER, marks=pytest.mark.slow)])
-def test_a_part_of_real_drives_equals_the_oracle(av2_folder, kitti_file, data_root, region):
+@pytest.mark.parametrize(("region", "count"), [(NEAR, 2), pytest.param(WIDER, 3, marks=pytest.mark.slow)])
+def test_a_part_of_real_drives_equals_the_oracle(av2_folder, kitti_file, data_root, region, count):
     settings = make_config("default", point_cloud_range=region)
     windows = [window_of(AV2Log(av2_folder), 0)]
     with HDF5Log(kitti_file) as kitti, HDF5Log(data_root / "av2-crown" / "av2-crown.h5") as crown:
         windows += [window_of(kitti, 9, 4), window_of(crown, len(crown) - 2, 4)]
-    for window in windows:
+    for window in windows[-count:]:
         moves = flow_as_oracle(untimed(window), settings).residual_flow.norm(dim=1) >= 0.05
         assert moves.sum() > 500  # there is something to find
 
