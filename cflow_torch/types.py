@@ -17,7 +17,7 @@ from cflow_torch.errors import CFlowWarning as CFlowWarning
 from cflow_torch.errors import import_optional
 
 Array = Union[np.ndarray, Tensor]
-# What moves: a residual flow of 0.05 m per sweep at least, as in evaluation, and a probability `moving` of one half.
+# A moving point has at least a residual flow of 0.05 m per sweep, as in evaluation, and a probability `moving` of 0.5.
 MOVING, MIN_MOVING = 0.05, 0.5
 # Names in flow files and data frames -> fields of `FlowResult`.
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}

@@ -194,7 +194,21 @@ def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then
     log = Hidden([straight((0, 0), (0.17, 0.0), 14)])
     table = track(log, log.results())
     assert len(table["id"]) == 13 and len(set(table["id"])) == 1
-    assert np.array_equal(table["is_confirmed"], np.arange(13) >= 7)
+    assert np.array_equal(table["is_confirmed"], np.arange(13) >= 6)
+
+
+def test_a_slow_car_that_is_ever_more_hidden_is_confirmed_if_its_flow_is_confident() -> None:
+    class Hidden(Staged):
+        """The car drives behind something that hides its front."""
+
+        def world(self, index: int) -> Any:
+            points, flow, car = super().world(index)
+            kept = (car < 0) | (points[:, 0] < 5)
+            return points[kept], flow[kept], car[kept]
+
+    log = Hidden([straight((0, 0), (0.17, 0.0), 9)])
+    assert len(set(track(log, log.results())["id"])) == 1
+    assert not len(track(log, [(index, log.result(index, 0.6)) for index in range(8)])["id"])
 
 
 def test_ids_survive_empty_sweeps_and_missing_frames() -> None:
