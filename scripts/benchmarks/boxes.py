@@ -15,6 +15,7 @@ scored, and has no better box, is above the threshold. Boxes on objects that mov
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any, Dict, NamedTuple
 
@@ -364,7 +365,7 @@ def main() -> None:
         tracked = [(log, *boxes_of(log, model)) for log in logs]
         rows = [row for each in tracked for row in score(*each)]
         summaries.append(summary(name, rows, detections(tracked)))
-        print(summaries[-1], flush=True)
+        print(f"{name} is scored", file=sys.stderr)
     print(markdown(summaries))
 
 
