@@ -16,6 +16,7 @@ from cflow_torch.model import SceneFlowModel
 from cflow_torch.tensors import choose_device
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, check_sweep
 from cflow_torch.verified.method import VerifiedFlow
+from cflow_torch.windows.inspection import Inspection
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import keep_nearest
 
@@ -65,7 +66,7 @@ def estimate_flow(
 
     Warns:
         CFlowWarning: we left out missing returns; a sweep has no mask, so we found its ground (`ground="auto"`); a
-            likely mistake in the input, see `SceneFlowModel.forward`; `is_valid` is False for all points of pc0.
+            likely mistake in the input, see `Inspection`; `is_valid` is False for all points of pc0.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
@@ -100,7 +101,9 @@ def estimate_flow(
     window = Window(pc0, pc1, tuple(history), tuple(future))  # type: ignore[arg-type]  # it refuses arrays
     window = _leave_out_missing(keep_nearest(window, config.num_history))
     window = _find_ground(window, ground, device)
-    return make_model(config, device)([window])[0]
+    (result,) = make_model(config, device)([window])
+    Inspection()([window])
+    return result
 
 
 def make_model(preset: str | Config = "default", device: Any = "auto", **settings: Any) -> SceneFlowModel:

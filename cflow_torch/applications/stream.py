@@ -17,6 +17,7 @@ from cflow_torch.ground.segmentation import CHOICES, find_ground
 from cflow_torch.tensors import choose_device, read_ground, read_positions
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.collation import make_batch
+from cflow_torch.windows.inspection import Inspection
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import check_windows
 
@@ -76,6 +77,7 @@ class FlowStream:
             raise CFlowError(f"num_future={config.num_future}: a stream does not know later sweeps; give num_future=0")
         self.config = config
         self._model = make_model(config, device)
+        self._inspect = Inspection()
         self._ground = ground
         self._max_gap = max_gap
         self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
@@ -131,6 +133,7 @@ class FlowStream:
             before, *history = self._sweeps
             window = Window(before, sweep, tuple(history))
             (result,) = self._model([window])
+            self._inspect([window])
             self.window = window
         else:  # check it now, so that errors do not wait for the next sweep
             alone = replace(sweep, timestamp_ns=None)

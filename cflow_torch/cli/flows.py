@@ -16,15 +16,10 @@ from cflow_torch.windows.memory import keep_freed_memory
 
 
 def make_log_model(config: Config, device: str, keep_memory: bool = True) -> SceneFlowModel:
-    """Make a method for the windows of logs, which are checked when they are opened, not at each call.
-
-    With `keep_memory`, this process keeps the memory that it frees, see `keep_freed_memory`.
-    """
+    """Make a method. With `keep_memory`, this process keeps the memory that it frees, see `keep_freed_memory`."""
     if keep_memory:
         keep_freed_memory()
-    model = estimate.make_model(config, device)
-    model.inspect = None
-    return model
+    return estimate.make_model(config, device)
 
 
 def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], FlowResult]:

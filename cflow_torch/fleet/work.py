@@ -55,7 +55,6 @@ class Worker:
             raise CFlowError(f"no worker can start on {device}: {describe_error(error)}") from error
         self._job, self._device, self._ahead = job, device, _AHEAD
         self._model: Any = make_model(job.config, device)
-        self._model.inspect = None  # the log is checked instead
         self._source: Any = None
         self._log: Any = None
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)

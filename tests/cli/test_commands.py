@@ -21,7 +21,7 @@ from cflow_torch import make_config
 from cflow_torch.cli import failures, flows, pairs
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.eval import objective
-from cflow_torch.config import config_from
+from cflow_torch.config import Config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.viz import page
@@ -51,7 +51,7 @@ def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys):
     assert scores["results"]["num_frames"] == 1 and 0 < scores["results"]["three_way"]["epe_fd"] < 2
     left: Any = OmegaConf.to_container(OmegaConf.load(tmp_path / "config.yaml").model)
     region = (-20.0, -20.0, -np.inf, 20.0, 20.0, np.inf)
-    assert config_from(left) == make_config(num_history=0, point_cloud_range=region)
+    assert Config.of(left) == make_config(num_history=0, point_cloud_range=region)
     assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert re.search("^mean dynamic error 0[.]", printed, re.MULTILINE)  # Python 3.8 has no k3d, which is said before

@@ -69,7 +69,7 @@ CHEAP = (
     ("flow shard.index=one shard.count=3", "shard.index='one': give a whole number of at least 0"),
     ("flow engine.workers=0", "engine.workers=0: give a whole number of at least 1"),
     ("flow engine.memory=true", "engine.memory=True: give a number above 0"),
-    ("eval +model.thorough=1", "unknown setting thorough: the fields are pixel_size"),
+    ("eval +model.thorough=1", "unknown setting thorough: the fields are method"),
 )
 OTHERS = (
     ("submit version=1 masks=none data.num_sweeps=2", "none"),
