@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar, Optional, Sequence, Tuple, TypeVar
 
-from cflow_torch.errors import CFlowError
+from cflow_torch.errors import CFlowError, near
 from cflow_torch.setting import LIMIT, Settings, setting
 
 Method = TypeVar("Method", bound="Config")
@@ -287,8 +287,8 @@ def make_config(preset: str | Config = "default", **settings: Any) -> Config:
             )
     if not isinstance(preset, Config):
         if not isinstance(preset, str) or preset not in PRESETS:
-            raise CFlowError(
-                f"preset={preset!r}: give one of {', '.join(map(repr, PRESETS))}, or the result of make_config"
-            )
+            hint = near(str(preset), PRESETS)
+            known = ", ".join(map(repr, PRESETS))
+            raise CFlowError(f"preset={preset!r}{hint}: give one of {known}, or the result of make_config")
         preset = PRESETS[preset]
     return preset.replace(**settings)

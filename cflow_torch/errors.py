@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 from difflib import get_close_matches
@@ -31,9 +32,13 @@ class NoActivePoints(CFlowWarning):
 
 
 def near(word: str, known: Iterable[str]) -> str:
-    """Return the hint " (did you mean X?)", "" if no name is similar. We compare names with and without their group."""
+    """Return the hint " (did you mean X?)", "" if no name is similar.
+
+    We compare names with and without their group, such as "model.", and prefer one that has the word as a part.
+    """
     names = {form: name for name in known for form in (name.rpartition(".")[2], name)}
-    similar = get_close_matches(word, names, 1)
+    whole = [form for form in names if word in re.split("[._]", form)]
+    similar = whole or get_close_matches(word, names, 1)
     return f" (did you mean {names[similar[0]]}?)" if similar else ""
 
 

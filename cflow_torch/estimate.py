@@ -14,6 +14,7 @@ from cflow_torch.ground.segmentation import CHOICES, find_ground_batch
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.tensors import choose_device
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, check_sweep
 from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.windows.inspection import Inspection
@@ -112,7 +113,7 @@ def make_model(preset: str | Config = "default", device: Any = "auto", **setting
     `preset` and `settings` are as for `make_config`, `device` is as for `estimate_flow`.
     """
     methods = {method.method: method for method in (CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow)}
-    config = make_config(preset, **settings)
+    config = preset if isinstance(preset, Config) and not settings else make_config(preset, **settings)
     return methods[config.method](config, device)
 
 
@@ -157,4 +158,6 @@ def _sweeps_of_arrays(
     """Make sweeps in a world that is the ego frame at t+1. Without a transform they have no poses."""
     check_sweep(("pc0", "gm0", "T_ego1_ego0", "dt0"), pc0, gm0, T_ego1_ego0, None)
     check_sweep(("pc1", "gm1", "T_ego1_ego0", "dt1"), pc1, gm1, None, None)
+    if T_ego1_ego0 is not None:
+        rigid_transform(T_ego1_ego0, "T_ego1_ego0")
     return Sweep(pc0, gm0, T_ego1_ego0), Sweep(pc1, gm1, None if T_ego1_ego0 is None else np.eye(4))

@@ -113,7 +113,7 @@ def describe_limits(limits: Mapping[str, Any]) -> str:
     text += f" above {above:g}" if above > -math.inf else ""
     text += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
     text += f", or {limits['word']}" if limits["word"] else ""
-    return text + (", or None" if limits["optional"] else "")
+    return text + (", or None (in YAML null)" if limits["optional"] else "")
 
 
 def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
@@ -137,4 +137,5 @@ def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
             is_allowed &= value in limits["choices"]
         if is_allowed:
             return value if kind is object else kind(value)
-    raise CFlowError(f"{name}={value!r}: give {describe_limits(limits)}")
+    meaning = f": {limits['help']}" if kind is tuple else ""
+    raise CFlowError(f"{name}={value!r}: give {describe_limits(limits)}{meaning}")

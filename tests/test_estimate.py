@@ -21,6 +21,7 @@ from cflow_torch.ground.segmentation import find_ground_batch
 from cflow_torch.simulator import make_drive
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import Sweep, Window
+from cflow_torch.windows.inspection import Inspection
 
 RNG = np.random.default_rng(0)
 P0, P1 = RNG.uniform(-5, 5, (50, 3)).astype(np.float32), RNG.uniform(-5, 5, (40, 3)).astype(np.float32)
@@ -37,7 +38,11 @@ EYE, SWEEPS = np.eye(4), {"pc0": Sweep(P0), "pc1": Sweep(P1)}
         ({**SWEEPS, "history": [P1]}, "history: give a list of cflow_torch.Sweep"),
         ({**SWEEPS, "future": Sweep(P1), "preset": "offline"}, "future: give a list of cflow_torch.Sweep"),
         ({"T_ego1_ego0": EYE[None]}, r"T_ego1_ego0 has shape \(1, 4, 4\)"),
-        ({"T_ego1_ego0": np.diag([1, 1, -1, 1.0])}, "pc0 is not rigid"),
+        ({"T_ego1_ego0": np.diag([1, 1, -1, 1.0])}, "T_ego1_ego0 is not rigid"),
+        ({"pc0": np.repeat(P0, 10, 0).T}, r"pc0 has shape \(3, 500\): .* give its transpose"),
+        ({"preset": "defualt"}, r"preset='defualt' \(did you mean default\?\)"),
+        ({"point_cloud_range": 50}, r"give a list of numbers: \(x0, y0, z0, x1, y1, z1\)"),
+        ({"pc0": Sweep(P0, timestamp_ns=0.1), "pc1": Sweep(P1, timestamp_ns=0.2)}, "give whole nanoseconds"),
         ({"max_hight": 3}, r"unknown setting max_hight \(did you mean min_height\?\): the fields are method,"),
         ({"ground": "yes"}, "ground='yes'.*'auto'"),
         ({"pixel_size": 1e-5}, "point_cloud_range"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import operator
 from collections import deque
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -70,8 +72,8 @@ class FlowStream:
     ) -> None:
         if ground not in CHOICES:
             raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
-        if not max_gap > 0:
-            raise CFlowError(f"max_gap={max_gap}: give seconds above 0")
+        if not (isinstance(max_gap, (int, float)) and max_gap > 0):
+            raise CFlowError(f"max_gap={max_gap!r}: give seconds above 0")
         config = make_config(preset, **settings)
         if config.num_future > 0:
             raise CFlowError(f"num_future={config.num_future}: a stream does not know later sweeps; give num_future=0")
@@ -123,8 +125,7 @@ class FlowStream:
                 raise CFlowError("a Sweep and more are given: put pose, time, mask and point times into the Sweep")
             given = points
         else:
-            stamp = None if time is None else round(time * 1e9) if isinstance(time, float) else int(time)
-            given = Sweep(points, is_ground, pose, stamp, point_times)
+            given = Sweep(points, is_ground, pose, None if time is None else _nanoseconds(time), point_times)
         if not self._accepts(given.timestamp_ns):
             return None
         sweep = self._prepare(given)
@@ -196,3 +197,10 @@ class FlowStream:
             "there is no ground mask for a sweep of the stream, so we find the ground. To turn this line off give "
             "masks (is_ground), ground='grid' (the same result), or ground=None if the clouds have no ground"
         )
+
+
+def _nanoseconds(time: int | float) -> int:
+    """Convert a time in nanoseconds (int) or seconds (float)."""
+    with suppress(TypeError, ValueError, OverflowError):
+        return round(time * 1e9) if isinstance(time, float) else operator.index(time)
+    raise CFlowError(f"time={time!r}: give whole nanoseconds (int) or seconds (float)")

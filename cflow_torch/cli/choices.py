@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Dict, Iterable, Iterator, Mapping, Optional, Tuple
 
@@ -43,14 +42,13 @@ def _of_class(kind: type[Settings], prefix: str = "") -> Iterator[_Named]:
         if issubclass(f.metadata["kind"], Settings):
             yield from _of_class(f.metadata["kind"], f"{prefix}{f.name}.")
         else:
-            yield f"{prefix}{f.name}", f.metadata
+            yield f"{prefix}{f.name}", None if f.name == kind.NAMED_BY else f.metadata
 
 
 def _of_choices() -> Iterator[tuple[str, Iterable[_Named]]]:
     """Yield each choice of the groups, and its settings."""
     for preset, config in PRESETS.items():
-        named = [(f"model.{f.name}", f.metadata if f.name != config.NAMED_BY else None) for f in fields(config)]
-        yield f"model={preset}", named
+        yield f"model={preset}", _of_class(type(config), "model.")
     for engine, kind in ENGINES.items():
         yield f"engine={engine}", _of_class(kind, "engine.")
     for picture, of_picture in PICTURES.items():

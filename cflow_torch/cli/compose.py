@@ -169,7 +169,7 @@ def wrong_call_told(command: str) -> Iterator[None]:
 
 @contextmanager
 def failed_job_told(command: str) -> Iterator[None]:
-    """Exit with status 2 if a job is called wrongly. A bug raises `UnfinishedJob`, so other jobs of a sweep still run."""
+    """Exit with status 2 if a job is called wrongly. A bug raises `UnfinishedJob`: a sweep goes on."""
     try:
         yield
     except UnfinishedJob:
@@ -192,4 +192,7 @@ def explain(error: Exception, command: str) -> str:
     if isinstance(error, OverrideParseException):
         return f"cannot read {error.override!r}: give NAME=VALUE, special characters in quotes: 'NAME=\"VALUE\"'"
     message = " ".join(str(error).split())
+    if message.startswith("Ambiguous value"):
+        word = message.split("'")[1]
+        return f"{word}: for a list, give [...] around the values; for a run with each of them (a sweep), add -m"
     return f"{message}; `cflow {command} --help` has examples"

@@ -75,7 +75,8 @@ def _check_settings(settings: list[str], kind: type[Command], has_own: bool) -> 
         if is_group or _is_for_hydra(key) or (has_own and key.partition(".")[0] in chosen):
             continue
         if key not in known:
-            hint = near(key, [*chosen, *known])
+            of_value = [group for group in chosen if value in choices(group)]  # preset=live
+            hint = f" (did you mean {of_value[0]}={value}?)" if of_value else near(key, [*chosen, *known])
             raise CFlowError(
                 f"unknown setting {key!r}{hint}: `cflow {command_name(kind)} --cfg job` prints all settings"
             )
@@ -146,4 +147,4 @@ def _is_for_hydra(key: str) -> bool:
 def check_exists(path: str) -> None:
     """Reject a path that does not exist. The address of an object store is not looked up."""
     if "://" not in path and not os.path.exists(path):
-        raise CFlowError(f"{path}: there is no such file or folder; settings are NAME=VALUE")
+        raise CFlowError(f"{path}: there is no such file or folder; settings are NAME=VALUE, without spaces")

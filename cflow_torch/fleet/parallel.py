@@ -1,4 +1,4 @@
-"""Engine `local`, and what all engines share: parts go to workers, and a part whose worker ends is tried once more."""
+"""Run the parts of logs on executors. A part whose worker ends is tried once more, frame by frame, then reported."""
 
 from __future__ import annotations
 
@@ -6,54 +6,44 @@ import math
 import time
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, wait
-from contextlib import closing
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Callable, Iterator, Sequence
+from functools import partial
+from typing import Callable, Generator, Iterator, Sequence
 
-from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, describe_error
+from cflow_torch.fleet.executors import CannotStart, Executor, InlineExecutor, ProcessExecutor, describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.work import Worker, make_worker, source_name
 
+Events = Generator[Event, None, None]
 _POLL_S = 0.2  # how soon a signal is noticed
 _GRACE_S = 20.0  # after a signal, time to finish the frames that have begun; schedulers kill after 30 s or more
 _REMEDY = "if memory is short, give fewer engine.workers"
 
 
-def run_local(
-    job: Job,
-    parts: Sequence[Part],
-    layout: Layout,
-    stop: Callable[[], bool],
-    *,
-    timeout: float = 600.0,
-    memory: float | None = None,
-) -> Iterator[Event]:
-    """Do all parts with processes of this machine, one per device, and yield events as they happen.
+@contextmanager
+def local_executors(
+    job: Job, layout: Layout, timeout: float = 600.0, memory: float | None = None
+) -> Iterator[list[Executor]]:
+    """Engine `local`: a process of this machine per device; `cli.commands.Local` explains the settings.
 
-    `cli.commands.Local` explains the settings. A single worker without a memory limit runs in this process.
+    A single worker without a memory limit runs in this process.
     """
-    if len(layout.devices) > 1 or memory is not None:
-        executors = [ProcessExecutor(make_worker, job, device, memory) for device in layout.devices]
-        yield from run_parallel(executors, parts, stop, timeout)
-        return
-    with closing(Worker(job, layout.devices[0])) as worker:
-        for part in parts:
-            if stop():
-                break
-            yield from worker.run(part, stop)
+    if len(layout.devices) == 1 and memory is None:
+        yield [InlineExecutor(partial(Worker, job, layout.devices[0]))]
+    else:
+        yield [ProcessExecutor(partial(make_worker, job, device, memory), timeout) for device in layout.devices]
 
 
-def run_parallel(
-    executors: Sequence[Executor], parts: Sequence[Part], stop: Callable[[], bool], timeout: float = math.inf
-) -> Iterator[Event]:
+def run_parallel(executors: Sequence[Executor], parts: Sequence[Part], stop: Callable[[], bool]) -> Events:
     """Do all parts, and yield events as they happen. A worker that cannot start is a `CFlowError`.
 
     Args:
         executors: of `Worker` objects.
         parts: numbered from 0.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
-        timeout: seconds after which a worker that has not answered is replaced.
     """
     todo = deque(parts)
     idle = list(executors)
@@ -65,7 +55,7 @@ def run_parallel(
             if is_stopped:
                 end = min(end, time.monotonic() + _GRACE_S)
             while todo and idle and not is_stopped:
-                tasks.append(_Task(idle.pop(), todo.popleft(), timeout))
+                tasks.append(_Task(idle.pop(), todo.popleft()))
             if not tasks:
                 break
             wait([task.answer for task in tasks], _POLL_S, FIRST_COMPLETED)
@@ -81,31 +71,31 @@ def run_parallel(
 class _Task:
     """A part of a log that a `Worker` in an executor does."""
 
-    def __init__(self, executor: Executor, part: Part, timeout: float) -> None:
+    def __init__(self, executor: Executor, part: Part) -> None:
         self.executor = executor
         self.is_done = False
         self._part = part
-        self._timeout = timeout
         self._name = source_name(part.source)  # of the log
         self._missing: set[int] | None = None  # time stamps of frames without a result; None = the log is not open
         self._ask(part, False)
 
     def _ask(self, part: Part | None, is_stopped: bool) -> None:
         self.answer = self.executor.submit("next_event", part, is_stopped)
-        self._deadline = time.monotonic() + self._timeout
+        self._deadline = time.monotonic() + self.executor.timeout
 
     def follow(self, is_stopped: bool, todo: deque[Part]) -> Iterator[Event]:
         """Yield the event that the worker has answered, if it has, and ask for the next one."""
         is_late = time.monotonic() > self._deadline
         if not (self.answer.done() or is_late):
             return
-        error = self.answer.exception() if self.answer.done() else BrokenExecutor(f"no answer for {self._timeout:g} s")
+        silence = BrokenExecutor(f"no answer for {self.executor.timeout:g} s")
+        error = self.answer.exception() if self.answer.done() else silence
         if isinstance(error, CannotStart):
             raise error
         if error is not None:
-            self.executor.close()
+            ending = self.executor.close()
             self.is_done = True
-            yield from self._try_again(todo, describe_error(error))
+            yield from self._try_again(todo, ending if isinstance(error, BrokenProcessPool) else describe_error(error))
             return
         event: Event | None = self.answer.result()
         if event is None:
