@@ -250,7 +250,7 @@ def score(log: Any, table: dict[str, np.ndarray], sweeps: range) -> list[Row]:
 
 
 def summary(name: str, rows: list[Row]) -> Row:
-    """The columns of docs/applications.md."""
+    """The columns of docs/boxes.csv."""
     ious = np.array([row["iou"] for row in rows])
     hits = [row for row in rows if row["track"] >= 0]
     size = np.array([np.abs(row["size"] / row["true"] - 1) for row in hits]).reshape(-1, 3)
@@ -259,8 +259,10 @@ def summary(name: str, rows: list[Row]) -> Row:
     out.update({f"> {least}, %": 100 * (ious > least).mean() for least in (0.4, 0.7)})
     for kind in ("car", "truck", "cyclist", "pedestrian"):
         of_kind = ious[[row["kind"] == kind for row in rows]]
-        out[f"{kind}"] = f"{of_kind.mean():.3f} ({len(of_kind)})" if len(of_kind) else "-"
-    out["length, width off by %"] = " ".join(f"{100 * each:.1f}" for each in np.median(size[is_vehicle, :2], 0))
+        out[f"IoU of {kind}"] = of_kind.mean() if len(of_kind) else "-"
+        out[f"{kind}s"] = len(of_kind)
+    for axis, name in enumerate(("length", "width")):
+        out[f"{name} off by, %"] = 100 * np.median(size[is_vehicle, axis])
     out["within 15 %"] = 100 * (size[is_vehicle, :2] <= 0.15).all(1).mean()
     out["heading, degrees"] = float(np.median([row["heading"] for row in hits]))
     out["same size, %"] = constancy(hits)
