@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import signal
@@ -37,7 +36,7 @@ class Holder:
 class Executor(ABC):
     """Holds one object. A call makes it if there is none yet, or if it was lost or closed."""
 
-    timeout: float = math.inf  # seconds after which a call without an answer is hopeless
+    timeout: float | None = None  # seconds after which a call without an answer is hopeless
 
     @abstractmethod
     def submit(self, method: str, *arguments: Any) -> Future[Any]:
@@ -79,7 +78,7 @@ class ProcessExecutor(Executor):
         timeout: see `Executor`.
     """
 
-    def __init__(self, make: Callable[[], Any], timeout: float = math.inf) -> None:
+    def __init__(self, make: Callable[[], Any], timeout: float | None = None) -> None:
         self._make = make
         self._pool: Any = None
         self.timeout = timeout

@@ -216,7 +216,7 @@ def test_workers_that_die_at_their_start_are_started_twice_for_each_log(fleet, t
     assert executor.num_starts == 2 * len(parts) and [name for name, _ in counters.failures] == sorted(
         source.name for source in fleet.iterdir()
     )
-    assert count(run_parallel([HereExecutor(job, failed_starts=3)], parts, never), parts).is_complete
+    assert count(run_parallel([HereExecutor(job, failed_starts=1)], parts, never), parts).is_complete
 
 
 def test_a_worker_that_cannot_start_ends_the_run(fleet, tmp_path):
