@@ -18,6 +18,7 @@ from run import Figures, make_parser, print_table, score_preset
 from sets import ScoredSet, make_sets
 from torch import Tensor
 
+from cflow_torch.ops.groups import Groups
 from cflow_torch.verified import changed_pixels, component_tree, confidence, paired_test, refinement
 
 
@@ -36,7 +37,7 @@ def _without_margin(*given: Any) -> confidence.MotionMargin:
     return margin._replace(is_dynamic=torch.ones_like(margin.is_dynamic))
 
 
-def _nothing_slides(sweeps: Any, pixels: Any, groups: Any, motions: Tensor, *_: Any) -> Tensor:
+def _nothing_slides(sweeps: Any, pixels: Any, groups: Any, motions: Tensor) -> Tensor:
     return torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
 
 
@@ -44,8 +45,8 @@ def _nothing_is_slow(sweeps: Any, objects: Any, motion: Tensor, may_be_slow: Ten
     return motion.flip(1) * sweeps.grid.pixel_size
 
 
-def _no_ends_move(sweeps: Any, tree: Any, is_long: Tensor) -> Tensor:
-    return torch.zeros_like(is_long)
+def _no_ends_move(sweeps: Any, pixels: Any, groups: Groups) -> Tensor:
+    return torch.zeros(groups.count, dtype=torch.bool, device=groups.of_item.device)
 
 
 # For each row of the table, the steps of `VerifiedFlow` that it replaces.

@@ -93,7 +93,7 @@ def link_unlinked(sweeps: SlicedSweeps, is_missing: np.ndarray, tree: Tree) -> l
             continue
         won, lost = count_wins(sweeps, members, velocity, is_near=True).sum(1)
         if 2 * won > lost:
-            nodes.append(Node(members, len(tree.levels) + 1, -1, False, velocity))
+            nodes.append(Node(members, len(tree.levels) + 1, -1, velocity))
     return nodes
 
 

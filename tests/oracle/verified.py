@@ -96,7 +96,7 @@ def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_l
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))
         own = evidence_of(*exact, z) + evidence_of(*near, near_z)
         stays = is_fast and LEAVES * exact[1] > exact[0]
-        counts = own > least and not stays and (node.travels or not slides_along_itself(sweeps, node.members, motion))
+        counts = own > least and not stays and not slides_along_itself(sweeps, node.members, motion)
         evidence.append(own if counts else 0)
     best = evidence.index(max(evidence))  # ties: the first
     return (candidates[best] if evidence[best] > 0 else (0.0, 0.0)), evidence[best]

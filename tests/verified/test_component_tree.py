@@ -92,23 +92,20 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
         found = grown(seed, longest, blocks)
         names, none = found.fast_names(), found.nodes.count
         parents = [None if parent == none else names[parent] for parent in found.nodes.children.of_item.tolist()]
-        given = list(zip(names, parents, found.nodes.travels.tolist()))
+        given = list(zip(names, parents))
         for window, tree in enumerate(found.trees):
             mine = found.sweeps.pixels.window == window
             for level, roots in enumerate(found.components.levels):
                 assert same_groups(roots.of_item[mine].numpy(), tree.levels[level])
             own = found.names(window)
-            expected = {
-                (name, None if node.parent < 0 else own[node.parent], node.travels)
-                for name, node in zip(own, tree.nodes)
-            }
+            expected = {(name, None if node.parent < 0 else own[node.parent]) for name, node in zip(own, tree.nodes)}
             of_window = (found.nodes.window == window).tolist()
             assert {node for node, is_mine in zip(given, of_window) if is_mine} == expected
             assert len(expected) == sum(of_window)
             counts += (
                 len(expected),
-                sum(parent is not None for _, parent, _ in expected),
-                sum(level > len(blocks) for (_, level), _, _ in expected),
+                sum(parent is not None for _, parent in expected),
+                sum(level > len(blocks) for (_, level), _ in expected),
             )
     assert counts[0] > 30 and counts[1] > 10 * (len(blocks) > 1) and counts[2] > 5, counts
 
