@@ -6,7 +6,6 @@ neither torch nor Hydra here, so that help costs little.
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Iterator
 
@@ -113,10 +112,6 @@ class Words:
 
     SUMMARY: ClassVar[str]
 
-    @classmethod
-    def help(cls) -> str:
-        return f"cflow {command_name(cls)}: {cls.SUMMARY}\n\n{inspect.cleandoc(cls.__doc__ or '')}\n"
-
 
 @dataclass(frozen=True)
 class Command(Settings):
@@ -137,16 +132,6 @@ class Command(Settings):
     def groups(cls) -> dict[str, str | None]:
         """Return the default choice of each group."""
         return {f.name: getattr(cls, f.name) for f in fields(cls) if "group" in f.metadata}
-
-    @classmethod
-    def help(cls) -> str:
-        """Return what the command does, its settings, and the choices of its groups."""
-        from cflow_torch.cli.choices import choices
-
-        of_groups = [f"{name}={'|'.join(choices(name))}" for name in cls.groups()]
-        lines = [*setting_lines(cls), *of_groups, "data.NAME, model.NAME, ...: `cflow settings` lists them"]
-        text = inspect.cleandoc(cls.__doc__ or "")
-        return "\n  ".join([f"cflow {command_name(cls)}: {cls.SUMMARY}\n\n{text}\n\nsettings:", *lines]) + "\n"
 
 
 @dataclass(frozen=True)
@@ -650,10 +635,6 @@ COMMANDS: dict[str, type[Command] | type[Words]] = {
     "info": Info,
 }
 WITH_SETTINGS: dict[str, type[Command]] = {name: kind for name, kind in COMMANDS.items() if issubclass(kind, Command)}
-
-
-def command_name(kind: type) -> str:
-    return next(name for name, one in COMMANDS.items() if one is kind)
 
 
 def own_fields(kind: type[Settings]) -> list[Any]:

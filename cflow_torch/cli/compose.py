@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import traceback
 from contextlib import contextmanager
@@ -15,8 +16,7 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -32,6 +32,10 @@ from cflow_torch.setting import Settings
 
 _PARSER = OverridesParser.create()
 _PATHS = {"data.root", "data.cache"}  # text, even if they look like numbers
+# Values that Hydra must read by itself: null, a reference, a function, a quoted text.
+_SYNTAX = re.compile(
+    r"null|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
+)
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
 
@@ -100,6 +104,10 @@ def run_job(name: str, composed: Any) -> Any:
         settings = WITH_SETTINGS[name].of(values)
         show_warnings_as_lines()
         settings = replace(settings, data=_complete(settings))
+        from cflow_torch.windows.memory import keep_freed_memory  # imports torch, which takes seconds
+
+        if getattr(settings, "keep_memory", True):
+            keep_freed_memory()
         return import_module(f"cflow_torch.cli.{name}").task(settings)
 
 
@@ -118,14 +126,8 @@ def hydra_overrides(command: type[Command], call: Call) -> list[str]:
 
 
 def _as_text(value: str) -> str:
-    """Quote text that Hydra would read as another type or reject: the name 1e5 is not a number."""
-    try:
-        read = _PARSER.parse_override(f"name={value}").value()
-    except HydraException:  # such as Ausgänge
-        return ",".join(_quoted(one) for one in value.split(","))
-    if isinstance(read, ChoiceSweep) and read.simple_form:  # of a sweep: a,b
-        return ",".join(_as_text(one) for one in value.split(","))
-    return _quoted(value) if isinstance(read, (bool, int, float)) else value
+    """Quote text, or each text of a sweep (a,b), so that Hydra reads no other type: the name 1e5 is not a number."""
+    return value if _SYNTAX.fullmatch(value) else ",".join(map(_quoted, value.split(",")))
 
 
 def _quoted(value: str) -> str:
@@ -149,7 +151,7 @@ def _complete(settings: Command) -> dict[str, Any]:
     for path in root if isinstance(root, list) else [root]:
         if isinstance(path, str):
             check_exists(path)
-    from cflow_torch.cli.logs import complete_data  # imports torch, which takes seconds
+    from cflow_torch.cli.logs import complete_data  # imports torch
 
     return data if isinstance(settings, Check) else complete_data(data)
 

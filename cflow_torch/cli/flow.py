@@ -163,18 +163,12 @@ def _useful_workers(cfg: FlowFiles, flow: FlowRun, layout: Layout) -> Layout:
     if cfg.engine.name != "local" or cfg.engine.workers != AUTO or layout.devices[0] != "cpu":
         return layout
     least = frames_per_worker(cfg.model)
-    count = _count_up_to(least * len(layout.devices), count_frames(flow.job, flow.parts))
-    return layout._replace(devices=layout.devices[: max(1, count // least)])
-
-
-def _count_up_to(enough: int, counts: Iterable[tuple[str, int, int]]) -> int:
-    """Add the frames that are left to do in each log. We do not open more logs than are needed for `enough` frames."""
-    total = 0
-    for _, _, todo in counts:
-        total += todo
-        if total >= enough:
+    count = 0
+    for _, _, todo in count_frames(flow.job, flow.parts):  # opens a log after the other
+        count += todo
+        if count >= least * len(layout.devices):
             break
-    return total
+    return layout._replace(devices=layout.devices[: max(1, count // least)])
 
 
 def _finish(

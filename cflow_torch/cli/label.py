@@ -13,12 +13,12 @@ from cflow_torch.applications.labels import find_labels
 from cflow_torch.cli.commands import Label
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow import FlowRun, compute
-from cflow_torch.cli.flows import make_log_model
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.errors import import_optional
+from cflow_torch.estimate import make_model
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.types import CFlowError
@@ -50,7 +50,7 @@ def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
-    model = make_log_model(cfg.model, cfg.device)
+    model = make_model(cfg.model, cfg.device)
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
     scenes = [part.source for part in flow.parts]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):

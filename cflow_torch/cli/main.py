@@ -6,6 +6,7 @@ import sys
 from importlib import import_module
 
 from cflow_torch import __version__
+from cflow_torch.cli.choices import help_of
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS
 from cflow_torch.cli.exits import exit_if_refused, exit_wrong
 from cflow_torch.cli.words import read_call
@@ -62,7 +63,7 @@ def _run(arguments: list[str]) -> None:
     elif command not in COMMANDS:
         raise CFlowError(f"unknown command {command!r}{near(command, COMMANDS)}: give one of {', '.join(COMMANDS)}")
     elif "-h" in words or "--help" in words:
-        print(COMMANDS[command].help(), end="")
+        print(help_of(command), end="")
     elif command in WITH_SETTINGS:
         call = read_call(words, command)
         from cflow_torch.cli.compose import run_with_hydra  # imports Hydra, which takes half a second

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from cflow_torch.cli.choices import choices, known_settings
-from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command, command_name
+from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
 from cflow_torch.errors import CFlowError, near
 from cflow_torch.setting import checked
 
@@ -43,7 +43,7 @@ def read_call(words: list[str], command: str) -> Call:
         raise CFlowError(f"unknown option {option!r}: give settings as NAME=VALUE; `cflow {command} --help` lists them")
     for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
         check_exists(path)
-    _check_settings(call.settings, WITH_SETTINGS[command], bool(given & set(_OWN_CONFIGS)))
+    _check_settings(call.settings, command, bool(given & set(_OWN_CONFIGS)))
     return call
 
 
@@ -65,8 +65,9 @@ def _is_path(word: str) -> bool:
     return word.startswith(("/", "./", "../", "~/")) or os.path.exists(word)
 
 
-def _check_settings(settings: list[str], kind: type[Command], has_own: bool) -> None:
+def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
     """Reject names that do not exist and plain values that are not allowed."""
+    kind = WITH_SETTINGS[command]
     chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
     known = known_settings(kind)
     for word in settings:
@@ -77,9 +78,7 @@ def _check_settings(settings: list[str], kind: type[Command], has_own: bool) -> 
         if key not in known:
             of_value = [group for group in chosen if value in choices(group)]  # preset=live
             hint = f" (did you mean {of_value[0]}={value}?)" if of_value else near(key, [*chosen, *known])
-            raise CFlowError(
-                f"unknown setting {key!r}{hint}: `cflow {command_name(kind)} --cfg job` prints all settings"
-            )
+            raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
         owners = [choice for choice in known[key] if _is_chosen(choice, chosen)]
         if not owners:
             raise CFlowError(

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch import make_config
-from cflow_torch.cli.choices import FOLDER, choices, names_in, read_settings
+from cflow_torch.cli.choices import FOLDER, choices, help_of, names_in, read_settings
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
 from cflow_torch.cli.compose import hydra_overrides
 from cflow_torch.cli.main import HELP
@@ -42,7 +42,7 @@ def test_every_choice_of_every_group_composes(compose):
 
 
 def test_examples_use_existing_settings_and_choices(compose):
-    lines = [line for text in (HELP, *(kind.help() for kind in COMMANDS.values())) for line in text.splitlines()]
+    lines = [line for text in (HELP, *map(help_of, COMMANDS)) for line in text.splitlines()]
     lines = [line for line in lines if line.startswith("  cflow ")]
     assert len(lines) > 30
     calls: dict[tuple[str, ...], dict[str, None]] = {}  # examples with the same choices are one call
@@ -146,7 +146,7 @@ def test_hydra_syntax_in_names_keeps_its_meaning(compose):
 
     cfg = compose("plot", *words("log=null", "output=${device}"))
     assert cfg.log is None and cfg.output == "auto"
-    assert words("-m", "log=1_0,b,2_0", "pair=1,2") == ['log="1_0",b,"2_0"', "pair=1,2"]
+    assert words("-m", "log=1_0,b,2_0", "pair=1,2") == ['log="1_0","b","2_0"', "pair=1,2"]
     assert words("log=choice(a,b)", "log='1_0'") == ["log=choice(a,b)", "log='1_0'"]
 
 
