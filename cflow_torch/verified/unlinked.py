@@ -127,7 +127,8 @@ def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> t
     is_of_pair = ~sweeps.has_history.index_select(0, sweeps.pixels.window)
     index = flat_nonzero(is_of_pair)
     pixels = sweeps.pixels[index]  # all of t+1 or t
-    found = find_unmatched(sweeps, components, index, are_unmatched(sweeps, pixels, 1 - pixels.step), 1)
+    is_unmatched = are_unmatched(sweeps, pixels, 1 - pixels.step)
+    found = find_unmatched(sweeps, components, index, pixels, is_unmatched, 1)
     large = flat_nonzero(found.size >= _LEAST_SIZE)
     component = found.component[large]
     return index.index_select(0, large), component.select(flat_nonzero(draw(component.of_item, component.count)))

@@ -32,7 +32,12 @@ class Unmatched(NamedTuple):
 
 
 def find_unmatched(
-    sweeps: HeightSlicedSweeps, components: Components, index: Tensor, is_unmatched: Tensor, num_scales: int
+    sweeps: HeightSlicedSweeps,
+    components: Components,
+    index: Tensor,
+    pixels: Pixels,
+    is_unmatched: Tensor,
+    num_scales: int,
 ) -> Unmatched:
     """Find the unmatched components of t, or of t and t+1.
 
@@ -40,6 +45,7 @@ def find_unmatched(
         components: of the pixels without those of copies.
         index: (K,) int64, positions in the list of pixels, all pixels of t, or those of t and t+1. Copies have no
             component.
+        pixels: these pixels.
         is_unmatched: (K,) bool, `are_unmatched`.
         num_scales: 1 = dilated components of the second finest scale; 2 = where these are matched, those of the finest
             scale, because a barrier may touch a car.
@@ -47,7 +53,6 @@ def find_unmatched(
     Convention: the size is the sum of the reach of the pixels of a sweep, because pixels with a larger
         reach have fewer neighbours. So a car has a similar size for a sparse sensor as for a dense one.
     """
-    pixels = sweeps.pixels[index]
     levels = components.levels[:-1][-2:][:num_scales]
     num_originals = len(levels[0].of_item)
     original = index.clamp(max=num_originals - 1)
