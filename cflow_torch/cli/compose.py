@@ -90,7 +90,9 @@ def run_with_hydra(name: str, call: Call) -> None:
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
         sys.argv = [f"cflow {name}", *overrides, names, *call.options]
         main = hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
-        main(partial(run_job, name))()
+        job = partial(run_job, name)
+        job.__module__ = __name__  # Hydra reads it; that of Python 3.8 is missing
+        main(job)()
 
 
 def run_job(name: str, composed: Any) -> Any:
