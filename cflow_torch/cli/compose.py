@@ -32,9 +32,9 @@ from cflow_torch.setting import Settings
 
 _PARSER = OverridesParser.create()
 _PATHS = {"data.root", "data.cache"}  # text, even if they look like numbers
-# Values that Hydra must read by itself: null, a reference, a function, a quoted text.
+# Values that Hydra must read by itself: null, a list, a reference, a function, a quoted text.
 _SYNTAX = re.compile(
-    r"null|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
+    r"null|\[.*\]|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
 )
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
@@ -90,7 +90,9 @@ def run_with_hydra(name: str, call: Call) -> None:
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
         sys.argv = [f"cflow {name}", *overrides, names, *call.options]
         main = hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
-        main(partial(run_job, name))()
+        job = partial(run_job, name)
+        job.__module__ = __name__  # Hydra reads it; that of Python 3.8 is missing
+        main(job)()
 
 
 def run_job(name: str, composed: Any) -> Any:

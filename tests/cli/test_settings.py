@@ -147,6 +147,7 @@ def test_hydra_syntax_in_names_keeps_its_meaning(compose):
     cfg = compose("plot", *words("log=null", "output=${device}"))
     assert cfg.log is None and cfg.output == "auto"
     assert words("-m", "log=1_0,b,2_0", "pair=1,2") == ['log="1_0","b","2_0"', "pair=1,2"]
+    assert words("log=[a,b]", "log=a,b") == ["log=[a,b]", 'log="a","b"']
     assert words("log=choice(a,b)", "log='1_0'") == ["log=choice(a,b)", "log='1_0'"]
 
 
