@@ -22,7 +22,7 @@ MOVING, MIN_MOVING = 0.05, 0.5
 # Names in flow files and data frames -> fields of `FlowResult`.
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}
 # No sweep has more columns than this, so a wider array is a transposed one, (3, N) or (4, N).
-_MOST_COLUMNS = 1000
+_MOST_COLUMNS = 64
 _OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8, f8")
 _OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence", "moving")
 

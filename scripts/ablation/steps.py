@@ -41,8 +41,8 @@ def _nothing_slides(sweeps: Any, pixels: Any, groups: Any, motions: Tensor) -> T
     return torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
 
 
-def _nothing_is_slow(sweeps: Any, objects: Any, motion: Tensor, may_be_slow: Tensor) -> Tensor:
-    return motion.flip(1) * sweeps.grid.pixel_size
+def _nothing_is_slow(sweeps: Any, objects: Any, flow: Tensor, may_be_slow: Tensor) -> Tensor:
+    return flow
 
 
 def _no_ends_move(sweeps: Any, pixels: Any, groups: Groups) -> Tensor:
@@ -60,8 +60,8 @@ STEPS: dict[str, dict[str, Any]] = {
     "no least gain": {"verify": partial(paired_test.verify, least_gain=0)},
     "no price of an object": {"select_objects": partial(component_tree.select_objects, price=0)},
     "no margin": {"motion_margin": _without_margin},
-    "no registration": {"refine": partial(refinement.refine, num_steps=0)},
-    "no slow objects of pairs": {"refine": partial(refinement.refine, find_slow=_nothing_is_slow)},
+    "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
+    "no slow objects of pairs": {"refine": partial(refinement.refine, add_slow=_nothing_is_slow)},
     "long vehicles are static": {"movable_nodes": partial(component_tree.movable_nodes, ends_move=_no_ends_move)},
 }
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -310,7 +310,7 @@ def detections(drives: list[tuple[Any, dict[str, np.ndarray], range]]) -> Detect
 
 
 def summary(name: str, rows: list[Row], found: Detections) -> Row:
-    """The columns of docs/applications.md."""
+    """The columns of docs/boxes.csv."""
     ious = np.array([row["iou"] for row in rows])
     hits = [row for row in rows if row["track"] >= 0]
     size = np.array([np.abs(row["size"] / row["true"] - 1) for row in hits]).reshape(-1, 3)
@@ -320,8 +320,10 @@ def summary(name: str, rows: list[Row], found: Detections) -> Row:
     out.update({f"AP {least}": found.average_precision(number) for number, least in enumerate(THRESHOLDS)})
     for kind in ("car", "truck", "cyclist", "pedestrian"):
         of_kind = ious[[row["kind"] == kind for row in rows]]
-        out[kind] = of_kind.mean() if len(of_kind) else ""
-    out.update(zip(("length off, %", "width off, %"), 100 * np.median(size[is_vehicle, :2], 0)))
+        out[f"IoU of {kind}"] = of_kind.mean() if len(of_kind) else "-"
+        out[f"{kind}s"] = len(of_kind)
+    for axis, side in enumerate(("length", "width")):
+        out[f"{side} off by, %"] = 100 * np.median(size[is_vehicle, axis])
     out["within 15 %"] = 100 * (size[is_vehicle, :2] <= 0.15).all(1).mean()
     out["heading, degrees"] = float(np.median([row["heading"] for row in hits]))
     out["same size, %"] = constancy(hits)

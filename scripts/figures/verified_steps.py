@@ -65,7 +65,7 @@ def take_steps(drive: Any) -> tuple[Any, ...]:
     motion, evidence = verify(sweeps, tree, candidates.motion, config.significance)
     tree = add_unchanged(sweeps, tree, motion)
     objects = select_objects(sweeps, components, tree, evidence)
-    return sweeps, change, components, tree, objects, objects.nodes.spread(motion).any(1), model(given)[0]
+    return sweeps, change, components, tree, objects, objects.by_node.spread(motion).any(1), model(given)[0]
 
 
 def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: float) -> None:

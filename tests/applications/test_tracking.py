@@ -371,19 +371,20 @@ def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> No
 
 
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+FAST = (SMALL, "model.num_history=0", "model.pixel_sizes=[0.4,0.2]")
 RANGE = (-20, -20, -float("inf"), 20, 20, float("inf"))
 
 
 def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
     """Write a small simulated drive; returns (command, folder of its output, settings) -> exit status."""
     write_av2_log(make_small_drive(num_sweeps=num_sweeps), folder / "data")
-    data = ("data=av2", f"data.root={folder / 'data'}", "data.check=false", SMALL)
+    data = ("data=av2", f"data.root={folder / 'data'}", "data.check=false", *FAST)
     return lambda command, output, *settings: cflow(command, *data, f"output={folder / output}", *settings)
 
 
 def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     call = calls_on_a_drive(tmp_path, num_sweeps=5)
-    run = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", "engine.workers=1", "tracks=true")
+    run = ("engine.workers=1", "tracks=true")
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
     whole = read_tracks(file)
@@ -412,21 +413,21 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert other.read_bytes() == file.read_bytes()
 
     before = file.read_bytes()
-    assert call("flow", "whole", *run[:3], "tracks=mot") == 0 and call("flow", "whole", *run[:3], "tracks=csv") == 2
+    assert call("flow", "whole", *run[:-1], "tracks=mot") == 0 and call("flow", "whole", *run[:-1], "tracks=csv") == 2
     assert (file.parent / "mot.txt").read_text().count("\n") == len(whole["id"])
-    assert call("flow", "whole", *run[:3], "tracks=drivestudio") == 0
+    assert call("flow", "whole", *run[:-1], "tracks=drivestudio") == 0
     poses, _, classes = read_instances(file.parent)
     assert np.isfinite(poses[:, :, 0, 0]).sum() == len(whole["id"]) and set(classes) <= {"REGULAR_VEHICLE", "BICYCLIST"}
-    assert call("flow", "whole", *run[:3], "tracks=nuscenes") == 0
+    assert call("flow", "whole", *run[:-1], "tracks=nuscenes") == 0
     detections = json.loads((file.parent / "nuscenes_detection.json").read_text())["results"]
     assert sum(map(len, detections.values())) == len(whole["id"]) and len(detections) == 5
-    assert call("flow", "whole", *run[:3], "tracks=openpcdet") == 0 and (file.parent / "result.pkl").exists()
+    assert call("flow", "whole", *run[:-1], "tracks=openpcdet") == 0 and (file.parent / "result.pkl").exists()
     for lost in (file, sorted(file.parent.glob("*.feather"))[2]):
         lost.unlink()
         assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
         tables = [feather.read_table(each) for each in file.parent.glob("*.feather")]
         assert [table.column_names.count("track_id") for table in tables] == [1] * 4, "also in a frame that was missing"
-    assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
+    assert call("flow", "whole", *run[:-1], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
     others = [other.name for other in file.parent.iterdir() if other.suffix != ".feather"]
     assert others == ["manifest.json"], "nor their other forms"
     capsys.readouterr()
@@ -437,7 +438,7 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
 def test_a_log_with_a_gap_has_tracks_before_and_behind_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AV2Log, "gaps", frozenset([2]))
     call = calls_on_a_drive(tmp_path, num_sweeps=6)
-    assert call("flow", "flow", "model.num_history=0", "tracks=true", "engine.workers=1") == 0
+    assert call("flow", "flow", "tracks=true", "engine.workers=1") == 0
     (file,) = (tmp_path / "flow").glob("*/tracks.parquet")
     assert len(list(file.parent.glob("*.feather"))) == 4, "the pair over the gap has no flow"
     assert set(read_tracks(file)["sweep"]) >= {0, 1, 3, 4}
@@ -448,7 +449,7 @@ def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyP
     from cflow_torch.viz import recording
 
     call, shown = calls_on_a_drive(tmp_path, 6), []
-    assert call("flow", "flow", "model.num_history=0", "tracks=true", "engine.workers=1") == 0
+    assert call("flow", "flow", "tracks=true", "engine.workers=1") == 0
     add = recording._Drive.add_tracks
     monkeypatch.setattr(recording._Drive, "add_tracks", lambda self, rows: (shown.append(rows), add(self, rows)))
     assert call("view", "view", "format=rerun", f"flow={tmp_path / 'flow'}") == 0

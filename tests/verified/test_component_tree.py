@@ -127,7 +127,7 @@ def test_the_cut_equals_the_oracle(seed, of_evidence):
     for window, name, value in zip(found.nodes.window.tolist(), names, evidence.tolist()):
         evidence_of[window, name] = value
     objects = select_objects(found.sweeps, found.components, found.nodes, evidence)
-    node = objects.nodes.of_item
+    node = objects.by_node.of_item
     assert torch.equal(objects.pixels.of_item[objects.first], torch.arange(objects.count))
     assert torch.equal(objects.first, objects.first.sort().values)
     start = 0
@@ -156,7 +156,7 @@ def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_
     nodes = movable_nodes(sweeps, components, None)
     assert nodes.kind.tolist() == [0, 1, 1] and nodes.children.of_item.tolist() == [3, 0, 0]
     objects = select_objects(sweeps, components, nodes, torch.tensor([whole, 100, 100]))
-    assert objects.nodes.of_item.tolist() == ([0] if wins else [1, 2])
+    assert objects.by_node.of_item.tolist() == ([0] if wins else [1, 2])
 
 
 def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_of_it_has_no_evidence():
@@ -173,7 +173,7 @@ def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_o
     evidence = torch.zeros(nodes.count, dtype=torch.int64)
     evidence[first] = 100
     objects = select_objects(sweeps, components, nodes, evidence)
-    assert objects.nodes.of_item[objects.pixels.of_item[joined]].tolist() == [first]
+    assert objects.by_node.of_item[objects.pixels.of_item[joined]].tolist() == [first]
 
 
 @pytest.mark.parametrize("num_missing, may_move", [(0, False), (1, False), (2, True)])
