@@ -32,9 +32,9 @@ from cflow_torch.setting import Settings
 
 _PARSER = OverridesParser.create()
 _PATHS = {"data.root", "data.cache"}  # text, even if they look like numbers
-# Values that Hydra must read by itself: null, a reference, a function, a quoted text.
+# Values that Hydra must read by itself: null, a list, a reference, a function, a quoted text.
 _SYNTAX = re.compile(
-    r"null|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
+    r"null|\[.*\]|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
 )
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
