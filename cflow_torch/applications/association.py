@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups
-from cflow_torch.applications.track_state import Tracks
+from cflow_torch.applications.track_state import TrackStates
 from cflow_torch.ops.indices import concat_ranges, lookup, unique_pairs
 
 _MIN_OVERLAP = 0.1  # least intersection over union of the voxels of two groups that match
@@ -19,7 +19,7 @@ VOXELS = (0.3, 0.6, 1.2)  # metres, sides; sparse groups share only large voxels
 _HEIGHT = 3.0  # ratio of a voxel's height to its side: the beams hit an object at different heights in each sweep
 
 
-class Matches(NamedTuple):
+class TrackMatches(NamedTuple):
     """Tracks that are seen in a sweep: `track[i]` continues as moving group `group[i]`; `stopped` tracks are static."""
 
     track: Tensor  # (M,) int64
@@ -29,7 +29,7 @@ class Matches(NamedTuple):
     track_of_static: Tensor  # (P,) int64, the stopped track whose box holds each static point, -1 = none
 
 
-def regroup(groups: MovingGroups, tracks: Tracks) -> MovingGroups:
+def regroup(groups: MovingGroups, tracks: TrackStates) -> MovingGroups:
     """Correct the moving groups of a sweep with the predicted boxes of confirmed tracks."""
     known = tracks.take(tracks.is_confirmed)
     box = box_of_point(groups.point, known.box, known.size + _MARGIN, known.heading)
@@ -73,7 +73,7 @@ def _value_of_box(values: Tensor, box: Tensor, outside: float) -> Tensor:
     return lookup(values, torch.where(box < 0, len(values), box), outside)
 
 
-def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> Matches:
+def match(tracks: TrackStates, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> TrackMatches:
     """Match tracks with a sweep, given the predicted points (P, 3) of the tracks and the track of each point."""
     moves = groups.group >= 0
     track, group = link(points, track_of_point, groups.point[moves], groups.group[moves], _MIN_OVERLAP)
@@ -84,7 +84,7 @@ def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: Moving
     box = box_of_point(groups.point[~moves], candidates.box, candidates.size + _MARGIN, candidates.heading)
     count = torch.bincount(box[box >= 0], minlength=len(candidate))
     has_stopped = count >= (MIN_STOPPED_SHARE * candidates.num_points).clamp(min=MIN_POINTS)
-    return Matches(
+    return TrackMatches(
         track=track,
         group=group,
         stopped=candidate[has_stopped],
@@ -149,29 +149,29 @@ def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) 
     The (K, 3) sizes are length, width, height; the length is along `heading`, (K,) radians. Cost: K * N comparisons.
     """
     offset = points[None] - centre[:, None]
-    along, across = rotate(offset[..., 0], offset[..., 1], -heading[:, None])
+    along, across = rotate_about_z(offset[..., 0], offset[..., 1], -heading[:, None])
     is_inside = (along.abs() <= size[:, None, 0] / 2) & (across.abs() <= size[:, None, 1] / 2)
     is_inside &= offset[..., 2].abs() <= size[:, None, 2] / 2
     is_outside = ~is_inside.any(0, keepdim=True)
     return torch.cat([is_outside, is_inside]).to(torch.uint8).argmax(0) - 1
 
 
-def boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
+def enclosing_boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
     """Return the centres and the sizes, (K, 3) float64 each, of upright boxes around K groups.
 
     `group` is the group of each point, (N,), and `heading` the direction of each box, (K,) radians. No group is empty.
     """
-    along, across = rotate(points[:, 0], points[:, 1], -heading[group])
+    along, across = rotate_about_z(points[:, 0], points[:, 1], -heading[group])
     local = torch.stack([along, across, points[:, 2]], 1)
     index = group[:, None].expand(-1, 3)
     extremes = local.new_zeros(len(heading), 3)
     low = extremes.scatter_reduce(0, index, local, "amin", include_self=False)
     high = extremes.scatter_reduce(0, index, local, "amax", include_self=False)
     middle = (low + high) / 2
-    return torch.stack([*rotate(middle[:, 0], middle[:, 1], heading), middle[:, 2]], 1), high - low
+    return torch.stack([*rotate_about_z(middle[:, 0], middle[:, 1], heading), middle[:, 2]], 1), high - low
 
 
-def rotate(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
+def rotate_about_z(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     """Rotate x, y by `angle` radians, counter-clockwise."""
     cos = angle.cos()
     sin = angle.sin()

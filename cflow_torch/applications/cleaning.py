@@ -9,7 +9,7 @@ from typing import Any, Callable, Mapping
 import numpy as np
 import torch
 
-from cflow_torch.applications.association import box_of_point, boxes
+from cflow_torch.applications.association import box_of_point, enclosing_boxes
 from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
@@ -156,7 +156,7 @@ class CleanLog(MaskedLog):
         total = np.zeros((len(clusters), 3))
         np.add.at(total, group, step)
         heading = torch.from_numpy(np.arctan2(total[:, 1], total[:, 0]))
-        centre, size = boxes(torch.from_numpy(before + step), torch.from_numpy(group), heading)
+        centre, size = enclosing_boxes(torch.from_numpy(before + step), torch.from_numpy(group), heading)
         return _inside(sweep, centre, size, heading)
 
     def _track(self) -> list[np.ndarray]:

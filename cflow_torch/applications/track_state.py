@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.applications.smoothing import Motion
+from cflow_torch.applications.smoothing import MotionState
 
 # A track must show motion to be confirmed, because most short-lived groups are noise of the static world.
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
@@ -38,8 +38,8 @@ class Times(NamedTuple):
     late: float  # from the end of the last flow to t; more than 0 if a sweep is missing
 
 
-class Tracks(NamedTuple):
-    """K tracks in the world frame; float64 unless another type is named. `Tracks()` has no tracks."""
+class TrackStates(NamedTuple):
+    """K tracks in the world frame; float64 unless another type is named. `TrackStates()` has no tracks."""
 
     id: Tensor = _NUMBER  # (K,) int64
     state: Tensor = _PAIR  # (K, 2, 3) filtered position of the centre of the whole box, metres, and velocity, m/s
@@ -63,15 +63,15 @@ class Tracks(NamedTuple):
     is_moving: Tensor = _FLAG  # (K,) bool
     is_confirmed: Tensor = _FLAG  # (K,) bool
 
-    def map(self, function: Callable[[Tensor], Any]) -> Tracks:
+    def map(self, function: Callable[[Tensor], Any]) -> TrackStates:
         """Apply a function to each tensor."""
-        return Tracks(*map(function, self))
+        return TrackStates(*map(function, self))
 
-    def take(self, index: Tensor) -> Tracks:
+    def take(self, index: Tensor) -> TrackStates:
         """Select tracks by index or mask."""
         return self.map(lambda values: values[index])
 
-    def extend(self, count: int) -> Tracks:
+    def extend(self, count: int) -> TrackStates:
         """Append tracks whose values are all 0."""
         return self.map(lambda values: F.pad(values, (0, 0) * (values.dim() - 1) + (0, count)))
 
@@ -86,11 +86,11 @@ class Tracks(NamedTuple):
             getattr(self, name)[index] = values
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> MotionState:
         """Position and velocity of the K tracks; a view."""
-        return Motion(self.state, self.covariance)
+        return MotionState(self.state, self.covariance)
 
-    def predict(self, seconds: float) -> Tracks:
+    def predict(self, seconds: float) -> TrackStates:
         """Predict the state after `seconds`."""
         motion, _ = self.motion.predict(self.state.new_full((len(self.id),), seconds))
         return self._replace(state=motion.state, covariance=motion.covariance)

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import Matches, boxes, match, regroup
+from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, regroup
 from cflow_torch.applications.completion import SeenPoints, TrackedPoints, complete
 from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
-from cflow_torch.applications.track_state import Times, Tracks
+from cflow_torch.applications.track_state import Times, TrackStates
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds_and_sizes, turned
 from cflow_torch.config import make_config
@@ -93,7 +93,7 @@ class Tracker:
         self.times = Times(0.0, sweep_interval, 0.0, 0.0)  # of the last sweep
         self._num_sweeps = 0
         self._num_tracks = 0
-        self._tracks = Tracks()
+        self._tracks = TrackStates()
         self._recent: deque[_SeenEdges] = deque(maxlen=_RECENT)
         # Points of the tracks, at their predicted positions in the next sweep.
         self._points = _TrackPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64))
@@ -156,7 +156,7 @@ class Tracker:
             raise CFlowError(f"this sweep is {last - now:.3f} s before the last one: push sweeps in the order of time")
         return Times(now, interval, elapsed=now - last, late=now - due)
 
-    def _predict(self, times: Times, device: torch.device) -> tuple[Tracks, _TrackPoints]:
+    def _predict(self, times: Times, device: torch.device) -> tuple[TrackStates, _TrackPoints]:
         """Move the tracks and their points to t.
 
         The last flow has already moved boxes and points. If the sweep is late, their velocity moves them further.
@@ -169,8 +169,14 @@ class Tracker:
         return tracks.predict(times.elapsed), points
 
     def _update(
-        self, tracks: Tracks, groups: MovingGroups, flow: Tensor, matches: Matches, times: Times, sensor: Tensor
-    ) -> tuple[Tracks, Tensor]:
+        self,
+        tracks: TrackStates,
+        groups: MovingGroups,
+        flow: Tensor,
+        matches: TrackMatches,
+        times: Times,
+        sensor: Tensor,
+    ) -> tuple[TrackStates, Tensor]:
         """Begin tracks for groups without a match, and update all tracks by the mean flow (G, 3) of each group.
 
         Returns the tracks, new ones last, and the (G,) int64 track of each group.
@@ -181,7 +187,7 @@ class Tracker:
         track_heading = torch.atan2(velocity[:, 1], velocity[:, 0])
         heading[matches.group] = torch.where(is_fast, track_heading, tracks.heading[matches.track])
         moves = groups.group >= 0
-        box, size = boxes(groups.point[moves], groups.group[moves], heading)
+        box, size = enclosing_boxes(groups.point[moves], groups.group[moves], heading)
 
         is_new = torch.ones_like(groups.count, dtype=torch.bool)
         is_new[matches.group] = False
@@ -217,7 +223,7 @@ class Tracker:
         return tracks, track_of_group
 
     def _measure(
-        self, tracks: Tracks, track_of_group: Tensor, groups: MovingGroups, velocity: Tensor, sensor: Tensor
+        self, tracks: TrackStates, track_of_group: Tensor, groups: MovingGroups, velocity: Tensor, sensor: Tensor
     ) -> None:
         """Update the whole boxes of moving tracks by the visible edges and the mean velocity (G, 3) of their groups."""
         heading = tracks.heading[track_of_group]
@@ -231,7 +237,7 @@ class Tracker:
         tracks.measure(track_of_group, measured, noise)
 
     def _whole_sizes(
-        self, tracks: Tracks, track_of_group: Tensor, edges: Edges, velocity: Tensor
+        self, tracks: TrackStates, track_of_group: Tensor, edges: Edges, velocity: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Estimate kind (G,) and whole size (G, 3) of each group from what was seen of its track in recent sweeps."""
         count = len(track_of_group)
@@ -244,7 +250,7 @@ class Tracker:
         is_seen = group >= 0
         return kinds_and_sizes(recent.edges.at(is_seen), group[is_seen], count, velocity[:, :2].norm(dim=1))
 
-    def _table(self, tracks: Tracks, now: float, stamp: int | None) -> dict[str, np.ndarray]:
+    def _table(self, tracks: TrackStates, now: float, stamp: int | None) -> dict[str, np.ndarray]:
         rows: Any = tracks.take(tracks.missed == 0).map(lambda values: values.cpu().numpy())
         return {
             "sweep": np.full(len(rows.id), self._num_sweeps),
@@ -266,7 +272,7 @@ class Tracker:
         }
 
 
-def _track_of_point(groups: MovingGroups, matches: Matches, track_of_group: Tensor) -> Tensor:
+def _track_of_point(groups: MovingGroups, matches: TrackMatches, track_of_group: Tensor) -> Tensor:
     """Return the track of each point that moves or lies in the box of a stopped object, (P,) int64; -1 = none."""
     moves = groups.group >= 0
     track = torch.full_like(groups.group, -1)
@@ -275,7 +281,7 @@ def _track_of_point(groups: MovingGroups, matches: Matches, track_of_group: Tens
     return track
 
 
-def _missing_points(points: _TrackPoints, tracks: Tracks, step: Tensor) -> _TrackPoints:
+def _missing_points(points: _TrackPoints, tracks: TrackStates, step: Tensor) -> _TrackPoints:
     """Move the points of tracks that are not seen by the steps of their tracks, (K, 3) metres."""
     is_missing = tracks.missed[points.track] > 0
     track = points.track[is_missing]

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import rotate
-from cflow_torch.applications.smoothing import Motion, smooth
+from cflow_torch.applications.association import rotate_about_z
+from cflow_torch.applications.smoothing import MotionState, smooth
 
 PEDESTRIAN, CYCLIST, CAR, TRUCK = range(4)
 KINDS = ("pedestrian", "cyclist", "car", "truck")
@@ -46,7 +46,7 @@ class Sightings(NamedTuple):
 class WholeBoxes(NamedTuple):
     """The boxes of R sightings, in the world."""
 
-    motion: Motion  # of the centre
+    motion: MotionState  # of the centre
     size: Tensor  # (R, 3) metres: length, width, height
     heading: Tensor  # (R,) radians
     kind: Tensor  # (R,) int64, index in `KINDS`
@@ -135,7 +135,7 @@ def whole_boxes(sightings: Sightings) -> WholeBoxes:
     return WholeBoxes(motion, size[track], heading, kind[track])
 
 
-def _smoothed(sightings: Sightings, centre: Tensor, noise: Tensor) -> Motion:
+def _smoothed(sightings: Sightings, centre: Tensor, noise: Tensor) -> MotionState:
     measured = torch.stack([centre, sightings.velocity], 1)
     deviations = torch.stack([noise, torch.full_like(noise, FLOW_NOISE)], 1)
     return smooth(sightings.track, sightings.seconds, measured, deviations)
@@ -200,7 +200,7 @@ def headings(velocity: Tensor, track: Tensor, otherwise: Tensor) -> Tensor:
 
 def turned(values: Tensor, angle: Tensor) -> Tensor:
     """Rotate (N, 3) vectors by (N,) angles about z, counter-clockwise, radians."""
-    return torch.stack([*rotate(values[:, 0], values[:, 1], angle), values[:, 2]], 1)
+    return torch.stack([*rotate_about_z(values[:, 0], values[:, 1], angle), values[:, 2]], 1)
 
 
 def quantiles(values: Tensor, group: Tensor, count: int, *shares: float) -> list[Tensor]:

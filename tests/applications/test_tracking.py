@@ -16,7 +16,7 @@ from small_logs import make_small_drive
 from staged_cars import SIZE, Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
-from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
+from cflow_torch.applications.association import VOXELS, box_of_point, enclosing_boxes, link
 from cflow_torch.applications.instance_files import write_drivestudio
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
@@ -269,7 +269,7 @@ def test_boxes_are_tight_around_their_points() -> None:
     generator = np.random.default_rng(1)
     points, group = torch.from_numpy(generator.normal(size=(80, 3))), torch.arange(80) % 4
     heading = torch.tensor([0.0, 0.5, 2.0, -3.0], dtype=torch.float64)
-    centre, size = boxes(points, group, heading)
+    centre, size = enclosing_boxes(points, group, heading)
     for number in range(4):
         own = slice(number, number + 1)
         inside = box_of_point(points, centre[own], size[own] + 1e-9, heading[own])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from cflow_torch.applications.smoothing import ACCELERATION, Motion, smooth
+from cflow_torch.applications.smoothing import ACCELERATION, MotionState, smooth
 from cflow_torch.applications.whole_boxes import (
     CAR,
     CYCLIST,
@@ -180,7 +180,7 @@ def test_smoothing_equals_the_textbook_equations() -> None:
 
 def test_the_filter_equals_the_textbook_equations() -> None:
     covariance = torch.tensor([[[0.2, 0.05], [0.05, 0.1]]], dtype=torch.float64)
-    before = Motion(torch.tensor([[[0.0] * 3, [5.0] * 3]], dtype=torch.float64), covariance)
+    before = MotionState(torch.tensor([[[0.0] * 3, [5.0] * 3]], dtype=torch.float64), covariance)
     ahead, _ = before.predict(torch.tensor([0.1], dtype=torch.float64))
     measured = torch.tensor([[[0.55] * 3, [5.1] * 3]], dtype=torch.float64)
     after = ahead.update(measured, torch.tensor([[0.3, 0.2]], dtype=torch.float64))
