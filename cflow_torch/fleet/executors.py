@@ -102,11 +102,14 @@ class ProcessExecutor(Executor):
         if self._pool is None:
             return ""
         pool, self._pool = self._pool, None
-        processes = list((pool._processes or {}).values())  # Python 3.14 has kill_workers instead
-        pool.shutdown(wait=False)
-        for process in processes:
+        processes = list((pool._processes or {}).values())
+        for process in processes:  # Python 3.14 has kill_workers instead
             process.kill()
             process.join()
+        # Threads of the pool may wait for the rest of a message of a dead process, or for it to read one.
+        for end in (pool._result_queue._writer, pool._call_queue._reader):
+            end.close()
+        pool.shutdown()
         return "".join(_ending(process.exitcode) for process in processes)
 
 
