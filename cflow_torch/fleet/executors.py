@@ -106,9 +106,9 @@ class ProcessExecutor(Executor):
         for process in processes:  # Python 3.14 has kill_workers instead
             process.kill()
             process.join()
-        # Threads of the pool may wait for the rest of a message of a dead process, or for it to read one.
-        for end in (pool._result_queue._writer, pool._call_queue._reader):
-            end.close()
+        # Threads of the pool must not wait for the rest of a message of a dead process, or for it to read one.
+        pool._result_queue._writer.close()
+        pool._call_queue.cancel_join_thread()
         pool.shutdown()
         return "".join(_ending(process.exitcode) for process in processes)
 
@@ -117,7 +117,10 @@ _holder = Holder()  # of a process that `ProcessExecutor` has started
 
 
 def _call(make: Callable[[], Any], method: str, arguments: Sequence[Any]) -> Any:
-    return _holder.call(make, method, arguments)
+    try:
+        return _holder.call(make, method, arguments)
+    except SystemExit:  # of a library; the pool would raise it in the parent
+        os._exit(1)
 
 
 def _begin() -> None:
