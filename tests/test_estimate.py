@@ -8,6 +8,7 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -237,6 +238,15 @@ def test_the_number_of_threads_is_as_before(number: int, monkeypatch: pytest.Mon
         torch.set_num_threads(before)
 
 
+def test_the_model_is_kept_from_a_loaded_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = []
+    compiler = SimpleNamespace(disable=lambda function: kept.append(function) or function)
+    model = CorrelationFlow.from_preset("paper")
+    monkeypatch.setitem(sys.modules, "torch._dynamo", compiler)
+    assert len(model([scene(0)])) == 1 and kept == [model._estimate]
+
+
+@pytest.mark.slow
 def test_compiling_leaves_the_model_alone():
     """In a process of its own, because TorchDynamo takes seconds to load and stays loaded."""
     script = """

@@ -174,7 +174,7 @@ def test_a_sweeper_minimises_the_mean_dynamic_error():
     assert np.isnan(objective({"bucketed": {"mean": {"dynamic_error": None}}}))
 
 
-def test_worker_processes_give_the_results_of_one_process(log_folder, tmp_path, evaluate, monkeypatch, capsys):
+def test_worker_processes_give_the_results_of_one_process(log_folder, tmp_path, evaluate, monkeypatch):
     """Scores, times of all pairs, and a bad frame that is reported and skipped."""
     root = tmp_path / "data" / "log"
     shutil.copytree(log_folder, root)

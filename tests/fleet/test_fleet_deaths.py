@@ -66,7 +66,7 @@ def test_dying_workers_lose_only_the_frame_that_always_kills(once, always, fleet
     assert tree(tmp_path / "out") == {file: c for file, c in single.items() if file != f"{name}.feather"}
 
 
-COPIES = 12  # of a log of five pairs: a run of some seconds
+COPIES = 8  # of a log of five pairs: a run of some seconds
 
 
 @pytest.fixture(scope="module")

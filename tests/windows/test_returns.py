@@ -43,8 +43,7 @@ def test_returns_of_an_organised_cloud_are_transformed_alone(tmp_path, fill: flo
     assert np.allclose(sweep.points[:-500], drive.sweep(1).points + mount[:3, 3].astype(np.float32), atol=1e-5)
 
 
-@pytest.mark.parametrize("fill", [0.0, 1.5])
-@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+@pytest.mark.parametrize(("fill", "kind"), [(0.0, np.asarray), (1.5, torch.from_numpy)])
 def test_missing_returns_in_arrays_are_left_out_and_said(fill: float, kind: Any) -> None:
     """Real points get the same flow as without them, and the given arrays stay."""
     drive = make_drive(seed=1, num_sweeps=2, profile="demo")
