@@ -8,7 +8,6 @@ import sys
 import traceback
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from functools import partial
 from importlib import import_module
 from typing import Any, Iterator
 
@@ -89,10 +88,12 @@ def run_with_hydra(name: str, call: Call) -> None:
         names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
         sys.argv = [f"cflow {name}", *overrides, names, *call.options]
-        main = hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
-        job = partial(run_job, name)
-        job.__module__ = __name__  # Hydra reads it; that of Python 3.8 is missing
-        main(job)()
+
+        @hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
+        def job(composed: Any) -> Any:
+            return run_job(name, composed)
+
+        job()
 
 
 def run_job(name: str, composed: Any) -> Any:

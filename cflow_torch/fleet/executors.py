@@ -102,11 +102,14 @@ class ProcessExecutor(Executor):
         if self._pool is None:
             return ""
         pool, self._pool = self._pool, None
-        processes = list((pool._processes or {}).values())  # Python 3.14 has kill_workers instead
-        pool.shutdown(wait=False)
-        for process in processes:
+        processes = list((pool._processes or {}).values())
+        for process in processes:  # Python 3.14 has kill_workers instead
             process.kill()
             process.join()
+        # Threads of the pool must not wait for the rest of a message of a dead process, or for it to read one.
+        pool._result_queue._writer.close()
+        pool._call_queue.cancel_join_thread()
+        pool.shutdown()
         return "".join(_ending(process.exitcode) for process in processes)
 
 
@@ -114,7 +117,10 @@ _holder = Holder()  # of a process that `ProcessExecutor` has started
 
 
 def _call(make: Callable[[], Any], method: str, arguments: Sequence[Any]) -> Any:
-    return _holder.call(make, method, arguments)
+    try:
+        return _holder.call(make, method, arguments)
+    except SystemExit:  # of a library; the pool would raise it in the parent
+        os._exit(1)
 
 
 def _begin() -> None:

@@ -73,7 +73,7 @@ def _merged(sources: Sequence[Iterator[Event]], stop: Callable[[], bool]) -> Ite
             for event in source:
                 events.put(event)
             events.put(None)
-        except Exception as error:
+        except BaseException as error:
             events.put(error)
 
     for source in sources:
@@ -85,7 +85,7 @@ def _merged(sources: Sequence[Iterator[Event]], stop: Callable[[], bool]) -> Ite
             end = min(end, time.monotonic() + _GRACE_S)
         with suppress(Empty):
             event = events.get(timeout=_POLL_S)
-            if isinstance(event, Exception):
+            if isinstance(event, BaseException):
                 raise event
             if event is None:
                 num_left = num_left - 1

@@ -292,6 +292,11 @@ def test_a_process_passes_answers_and_errors():
         assert executor.submit("pop").result(60) == 1, "another process"
         executor.close()
         assert executor.submit("pop").result(60) == 1, "another process"
+        executor.close()
+        leaver = ProcessExecutor(partial(eval, "__import__('sys')"))
+        with pytest.raises(BrokenExecutor):
+            leaver.submit("exit", "out").result(60)
+        assert leaver.close() == "exit status 1"
     finally:
         executor.close()
     executor = ProcessExecutor(partial(eval, "1 / 0"))
