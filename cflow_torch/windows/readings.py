@@ -48,6 +48,7 @@ AXES = {
 }
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
+_TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
 _NEAR_GIVEN = 0.7  # share of a reading over that as given
 _FEWEST_POINTS = 150  # of source and target; fewer do not show anything
 _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
@@ -130,21 +131,26 @@ class Pair:
     scans: tuple[str, ...]  # how points may move to the instant of their sweep, as `deskew`; the first one is expected
     has_motion: bool  # the poses move the structure enough to tell readings apart
 
-    def share(self, reading: str, scan: str, count: int = _MOST_POINTS, shift: float = 0.0) -> float:
-        """Return the share of the first `count` points that are in place, moved by `shift` metres along the path."""
-        path = self.transforms[GIVEN][:3, 3]
-        T = self.transforms[reading].copy()
-        T[:3, 3] += shift * path / max(float(np.linalg.norm(path)), 1e-9)
+    def share(self, scan: str, count: int = _MOST_POINTS, shift: float = 0.0) -> float:
+        """Return the share of the first `count` points in place as given, moved by `shift` metres along the path."""
+        T = self.transforms[GIVEN].copy()
+        T[:3, 3] *= 1 + shift / max(float(np.linalg.norm(T[:3, 3])), 1e-9)
         return self.target.structure(scan).share(self.source.points(scan)[:count], T)
 
     def shares_of_scans(self, scans: Sequence[str]) -> dict[str, float]:
-        return {scan: self.share(GIVEN, scan) for scan in scans}
+        count = _TIMED_POINTS if TIMES in scans else _MOST_POINTS
+        return {scan: self.share(scan, count) for scan in scans}
 
     def shares_of_poses(self, scan: str) -> dict[str, float]:
         """Return the share of each reading of the poses, by few points if it is much worse than as given."""
-        shares = {name: self.share(name, scan, _FEW_POINTS) for name in self.transforms}
+        shares = self._shares(list(self.transforms), scan, _FEW_POINTS)
         rivals = [name for name, share in shares.items() if share >= _NEAR_GIVEN * shares[GIVEN]]
-        return {**shares, **{name: self.share(name, scan) for name in rivals}}
+        return {**shares, **self._shares(rivals, scan, _MOST_POINTS)}
+
+    def _shares(self, readings: Sequence[str], scan: str, count: int) -> dict[str, float]:
+        transforms = np.stack([self.transforms[name] for name in readings])
+        shares = self.target.structure(scan).shares(self.source.points(scan)[:count], transforms)
+        return dict(zip(readings, shares.tolist()))
 
 
 @dataclass(frozen=True)
@@ -161,6 +167,10 @@ class Judgement:
     def given(self) -> float:
         """Share of structure in place as given, NaN = nothing could be compared."""
         return self.shares.get(GIVEN, float("nan"))
+
+    def adopted(self) -> Judgement:
+        """Return the judgement of the log under its best reading."""
+        return replace(self, shares={GIVEN: self.shares[self.best[0]]}, best=()) if self.best else self
 
     @property
     def offset(self) -> tuple[float, float] | None:
@@ -270,13 +280,16 @@ def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
     """Return the scan under which the world stands still, and the shares of all.
 
     If it is a direction, the turns begin behind the vehicle, unless another start is clearly better. If the structure
-    is shifted along the path, less of it must be in place: along smooth walls this is not so.
+    is shifted along the path, less of it must be in place: along smooth walls this is not so. Points with times may be
+    compensated already, so we move them only if they then fit at least as well.
     """
     expected, *_ = pairs[0].scans
     shares, clear = _compare([pair.shares_of_scans(pair.scans) for pair in pairs], expected)
+    if expected == TIMES:
+        return max(shares, key=shares.__getitem__), shares  # ties: the times
     if not clear:
         return expected, shares
-    at_place, beside = (np.mean([pair.share(GIVEN, clear[0], shift=by) for pair in pairs]) for by in (0, _SHIFT))
+    at_place, beside = (np.mean([pair.share(clear[0], shift=by) for pair in pairs]) for by in (0, _SHIFT))
     if at_place < _PEAK * beside:
         return expected, shares
     starts = [clear[0] + start for start in STARTS] if clear[0] in DIRECTIONS else clear[:1]
@@ -290,7 +303,7 @@ def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
     of_pairs = []
     for pair in pairs:
         given = {GIVEN: pair.transforms[GIVEN]}
-        if pair.share(GIVEN, OFF) < _SEARCHED:
+        if pair.share(OFF) < _SEARCHED:
             motion = find_motion(pair.source.points(OFF)[:_MOST_POINTS], pair.target.points(OFF))
             if difference(motion, given[GIVEN]) >= _LEAST_MOTION:
                 motions.append(motion)
