@@ -316,9 +316,9 @@ def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
 def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tuple[dict[str, float], list[str]]:
     """Compare the shares of readings over the pairs that show them.
 
-    A reading is clearly better than as given if it is so in the mean, and better in each pair. It may be a small
-    mistake, such as the direction of the scan or another mounting: then a smaller margin is enough, but the opposite
-    mistake must be worse than as given.
+    A reading is clearly better than as given if it is so in the mean, and better in each pair that shows it. It may be
+    a small mistake, such as the direction of the scan or another mounting: then a smaller margin is enough, but the
+    opposite mistake must be worse than as given.
 
     Returns:
         The mean share of each reading, and those that are clearly better than as given, best first.
@@ -327,11 +327,11 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
     gains: dict[str, float] = {}
     better = []
     for name in dict.fromkeys(name for each in of_pairs for name in each):
-        shown = [(each[name], each[given]) for each in of_pairs if name in each]
-        share, as_given = np.mean(shown, axis=0)
+        # In a pair that does not show it, the reading is about the same as that as given.
+        share, as_given = np.mean([(each.get(name, each[given]), each[given]) for each in of_pairs], axis=0)
         shares[name] = float(share)
         gains[name] = float(share / max(as_given, 1e-9))
-        if share >= _LEAST_SHARE and all(ours > theirs for ours, theirs in shown):
+        if share >= _LEAST_SHARE and all(each[name] > each[given] for each in of_pairs if name in each):
             better.append(name)
     clear = [name for name in better if gains[name] >= _MARGINS.get(name, _MARGIN)]
     clear = [name for name in clear if gains.get(_OPPOSITES.get(name, ""), 0) <= _OPPOSITE]

@@ -21,7 +21,7 @@ from cflow_torch.data.read_as import read_as
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import as_matrix, rotations_about, to_quaternions, to_rotations
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.readings import AXES, CAMERA, MOUNT, NO_READING, UNKNOWN, WORLD
+from cflow_torch.windows.readings import AXES, CAMERA, GIVEN, MOUNT, NO_READING, UNKNOWN, WORLD, _compare
 
 MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
 
@@ -149,6 +149,14 @@ def test_points_in_the_world_are_found_and_moved_back(source, request, tmp_path)
     assert "world's frame" in text and "data.read_as=world" in text
     assert find_problems(read_as(world, "world")) == [], "what you say is not repeated"
     assert "world's frame" in find_problems(world)[0] and read_as(good) is good
+
+
+def test_a_mounting_that_one_pair_shows_weakly_is_not_named():
+    """A slight turn in one of several pairs is no evidence: in the others, both mountings are the same."""
+    straight = {GIVEN: 0.34}
+    turn = {GIVEN: 0.12, "mount 0 0.7": 0.136, "mount 0 -0.7": 0.10}
+    assert _compare([straight, turn])[1] == []
+    assert _compare([straight, {**turn, "mount 0 0.7": 0.22}])[1] == ["mount 0 0.7"]
 
 
 def test_opening_a_folder_finds_points_in_the_world(drive, tmp_path):
