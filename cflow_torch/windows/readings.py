@@ -60,6 +60,7 @@ _LEAST_SHARE = 0.1
 _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
+_TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 _EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 _HOPELESS = 0.04  # nothing fits if the share as given is below this
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
@@ -277,24 +278,30 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
 
 
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
-    """Return the scan under which the world stands still, and the shares of all.
+    """Return the scan under which the world stands still, and the shares of those that were compared.
 
-    If it is a direction, the turns begin behind the vehicle, unless another start is clearly better. If the structure
-    is shifted along the path, less of it must be in place: along smooth walls this is not so. Points with times may be
-    compensated already, so we move them only if they then fit at least as well.
+    Points with times may be compensated already, so we move them only if they then fit at least as well. If a direction
+    fits better than its opposite, turns may begin behind the vehicle or elsewhere: we choose behind, unless another
+    start is clearly better. If the structure is shifted along the path, less of it must be in place: along smooth walls
+    this is not so.
     """
-    expected, *_ = pairs[0].scans
-    shares, clear = _compare([pair.shares_of_scans(pair.scans) for pair in pairs], expected)
+    expected, *others = pairs[0].scans
+    of_pairs = [pair.shares_of_scans(pair.scans) for pair in pairs]
+    shares, clear = _compare(of_pairs, expected)
     if expected == TIMES:
         return max(shares, key=shares.__getitem__), shares  # ties: the times
+    direction, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
+    if direction in DIRECTIONS and shares[direction] >= _TURN * max(shares[scan] for scan in opposite):
+        starts = [direction + start for start in STARTS]
+        of_pairs = [{**pair.shares_of_scans(starts), **each} for pair, each in zip(pairs, of_pairs)]
+        of_starts, clear = _compare(of_pairs, expected)
+        _, better = _compare([{start: each[start] for start in starts} for each in of_pairs], direction)
+        clear = clear[:1] if direction not in clear else [*better, direction]
+        shares.update({scan: of_starts[scan] for scan in clear[:1]})
     if not clear:
         return expected, shares
     at_place, beside = (np.mean([pair.share(clear[0], shift=by) for pair in pairs]) for by in (0, _SHIFT))
-    if at_place < _PEAK * beside:
-        return expected, shares
-    starts = [clear[0] + start for start in STARTS] if clear[0] in DIRECTIONS else clear[:1]
-    _, better = _compare([pair.shares_of_scans(starts) for pair in pairs], clear[0])
-    return (better or clear)[0], shares
+    return (clear[0] if at_place >= _PEAK * beside else expected), shares
 
 
 def _judge_motion(pairs: Sequence[Pair]) -> Judgement:

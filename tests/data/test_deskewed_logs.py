@@ -113,6 +113,15 @@ def test_a_turn_may_begin_elsewhere(start: float, deskew: str, reading: str) -> 
     assert shares[0] < 0.85 * shares[2] and shares[1] > 0.95 * shares[2]
 
 
+@pytest.mark.parametrize(
+    ("start", "span", "direction"), [(0.0, -360.0, "clockwise"), (-90.0, 360.0, "counterclockwise")]
+)
+def test_a_direction_is_found_where_turns_do_not_begin_behind(start: float, span: float, direction: str) -> None:
+    """The seam of the turn hides the direction, if we only compare turns that begin behind."""
+    log = DeskewedLog(Untimed(make(speed=15.0, num_sweeps=10, start=start, span=span)))
+    assert log.reading.name == reading
+
+
 @pytest.mark.parametrize("case", ["compensated", "slow"])
 def test_compensated_and_slow_sweeps_stay_as_they_are(case: str, truth: Drive) -> None:
     given = truth if case == "compensated" else make(speed=1.0, num_sweeps=4)
