@@ -17,7 +17,7 @@ from cflow_torch.types import Sweep
 from cflow_torch.windows.readings import AXES, CAMERA, CAUSES, EARLY, LATE, MOUNT, OF_POSES, WORLD
 
 _OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
-_OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}  # axes of points and poses
+_OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["down"]}  # axes of points and poses
 _OF_POSES = [name for name in OF_POSES if not name.startswith(MOUNT)]
 CHANGES_POINTS = frozenset({*_OF_BOTH, *_OF_POINTS})
 """Readings under which the numbers of the points are others than those in the files."""
@@ -37,7 +37,8 @@ def read_as(log: Log, reading: str | None = "auto") -> Log:
             - "still": ignore the poses;
             - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; the first, or last, is extrapolated;
             - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
-              camera's, or the x axis points to the left, backward or to the right of that of the points;
+              camera's, or the x axis points to the left, backward or to the right of that of the points; "down": z
+              points down, and y to the right;
             - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
             - "millimetres", "centimetres": unit of the poses; "points_millimetres", "points_centimetres": of points;
             - "points_camera", "points_upside_down": points and poses have a camera's axes (x right, y down, z

@@ -33,6 +33,7 @@ CAUSES = {
     "left": "the poses are of a frame whose x axis points to the left of the points' x axis",
     "back": "the poses are of a frame whose x axis points backward",
     "right": "the poses are of a frame whose x axis points to the right of the points' x axis",
+    "down": "the poses are of a frame whose z axis points down (x forward, y right)",
     "w_first": "the quaternions of the poses begin with w, but were read with w last",
     "w_last": "the quaternions of the poses end with w, but were read with w first",
     "millimetres": "the poses are in millimetres",
@@ -44,7 +45,7 @@ AXES = {
     "left": np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], float),  # x to the left of the vehicle
     "back": np.diag([-1.0, -1.0, 1.0]),
     "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
-    "upside_down": np.diag([1.0, -1.0, -1.0]),
+    "down": np.diag([1.0, -1.0, -1.0]),  # x forward, y right, z down, as of inertial units
 }
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
@@ -91,7 +92,7 @@ _MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, 
 OF_POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     STILL: lambda pose: np.eye(4),
     INVERTED: np.linalg.inv,
-    **{name: _moved(as_matrix(AXES[name].T)) for name in (CAMERA, "left", "back", "right")},
+    **{name: _moved(as_matrix(AXES[name].T)) for name in AXES},
     **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
     **{name: _scaled(unit) for name, unit in (("millimetres", 1e-3), ("centimetres", 1e-2))},
     **{name: _moved(as_matrix(np.eye(3), (*offset, 0))) for name, offset in _MOUNTS.items()},

@@ -114,9 +114,9 @@ def test_a_turn_may_begin_elsewhere(start: float, deskew: str, reading: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("start", "span", "direction"), [(0.0, -360.0, "clockwise"), (-90.0, 360.0, "counterclockwise")]
+    ("start", "span", "reading"), [(0.0, -360.0, "clockwise_ahead"), (-90.0, 360.0, "counterclockwise_right")]
 )
-def test_a_direction_is_found_where_turns_do_not_begin_behind(start: float, span: float, direction: str) -> None:
+def test_a_direction_is_found_where_turns_do_not_begin_behind(start: float, span: float, reading: str) -> None:
     """The seam of the turn hides the direction, if we only compare turns that begin behind."""
     log = DeskewedLog(Untimed(make(speed=15.0, num_sweeps=10, start=start, span=span)))
     assert log.reading.name == reading

@@ -112,6 +112,7 @@ POSES = {
     "back": lambda pose: pose @ as_matrix(AXES["back"]),
     "w_first": reordered((3, 0, 1, 2)),
     "w_last": reordered((1, 2, 3, 0)),
+    "down": lambda pose: pose @ as_matrix(AXES["down"]),
     "right": lambda pose: pose @ as_matrix(AXES["right"]),
 }
 WRONG_POSES = {
@@ -292,7 +293,7 @@ def camera_points(points, _):
         (lambda points, _: 100 * points, "data.read_as=points_centimetres"),
         (lambda points, _: 0.001 * points, "in metres"),
         (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
-        (lambda points, _: points @ AXES["upside_down"], "data.read_as=points_upside_down"),
+        (lambda points, _: points @ AXES["down"], "data.read_as=points_upside_down"),
         (camera_points, "data.read_as=points_camera"),
     ],
     ids=["millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera"],
@@ -309,7 +310,7 @@ def test_wrong_units_and_axes_are_recognised(source, change, found, request):
     assert found in text
     if "read_as=points" in found:
         reading = found.split("=")[-1]
-        axes = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}.get(reading, np.eye(3))
+        axes = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["down"]}.get(reading, np.eye(3))
         wrong = Wrong(good, points=change, poses=each(lambda pose: pose @ as_matrix(axes)), masks=False)
         again = read_as(wrong, reading)
         assert np.allclose(again.sweep(3).points, good.sweep(3).points, atol=1e-3)
