@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Optional, Tuple, TypeVar
+from typing import Any, ClassVar, Optional, Sequence, Tuple, TypeVar
 
-from cflow_torch.errors import CFlowError
+from cflow_torch.errors import CFlowError, near
 from cflow_torch.setting import LIMIT, Settings, setting
 
-Kind = TypeVar("Kind", bound="Config")
+Method = TypeVar("Method", bound="Config")
 
 
 def _method(name: str) -> Any:
@@ -38,6 +38,8 @@ class Config(Settings):
 
     An invalid value raises `CFlowError`. `cflow settings` lists the meaning and the bounds of every field.
     """
+
+    NAMED_BY: ClassVar[str] = "method"
 
     method: str = _method("")
     pixel_sizes: Tuple[float, ...] = setting(
@@ -74,9 +76,25 @@ class Config(Settings):
         high=float(LIMIT),
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check(self) -> None:
         _check_space(self.pixel_sizes, self.point_cloud_range, self.ego_box)
+
+    @classmethod
+    def kinds(cls) -> dict[str, type[Config]]:
+        return METHODS
+
+    @classmethod
+    def check_names(cls, names: Sequence[str]) -> None:
+        """Raise a `CFlowError` if one of the names is not a setting of this method; name the method that has it."""
+        own = [f.name for f in fields(cls)]
+        for name in sorted(set(names) - set(own)):
+            methods = [method for method, other in METHODS.items() if name in (f.name for f in fields(other))]
+            if methods:
+                raise CFlowError(
+                    f"{name} is a setting of method {' and '.join(methods)}, not of {fields(cls)[0].default}: "
+                    "leave it out, or choose another preset"
+                )
+        super().check_names(names)
 
     @property
     def num_history(self) -> int:
@@ -93,12 +111,17 @@ class Config(Settings):
         """Number of sweeps of a window: the history, t, t+1 and the sweeps after it."""
         return self.num_history + 2 + self.num_future
 
-    def replace(self: Kind, **overrides: Any) -> Kind:
+    def replace(self: Method, **overrides: Any) -> Method:
         """Copy the settings with some fields changed. An unknown field raises a `CFlowError` that lists the fields."""
-        return replace(self, **_known(type(self), overrides))
+        if "pixel_size" in overrides:
+            if "pixel_sizes" in overrides:
+                raise CFlowError("pixel_size and pixel_sizes were both given: give one of them")
+            overrides["pixel_sizes"] = (overrides.pop("pixel_size"),)
+        self.check_names(list(overrides))
+        return replace(self, **overrides)
 
     def as_dict(self) -> dict[str, Any]:
-        """A plain dictionary for YAML or JSON, which `config_from` reads."""
+        """A plain dictionary for YAML or JSON, which `Config.of` reads."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
@@ -164,8 +187,8 @@ class KeypointsConfig(ClusteringConfig):
         3.0, "farthest match, metres per 0.1 s between the sweeps (3 = 30 m/s)", low=1e-6, high=1e6
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check(self) -> None:
+        super().check()
         if self.patch_size % 2 == 0:
             raise CFlowError(f"patch_size={self.patch_size}: give an odd number of pixels, for example 11")
 
@@ -203,8 +226,8 @@ class VerifiedConfig(_WithHistory):
         high=1000,
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check(self) -> None:
+        super().check()
         blocks = [size / self.pixel_sizes[-1] for size in self.pixel_sizes]
         if any(math.isinf(block) or abs(block - round(block)) > 1e-6 for block in blocks):
             raise CFlowError(
@@ -264,36 +287,8 @@ def make_config(preset: str | Config = "default", **settings: Any) -> Config:
             )
     if not isinstance(preset, Config):
         if not isinstance(preset, str) or preset not in PRESETS:
-            raise CFlowError(
-                f"preset={preset!r}: give one of {', '.join(map(repr, PRESETS))}, or the result of make_config"
-            )
+            hint = near(str(preset), PRESETS)
+            known = ", ".join(map(repr, PRESETS))
+            raise CFlowError(f"preset={preset!r}{hint}: give one of {known}, or the result of make_config")
         preset = PRESETS[preset]
     return preset.replace(**settings)
-
-
-def config_from(settings: dict[str, Any]) -> Config:
-    """Make settings from `Config.as_dict`. Missing fields get their defaults. A wrong field is a `CFlowError`."""
-    method = settings.get("method")
-    if method not in METHODS:
-        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, METHODS))}")
-    return METHODS[method]().replace(**settings)
-
-
-def _known(kind: type[Config], overrides: dict[str, Any]) -> dict[str, Any]:
-    overrides = dict(overrides)
-    if "pixel_size" in overrides:
-        if "pixel_sizes" in overrides:
-            raise CFlowError("pixel_size and pixel_sizes were both given: give one of them")
-        overrides["pixel_sizes"] = (overrides.pop("pixel_size"),)
-    names = [f.name for f in fields(kind)]
-    unknown = sorted(set(overrides) - set(names))
-    for name in unknown:
-        methods = [method for method, other in METHODS.items() if name in (f.name for f in fields(other))]
-        if methods:
-            raise CFlowError(
-                f"{name} is a setting of method {' and '.join(methods)}, not of {fields(kind)[0].default}: "
-                "leave it out, or choose another preset"
-            )
-    if unknown:
-        raise CFlowError(f"unknown setting {', '.join(unknown)}: the fields are {', '.join(['pixel_size', *names])}")
-    return overrides

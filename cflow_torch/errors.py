@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
+from difflib import get_close_matches
 from importlib import import_module
-from typing import Any
+from typing import Any, Iterable
 
 _NOT_OF_USERS = ("cflow_torch", "torch", "contextlib")  # packages between the user's code and a warning
 
@@ -27,6 +29,17 @@ class CFlowWarning(UserWarning):
 
 class NoActivePoints(CFlowWarning):
     """No point of pc0 is active (finite, not ground, not of the vehicle, in the region), so no row has a result."""
+
+
+def near(word: str, known: Iterable[str]) -> str:
+    """Return the hint " (did you mean X?)", "" if no name is similar.
+
+    We compare names with and without their group, such as "model.", and prefer one that has the word as a part.
+    """
+    names = {form: name for name in known for form in (name.rpartition(".")[2], name)}
+    whole = [form for form in names if word in re.split("[._]", form)]
+    similar = whole or get_close_matches(word, names, 1)
+    return f" (did you mean {names[similar[0]]}?)" if similar else ""
 
 
 def import_optional(module: str, need: str, name: str | None = None) -> Any:

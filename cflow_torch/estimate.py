@@ -14,8 +14,10 @@ from cflow_torch.ground.segmentation import CHOICES, find_ground_batch
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.tensors import choose_device
+from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, check_sweep
 from cflow_torch.verified.method import VerifiedFlow
+from cflow_torch.windows.inspection import Inspection
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import keep_nearest
 
@@ -65,7 +67,7 @@ def estimate_flow(
 
     Warns:
         CFlowWarning: we left out missing returns; a sweep has no mask, so we found its ground (`ground="auto"`); a
-            likely mistake in the input, see `SceneFlowModel.forward`; `is_valid` is False for all points of pc0.
+            likely mistake in the input, see `Inspection`; `is_valid` is False for all points of pc0.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, mixed devices, an unknown setting.
@@ -100,7 +102,9 @@ def estimate_flow(
     window = Window(pc0, pc1, tuple(history), tuple(future))  # type: ignore[arg-type]  # it refuses arrays
     window = _leave_out_missing(keep_nearest(window, config.num_history))
     window = _find_ground(window, ground, device)
-    return make_model(config, device)([window])[0]
+    (result,) = make_model(config, device)([window])
+    Inspection()([window])
+    return result
 
 
 def make_model(preset: str | Config = "default", device: Any = "auto", **settings: Any) -> SceneFlowModel:
@@ -109,7 +113,7 @@ def make_model(preset: str | Config = "default", device: Any = "auto", **setting
     `preset` and `settings` are as for `make_config`, `device` is as for `estimate_flow`.
     """
     methods = {method.method: method for method in (CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow)}
-    config = make_config(preset, **settings)
+    config = preset if isinstance(preset, Config) and not settings else make_config(preset, **settings)
     return methods[config.method](config, device)
 
 
@@ -154,4 +158,6 @@ def _sweeps_of_arrays(
     """Make sweeps in a world that is the ego frame at t+1. Without a transform they have no poses."""
     check_sweep(("pc0", "gm0", "T_ego1_ego0", "dt0"), pc0, gm0, T_ego1_ego0, None)
     check_sweep(("pc1", "gm1", "T_ego1_ego0", "dt1"), pc1, gm1, None, None)
+    if T_ego1_ego0 is not None:
+        rigid_transform(T_ego1_ego0, "T_ego1_ego0")
     return Sweep(pc0, gm0, T_ego1_ego0), Sweep(pc1, gm1, None if T_ego1_ego0 is None else np.eye(4))

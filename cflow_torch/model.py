@@ -16,7 +16,7 @@ from cflow_torch.tensors import choose_device
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch, make_batch
-from cflow_torch.windows.inspection import Inspection, warn_of_inactive
+from cflow_torch.windows.inspection import warn_of_inactive
 from cflow_torch.windows.memory import split_windows
 from cflow_torch.windows.validation import check_windows
 
@@ -93,7 +93,6 @@ class SceneFlowModel(nn.Module):
             )
         self.config: Any = config
         self.device = device
-        self.inspect: Any = Inspection()  # None = do not warn of likely mistakes in the windows
 
     @classmethod
     def from_preset(
@@ -135,8 +134,8 @@ class SceneFlowModel(nn.Module):
             B results. Each depends only on its window and the settings.
 
         Warns:
-            CFlowWarning: likely mistakes in the windows, see `Inspection`.
-            NoActivePoints: no point of a pc0 is active.
+            NoActivePoints: no point of a pc0 is active. `Inspection` warns of other likely mistakes; `estimate_flow`
+                and `FlowStream` call it.
 
         Convention: `torch.compile` does not change the model. Shapes differ from window to window, so compiling would
             not pay.
@@ -168,8 +167,6 @@ class SceneFlowModel(nn.Module):
                     motion = self.motion(batch)
                 with stage("spread"):  # outside of inference mode: a training loop may use these tensors
                     results += _results(batch, motion)
-        if self.inspect is not None:
-            self.inspect(windows)
         warn_of_inactive(windows, results, self.config)
         return results
 

@@ -6,13 +6,14 @@ import math
 from contextlib import suppress
 from dataclasses import field, fields
 from numbers import Integral, Real
-from typing import Any, ClassVar, Mapping
+from typing import Any, ClassVar, Mapping, Sequence, TypeVar
 
-from cflow_torch.errors import CFlowError
+from cflow_torch.errors import CFlowError, near
 
 # Whole numbers stay below this, because they are compared with tensors of int64 and of float64.
 LIMIT = 2**53
 AUTO = "auto"  # a value that we choose
+Kind = TypeVar("Kind", bound="Settings")
 # Names of types in error messages.
 _NAMES = {int: "a whole number", float: "a number", bool: "True or False", tuple: "a list of numbers", str: "text"}
 
@@ -21,12 +22,43 @@ class Settings:
     """Base of frozen dataclasses whose fields are made by `setting`. A value that is not allowed is a `CFlowError`."""
 
     PREFIX: ClassVar[str] = ""  # of the names in messages, such as "engine."
+    NAMED_BY: ClassVar[str] = ""  # the setting that names a class of `kinds`; "" = this class is the only one
+
+    @classmethod
+    def kinds(cls) -> Mapping[str, type[Settings]]:
+        """Return the classes that a value of the setting `NAMED_BY` chooses."""
+        return {}
+
+    @classmethod
+    def of(cls: type[Kind], values: Mapping[str, Any]) -> Kind:
+        """Make settings from a dictionary. Missing ones get their defaults."""
+        kind: Any = cls
+        if cls.NAMED_BY:
+            name: Any = values.get(cls.NAMED_BY)
+            if name not in cls.kinds():
+                known = ", ".join(map(repr, cls.kinds()))
+                raise CFlowError(f"{cls.PREFIX}{cls.NAMED_BY}={name!r}: give one of {known}")
+            kind = cls.kinds()[name]
+        kind.check_names(list(values))
+        return kind(**values)  # type: ignore[no-any-return]
+
+    @classmethod
+    def check_names(cls, names: Sequence[str]) -> None:
+        """Raise a `CFlowError` that lists all settings, if one of the names is not a setting."""
+        known = [f.name for f in fields(cls)]  # type: ignore[arg-type]
+        unknown = [f"{cls.PREFIX}{name}{near(name, known)}" for name in sorted(names) if name not in known]
+        if unknown:
+            raise CFlowError(f"unknown setting {', '.join(unknown)}: the fields are {', '.join(known)}")
+
+    def check(self) -> None:
+        """Raise a `CFlowError` if values that are allowed one by one do not fit together."""
 
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]
             if "kind" in f.metadata:
                 value = checked(f"{self.PREFIX}{f.name}", getattr(self, f.name), f.metadata)
                 object.__setattr__(self, f.name, value)
+        self.check()
 
 
 def setting(default: Any, help: str, *, kind: type | None = None, **limits: Any) -> Any:
@@ -81,7 +113,7 @@ def describe_limits(limits: Mapping[str, Any]) -> str:
     text += f" above {above:g}" if above > -math.inf else ""
     text += f"{' and' if max(low, above) > -math.inf else ''} of at most {high:g}" if high < math.inf else ""
     text += f", or {limits['word']}" if limits["word"] else ""
-    return text + (", or None" if limits["optional"] else "")
+    return text + (", or None (in YAML null)" if limits["optional"] else "")
 
 
 def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
@@ -92,7 +124,7 @@ def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
     if value is None and limits["optional"] or limits["word"] and value == limits["word"]:
         return value
     if issubclass(kind, Settings):
-        return value if isinstance(value, kind) else kind(**value)
+        return value if isinstance(value, kind) else kind.of(value)
     with suppress(TypeError, ValueError, OverflowError):
         if kind is tuple:
             return tuple(float(v) for v in value)
@@ -105,4 +137,5 @@ def checked(name: str, value: Any, limits: Mapping[str, Any]) -> Any:
             is_allowed &= value in limits["choices"]
         if is_allowed:
             return value if kind is object else kind(value)
-    raise CFlowError(f"{name}={value!r}: give {describe_limits(limits)}")
+    meaning = f": {limits['help']}" if kind is tuple else ""
+    raise CFlowError(f"{name}={value!r}: give {describe_limits(limits)}{meaning}")

@@ -17,11 +17,12 @@ from cflow_torch.errors import CFlowWarning as CFlowWarning
 from cflow_torch.errors import import_optional
 
 Array = Union[np.ndarray, Tensor]
-MOVING = 0.05  # metres per sweep: least residual flow of a moving point, as in evaluation
+# A moving point has at least a residual flow of 0.05 m per sweep, as in evaluation, and a probability `moving` of 0.5.
+MOVING, MIN_MOVING = 0.05, 0.5
 # Names in flow files and data frames -> fields of `FlowResult`.
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}
 # No sweep has more columns than this, so a wider array is a transposed one, (3, N) or (4, N).
-_MOST_COLUMNS = 1000
+_MOST_COLUMNS = 64
 _OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8, f8")
 _OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence", "moving")
 
@@ -269,7 +270,7 @@ class FlowResult:
         Without `moving`, the flow alone decides.
         """
         is_moving = self.residual_flow.norm(dim=1) >= MOVING
-        return is_moving if self.moving is None else is_moving & (self.moving >= 0.5)
+        return is_moving if self.moving is None else is_moving & (self.moving >= MIN_MOVING)
 
     def __repr__(self) -> str:
         """The numbers of points and clusters; fields that every method has are named if they are None."""
@@ -334,7 +335,7 @@ class FlowResult:
         sweep_interval: float = 0.1,
         min_speed: float = 0.5,
         min_points: int = 10,
-        min_moving: float = 0.5,
+        min_moving: float = MIN_MOVING,
     ) -> Objects:
         """List the moving objects at t+1.
 

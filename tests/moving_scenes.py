@@ -148,7 +148,7 @@ def _draw(
     of_pixel = number_of_point[inside.numpy()][first_point]
     name = Groups(torch.from_numpy(np.where(of_pixel < 0, len(flows), of_pixel)), len(flows))
     objects = number_objects(name, len(flows))
-    flow = np.array(flows, dtype=np.float64).reshape(-1, 2)[objects.nodes.of_item.numpy()]
+    flow = np.array(flows, dtype=np.float64).reshape(-1, 2)[objects.by_node.of_item.numpy()]
     return Scene(sweeps, objects, torch.from_numpy(flow))
 
 

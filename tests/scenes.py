@@ -146,17 +146,15 @@ def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
     """The result of the method of the settings, which is the oracle's, without the steps that the oracle lacks."""
     with pytest.MonkeyPatch.context() as without:
         without.setattr(VerifiedFlow, "add_overhung", staticmethod(lambda sweeps, components, tree: (sweeps, tree)))
-        without.setattr(VerifiedFlow, "refine", staticmethod(partial(refine, find_slow=_nothing_is_slow)))
+        without.setattr(VerifiedFlow, "refine", staticmethod(partial(refine, add_slow=_nothing_is_slow)))
         (result,) = make_model(settings)([window])
     assert_same(result, reference_flow(window, settings))
     return result
 
 
-def _nothing_is_slow(
-    sweeps: HeightSlicedSweeps, objects: Objects, motion: torch.Tensor, _: torch.Tensor
-) -> torch.Tensor:
-    """The motion of all objects in metres, instead of `subpixel_motion`."""
-    return motion.flip(1) * sweeps.grid.pixel_size
+def _nothing_is_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
+    """The motion of all objects, instead of `with_slow_objects`."""
+    return flow
 
 
 def assert_same_bits(a: FlowResult, b: FlowResult) -> None:

@@ -13,6 +13,8 @@ from cflow_torch.data.catalog import find_sources
 from cflow_torch.fleet.job import Job, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import check_logs, clear_log, make_identity
+from cflow_torch.fleet.parallel import local_executors
+from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import run_fleet
 
 SWEEPS = (4, 6, 3)  # of the logs
@@ -21,6 +23,7 @@ CONFIG = make_config("paper", pixel_size=0.4, num_history=1)
 # The same settings for the command.
 COMMAND = ["flow", "data=av2", "model=paper", "model.pixel_sizes=[0.4]", "model.num_history=1", "data.check=false"]
 ONE = Layout(("cpu",), 2)
+ENGINES: dict[str, Any] = {"local": local_executors, "ray": ray_executors}
 TWO = Layout(("cpu", "cpu"), 2)
 
 
@@ -49,7 +52,9 @@ def run(
     check_logs(output, names, job.identity, resume, overwrite, shard.count == 1)
     for name in names if overwrite and shard.count == 1 else ():
         clear_log(output / name)
-    return run_fleet(job, sources, layout, shard, engine, **engine_settings)
+    with ENGINES[engine](job, layout, **engine_settings) as executors:
+        parts = shard.parts(sources, len(layout.devices))
+        return run_fleet(executors, parts, layout, shard, job.output, engine)
 
 
 def command(*arguments: Any) -> int:

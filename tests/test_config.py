@@ -9,7 +9,7 @@ from dataclasses import fields
 import pytest
 
 from cflow_torch import CFlowError, make_config, make_model
-from cflow_torch.config import METHODS, PRESETS, DenseConfig, KeypointsConfig, VerifiedConfig, config_from
+from cflow_torch.config import METHODS, PRESETS, Config, DenseConfig, KeypointsConfig, VerifiedConfig
 
 INF = math.inf
 CLUSTERING = ("connectivity", "max_extent", "labeling")
@@ -42,7 +42,7 @@ def test_invalid_values_are_refused_and_the_allowed_ones_named(method, field, va
         METHODS[method](**{field: value})
     assert str(caught.value).startswith(f"{field}={value!r}"[:12]) and allowed in str(caught.value)
     with pytest.raises(CFlowError, match=field):
-        config_from({"method": method, field: value})
+        Config.of({"method": method, field: value})
 
 
 SPACE = {
@@ -63,7 +63,7 @@ def test_invalid_pixels_regions_and_boxes_are_refused(field):
 
 
 def test_an_unknown_setting_lists_the_fields():
-    message = "unknown setting voxel_size: the fields are pixel_size, method,"
+    message = r"unknown setting voxel_size \(did you mean pixel_sizes\?\): the fields are method, pixel_sizes,"
     for call in (make_config, VerifiedConfig().replace):
         with pytest.raises(CFlowError, match=message) as caught:
             call(voxel_size=0.1)
@@ -118,11 +118,11 @@ def test_settings_survive_a_dictionary(preset):
     config = make_config(preset, point_cloud_range=(-1, -2, -3, 1, 2, 3), ego_box=(-1, -1, 1, 1), max_speed=None)
     plain = json.loads(json.dumps(config.as_dict()))
     assert list(plain) == [f.name for f in fields(config)] and plain["method"] == config.method
-    assert config_from(plain) == config
-    assert config_from({"method": config.method}) == METHODS[config.method]()
+    assert Config.of(plain) == config
+    assert Config.of({"method": config.method}) == METHODS[config.method]()
     for wrong in ({}, {"method": "sparse"}, {**plain, "voxel_size": 1}, {**plain, "max_speed": -1}):
         with pytest.raises(CFlowError, match="give|the fields are"):
-            config_from(wrong)
+            Config.of(wrong)
 
 
 @pytest.mark.parametrize("kind", METHODS.values())

@@ -21,8 +21,8 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper": (small("paper", num_history=0), 608, 32, 637),
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3510, 129, 3539),
     "keypoints": (small("keypoints"), 868, 35, 898),
-    "default": (small("default"), 3083, 94, 3113),
-    "offline": (small("offline"), 3089, 96, 3104),
+    "default": (small("default"), 3195, 97, 3227),
+    "offline": (small("offline"), 3502, 108, 3517),
 }
 
 

@@ -8,6 +8,7 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from cflow_torch.ground.segmentation import find_ground_batch
 from cflow_torch.simulator import make_drive
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import Sweep, Window
+from cflow_torch.windows.inspection import Inspection
 
 RNG = np.random.default_rng(0)
 P0, P1 = RNG.uniform(-5, 5, (50, 3)).astype(np.float32), RNG.uniform(-5, 5, (40, 3)).astype(np.float32)
@@ -37,8 +39,12 @@ EYE, SWEEPS = np.eye(4), {"pc0": Sweep(P0), "pc1": Sweep(P1)}
         ({**SWEEPS, "history": [P1]}, "history: give a list of cflow_torch.Sweep"),
         ({**SWEEPS, "future": Sweep(P1), "preset": "offline"}, "future: give a list of cflow_torch.Sweep"),
         ({"T_ego1_ego0": EYE[None]}, r"T_ego1_ego0 has shape \(1, 4, 4\)"),
-        ({"T_ego1_ego0": np.diag([1, 1, -1, 1.0])}, "pc0 is not rigid"),
-        ({"max_hight": 3}, "unknown setting max_hight: the fields are pixel_size"),
+        ({"T_ego1_ego0": np.diag([1, 1, -1, 1.0])}, "T_ego1_ego0 is not rigid"),
+        ({"pc0": np.repeat(P0, 10, 0).T}, r"pc0 has shape \(3, 500\): .* give its transpose"),
+        ({"preset": "defualt"}, r"preset='defualt' \(did you mean default\?\)"),
+        ({"point_cloud_range": 50}, r"give a list of numbers: \(x0, y0, z0, x1, y1, z1\)"),
+        ({"pc0": Sweep(P0, timestamp_ns=0.1), "pc1": Sweep(P1, timestamp_ns=0.2)}, "give whole nanoseconds"),
+        ({"max_hight": 3}, r"unknown setting max_hight \(did you mean min_height\?\): the fields are method,"),
         ({"ground": "yes"}, "ground='yes'.*'auto'"),
         ({"pixel_size": 1e-5}, "point_cloud_range"),
         ({**SWEEPS, "gm0": np.zeros(50, bool), "T_ego1_ego0": EYE}, "T_ego1_ego0, gm0 or gm1 is given with a Sweep"),
@@ -157,22 +163,22 @@ def test_likely_mistakes_are_warned_of(street, change, found):
     masks = [np.zeros(len(points), bool) for points in (pc0, pc1)]
     with pytest.warns(CFlowWarning, match=found):
         estimate_flow(pc0, pc1, T_ego1_ego0=T, gm0=masks[0], gm1=masks[1], preset="paper")
-    model, window = make_model(make_config("paper")), Window(Sweep(pc0, masks[0], T), Sweep(pc1, masks[1], np.eye(4)))
+    inspect, window = Inspection(), Window(Sweep(pc0, masks[0], T), Sweep(pc1, masks[1], np.eye(4)))
     with pytest.warns(CFlowWarning, match=found):
-        model([window])
+        inspect([window])
     with warnings.catch_warnings():  # once, but for repeated sweeps
         warnings.simplefilter("error" if found != "the same points" else "ignore")
-        model([window])
+        inspect([window])
 
 
 def test_ground_left_in_is_warned_of_once(street):
     now, later, _ = street
-    model = make_model(make_config("paper"))
+    inspect = Inspection()
     with pytest.warns(CFlowWarning, match="without a ground mask contains ground"):
-        model([Window(now, later)])
+        inspect([Window(now, later)])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model([Window(now, later)])
+        inspect([Window(now, later)])
 
 
 OF_METHOD = {"dense": "paper", "keypoints": "keypoints", "verified": "default"}
@@ -232,6 +238,15 @@ def test_the_number_of_threads_is_as_before(number: int, monkeypatch: pytest.Mon
         torch.set_num_threads(before)
 
 
+def test_the_model_is_kept_from_a_loaded_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = []
+    compiler = SimpleNamespace(disable=lambda function: kept.append(function) or function)
+    model = CorrelationFlow.from_preset("paper")
+    monkeypatch.setitem(sys.modules, "torch._dynamo", compiler)
+    assert len(model([scene(0)])) == 1 and kept == [model._estimate]
+
+
+@pytest.mark.slow
 def test_compiling_leaves_the_model_alone():
     """In a process of its own, because TorchDynamo takes seconds to load and stays loaded."""
     script = """

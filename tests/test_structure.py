@@ -8,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+
 import cflow_torch
-from cflow_torch import CorrelationFlow
+from cflow_torch import CorrelationFlow, Sweep, Window
 
 PACKAGE = Path(cflow_torch.__file__).parent
 # A room imports from itself and from rooms that stand before it.
@@ -65,6 +67,10 @@ def test_prose_uses_the_words_of_the_field():
 
 def test_a_model_has_no_state():
     model = CorrelationFlow.from_preset("paper")
+    before = dict(vars(model))
+    sweep = Sweep(np.zeros((5, 3), np.float32), np.zeros(5, bool))
+    model([Window(sweep, sweep)])
+    assert vars(model) == before, "a call leaves nothing behind"
     assert not list(model.parameters()) and not list(model.buffers()) and not model.state_dict()
     assert [type(module) for module in model.modules()] == [CorrelationFlow]
     assert model.eval() is model and model.to("cpu") is model

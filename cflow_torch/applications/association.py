@@ -13,7 +13,7 @@ from cflow_torch.ops.indices import concat_ranges, lookup, unique_pairs
 
 _MIN_OVERLAP = 0.1  # least intersection over union of the voxels of two groups that match
 _MIN_CLAIM = 0.5  # a track of N points claims a group if its box holds at least 0.5 N points of the group
-_MIN_STOPPED_SHARE = 0.3  # a track of N points has stopped if its box holds at least 0.3 N static points
+MIN_STOPPED_SHARE = 0.3  # a track of N points has stopped if its box holds at least 0.3 N static points
 _MARGIN = 0.2  # metres, added to length, width and height of these boxes
 VOXELS = (0.3, 0.6, 1.2)  # metres, sides; sparse groups share only large voxels with the next sweep
 _HEIGHT = 3.0  # ratio of a voxel's height to its side: the beams hit an object at different heights in each sweep
@@ -83,7 +83,7 @@ def match(tracks: Tracks, points: Tensor, track_of_point: Tensor, groups: Moving
     candidates = tracks.take(candidate)
     box = box_of_point(groups.point[~moves], candidates.box, candidates.size + _MARGIN, candidates.heading)
     count = torch.bincount(box[box >= 0], minlength=len(candidate))
-    has_stopped = count >= (_MIN_STOPPED_SHARE * candidates.num_points).clamp(min=MIN_POINTS)
+    has_stopped = count >= (MIN_STOPPED_SHARE * candidates.num_points).clamp(min=MIN_POINTS)
     return Matches(
         track=track,
         group=group,

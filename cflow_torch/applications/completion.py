@@ -36,6 +36,11 @@ class TrackedPoints(NamedTuple):
         row = np.flatnonzero(track_id >= 0)
         return cls(sweep, len(track_id), row, track_id[row])
 
+    def followed_by(self, row: np.ndarray, number: int) -> TrackedPoints:
+        """Append rows of the points of another track, with its id."""
+        ids = np.append(self.id, np.full(len(row), number))
+        return self._replace(row=np.append(self.row, row), id=ids)
+
     def track_id(self, kept: np.ndarray) -> np.ndarray:
         """Return the id of every point, (N,) int64; -1 = no track, or one that is not among the ids `kept`."""
         ids = np.full(self.num_points, -1)
@@ -68,9 +73,23 @@ class SeenPoints(NamedTuple):
         offset = (position - sensor).astype(np.float32)
         return cls(points.sweep, times.now, ids, velocity, sensor, offset, number.astype(np.int32))
 
+    def positions(self, index: int) -> np.ndarray:
+        """(P, 3) float64 metres in the world, points of the track `id[index]`."""
+        return self.sensor + self.offset[self.track == index]
+
+    def insert(self, index: int, number: int, velocity: np.ndarray, position: np.ndarray) -> SeenPoints:
+        """Insert a track with the id `number` before `id[index]`: its velocity, (3,), and its points, (P, 3)."""
+        shifted = self.track + (self.track >= index)
+        return self._replace(
+            id=np.insert(self.id, index, number),
+            velocity=np.insert(self.velocity, index, velocity, axis=0),
+            offset=np.concatenate([self.offset, (position - self.sensor).astype(np.float32)]),
+            track=np.append(shifted, np.full(len(position), index)).astype(np.int32),
+        )
+
 
 def complete(table: Table, seen: Sequence[SeenPoints]) -> Table:
-    """Give every row of a table its whole box, the smoothed position and velocity of its centre, and its class.
+    """Give every row of a table its whole box, the smoothed position and velocity of its centre, its class and its age.
 
     Args:
         table: rows of confirmed tracks, sorted by sweep.
@@ -80,7 +99,10 @@ def complete(table: Table, seen: Sequence[SeenPoints]) -> Table:
         return table
     order = np.lexsort((table["sweep"], table["id"]))  # rows by track, then time
     rank = np.argsort(order)  # position of each row in this order
-    boxes = whole_boxes(_sightings(table, order, rank, seen))
+    sightings = _sightings(table, order, rank, seen)
+    boxes = whole_boxes(sightings)
+    seconds = sightings.seconds.numpy()[rank]
+    begin = seconds[np.unique(table["id"], return_index=True)[1]]
     size = boxes.size.numpy()[rank]
     position = boxes.motion.position.numpy()[rank]
     velocity = boxes.motion.velocity.numpy()[rank]
@@ -93,6 +115,7 @@ def complete(table: Table, seen: Sequence[SeenPoints]) -> Table:
         **dict(zip(("length", "width", "height"), size.T)),
         "heading": boxes.heading.numpy()[rank],
         "class": np.array(KINDS)[boxes.kind.numpy()[rank]],
+        "age": seconds - begin[sightings.track.numpy()[rank]],
     }
 
 

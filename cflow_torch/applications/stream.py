@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import operator
 from collections import deque
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +19,7 @@ from cflow_torch.ground.segmentation import CHOICES, find_ground
 from cflow_torch.tensors import choose_device, read_ground, read_positions
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.collation import make_batch
+from cflow_torch.windows.inspection import Inspection
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import check_windows
 
@@ -69,13 +72,14 @@ class FlowStream:
     ) -> None:
         if ground not in CHOICES:
             raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
-        if not max_gap > 0:
-            raise CFlowError(f"max_gap={max_gap}: give seconds above 0")
+        if not (isinstance(max_gap, (int, float)) and max_gap > 0):
+            raise CFlowError(f"max_gap={max_gap!r}: give seconds above 0")
         config = make_config(preset, **settings)
         if config.num_future > 0:
             raise CFlowError(f"num_future={config.num_future}: a stream does not know later sweeps; give num_future=0")
         self.config = config
         self._model = make_model(config, device)
+        self._inspect = Inspection()
         self._ground = ground
         self._max_gap = max_gap
         self._sweeps: deque[Sweep] = deque(maxlen=config.num_history + 1)
@@ -121,8 +125,7 @@ class FlowStream:
                 raise CFlowError("a Sweep and more are given: put pose, time, mask and point times into the Sweep")
             given = points
         else:
-            stamp = None if time is None else round(time * 1e9) if isinstance(time, float) else int(time)
-            given = Sweep(points, is_ground, pose, stamp, point_times)
+            given = Sweep(points, is_ground, pose, None if time is None else _nanoseconds(time), point_times)
         if not self._accepts(given.timestamp_ns):
             return None
         sweep = self._prepare(given)
@@ -131,6 +134,7 @@ class FlowStream:
             before, *history = self._sweeps
             window = Window(before, sweep, tuple(history))
             (result,) = self._model([window])
+            self._inspect([window])
             self.window = window
         else:  # check it now, so that errors do not wait for the next sweep
             alone = replace(sweep, timestamp_ns=None)
@@ -193,3 +197,10 @@ class FlowStream:
             "there is no ground mask for a sweep of the stream, so we find the ground. To turn this line off give "
             "masks (is_ground), ground='grid' (the same result), or ground=None if the clouds have no ground"
         )
+
+
+def _nanoseconds(time: int | float) -> int:
+    """Convert a time in nanoseconds (int) or seconds (float)."""
+    with suppress(TypeError, ValueError, OverflowError):
+        return round(time * 1e9) if isinstance(time, float) else operator.index(time)
+    raise CFlowError(f"time={time!r}: give whole nanoseconds (int) or seconds (float)")

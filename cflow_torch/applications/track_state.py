@@ -16,6 +16,9 @@ _NO_CONFIDENCE = 0.7  # log-odds per sweep if the method has no confidence
 _THIN = 0.12  # metres; narrower boxes add no evidence: posts, and strips of a façade at the edge of an occlusion
 _MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # least net displacement of the box: metres, plus a share of its length
 _TRAVEL_FACTOR = 2.0  # largest ratio between the displacement of the box and the sum of its flow, either way
+# The box of an object that is ever more hidden shrinks: one end stays. With much evidence, it is enough that the centre
+# has moved. A change of length moves the centre half as far as the end, so we ask for half the share of the length.
+_MUCH_EVIDENCE = 4.0
 # With less evidence, the box must move farther and follow the flow more closely.
 _LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres (or the box's length if longer); share; sweeps
 _JUMP, _SMALL = 1.5, 1.5  # if length + _SMALL (metres) changes by the factor _JUMP, we see another part
@@ -111,15 +114,21 @@ class Tracks(NamedTuple):
         """(K,) bool: the track moves, and its box has moved roughly as its flow predicts.
 
         If `evidence` is high, both ends of the box must have moved at least a little: a piece of a wall may have flow,
-        but its box then grows, shrinks or jumps. Otherwise, the box must have moved far, and very nearly as predicted.
+        but its box then grows, shrinks or jumps. If it is very high and the box shrinks, the centre must have moved.
+        Otherwise, the box must have moved far, and very nearly as predicted.
         """
         predicted = self.travel.norm(dim=1)
         length = self.size[:, 0]
         moved = self.box - self.start
         centre = (moved * self.travel).sum(1) / predicted.clamp(min=1e-9)
         slower_end = centre - (length - self.start_length).abs() / 2
-        least = torch.maximum(_MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH * length, predicted / _TRAVEL_FACTOR)
-        is_evident = (slower_end >= least) & (centre <= predicted * _TRAVEL_FACTOR) & (self.evidence >= _MIN_EVIDENCE)
+        least = predicted / _TRAVEL_FACTOR
+        ends_moved = slower_end >= torch.maximum(least, _MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH * length)
+        centre_moved = (length <= self.start_length) & (
+            centre >= torch.maximum(least, _MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH / 2 * length)
+        )
+        is_evident = ends_moved & (self.evidence >= _MIN_EVIDENCE) | centre_moved & (self.evidence >= _MUCH_EVIDENCE)
+        is_evident &= centre <= predicted * _TRAVEL_FACTOR
         has_gone_far = predicted >= torch.maximum(length, self.start_length).clamp(min=_LONG_TRAVEL)
         is_exact = (moved - self.travel)[:, :2].norm(dim=1) <= _TRAVEL_ERROR * predicted
         return self.is_moving & (is_evident | (has_gone_far & is_exact & (self.num_moving >= _MIN_SWEEPS)))

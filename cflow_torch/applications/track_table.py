@@ -29,6 +29,7 @@ COLUMNS = {
 }
 
 
+UNKNOWN = "unknown"  # class of tracks of older tables
 KITTI_NAMES = {"car": "Car", "pedestrian": "Pedestrian", "cyclist": "Cyclist", "truck": "Truck"}
 """Class of a track -> name in KITTI and OpenPCDet, in the order of OpenPCDet's labels 1, 2, 3, 4."""
 
@@ -54,12 +55,17 @@ def write_tracks(path: PathLike, table: Table) -> None:
 
 
 def read_tracks(path: PathLike) -> Table:
-    """Read a table that `write_tracks` wrote; a missing file, or one without its columns, is a `CFlowError`."""
+    """Read a table that `write_tracks` wrote; a missing file, or one without its columns, is a `CFlowError`.
+
+    Tables of version 0.4.0 have no classes, so the class is "unknown", and boxes of the visible part.
+    """
     path = as_path(path)
     hint = "give a table that `cflow flow tracks=true` wrote"
     with file_errors(path, hint):
         table = parquet.read_table(pa.BufferReader(read_bytes(path)), use_threads=False)
-    check_columns(path, table.column_names, list(COLUMNS), hint)
+    check_columns(path, table.column_names, [name for name in COLUMNS if name != "class"], hint)
+    if "class" not in table.column_names:
+        table = table.append_column("class", [[UNKNOWN] * len(table)])
     return {name: table.column(name).to_numpy().astype(dtype) for name, dtype in COLUMNS.items()}
 
 
@@ -76,7 +82,7 @@ def write_mot(path: PathLike, table: Table, log: Log) -> None:
 def write_kitti(path: PathLike, table: Table, log: Log) -> None:
     """Write tracks as text of KITTI's tracking benchmark, with poses from the log: a line of 18 columns per row.
 
-    Frames and ids count from 0; the type is Misc in tables without classes; unknown columns are -1. The camera is
+    Frames and ids count from 0; the type is Misc where the class is unknown; unknown columns are -1. The camera is
     at the origin of the ego frame of the sweep, looks to +x, and has KITTI's axes: x to the right, y down, z ahead. The
     position is the middle of the lower face of the box.
 
@@ -90,15 +96,16 @@ def write_kitti(path: PathLike, table: Table, log: Log) -> None:
     numbers = np.stack([alpha, *size, x, y, z, rotation, score_of(table)], 1)
     lines = []
     for row, values in enumerate(numbers.tolist()):
-        kind = KITTI_NAMES[class_of(table, row)] if "class" in table else "Misc"
+        kind = KITTI_NAMES.get(str(table["class"][row]), "Misc") if "class" in table else "Misc"
         first = f"{table['sweep'][row]} {table['id'][row]} {kind} -1 -1 {values[0]:.6f} -1 -1 -1 -1"
         lines.append(" ".join([first, *(f"{value:.6f}" for value in values[1:])]) + "\n")
     write_text(as_path(path), "".join(lines))
 
 
 def class_of(table: Table, row: int) -> str:
-    """Return the class of a row; in tables without classes, everything is a car."""
-    return str(table["class"][row]) if "class" in table else "car"
+    """Return the class of a row; a car where it is unknown."""
+    name = str(table["class"][row]) if "class" in table else UNKNOWN
+    return "car" if name == UNKNOWN else name
 
 
 def score_of(table: Table) -> np.ndarray:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cflow_torch.applications.association import Matches, boxes, match, regroup
 from cflow_torch.applications.completion import SeenPoints, TrackedPoints, complete
+from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
 from cflow_torch.applications.track_state import Times, Tracks
 from cflow_torch.applications.track_table import confirmed, join_tables
@@ -302,7 +303,8 @@ def track(
 
     Returns:
         Column -> (R,) array, which `pandas.DataFrame(table)` takes. There is a row for each track and sweep in which it
-        is seen, sorted by sweep, then id. The columns are:
+        is seen, sorted by sweep, then id. In up to three sweeps before its flow begins, and in such gaps, it is seen
+        where enough points are in the place from which its flow comes. The columns are:
         `sweep`, `timestamp_ns`, `id`;
         x, y, z: smoothed centre of the whole box, metres in the world; vx, vy, vz: its velocity over ground, m/s;
         `velocity_std`: m/s, standard deviation of each of vx, vy and vz, if errors are independent;
@@ -311,12 +313,13 @@ def track(
         `class`: pedestrian, cyclist, car or truck, by size and speed alone;
         `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved;
         `is_moving`: False = the track moved before, and is static now;
-        `cluster_id`: of this sweep's flow, -1 while it is static; `num_points`;
+        `cluster_id`: of this sweep's flow, -1 while it is static or where its flow is missing; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;
         `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must
-        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. Otherwise, its
-        flow in at least three sweeps must add up to the larger of 1.5 m and its length, and the box must have moved by
-        this sum ± 25 %. Tracks that are never confirmed are left out.
+        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much, if
+        the box shrinks, the centre must have moved by 0.3 m plus a twentieth of the length. Otherwise, its flow in at
+        least three sweeps must add up to the larger of 1.5 m and its length, and the box must have moved by this sum
+        ± 25 %. Tracks that are never confirmed are left out.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
@@ -345,25 +348,46 @@ def track_points(
 class LogTracker:
     """Track the moving objects of a log as its flow arrives, and complete their boxes at the end.
 
-    Arguments are those of `track`. `points` has the points of tracks of each sweep that was pushed.
+    Arguments are those of `track`. The flow of an object often begins a few sweeps late, or has gaps. So we look for
+    each track in up to three sweeps before, where its flow says that it was.
     """
 
     def __init__(self, log: Log, sweep_interval: float = 0.1) -> None:
-        self.points: list[TrackedPoints] = []
         self._log = log
         self._tracker = Tracker(sweep_interval)
-        self._tables: list[dict[str, np.ndarray]] = []
-        self._seen: list[SeenPoints] = []
+        self._sweeps: list[SweepTracks] = []
+        self._last: dict[int, int] = {}  # id -> number of the last sweep in which the track is seen
 
     def push(self, index: int, result: FlowResult) -> None:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
-        self.points.append(TrackedPoints.of(index, track_id))
-        where = {"sweep": index, "timestamp_ns": int(self._log.timestamps[index])}
-        self._tables.append({**table, **{name: np.full(len(table["id"]), value) for name, value in where.items()}})
-        self._seen.append(SeenPoints.of(sweeps, result, self.points[-1], self._tracker.times))
+        points = TrackedPoints.of(index, track_id)
+        seen = SeenPoints.of(sweeps, result, points, self._tracker.times)
+        free = FreePoints.of(sweeps, result, points)
+        now = SweepTracks(table, points, seen, int(self._log.timestamps[index]), free)
+        self._find_before(now)
+        self._sweeps.append(now)
+        if len(self._sweeps) > _MAX_MISSED:
+            self._sweeps[-_MAX_MISSED - 1].free = None  # to save memory
+
+    def _find_before(self, now: SweepTracks) -> None:
+        """Look for tracks that move now in the sweeps before, up to three, in which they were not seen."""
+        count = len(self._sweeps)
+        for row, number in enumerate(now.table["id"].tolist()):
+            first = max(self._last.get(number, -1) + 1, count - _MAX_MISSED, 0)
+            self._last[number] = count
+            if now.table["is_moving"][row]:
+                for before in reversed(self._sweeps[first:count]):
+                    if not before.find(now, row):
+                        break
+
+    @property
+    def points(self) -> list[TrackedPoints]:
+        """The points of the tracks of each sweep that was pushed."""
+        return [each.points for each in self._sweeps]
 
     def table(self) -> dict[str, np.ndarray]:
         """Return the table of `track`."""
-        return complete(confirmed(join_tables(self._tables)), self._seen)
+        table = confirmed(join_tables([each.table for each in self._sweeps]))
+        return complete(table, [each.seen for each in self._sweeps])

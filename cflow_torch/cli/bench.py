@@ -7,13 +7,13 @@ from typing import Any, Sequence
 import torch
 
 from cflow_torch.cli.commands import Bench
-from cflow_torch.cli.flows import make_log_model
 from cflow_torch.cli.logs import open_first_log
 from cflow_torch.cli.outputs import machine, output_folder, versions
 from cflow_torch.config import Config
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, window
+from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.tables import markdown
 from cflow_torch.stages import FlowModel, TimedModel
 from cflow_torch.types import Window
@@ -22,7 +22,7 @@ from cflow_torch.windows.memory import peak_memory
 
 def task(cfg: Bench) -> None:
     output = output_folder(cfg)
-    model = make_log_model(cfg.model, cfg.device, cfg.keep_memory)
+    model = make_model(cfg.model, cfg.device)
     log = open_first_log(cfg.data)
     windows = _windows(log, cfg.pairs, model.config)
     ensure_writable(output)

@@ -1,19 +1,33 @@
-"""The names of all settings, the choices of each group, and the nearest name to a mistyped one."""
+"""The settings of each command with their limits, its help, and the choices of each group."""
 
 from __future__ import annotations
 
-from dataclasses import fields
-from difflib import get_close_matches
+import inspect
 from pathlib import Path
-from typing import Any, Iterable, Iterator
+from typing import Any, Dict, Iterable, Iterator, Mapping, Optional, Tuple
 
 import cflow_torch.configs
-from cflow_torch.cli.commands import ENGINES, PICTURES, Command
+from cflow_torch.cli.commands import COMMANDS, DATA_SETTINGS, ENGINES, PICTURES, Command, own_fields, setting_lines
 from cflow_torch.config import PRESETS
 from cflow_torch.setting import Settings
 
 FOLDER = Path(cflow_torch.configs.__path__[0])  # YAML files of data sets and experiments
 _KINDS: dict[str, Iterable[str]] = {"model": PRESETS, "engine": ENGINES, "picture": PICTURES}
+Limits = Optional[Mapping[str, Any]]  # see `setting.bounds`; None = only a reader or Hydra checks the value
+_Named = Tuple[str, Limits]  # name of a setting, and its limits
+# Dotted name -> limits by choice, such as "data=av2", that has the setting; "" = the command itself has it.
+Known = Dict[str, Dict[str, Limits]]
+
+
+def help_of(name: str) -> str:
+    """Return what a command does, and its settings with the choices of its groups, if it has settings."""
+    kind = COMMANDS[name]
+    text = f"cflow {name}: {kind.SUMMARY}\n\n{inspect.cleandoc(kind.__doc__ or '')}\n"
+    if not issubclass(kind, Command):
+        return text
+    of_groups = [f"{group}={'|'.join(choices(group))}" for group in kind.groups()]
+    lines = [*setting_lines(kind), *of_groups, "data.NAME, model.NAME, ...: `cflow settings` lists them"]
+    return "\n  ".join([f"{text}\nsettings:", *lines]) + "\n"
 
 
 def choices(group: str) -> list[str]:
@@ -24,36 +38,35 @@ def files(group: str) -> list[Path]:
     return sorted((FOLDER / group).glob("*.yaml"))
 
 
-def setting_names(command: type[Command]) -> dict[str, list[str]]:
-    """Return the dotted names of all settings of a command, each with the choices that have it, such as "data=av2"."""
-    names: dict[str, list[str]] = {name: [] for name in own_names(command)}
-    of_groups = command.groups()
-    for choice, name in _names_of_choices():
-        if choice.partition("=")[0] in of_groups and choice not in names.setdefault(name, []):
-            names[name].append(choice)
-    return names
+def known_settings(command: type[Command]) -> Known:
+    """Return all settings of a command."""
+    known: Known = {name: {"": limits} for name, limits in _of_class(command)}
+    groups = command.groups()
+    for choice, settings in _of_choices():
+        if choice.partition("=")[0] in groups:
+            for name, limits in settings:
+                known.setdefault(name, {}).setdefault(choice, limits)
+    return known
 
 
-def own_names(kind: type[Settings], prefix: str = "") -> Iterator[str]:
-    """Yield the dotted names of the settings of a class."""
-    for f in fields(kind):  # type: ignore[arg-type]
-        of_kind = f.metadata.get("kind", object)
-        if issubclass(of_kind, Settings):
-            yield from own_names(of_kind, f"{prefix}{f.name}.")
-        elif "kind" in f.metadata:
-            yield f"{prefix}{f.name}"
+def _of_class(kind: type[Settings], prefix: str = "") -> Iterator[_Named]:
+    for f in own_fields(kind):
+        if issubclass(f.metadata["kind"], Settings):
+            yield from _of_class(f.metadata["kind"], f"{prefix}{f.name}.")
+        else:
+            yield f"{prefix}{f.name}", None if f.name == kind.NAMED_BY else f.metadata
 
 
-def _names_of_choices() -> Iterator[tuple[str, str]]:
-    """Yield (choice, dotted name of one of its settings)."""
+def _of_choices() -> Iterator[tuple[str, Iterable[_Named]]]:
+    """Yield each choice of the groups, and its settings."""
     for preset, config in PRESETS.items():
-        yield from ((f"model={preset}", f"model.{f.name}") for f in fields(config))
+        yield f"model={preset}", _of_class(type(config), "model.")
     for engine, kind in ENGINES.items():
-        yield from ((f"engine={engine}", name) for name in own_names(kind, "engine."))
-    for picture, kind in PICTURES.items():
-        yield from ((f"picture={picture}", name) for name in own_names(kind))
+        yield f"engine={engine}", _of_class(kind, "engine.")
+    for picture, of_picture in PICTURES.items():
+        yield f"picture={picture}", _of_class(of_picture)
     for file in files("data"):
-        yield from ((f"data={file.stem}", f"data.{name}") for name in names_in(file))
+        yield f"data={file.stem}", [(f"data.{name}", DATA_SETTINGS.get(name)) for name in names_in(file)]
 
 
 def names_in(file: Path) -> Iterator[str]:
@@ -74,10 +87,3 @@ def read_settings(file: Path) -> dict[str, Any]:
     for base in content.pop("defaults", ()):
         settings.update(read_settings(file.with_name(f"{base}.yaml")))
     return {**settings, **content}
-
-
-def near(word: str, known: Iterable[str]) -> str:
-    """Return the hint " (did you mean X?)", "" if no name is similar. We compare names with and without their group."""
-    names = {form: name for name in known for form in (name.rpartition(".")[2], name)}
-    similar = get_close_matches(word, names, 1)
-    return f" (did you mean {names[similar[0]]}?)" if similar else ""

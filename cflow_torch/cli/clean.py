@@ -13,7 +13,7 @@ from cflow_torch.applications.clean_files import own_suffix, stored_masks, write
 from cflow_torch.applications.cleaning import CleanLog, MaskedLog, static_map_with_intensity
 from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
-from cflow_torch.cli.flows import make_log_model, stored_flow
+from cflow_torch.cli.flows import stored_flow
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import local_folder, settings_record, versions, write_config
 from cflow_torch.data.arrays import ArraysLog
@@ -23,6 +23,7 @@ from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
+from cflow_torch.estimate import make_model
 from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
@@ -53,7 +54,7 @@ def task(cfg: Clean) -> None:
 def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
     """Return a function that makes the clean log, by the flow of earlier files or by the method."""
     if cfg.flow is None:
-        model = make_log_model(cfg.model, cfg.device)
+        model = make_model(cfg.model, cfg.device)
         return lambda log: CleanLog(log, model, None, cfg.remove_stopped)
     stored = stored_flow(cfg.flow, _NEEDED)
     return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped)

@@ -6,12 +6,13 @@ neither torch nor Hydra here, so that help costs little.
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, Iterator, Union
+from typing import Any, ClassVar, Iterator
 
 from cflow_torch.config import Config
-from cflow_torch.setting import AUTO, Settings, bounds, setting
+from cflow_torch.setting import AUTO, Settings, bounds, checked, setting
+
+NOT_GIVEN = "???"  # a setting without a value
 
 # Settings of data sets that we check before a reader gets them. configs/data/ has the defaults of all of them.
 DATA_SETTINGS: dict[str, dict[str, Any]] = {
@@ -21,9 +22,12 @@ DATA_SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
-def group(default: str | None, help: str = "") -> Any:
-    """Make a field whose value is one of several groups of settings, such as `model=paper`; by default `default`."""
-    return field(default=default, metadata={"group": True, "help": help})
+def group(default: str | None, help: str = "", kind: type | None = None) -> Any:
+    """Make a field whose value is one of several groups of settings, such as `model=paper`; by default `default`.
+
+    `kind` is the class of the settings, if they have one.
+    """
+    return field(default=default, metadata={"group": True, "help": help, **({} if kind is None else bounds(kind))})
 
 
 def _device() -> Any:
@@ -61,14 +65,26 @@ class ShardSettings(Settings):
 
 
 @dataclass(frozen=True)
-class Local(Settings):
-    """Worker processes of this machine."""
+class Engine(Settings):
+    """Settings of what runs the workers."""
 
     PREFIX: ClassVar[str] = "engine."
+    NAMED_BY: ClassVar[str] = "name"
 
-    name: str = setting("local", "the engine; engine= chooses it", choices=("local",))
+    name: str = setting("", "the engine; engine= chooses it")
     workers: int | str = _number("processes; auto = one per core of a CPU, with one thread each, or one per GPU")
     batch: int | str = _number("number of windows that are computed together")
+
+    @classmethod
+    def kinds(cls) -> dict[str, type[Engine]]:
+        return ENGINES
+
+
+@dataclass(frozen=True)
+class Local(Engine):
+    """Worker processes of this machine."""
+
+    name: str = setting("local", "the engine; engine= chooses it", choices=("local",))
     timeout: float = _above_0(600, "seconds after which a silent worker is replaced (with several workers)")
     memory: float | None = _above_0(
         None, "limit of the address space of each worker on a CPU, in bytes, for example 8e9; null = no limit"
@@ -76,33 +92,25 @@ class Local(Settings):
 
 
 @dataclass(frozen=True)
-class Ray(Settings):
+class Ray(Engine):
     """Ray actors on one machine or on a cluster (extra ray)."""
 
-    PREFIX: ClassVar[str] = "engine."
-
     name: str = setting("ray", "the engine; engine= chooses it", choices=("ray",))
-    address: str | None = _path("null = start a cluster in this process, and end it; auto or HOST:PORT = join one")
     workers: int | str = _number("actors; auto = the cores or GPUs of this machine; with an address, give a number")
-    batch: int | str = _number("number of windows that are computed together")
+    address: str | None = _path("null = start a cluster in this process, and end it; auto or HOST:PORT = join one")
     num_cpus: float | str = _share("CPUs that each worker takes from the cluster; auto = 1 without a GPU, 0 with one")
     num_gpus: float | str = _share(
         "GPUs that each worker takes, 0.5 = two workers share one; auto = 1 if device is cuda"
     )
 
 
-ENGINES = {"local": Local, "ray": Ray}
-Engine = Union[Local, Ray]
+ENGINES: dict[str, type[Engine]] = {"local": Local, "ray": Ray}
 
 
 class Words:
     """A command that takes words instead of settings."""
 
     SUMMARY: ClassVar[str]
-
-    @classmethod
-    def help(cls) -> str:
-        return f"cflow {command_name(cls)}: {cls.SUMMARY}\n\n{inspect.cleandoc(cls.__doc__ or '')}\n"
 
 
 @dataclass(frozen=True)
@@ -112,23 +120,18 @@ class Command(Settings):
     SUMMARY: ClassVar[str]
 
     output: str = setting("outputs", "folder of the results")
-    model: Config = group("default")
-    data: dict[str, Any] = group(AUTO)  # type: ignore[assignment]  # settings of the data set
+    model: Config = group("default", kind=Config)
+    data: dict[str, Any] = group(AUTO)  # settings of the data set
+
+    def check(self) -> None:
+        for name, value in self.data.items():
+            if name in DATA_SETTINGS and value != NOT_GIVEN:
+                checked(f"data.{name}", value, DATA_SETTINGS[name])
 
     @classmethod
     def groups(cls) -> dict[str, str | None]:
         """Return the default choice of each group."""
         return {f.name: getattr(cls, f.name) for f in fields(cls) if "group" in f.metadata}
-
-    @classmethod
-    def help(cls) -> str:
-        """Return what the command does, its settings, and the choices of its groups."""
-        from cflow_torch.cli.choices import choices
-
-        of_groups = [f"{name}={'|'.join(choices(name))}" for name in cls.groups()]
-        lines = [*setting_lines(cls), *of_groups, "data.NAME, model.NAME, ...: `cflow settings` lists them"]
-        text = inspect.cleandoc(cls.__doc__ or "")
-        return "\n  ".join([f"cflow {command_name(cls)}: {cls.SUMMARY}\n\n{text}\n\nsettings:", *lines]) + "\n"
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ class Demo(Command):
     device: str = _device()
     definition: str = setting("opensceneflow", "definition of the scores, see `cflow eval --help`")
     pair: int = setting(3, "index of the pair that is drawn", low=0)
-    data: dict[str, Any] = group("synthetic")  # type: ignore[assignment]
+    data: dict[str, Any] = group("synthetic")
 
 
 @dataclass(frozen=True)
@@ -186,7 +189,7 @@ class FlowFiles(Command):
     dry_run: bool = setting(False, "true = only count the frames of each log, and those left to do")
     verbose: bool = setting(False, "true = print the time of each stage")
     shard: ShardSettings = setting(ShardSettings(), "share of the work for this process", kind=ShardSettings)
-    engine: Engine = group("local")
+    engine: Engine = group("local", kind=Engine)
 
 
 @dataclass(frozen=True)
@@ -279,8 +282,8 @@ class Label(FlowFiles):
     SUMMARY: ClassVar[str] = "write pseudo-labels for self-supervised training into OpenSceneFlow's scenes"
 
     output: str = setting("outputs/label", "folder for the flow that the labels follow from")
-    model: Config = group("offline")
-    data: dict[str, Any] = group("hdf5")  # type: ignore[assignment]
+    model: Config = group("offline", kind=Config)
+    data: dict[str, Any] = group("hdf5")
 
 
 @dataclass(frozen=True)
@@ -366,6 +369,7 @@ class Plot(Command):
     """
 
     SUMMARY: ClassVar[str] = "draw flow, clusters, key points, correlation, scales or an animation"
+    NAMED_BY: ClassVar[str] = "picture"
     PRESET: ClassVar[str] = ""  # that the picture chooses, "" = none
     PIXEL_SIZES: ClassVar[tuple[float, ...]] = ()  # that the picture chooses
 
@@ -379,6 +383,10 @@ class Plot(Command):
         None, "index of the pair in the log, from 0; null = 3, or the last pair of a shorter log", kind=int, low=0
     )
     picture: str = group("flow")
+
+    @classmethod
+    def kinds(cls) -> dict[str, type[Plot]]:
+        return PICTURES
 
 
 @dataclass(frozen=True)
@@ -535,7 +543,7 @@ class Clean(Command):
     SUMMARY: ClassVar[str] = "remove dynamic objects from logs, and build static maps"
 
     output: str = setting("outputs/clean", "local folder; each log gets <log id>/points, poses.txt, ...")
-    model: Config = group("offline")
+    model: Config = group("offline", kind=Config)
     device: str = _device()
     resume: bool = setting(True, "skip logs that were written with the same settings; false = reject them")
     overwrite: bool = setting(False, "true = write these logs again and replace their older results")
@@ -629,15 +637,16 @@ COMMANDS: dict[str, type[Command] | type[Words]] = {
 WITH_SETTINGS: dict[str, type[Command]] = {name: kind for name, kind in COMMANDS.items() if issubclass(kind, Command)}
 
 
-def command_name(kind: type) -> str:
-    return next(name for name, one in COMMANDS.items() if one is kind)
+def own_fields(kind: type[Settings]) -> list[Any]:
+    """Return the settings of a class that are not groups."""
+    return [f for f in fields(kind) if "kind" in f.metadata and "group" not in f.metadata]  # type: ignore[arg-type]
 
 
 def setting_lines(kind: type[Settings], base: type[Settings] | None = None) -> Iterator[str]:
     """Yield a line for each setting of a class that is not in `base`: "name: default  # meaning"."""
     known = {f.name for f in fields(base)} if base is not None else set()  # type: ignore[arg-type]
-    for f in fields(kind):  # type: ignore[arg-type]
-        if "kind" not in f.metadata or f.name in known:
+    for f in own_fields(kind):
+        if f.name in known:
             continue
         if issubclass(f.metadata["kind"], Settings):
             yield f"{f.name}:  # {f.metadata['help']}"

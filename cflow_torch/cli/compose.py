@@ -3,32 +3,46 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
-from dataclasses import asdict, fields, replace
-from typing import Any, Callable
+import traceback
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from functools import partial
+from importlib import import_module
+from typing import Any, Iterator
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ChoiceSweep
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Check, Command, Plot
-from cflow_torch.cli.words import NOT_GIVEN, Call, check_exists, make_settings, text_names
+from cflow_torch.cli.choices import known_settings
+from cflow_torch.cli.commands import ENGINES, NOT_GIVEN, PICTURES, WITH_SETTINGS, Check, Command, Plot, own_fields
+from cflow_torch.cli.exits import exit_if_refused, exit_wrong
+from cflow_torch.cli.failures import UnfinishedJob
+from cflow_torch.cli.words import Call, check_exists
 from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError
+from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.setting import Settings
 
 _PARSER = OverridesParser.create()
+_PATHS = {"data.root", "data.cache"}  # text, even if they look like numbers
+# Values that Hydra must read by itself: null, a reference, a function, a quoted text.
+_SYNTAX = re.compile(
+    r"null|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
+)
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
 
 def _register() -> None:
     """Register the settings of commands and of their groups, and the presets, where Hydra looks for configurations.
 
-    We register plain dictionaries: `settings_of` checks the values.
+    We register plain dictionaries: `Settings.of` checks the values.
     """
     store = ConfigStore.instance().store
     for name, command in WITH_SETTINGS.items():
@@ -52,34 +66,59 @@ def _picture_node(name: str, picture: type[Plot]) -> dict[str, Any]:
 
 def _defaults(kind: type[Settings]) -> dict[str, Any]:
     """Return the defaults of the settings of a class, in types that OmegaConf has."""
-    own = [f.name for f in fields(kind) if "kind" in f.metadata]  # type: ignore[arg-type]
-    values: dict[str, Any] = asdict(kind())  # type: ignore[call-overload]
-    return {name: list(values[name]) if isinstance(values[name], tuple) else values[name] for name in own}
+    values: dict[str, Any] = {}
+    for f in own_fields(kind):
+        is_nested = issubclass(f.metadata["kind"], Settings)
+        values[f.name] = (
+            asdict(f.default) if is_nested else list(f.default) if isinstance(f.default, tuple) else f.default
+        )
+    return values
 
 
 _register()
 
 
-def run_with_hydra(name: str, call: Call, job: Callable[[Any], Any]) -> None:
-    """Let Hydra compose the settings of a command and call `job` with them, or with those of each job of a sweep."""
-    overrides = hydra_overrides(WITH_SETTINGS[name], call)
-    # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
-    parsed = _PARSER.parse_overrides(overrides)
-    fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
-    unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}
-    names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
-    sys.argv = [f"cflow {name}", *overrides, names, *call.options]
-    hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)(job)()
+def run_with_hydra(name: str, call: Call) -> None:
+    """Let Hydra compose the settings of a command and run it with them, or with those of each job of a sweep."""
+    with wrong_call_told(name):
+        overrides = hydra_overrides(WITH_SETTINGS[name], call)
+        # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
+        parsed = _PARSER.parse_overrides(overrides)
+        fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
+        unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}
+        names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
+        os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
+        sys.argv = [f"cflow {name}", *overrides, names, *call.options]
+        main = hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
+        main(partial(run_job, name))()
+
+
+def run_job(name: str, composed: Any) -> Any:
+    """Run a command with the settings that Hydra has composed, perhaps as a job of a sweep.
+
+    Values are checked before torch is imported.
+    """
+    with failed_job_told(name):
+        values: Any = OmegaConf.to_container(composed, resolve=True)
+        values.pop("versions", None)  # of the config.yaml of an earlier run
+        settings = WITH_SETTINGS[name].of(values)
+        show_warnings_as_lines()
+        settings = replace(settings, data=_complete(settings))
+        from cflow_torch.windows.memory import keep_freed_memory  # imports torch, which takes seconds
+
+        if getattr(settings, "keep_memory", True):
+            keep_freed_memory()
+        return import_module(f"cflow_torch.cli.{name}").task(settings)
 
 
 def hydra_overrides(command: type[Command], call: Call) -> list[str]:
     """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
-    texts = text_names(command)
+    known = known_settings(command).items()
+    texts = {name for name, owners in known if any(limits and limits["kind"] is str for limits in owners.values())}
     overrides = []
     for word in call.settings:
         key, _, value = word.partition("=")
-        overrides.append(f"{key}={_as_text(value)}" if key.lstrip("+") in texts else word)
+        overrides.append(f"{key}={_as_text(value)}" if key.lstrip("+") in {*texts, *_PATHS} else word)
     paths = [_quoted(path) for path in call.paths]
     if paths:
         overrides.append(f"data.root={paths[0] if len(paths) == 1 else '[' + ','.join(paths) + ']'}")
@@ -87,52 +126,63 @@ def hydra_overrides(command: type[Command], call: Call) -> list[str]:
 
 
 def _as_text(value: str) -> str:
-    """Quote text that Hydra would read as another type or reject: the name 1e5 is not a number."""
-    try:
-        read = _PARSER.parse_override(f"name={value}").value()
-    except HydraException:  # such as Ausgänge
-        return ",".join(_quoted(one) for one in value.split(","))
-    if isinstance(read, ChoiceSweep) and read.simple_form:  # of a sweep: a,b
-        return ",".join(_as_text(one) for one in value.split(","))
-    return _quoted(value) if isinstance(read, (bool, int, float)) else value
+    """Quote text, or each text of a sweep (a,b), so that Hydra reads no other type: the name 1e5 is not a number."""
+    return value if _SYNTAX.fullmatch(value) else ",".join(map(_quoted, value.split(",")))
 
 
 def _quoted(value: str) -> str:
     return '"' + value.replace('"', r"\"") + '"'
 
 
-def find_own_modules() -> None:
-    """Let Python find the module of your own reader, which is next to its configuration."""
-    for source in HydraConfig.get().runtime.config_sources:
-        if source.schema == "file" and source.path not in sys.path:
-            sys.path.append(source.path)
-
-
-def settings_of(name: str, composed: Any) -> Command:
-    """Make the settings of a command from those that Hydra has composed. Values are checked before torch is imported.
+def _complete(settings: Command) -> dict[str, Any]:
+    """Check the paths of the data, and complete its settings.
 
     data=auto is replaced by the format of the path, which is printed; `cflow check` does this for each of its paths.
     """
-    values: dict[str, Any] = OmegaConf.to_container(composed, resolve=True)  # type: ignore[assignment]
-    values.pop("versions", None)  # of the config.yaml of an earlier run
-    settings: Any = make_settings(name, values)
-    _check_paths(settings.data)
-    from cflow_torch.cli.logs import complete_data  # imports torch, which takes seconds
-
-    if "_target_" in settings.data:  # your own reader
-        choice = str(HydraConfig.get().runtime.choices.get("data"))
-        return replace(settings, data={"label": choice, "first": 0, "step": 1, **settings.data})  # type: ignore[no-any-return]
-    is_completed = isinstance(settings, Check)
-    return settings if is_completed else replace(settings, data=complete_data(settings.data))  # type: ignore[no-any-return]
-
-
-def _check_paths(data: dict[str, Any]) -> None:
+    data = settings.data
+    if "_target_" in data:  # your own reader, whose module is next to its configuration
+        for source in HydraConfig.get().runtime.config_sources:
+            if source.schema == "file" and source.path not in sys.path:
+                sys.path.append(source.path)
+        return {"label": str(HydraConfig.get().runtime.choices.get("data")), "first": 0, "step": 1, **data}
     root = data.get("root")
     if root == NOT_GIVEN:
         raise CFlowError("the data is missing: give data.root=PATH, or only the path")
     for path in root if isinstance(root, list) else [root]:
-        if isinstance(path, str) and "_target_" not in data:
+        if isinstance(path, str):
             check_exists(path)
+    from cflow_torch.cli.logs import complete_data  # imports torch
+
+    return data if isinstance(settings, Check) else complete_data(data)
+
+
+@contextmanager
+def wrong_call_told(command: str) -> Iterator[None]:
+    """Exit with status 2 after an error of Hydra's or of the system, and with 1 if something is missing."""
+    try:
+        yield
+    except UnfinishedJob as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except Exception as error:
+        exit_if_refused(error)
+        exit_wrong(explain(error, command))
+
+
+@contextmanager
+def failed_job_told(command: str) -> Iterator[None]:
+    """Exit with status 2 if a job is called wrongly. A bug raises `UnfinishedJob`: a sweep goes on."""
+    try:
+        yield
+    except UnfinishedJob:
+        raise
+    except (CFlowError, OmegaConfBaseException) as error:
+        exit_wrong(explain(error, command))
+    except Exception as error:
+        exit_if_refused(error)
+        traceback.print_exc()
+        message = "this is a bug of cflow: please report it with the lines above and the output of `cflow info`"
+        raise UnfinishedJob(message) from None
 
 
 def explain(error: Exception, command: str) -> str:
@@ -144,4 +194,7 @@ def explain(error: Exception, command: str) -> str:
     if isinstance(error, OverrideParseException):
         return f"cannot read {error.override!r}: give NAME=VALUE, special characters in quotes: 'NAME=\"VALUE\"'"
     message = " ".join(str(error).split())
+    if message.startswith("Ambiguous value"):
+        word = message.split("'")[1]
+        return f"{word}: for a list, give [...] around the values; for a run with each of them (a sweep), add -m"
     return f"{message}; `cflow {command} --help` has examples"

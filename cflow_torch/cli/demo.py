@@ -8,7 +8,6 @@ from cflow_torch.applications.tracking import track
 from cflow_torch.cli.commands import Demo
 from cflow_torch.cli.eval import Scores
 from cflow_torch.cli.failures import finish
-from cflow_torch.cli.flows import make_log_model
 from cflow_torch.cli.logs import check_pair, open_logs
 from cflow_torch.cli.outputs import chosen_preset, output_folder
 from cflow_torch.cli.pairs import for_each_pair
@@ -16,6 +15,7 @@ from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import safe_name
+from cflow_torch.estimate import make_model
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
@@ -28,7 +28,7 @@ def task(cfg: Demo) -> None:
     draws = _is_available("picture", lambda: blank_figure((1, 1), 100))  # matplotlib and k3d are extras
     shows = _is_available("page", load_k3d)
     scores = Scores(cfg)
-    model = TimedModel(make_log_model(cfg.model, cfg.device))
+    model = TimedModel(make_model(cfg.model, cfg.device))
     logs, failures = open_logs(cfg.data)
     if logs:
         check_pair(cfg.pair, max(logs, key=lambda log: len(log.timestamps)))

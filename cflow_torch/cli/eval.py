@@ -14,13 +14,13 @@ import numpy as np
 from cflow_torch.cli.commands import Demo, Eval
 from cflow_torch.cli.comparison import RESULTS, headline, summary
 from cflow_torch.cli.failures import Failures, UnfinishedJob, finish
-from cflow_torch.cli.flows import make_log_model
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import machine, output_folder, settings_record, versions, write_config
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
+from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
@@ -42,7 +42,7 @@ def task(cfg: Eval) -> float:
         _print_scores(output, record["results"], record["seconds_per_pair"])
         return objective(record["results"])
     scores = Scores(cfg)
-    model = TimedModel(make_log_model(cfg.model, cfg.device))
+    model = TimedModel(make_model(cfg.model, cfg.device))
     logs, failures = open_logs(cfg.data)
     ensure_writable(output)
     first, step = cfg.data["first"], cfg.data["step"]

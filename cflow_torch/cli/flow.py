@@ -55,11 +55,14 @@ from cflow_torch.fleet.manifest import (
     make_identity,
     masks_folder,
 )
+from cflow_torch.fleet.parallel import local_executors
+from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
 from cflow_torch.fleet.work import source_name
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, FlowResult
 
+_ENGINES: dict[str, Callable[..., Any]] = {"local": local_executors, "ray": ray_executors}
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
 _FOR_MOVING = {"residual", "moving"}
 _TRACK_FILES = {
@@ -75,7 +78,11 @@ class FlowRun(NamedTuple):
     sources: Sources
     job: Job
     shard: Shard
-    parts: list[Part]
+
+    @property
+    def parts(self) -> list[Part]:
+        """The logs of this shard, or the parts of them that are its own."""
+        return self.shard.parts(self.sources.logs)
 
     def logs(self) -> Iterator[Log]:
         """Open the logs of this shard one by one, without what takes time."""
@@ -90,13 +97,9 @@ class FlowRun(NamedTuple):
         return (log.log_id for log in self.logs())
 
 
-def task(cfg: Flow) -> None:
-    compute(cfg, _contents(cfg), _check_results, _write_more)
-
-
 def compute(
-    cfg: FlowFiles,
-    contents: tuple[str, ...],
+    cfg: Any,
+    contents: Callable[[Any], tuple[str, ...]],
     check: Callable[[Any, FlowRun], None],
     use: Callable[[Any, FlowRun, dict[str, Any]], Failures],
 ) -> None:
@@ -105,79 +108,81 @@ def compute(
     With dry_run=true, count the frames instead. A job of a sweep raises `UnfinishedJob` if something failed.
 
     Args:
-        contents: columns of a flow file.
+        cfg: settings of the class `FlowFiles`.
+        contents: returns the columns of a flow file.
         check: called before anything is computed; raises an error if the logs cannot be used.
         use: called with the report, unless a signal has stopped the run; returns what failed.
     """
+    columns = contents(cfg)
     layout = choose_layout(cfg.device, cfg.engine.workers, cfg.engine.batch, os.environ)
-    flow = _plan(cfg, contents, layout.batch)
+    sources = find_logs(cfg.data)
+    output = output_folder(cfg)
+    job = Job(
+        config=cfg.model,
+        identity=make_identity(cfg.model, sources.reader, sources.settings, columns),
+        reader=sources.reader,
+        settings=sources.settings,
+        output=str(output),
+        contents=columns,
+        batch=layout.batch,
+        redo=cfg.overwrite,
+    )
+    flow = FlowRun(sources, job, find_shard(cfg.shard.index, cfg.shard.count, os.environ))
+    _check_output(cfg, flow, check)
+    if cfg.dry_run:
+        print(forecast(job, flow.parts))
+        return
+    write_config(cfg, output)
+    layout = _useful_workers(cfg, flow, layout)
+    settings = asdict(cfg.engine)
+    name = settings.pop("name")
+    own = {key: value for key, value in settings.items() if key not in ("workers", "batch")}
+    with _ENGINES[name](job, layout, **own) as executors:
+        parts = flow.shard.parts(sources.logs, len(layout.devices))
+        about = {"config": settings_record(cfg), "versions": versions()}
+        report = run_fleet(executors, parts, layout, flow.shard, job.output, name, about)
+    _finish(cfg, flow, report, use)
+
+
+def _check_output(cfg: FlowFiles, flow: FlowRun, check: Callable[[Any, FlowRun], None]) -> None:
+    """Make sure that the results may be added to the output, and clear what is replaced."""
     output = as_path(flow.job.output)
     is_alone = flow.shard.count == 1
-    names = [source_name(part.source) for part in flow.parts]
     if not cfg.dry_run:
         check(cfg, flow)
         ensure_writable(output)
+    names = [source_name(part.source) for part in flow.parts]
     check_logs(output, names, flow.job.identity, cfg.resume, cfg.overwrite, is_alone)
-    if cfg.dry_run:
-        print(forecast(flow.job, flow.parts))
-        return
-    if cfg.overwrite and is_alone:
+    if cfg.overwrite and is_alone and not cfg.dry_run:
         for log_id in flow.log_ids():
             clear_log(output / log_id)
-    write_config(cfg, output)
-    report = _run(cfg, flow, layout)
+
+
+def _useful_workers(cfg: FlowFiles, flow: FlowRun, layout: Layout) -> Layout:
+    """Leave out workers that would not save time, because few frames are left to do."""
+    if cfg.engine.name != "local" or cfg.engine.workers != AUTO or layout.devices[0] != "cpu":
+        return layout
+    least = frames_per_worker(cfg.model)
+    count = 0
+    for _, _, todo in count_frames(flow.job, flow.parts):  # opens a log after the other
+        count += todo
+        if count >= least * len(layout.devices):
+            break
+    return layout._replace(devices=layout.devices[: max(1, count // least)])
+
+
+def _finish(
+    cfg: FlowFiles, flow: FlowRun, report: dict[str, Any], use: Callable[[Any, FlowRun, dict[str, Any]], Failures]
+) -> None:
+    """Use the flow, print the report and what is missing, and exit with the status of the run unless it is complete."""
+    file = report_file(flow.job.output, flow.shard)
     failures: Failures = []
     if not report["stopped_by"]:  # a signal leaves no time for this
         begin = perf_counter()
         failures = use(cfg, flow, report)
         report["seconds"] += perf_counter() - begin
         with suppress(OSError):  # the run has reported it
-            write_json(report_file(flow.job.output, flow.shard), report)
-    _finish(cfg, flow, report, failures)
-
-
-def _plan(cfg: FlowFiles, contents: tuple[str, ...], batch: int) -> FlowRun:
-    """Find the logs, and this process's share of them."""
-    shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
-    sources = find_logs(cfg.data)
-    job = Job(
-        config=cfg.model,
-        identity=make_identity(cfg.model, sources.reader, sources.settings, contents),
-        reader=sources.reader,
-        settings=sources.settings,
-        output=str(output_folder(cfg)),
-        contents=contents,
-        batch=batch,
-        redo=cfg.overwrite,
-    )
-    return FlowRun(sources, job, shard, list(shard.parts(sources.logs)))
-
-
-def _run(cfg: FlowFiles, flow: FlowRun, layout: Layout) -> dict[str, Any]:
-    """Compute the frames by the chosen engine, with no more workers than save time, and return the report."""
-    engine = asdict(cfg.engine)
-    name, workers, _ = (engine.pop(key) for key in ("name", "workers", "batch"))
-    if name == "local" and workers == AUTO and layout.devices[0] == "cpu":
-        least = frames_per_worker(cfg.model)
-        count = _count_up_to(least * len(layout.devices), count_frames(flow.job, flow.parts))
-        layout = layout._replace(devices=layout.devices[: max(1, count // least)])
-    about = {"config": settings_record(cfg), "versions": versions()}
-    return run_fleet(flow.job, flow.sources.logs, layout, flow.shard, name, about, **engine)
-
-
-def _count_up_to(enough: int, counts: Iterable[tuple[str, int, int]]) -> int:
-    """Add the frames that are left to do in each log. We do not open more logs than are needed for `enough` frames."""
-    total = 0
-    for _, _, todo in counts:
-        total += todo
-        if total >= enough:
-            break
-    return total
-
-
-def _finish(cfg: FlowFiles, flow: FlowRun, report: dict[str, Any], failures: Failures) -> None:
-    """Print the report and what is missing, and exit with the status of the run unless it is complete."""
-    file = report_file(flow.job.output, flow.shard)
+            write_json(file, report)
     print(f"{format_report(report, cfg.verbose)}\nflow files in {flow.job.output}, report in {file}")
     status = report["exit_status"] or int(bool(failures))
     if status:
@@ -315,3 +320,6 @@ def _into_scenes(name: str, scenes: Sequence[Path], output: Path) -> Failures:
             count += write_hdf5_results(scene, name, ((t, read_flow(frame_file(folder, t)).flow) for t in stamps))
     print(f"sweeps with a key {name} written into their scene: {count} (the last sweep of a scene has no flow)")
     return failures
+
+
+task = partial(compute, contents=_contents, check=_check_results, use=_write_more)

@@ -1,30 +1,14 @@
-"""Where a command gets the flow of a pair: from the method, or from the output of `cflow flow`."""
+"""The flow of pairs in the output of `cflow flow`."""
 
 from __future__ import annotations
 
 from typing import Any, Callable, Sequence
 
-from cflow_torch import estimate
-from cflow_torch.config import Config
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.manifest import frame_file
-from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult
-from cflow_torch.windows.memory import keep_freed_memory
-
-
-def make_log_model(config: Config, device: str, keep_memory: bool = True) -> SceneFlowModel:
-    """Make a method for the windows of logs, which are checked when they are opened, not at each call.
-
-    With `keep_memory`, this process keeps the memory that it frees, see `keep_freed_memory`.
-    """
-    if keep_memory:
-        keep_freed_memory()
-    model = estimate.make_model(config, device)
-    model.inspect = None
-    return model
 
 
 def stored_flow(folder: Any, needed: Sequence[str]) -> Callable[[Log, int], FlowResult]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from tqdm import tqdm
@@ -12,26 +13,25 @@ from cflow_torch.applications.labels import find_labels
 from cflow_torch.cli.commands import Label
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow import FlowRun, compute
-from cflow_torch.cli.flows import make_log_model
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.errors import import_optional
+from cflow_torch.estimate import make_model
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.types import CFlowError
 
-_CONTENTS = ("residual", "cluster_id", "confidence")
 
-
-def task(cfg: Label) -> None:
+def _contents(cfg: Label) -> tuple[str, ...]:
+    """Return the columns that labels need, or reject settings that give no labels."""
     if cfg.data.get("name") != "hdf5":
         raise CFlowError("labels are written into HDF5 scenes of OpenSceneFlow: give their folder, and leave data= out")
     if cfg.model.method != "verified":
         raise CFlowError("labels need the confidence of the flow: give model=offline or default")
     import_optional("scipy.spatial", "labels need SciPy (extra label): pip install scipy")
-    compute(cfg, _CONTENTS, _check, _label)
+    return "residual", "cluster_id", "confidence"
 
 
 def _check(cfg: Label, flow: FlowRun) -> None:
@@ -50,7 +50,7 @@ def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
-    model = make_log_model(cfg.model, cfg.device)
+    model = make_model(cfg.model, cfg.device)
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
     scenes = [part.source for part in flow.parts]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
@@ -72,3 +72,6 @@ def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
     write_json(file, {**report, "labelled": labelled, "waiting": waiting, "not_labelled": failures})
     print(f"report: {file}")
     return failures
+
+
+task = partial(compute, contents=_contents, check=_check, use=_label)

@@ -6,8 +6,8 @@ import os
 from typing import Any, NamedTuple, TextIO
 
 from cflow_torch.cli.choices import FOLDER, read_settings
+from cflow_torch.cli.commands import NOT_GIVEN
 from cflow_torch.cli.failures import Failures, collect_failures
-from cflow_torch.cli.words import NOT_GIVEN
 from cflow_torch.data.catalog import find_sources, find_user_sources, open_log, recognise
 from cflow_torch.data.log import Log
 from cflow_torch.setting import AUTO

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import sys
-import traceback
 from importlib import import_module
-from typing import Any
 
 from cflow_torch import __version__
+from cflow_torch.cli.choices import help_of
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS
-from cflow_torch.errors import CFlowError
+from cflow_torch.cli.exits import exit_if_refused, exit_wrong
+from cflow_torch.cli.words import read_call
+from cflow_torch.errors import CFlowError, near
 
 HELP = f"""cflow: training-free LiDAR scene flow
 
@@ -43,9 +43,9 @@ def main(argv: list[str] | None = None) -> None:
         _run(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()
     except CFlowError as error:
-        _exit_wrong(error)
+        exit_wrong(error)
     except OSError as error:
-        _exit_if_refused(error)
+        exit_if_refused(error)
         raise
     except KeyboardInterrupt:
         print("stopped by Ctrl-C", file=sys.stderr)
@@ -61,70 +61,16 @@ def _run(arguments: list[str]) -> None:
     elif command in ("-V", "--version"):
         print(f"cflow_torch {__version__}")
     elif command not in COMMANDS:
-        from cflow_torch.cli.choices import near
-
         raise CFlowError(f"unknown command {command!r}{near(command, COMMANDS)}: give one of {', '.join(COMMANDS)}")
     elif "-h" in words or "--help" in words:
-        print(COMMANDS[command].help(), end="")
+        print(help_of(command), end="")
     elif command in WITH_SETTINGS:
-        _run_with_settings(command, words)
+        call = read_call(words, command)
+        from cflow_torch.cli.compose import run_with_hydra  # imports Hydra, which takes half a second
+
+        run_with_hydra(command, call)
     else:
         import_module(f"cflow_torch.cli.{command}").task(words)
-
-
-def _run_with_settings(command: str, words: list[str]) -> None:
-    from cflow_torch.cli.words import read_call
-
-    call = read_call(words, command)
-    from cflow_torch.cli.compose import explain, run_with_hydra  # imports Hydra, which takes half a second
-    from cflow_torch.cli.failures import UnfinishedJob
-
-    try:
-        run_with_hydra(command, call, lambda composed: _run_job(command, composed))
-    except UnfinishedJob as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
-    except Exception as error:
-        _exit_if_refused(error)
-        _exit_wrong(explain(error, command))
-
-
-def _run_job(command: str, composed: Any) -> Any:
-    """Run a command with the settings that Hydra has composed, perhaps as a job of a sweep."""
-    from omegaconf.errors import OmegaConfBaseException
-
-    from cflow_torch.cli.compose import explain, find_own_modules, settings_of
-    from cflow_torch.cli.failures import UnfinishedJob
-    from cflow_torch.fleet.progress import show_warnings_as_lines
-
-    try:
-        find_own_modules()
-        show_warnings_as_lines()
-        settings = settings_of(command, composed)
-        return import_module(f"cflow_torch.cli.{command}").task(settings)
-    except UnfinishedJob:
-        raise
-    except (CFlowError, OmegaConfBaseException) as error:
-        _exit_wrong(explain(error, command))
-    except Exception as error:
-        _exit_if_refused(error)
-        traceback.print_exc()
-        message = "this is a bug of cflow: please report it with the lines above and the output of `cflow info`"
-        raise UnfinishedJob(message) from None
-
-
-def _exit_wrong(message: object) -> None:
-    print(f"error: {message}", file=sys.stderr)
-    raise SystemExit(2) from None
-
-
-def _exit_if_refused(error: Exception) -> None:
-    """Exit after an error that is not a bug: a file that the system refused, or a pipe whose reader has ended."""
-    if isinstance(error, BrokenPipeError):  # as in `cflow info | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(128 + 13) from None  # as if SIGPIPE had ended it
-    if isinstance(error, OSError) and error.filename is not None:
-        _exit_wrong(f"{error.filename}: {error.strerror or error}; check data.root= (read) and output= (written)")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import torch
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.fleet.executors import ProcessExecutor, describe_error
+from cflow_torch.fleet.executors import ProcessExecutor
 from cflow_torch.fleet.machine import choose_layout, frames_per_worker
 from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
 from cflow_torch.model import SceneFlowModel
@@ -57,18 +57,19 @@ def _answers(pairs: Sequence[LogPair], model: TimedModel) -> Iterator[tuple[LogP
     if count < 2:
         yield from zip(Progress(pairs), (partial(_estimate, model, sweeps) for sweeps in windows))
         return
-    executors = [ProcessExecutor(_Estimator, method) for _ in range(count)]
-    waiting: deque[_Call] = deque()
+    make = partial(_Estimator, method)
+    executors = [ProcessExecutor(make) for _ in range(count)]
+    waiting: deque[Answer] = deque()
     in_order = iter(Progress(pairs))
     try:
         for executor, sweeps in zip(cycle(executors), windows):
-            waiting.append(_Call(executor, sweeps, model))
+            is_read = isinstance(sweeps, Window)
+            future = executor.submit("estimate", sweeps) if is_read else None
+            waiting.append(partial(_answer, model, sweeps, future, make))
             if len(waiting) > _AHEAD * count:
                 yield next(in_order), waiting.popleft()
         yield from zip(in_order, waiting)
     finally:
-        for call in waiting:
-            call.future.cancel()
         for executor in executors:
             executor.close()
 
@@ -92,30 +93,24 @@ def _estimate(model: TimedModel, sweeps: Window | Exception) -> tuple[Window, Fl
         return sweeps, model([sweeps])[0]
 
 
-class _Call:
-    """The estimate of one pair in a worker process. If the process ends, another one tries once more."""
-
-    def __init__(self, executor: ProcessExecutor, sweeps: Window | Exception, model: TimedModel) -> None:
-        self._executor = executor
-        self._sweeps = sweeps
-        self._model = model
-        self.future: Future[Any] = Future()
-        if isinstance(sweeps, Exception):
-            self.future.set_exception(sweeps)
-        else:
-            self.future = executor.submit("estimate", sweeps)
-
-    def __call__(self) -> tuple[Window, FlowResult]:
+def _answer(
+    model: TimedModel, sweeps: Window | Exception, future: Future[Any] | None, make: Callable[[], Any]
+) -> tuple[Window, FlowResult]:
+    """Wait for the estimate of a worker process. If the process ends, try once more, in another one, alone."""
+    if future is None or isinstance(sweeps, Exception):
+        raise sweeps  # type: ignore[misc]  # without a future, it is the error of reading
+    try:
+        arrays, seconds = future.result()
+    except BrokenExecutor:
+        alone = ProcessExecutor(make)
         try:
-            arrays, seconds = self.future.result()
+            arrays, seconds = alone.submit("estimate", sweeps).result()
         except BrokenExecutor:
-            try:
-                arrays, seconds = self._executor.submit("estimate", self._sweeps).result()
-            except BrokenExecutor as error:
-                raise CFlowError(f"2 worker processes died on it, the last one: {describe_error(error)}") from error
-        self._model.pairs.append(seconds)
-        result = FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
-        return self._sweeps, result  # type: ignore[return-value]  # an exception was raised above
+            raise CFlowError(f"2 worker processes died on it, the last one: {alone.close()}") from None
+        finally:
+            alone.close()
+    model.pairs.append(seconds)
+    return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
 class _Estimator:

@@ -12,13 +12,13 @@ from tqdm import tqdm
 
 from cflow_torch.cli.commands import Animation, CorrelationPicture, FlowPicture, Plot
 from cflow_torch.cli.failures import finish
-from cflow_torch.cli.flows import make_log_model
 from cflow_torch.cli.logs import check_pair, chosen_pairs, find_logs, paths_of
 from cflow_torch.cli.outputs import local_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import Log, window
 from cflow_torch.errors import import_optional
+from cflow_torch.estimate import make_model
 from cflow_torch.fleet.work import source_name
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
@@ -36,7 +36,7 @@ def task(cfg: Plot) -> None:
     blank_figure((1, 1), 100)  # fails now if matplotlib is missing, not after the work
     if isinstance(cfg, Animation) and cfg.format == "mp4":
         import_optional("imageio_ffmpeg", "format=mp4 needs imageio-ffmpeg (extra video): pip install imageio-ffmpeg")
-    model = make_log_model(cfg.model, cfg.device)
+    model = make_model(cfg.model, cfg.device)
     log = find_log(cfg)
     if isinstance(cfg, Animation):
         path = _animate(cfg, model, log, output)

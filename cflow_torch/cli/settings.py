@@ -7,10 +7,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Iterator, NamedTuple
 
-from cflow_torch.cli.choices import files, near, setting_names
+from cflow_torch.cli.choices import files, known_settings
 from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Plot, as_yaml, setting_lines
 from cflow_torch.config import METHODS, PRESETS, WINDOW
-from cflow_torch.errors import CFlowError
+from cflow_torch.errors import CFlowError, near
 from cflow_torch.setting import describe_limits
 
 _PAGE = """# Settings
@@ -133,7 +133,7 @@ def _about(name: str) -> list[str]:
     single = [f"{', '.join(titles)}:\n  {line}" for line, titles in titles_of.items()]
     found = [*whole, *(["\n".join(choices)] if choices else []), *single]
     if not found:
-        known = [key for command in WITH_SETTINGS.values() for key in setting_names(command)]
+        known = [key for command in WITH_SETTINGS.values() for key in known_settings(command)]
         known += [one for section in _sections() for one in (section.title, *section.names)]
         raise CFlowError(f"settings {name}: nothing has this name{near(name, known)}; `cflow settings` lists all")
     return found

@@ -15,12 +15,10 @@ from cflow_torch.cli.outputs import machine, output_folder, versions
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
-from cflow_torch.windows.memory import keep_freed_memory
 
 
 def task(cfg: Stream) -> None:
     output = output_folder(cfg)
-    keep_freed_memory()
     # The log finds the ground, or has none where data.find_ground is null.
     stream = FlowStream(cfg.model, device=cfg.device, ground=None, max_gap=cfg.max_gap)
     log = open_first_log(cfg.data)

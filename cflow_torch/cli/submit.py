@@ -8,11 +8,11 @@ from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
 from cflow_torch.cli.commands import Submit
 from cflow_torch.cli.failures import Failures, collect_failures, finish
-from cflow_torch.cli.flows import make_log_model
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import claim_output, output_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.log import Log
+from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.submission import archive, frames
 from cflow_torch.evaluation.submission.archive import SubmissionVersion
 from cflow_torch.evaluation.submission.frames import MaskArchive, SubmittedFrame
@@ -33,7 +33,7 @@ def task(cfg: Submit) -> None:
         raise CFlowError("masks= already lists the frames that are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = frames.read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
-    model = TimedModel(make_log_model(cfg.model, cfg.device))
+    model = TimedModel(make_model(cfg.model, cfg.device))
     logs, failures = open_logs(cfg.data)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable

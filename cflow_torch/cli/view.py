@@ -12,12 +12,13 @@ from cflow_torch.applications.track_table import TRACKS_FILE, Table, read_tracks
 from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.cli.commands import View
 from cflow_torch.cli.failures import Failures, collect_failures, finish
-from cflow_torch.cli.flows import make_log_model, stored_flow
+from cflow_torch.cli.flows import stored_flow
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import chosen_preset, local_folder, write_config
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path
+from cflow_torch.estimate import make_model
 from cflow_torch.fleet.progress import Progress
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.page import load_k3d, save_page
@@ -82,7 +83,7 @@ def _flow(cfg: View) -> tuple[Callable[[Log, int], FlowResult], int]:
     """Return a function that returns the flow of a pair, and the number of sweeps that this function needs."""
     if cfg.flow is not None:
         return stored_flow(cfg.flow, ("residual_flow", "pose_flow", "cluster_id", "is_valid")), 2
-    model = make_log_model(cfg.model, cfg.device)
+    model = make_model(cfg.model, cfg.device)
     num_history, num_future = model.config.num_history, model.config.num_future
     return lambda log, index: model([window(log, index, num_history, num_future)])[0], model.config.num_sweeps
 

@@ -9,27 +9,18 @@ import glob
 import math
 import os
 from contextlib import suppress
-from dataclasses import fields
 from typing import Any, NamedTuple
 
-from cflow_torch.cli.choices import choices, near, setting_names
-from cflow_torch.cli.commands import (
-    DATA_SETTINGS,
-    ENGINES,
-    PICTURES,
-    WITH_SETTINGS,
-    Command,
-)
-from cflow_torch.config import PRESETS, config_from
-from cflow_torch.errors import CFlowError
-from cflow_torch.setting import Settings, checked
+from cflow_torch.cli.choices import choices, known_settings
+from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
+from cflow_torch.errors import CFlowError, near
+from cflow_torch.setting import checked
 
 # Options of Hydra that the next word belongs to; the first of them name configurations of your own.
 _OWN_CONFIGS = ("-cd", "--config-dir", "-cn", "--config-name", "-cp", "--config-path")
 _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
 _LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan": math.nan}
-NOT_GIVEN = "???"  # a setting without a value
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
 
 
@@ -78,93 +69,53 @@ def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
     """Reject names that do not exist and plain values that are not allowed."""
     kind = WITH_SETTINGS[command]
     chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
-    known = setting_names(kind)
-    texts = text_names(kind)
-    values: dict[str, Any] = {}
+    known = known_settings(kind)
     for word in settings:
         key, _, value = word.partition("=")
-        if key in chosen or _is_for_hydra(key) or any(name.startswith(f"{key}.") for name in known):
-            continue
-        if has_own and key.partition(".")[0] in chosen:
+        is_group = key in chosen or any(name.startswith(f"{key}.") for name in known)
+        if is_group or _is_for_hydra(key) or (has_own and key.partition(".")[0] in chosen):
             continue
         if key not in known:
-            hint = near(key, [*chosen, *known])
+            of_value = [group for group in chosen if value in choices(group)]  # preset=live
+            hint = f" (did you mean {of_value[0]}={value}?)" if of_value else near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
-        owners = known[key]
-        group = owners[0].partition("=")[0] if owners else ""
-        if chosen.get(group) and not {f"{group}={choice}" for choice in chosen[group]} & set(owners):
-            raise CFlowError(f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out")
-        with suppress(ValueError):
-            plain = plain_value(value)
-            values[key] = value if key in texts and plain is not None else plain
-    single = {group: names[0] for group, names in chosen.items() if len(names) == 1}
-    make_settings(command, _nested(values, kind, single))
+        owners = [choice for choice in known[key] if _is_chosen(choice, chosen)]
+        if not owners:
+            raise CFlowError(
+                f"setting {key!r} belongs to {' or '.join(known[key])}: give that as well, or leave it out"
+            )
+        limits = known[key][owners[0]]
+        if len(owners) == 1 and limits is not None:
+            for plain in plain_values(value, limits["kind"] is str):
+                checked(key, plain, limits)
 
 
-def text_names(kind: type[Command]) -> set[str]:
-    """Return the names of settings whose values are text, even if they look like numbers."""
-    return {f.name for f in fields(kind) if f.metadata.get("kind") is str} | {"data.root", "data.cache"}
+def _is_chosen(choice: str, chosen: dict[str, list[str]]) -> bool:
+    """Test whether a choice, such as "data=av2", is or may be in effect; "" always is."""
+    group, _, name = choice.partition("=")
+    return not chosen.get(group) or name in chosen[group]
 
 
-def plain_value(text: str) -> Any:
-    """Return the value that Hydra reads from a text: null, a truth, a number, text, or a list of them.
+def plain_values(text: str, is_text: bool = False) -> list[Any]:
+    """Return the value that Hydra reads from a text, those of a sweep (a,b), or none if only Hydra can read them.
 
-    A ValueError is raised for a text that is more than this, such as the values of a sweep.
+    With `is_text`, numbers are text, too.
     """
-    if text[:1] == "[" and text[-1:] == "]":
-        return [plain_value(one.strip()) for one in text[1:-1].split(",")]
-    if not text or set(text) & set(_NOT_PLAIN) or "," in text:
-        raise ValueError(text)
-    if text.lower() in _LITERALS:
+    is_list = text[:1] == "["
+    inner = text[1:-1] if is_list else text
+    if set(inner) & set(_NOT_PLAIN) or is_list != (text[-1:] == "]"):
+        return []
+    values = [_plain_value(one.strip(), is_text) for one in inner.split(",")] if inner or not is_list else []
+    return [values] if is_list else values
+
+
+def _plain_value(text: str, is_text: bool) -> Any:
+    if text.lower() in _LITERALS and (not is_text or text.lower() == "null"):
         return _LITERALS[text.lower()]
-    for kind in (int, float):
+    for kind in () if is_text else (int, float):
         with suppress(ValueError):
             return kind(text)
     return text
-
-
-def _nested(values: dict[str, Any], kind: type[Command], chosen: dict[str, str]) -> dict[str, Any]:
-    """Nest the values of dotted names, and fill in the groups of which one choice is known. Others are left out."""
-    nested: dict[str, Any] = {}
-    for key, value in values.items():
-        group, _, own = key.rpartition(".")
-        level = nested.setdefault(group, {}) if group else nested
-        level[own] = value
-    model = nested.pop("model", {})
-    if "model" in chosen:
-        nested["model"] = {**PRESETS[chosen["model"]].as_dict(), **model}
-    engine = nested.pop("engine", {})
-    if "engine" in chosen:
-        nested["engine"] = {"name": chosen["engine"], **engine}
-    if "picture" in chosen:
-        return {**nested, "picture": chosen["picture"]}
-    return {name: value for name, value in nested.items() if name in kind.__dataclass_fields__}
-
-
-def make_settings(command: str, values: dict[str, Any]) -> Command:
-    """Make the settings of a command, and check the values. This does not import torch."""
-    kind = WITH_SETTINGS[command]
-    if "picture" in values:
-        kind = PICTURES[values["picture"]]
-    made = dict(values)
-    if "model" in values:
-        made["model"] = config_from(values["model"])
-    engine = values.get("engine")
-    if engine is not None:
-        if engine["name"] not in ENGINES:
-            raise CFlowError(f"engine={engine['name']!r}: give one of {', '.join(ENGINES)}")
-        made["engine"] = _make(ENGINES[engine["name"]], engine, command)
-    for name, value in values.get("data", {}).items():
-        if name in DATA_SETTINGS and value != NOT_GIVEN:
-            checked(f"data.{name}", value, DATA_SETTINGS[name])
-    return _make(kind, made, command)  # type: ignore[return-value]
-
-
-def _make(kind: type[Settings], values: dict[str, Any], command: str) -> Settings:
-    for name in values:
-        if name not in kind.__dataclass_fields__:  # type: ignore[attr-defined]
-            raise CFlowError(f"unknown setting {kind.PREFIX}{name}: `cflow {command} --cfg job` prints all settings")
-    return kind(**values)
 
 
 def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
@@ -195,4 +146,4 @@ def _is_for_hydra(key: str) -> bool:
 def check_exists(path: str) -> None:
     """Reject a path that does not exist. The address of an object store is not looked up."""
     if "://" not in path and not os.path.exists(path):
-        raise CFlowError(f"{path}: there is no such file or folder; settings are NAME=VALUE")
+        raise CFlowError(f"{path}: there is no such file or folder; settings are NAME=VALUE, without spaces")

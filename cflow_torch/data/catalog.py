@@ -85,7 +85,7 @@ def recognise(root: Any) -> str:
     top = as_path(root)
     with remote_errors(top):
         if not top.exists():
-            raise CFlowError(f"{root}: there is no such file or folder; settings are NAME=VALUE")
+            raise CFlowError(f"{root}: there is no such file or folder")
         level, fitting = [top], set()
         for _ in range(_DEEPEST):
             fitting = {name for name, one in DATA_SETS.items() for path in level if any(map(path.match, one.marks))}

@@ -186,6 +186,9 @@ class Log(ABC):
     def __exit__(self, *_: Any) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        return f"{type(self.unwrapped).__name__}({self.log_id}, {len(self.timestamps)} sweeps)"
+
     def __len__(self) -> int:
         return len(self.timestamps)
 

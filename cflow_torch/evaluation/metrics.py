@@ -35,7 +35,7 @@ class SceneFlowMetrics:
     def __init__(self, definition: str | Definition = "opensceneflow") -> None:
         if not isinstance(definition, Definition):
             if definition not in DEFINITIONS:
-                raise CFlowError(f"definition={definition!r}: give one of {sorted(DEFINITIONS)}")
+                raise CFlowError(f"definition={definition!r}: give one of {', '.join(sorted(DEFINITIONS))}")
             definition = DEFINITIONS[definition]
         self.definition = definition
         self.parts: dict[str, Accumulator] = {

@@ -1,15 +1,14 @@
-"""Executors: each is a process that holds one object and calls its methods, one call at a time, as futures."""
+"""Executors: each holds one object, such as a `Worker`, and calls its methods, one call at a time, as futures."""
 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
-import traceback
 from abc import ABC, abstractmethod
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from contextlib import suppress
-from threading import Lock
-from typing import Any, Callable
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from threading import Thread
+from typing import Any, Callable, Sequence
 
 from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.stop_signal import SIGNALS
@@ -19,103 +18,116 @@ class CannotStart(CFlowError):
     """The object of an executor could not be made, so no call can succeed."""
 
 
+class Holder:
+    """Makes an object at the first call and keeps it."""
+
+    held: Any = None
+
+    def call(self, make: Callable[[], Any], method: str, arguments: Sequence[Any]) -> Any:
+        """Call a method of the object that `make` returns. Errors of `make` become `CannotStart`."""
+        if self.held is None:
+            try:
+                self.held = make()
+            except Exception as error:
+                raise CannotStart(describe_error(error)) from error
+        return getattr(self.held, method)(*arguments)
+
+
 class Executor(ABC):
-    """A process that holds one object. A call starts it if it has not begun, has ended or was closed."""
+    """Holds one object. A call makes it if there is none yet, or if it was lost or closed."""
+
+    timeout: float | None = None  # seconds after which a call without an answer is hopeless
 
     @abstractmethod
     def submit(self, method: str, *arguments: Any) -> Future[Any]:
-        """Call a method of the object. Errors of the future: `BrokenExecutor` if the process has ended, `CannotStart`,
-        and those of the method."""
+        """Call a method of the object. Errors of the future: `BrokenExecutor` if the object is lost, `CannotStart`, and
+        those of the method."""
 
     @abstractmethod
-    def close(self) -> None:
-        """Kill the process, even during a call."""
+    def close(self) -> str:
+        """End the object, even during a call. Return in words how its process has ended, "" if there is none."""
+
+
+class InlineExecutor(Executor):
+    """An object of this process. A call returns when it is done. `make` returns the object."""
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self._make = make
+        self._holder = Holder()
+
+    def submit(self, method: str, *arguments: Any) -> Future[Any]:
+        answer: Future[Any] = Future()
+        try:
+            answer.set_result(self._holder.call(self._make, method, arguments))
+        except Exception as error:
+            answer.set_exception(error)
+        return answer
+
+    def close(self) -> str:
+        if self._holder.held is not None:
+            self._holder.held.close()
+        self._holder = Holder()
+        return ""
 
 
 class ProcessExecutor(Executor):
-    """A process of this machine. It ignores `SIGNALS`. When its parent ends, it ends after its call.
-
-    `CFlowError` and OSError arrive as they are, any other error as a RuntimeError with the traceback of the process.
+    """A process of this machine, which ignores `SIGNALS` and ends when its parent ends.
 
     Args:
-        make: called in the process; returns the object.
-        arguments: of `make`. They are pickled, like the arguments and results of calls.
+        make: called in the process; returns the object. It is pickled, like the arguments and results of calls.
+        timeout: see `Executor`.
     """
 
-    def __init__(self, make: Callable[..., Any], *arguments: Any) -> None:
-        self._make = (make, arguments)
-        self._caller = ThreadPoolExecutor(1)  # waits for the answers
-        self._lock = Lock()
-        self._process: Any = None
-        self._pipe: Any = None
+    def __init__(self, make: Callable[[], Any], timeout: float | None = None) -> None:
+        self._make = make
+        self._pool: Any = None
+        self.timeout = timeout
 
     def submit(self, method: str, *arguments: Any) -> Future[Any]:
-        return self._caller.submit(self._call, method, arguments)
-
-    def close(self) -> None:
-        with self._lock:
-            process, self._process = self._process, None
-        if process is not None:
-            process.kill()
-            process.join()
-
-    def _call(self, method: str, arguments: tuple[Any, ...]) -> Any:
-        with self._lock:
-            if self._process is None:
-                self._start()
-            process, pipe = self._process, self._pipe
-        try:
-            pipe.send((method, arguments))
-            answer, error = pipe.recv()
-        except (EOFError, OSError):
-            process.join()
-            how = _ending(process.exitcode)
-            self.close()
-            raise BrokenExecutor(how) from None
-        if error is not None:
-            raise error
+        how = ""
+        for _ in range(2):
+            if self._pool is None:
+                context = multiprocessing.get_context("spawn")  # threads and CUDA do not survive a fork
+                self._pool = ProcessPoolExecutor(1, context, _begin)
+            try:
+                return self._pool.submit(_call, self._make, method, arguments)  # type: ignore[no-any-return]
+            except (BrokenExecutor, OSError) as error:  # the process has ended since the last call, or cannot start
+                how = describe_error(error)
+                self.close()
+        answer: Future[Any] = Future()
+        answer.set_exception(BrokenExecutor(how))
         return answer
 
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")  # threads and CUDA do not survive a fork
-        self._pipe, pipe = context.Pipe()
-        process = context.Process(target=_serve, args=(pipe, *self._make), daemon=True)
-        try:
-            process.start()
-        except OSError as error:
-            raise BrokenExecutor(f"it could not start: {describe_error(error)}") from error
-        finally:
-            pipe.close()
-        self._process = process
+    def close(self) -> str:
+        if self._pool is None:
+            return ""
+        pool, self._pool = self._pool, None
+        processes = list((pool._processes or {}).values())  # Python 3.14 has kill_workers instead
+        pool.shutdown(wait=False)
+        for process in processes:
+            process.kill()
+            process.join()
+        return "".join(_ending(process.exitcode) for process in processes)
 
 
-def _serve(pipe: Any, make: Callable[..., Any], make_arguments: tuple[Any, ...]) -> None:
-    """Make the object at the first call, and answer calls until the parent ends."""
+_holder = Holder()  # of a process that `ProcessExecutor` has started
+
+
+def _call(make: Callable[[], Any], method: str, arguments: Sequence[Any]) -> Any:
+    return _holder.call(make, method, arguments)
+
+
+def _begin() -> None:
+    """Begin a process: the parent receives signals as well, and says when to stop."""
     for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)  # the parent receives them as well and says when to stop
-    held: Any = None
-    with suppress(EOFError, OSError):
-        while True:
-            method, arguments = pipe.recv()
-            answer: Any = None
-            error: Exception | None = None
-            try:
-                if held is None:
-                    held = make_object(make, *make_arguments)
-                answer = getattr(held, method)(*arguments)
-            except (CFlowError, OSError, BrokenExecutor) as caught:
-                error = caught
-            except Exception:
-                error = RuntimeError(traceback.format_exc())
-            pipe.send((answer, error))
+        signal.signal(number, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
 
 
-def make_object(make: Callable[..., Any], *arguments: Any) -> Any:
-    """Make the object of an executor; its errors become `CannotStart`."""
-    try:
-        return make(*arguments)
-    except Exception as error:
-        raise CannotStart(describe_error(error)) from error
+def _end_with_parent() -> None:
+    parent: Any = multiprocessing.parent_process()
+    parent.join()
+    os._exit(1)
 
 
 def describe_error(error: BaseException) -> str:

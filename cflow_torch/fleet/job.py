@@ -39,7 +39,6 @@ class Part:
     end: int = 1
     of: int = 1
     only: int | None = None  # time stamp of the only frame to do; None = all of them
-    is_retry: bool = False  # a worker has died on it
 
     def frames(self, num_pairs: int) -> range:
         """Indices of the sweeps t, in a log of `num_pairs` pairs."""

@@ -1,141 +1,158 @@
-"""Engine `local`, and what all engines share: parts go to workers, and a part whose worker ends is tried once more."""
+"""Run the parts of logs on executors. A part whose worker ends is tried once more, frame by frame, then reported."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections import deque
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, wait
-from contextlib import closing
+from concurrent.futures import TimeoutError as NoAnswer
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Callable, Iterator, Sequence
+from functools import partial
+from queue import Empty, SimpleQueue
+from threading import Event as Flag
+from threading import Thread
+from typing import Any, Callable, Generator, Iterator, Sequence
 
-from cflow_torch.fleet.executors import CannotStart, Executor, ProcessExecutor, describe_error
+from cflow_torch.fleet.executors import CannotStart, Executor, InlineExecutor, ProcessExecutor, describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.work import Worker, make_worker, source_name
 
+Events = Generator[Event, None, None]
 _POLL_S = 0.2  # how soon a signal is noticed
 _GRACE_S = 20.0  # after a signal, time to finish the frames that have begun; schedulers kill after 30 s or more
 _REMEDY = "if memory is short, give fewer engine.workers"
 
 
-def run_local(
-    job: Job,
-    parts: Sequence[Part],
-    layout: Layout,
-    stop: Callable[[], bool],
-    *,
-    timeout: float = 600.0,
-    memory: float | None = None,
-) -> Iterator[Event]:
-    """Do all parts with processes of this machine, one per device, and yield events as they happen.
+@contextmanager
+def local_executors(
+    job: Job, layout: Layout, timeout: float = 600.0, memory: float | None = None
+) -> Iterator[list[Executor]]:
+    """Engine `local`: a process of this machine per device; `cli.commands.Local` explains the settings.
 
-    `cli.commands.Local` explains the settings. A single worker without a memory limit runs in this process.
+    A single worker without a memory limit runs in this process.
     """
-    if len(layout.devices) > 1 or memory is not None:
-        executors = [ProcessExecutor(make_worker, job, device, memory) for device in layout.devices]
-        yield from run_parallel(executors, parts, stop, timeout)
-        return
-    with closing(Worker(job, layout.devices[0])) as worker:
-        for part in parts:
-            if stop():
-                break
-            yield from worker.run(part, stop)
+    if len(layout.devices) == 1 and memory is None:
+        yield [InlineExecutor(partial(Worker, job, layout.devices[0]))]
+    else:
+        yield [ProcessExecutor(partial(make_worker, job, device, memory), timeout) for device in layout.devices]
 
 
-def run_parallel(
-    executors: Sequence[Executor], parts: Sequence[Part], stop: Callable[[], bool], timeout: float = math.inf
-) -> Iterator[Event]:
+def run_parallel(executors: Sequence[Executor], parts: Sequence[Part], stop: Callable[[], bool]) -> Events:
     """Do all parts, and yield events as they happen. A worker that cannot start is a `CFlowError`.
+
+    A thread waits for each executor, unless its object is in this process.
 
     Args:
         executors: of `Worker` objects.
         parts: numbered from 0.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
-        timeout: seconds after which a worker that has not answered is replaced.
     """
-    todo = deque(parts)
-    idle = list(executors)
-    tasks: list[_Task] = []
-    end = math.inf
+    todo: SimpleQueue[Part] = SimpleQueue()
+    for part in parts:
+        todo.put(part)
+    is_over = Flag()
     try:
-        while time.monotonic() < end:
-            is_stopped = stop()
-            if is_stopped:
-                end = min(end, time.monotonic() + _GRACE_S)
-            while todo and idle and not is_stopped:
-                tasks.append(_Task(idle.pop(), todo.popleft(), timeout))
-            if not tasks:
-                break
-            wait([task.answer for task in tasks], _POLL_S, FIRST_COMPLETED)
-            for task in tasks:
-                yield from task.follow(is_stopped, todo)
-            idle += [task.executor for task in tasks if task.is_done]
-            tasks = [task for task in tasks if not task.is_done]
+        if len(executors) == 1 and isinstance(executors[0], InlineExecutor):
+            yield from _do_all(executors[0], todo, stop)
+        else:
+            yield from _merged([_do_all(e, todo, lambda: is_over.is_set() or stop()) for e in executors], stop)
     finally:
+        is_over.set()
         for executor in executors:
             executor.close()
 
 
-class _Task:
-    """A part of a log that a `Worker` in an executor does."""
+def _merged(sources: Sequence[Iterator[Event]], stop: Callable[[], bool]) -> Iterator[Event]:
+    """Yield events of several iterators, each in a thread of its own. After a stop, we do not wait for hanging ones."""
+    events: SimpleQueue[Any] = SimpleQueue()  # an error ends the run; None = an iterator has ended
 
-    def __init__(self, executor: Executor, part: Part, timeout: float) -> None:
-        self.executor = executor
-        self.is_done = False
-        self._part = part
-        self._timeout = timeout
-        self._name = source_name(part.source)  # of the log
-        self._missing: set[int] | None = None  # time stamps of frames without a result; None = the log is not open
-        self._ask(part, False)
+    def pass_on(source: Iterator[Event]) -> None:
+        try:
+            for event in source:
+                events.put(event)
+            events.put(None)
+        except Exception as error:
+            events.put(error)
 
-    def _ask(self, part: Part | None, is_stopped: bool) -> None:
-        self.answer = self.executor.submit("next_event", part, is_stopped)
-        self._deadline = time.monotonic() + self._timeout
-
-    def follow(self, is_stopped: bool, todo: deque[Part]) -> Iterator[Event]:
-        """Yield the event that the worker has answered, if it has, and ask for the next one."""
-        is_late = time.monotonic() > self._deadline
-        if not (self.answer.done() or is_late):
-            return
-        error = self.answer.exception() if self.answer.done() else BrokenExecutor(f"no answer for {self._timeout:g} s")
-        if isinstance(error, CannotStart):
-            raise error
-        if error is not None:
-            self.executor.close()
-            self.is_done = True
-            yield from self._try_again(todo, describe_error(error))
-            return
-        event: Event | None = self.answer.result()
-        if event is None:
-            self.is_done = True
-            return
-        yield from self._pass_on(event)
-        self._ask(None, is_stopped)
-
-    def _pass_on(self, event: Event) -> Iterator[Event]:
-        if isinstance(event, Opened):
-            self._name = event.log_id
-            self._missing = set(event.todo)
-            if self._part.only is None:
+    for source in sources:
+        Thread(target=pass_on, args=(source,), daemon=True).start()
+    num_left = len(sources)
+    end = math.inf
+    while num_left > 0 and time.monotonic() < end:
+        if stop():
+            end = min(end, time.monotonic() + _GRACE_S)
+        with suppress(Empty):
+            event = events.get(timeout=_POLL_S)
+            if isinstance(event, Exception):
+                raise event
+            if event is None:
+                num_left = num_left - 1
+            else:
                 yield event
-            elif not event.todo:  # its file was written just before the first worker died
-                yield Done(self._part.number, self._part.only, {})
-            return
-        if isinstance(event, (Done, Failed)) and self._missing is not None:
-            self._missing.discard(event.timestamp)  # type: ignore[arg-type]
-        yield event
 
-    def _try_again(self, todo: deque[Part], how: str) -> Iterator[Event]:
-        """Try each frame that has no result once more, alone, or the log if it did not open; then report it."""
-        part = self._part
-        if part.is_retry:
-            name = self._name if part.only is None else f"{self._name}/{part.only}"
-            yield Failed(part.number, name, f"its worker died again ({how}): {_REMEDY}", part.only)
+
+def _do_all(executor: Executor, todo: SimpleQueue[Part], stop: Callable[[], bool]) -> Iterator[Event]:
+    with suppress(Empty):
+        while not stop():
+            yield from _do(executor, todo.get_nowait(), stop)
+
+
+def _do(executor: Executor, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
+    """Do a part. If its worker dies, try each frame that has no result once more, alone, then report it.
+
+    If the log did not open, we try the part once more.
+    """
+    name = source_name(part.source)  # of the log
+    missing: set[int] | None = None  # time stamps of frames without a result; None = the log is not open
+    try:
+        for event in _events(executor, part, stop):
+            if isinstance(event, Opened):
+                name = event.log_id
+                missing = set(event.todo)
+            elif missing is not None and isinstance(event, (Done, Failed)):
+                missing.discard(event.timestamp)  # type: ignore[arg-type]
+            yield event
+        return
+    except _Lost as error:
+        if stop():
             return
-        if self._missing is None:
-            todo.append(replace(part, is_retry=True))
-        else:
-            todo.extend(replace(part, only=stamp, is_retry=True) for stamp in sorted(self._missing))
-        yield Noted(part.number, self._name, f"a worker died ({how}): its frames are tried again, one by one")
+        yield Noted(part.number, name, f"a worker died ({error}): its frames are tried again, one by one")
+    for stamp in [None] if missing is None else sorted(missing):
+        if stop():
+            return
+        try:
+            for event in _events(executor, replace(part, only=stamp), stop):
+                if stamp is None or not isinstance(event, Opened):
+                    yield event
+                elif not event.todo:  # its file was written just before the first worker died
+                    yield Done(part.number, stamp, {})
+        except _Lost as error:
+            of_frame = name if stamp is None else f"{name}/{stamp}"
+            yield Failed(part.number, of_frame, f"its worker died again ({error}): {_REMEDY}", stamp)
+
+
+class _Lost(Exception):
+    """The worker of an executor has ended; the text says how."""
+
+
+def _events(executor: Executor, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
+    """Yield the events of a part."""
+    asked: Part | None = part
+    while True:
+        try:
+            event = executor.submit("next_event", asked, stop()).result(executor.timeout)
+        except CannotStart:
+            raise
+        except Exception as error:
+            ending = executor.close()
+            if isinstance(error, NoAnswer):
+                ending = f"no answer for {executor.timeout:g} s"
+            raise _Lost(
+                ending if isinstance(error, (NoAnswer, BrokenProcessPool)) else describe_error(error)
+            ) from error
+        if event is None:
+            return
+        yield event
+        asked = None

@@ -7,35 +7,29 @@ import math
 import os
 import signal
 from concurrent.futures import BrokenExecutor, Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from types import ModuleType
-from typing import Any, Callable, Iterator, Sequence
+from typing import Any, Callable, Iterator
 
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.errors import CFlowError, import_optional
-from cflow_torch.fleet.executors import Executor, describe_error, make_object
-from cflow_torch.fleet.job import Event, Job, Part
+from cflow_torch.fleet.executors import Executor, Holder, describe_error
+from cflow_torch.fleet.job import Job
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import make_identity
-from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.work import Worker, make_worker
 from cflow_torch.setting import AUTO
 
 _OBJECT_STORE_BYTES = 200 * 2**20  # it holds names and events only; Ray's default is 30 % of the memory
 
 
-def run_ray(
-    job: Job,
-    parts: Sequence[Part],
-    layout: Layout,
-    stop: Callable[[], bool],
-    *,
-    address: str | None = None,
-    num_cpus: Any = AUTO,
-    num_gpus: Any = AUTO,
-) -> Iterator[Event]:
-    """Do all parts with Ray actors, see `run_local`.
+@contextmanager
+def ray_executors(
+    job: Job, layout: Layout, address: str | None = None, num_cpus: Any = AUTO, num_gpus: Any = AUTO
+) -> Iterator[list[Executor]]:
+    """Engine `ray`: an actor per device, see `local_executors`.
 
     The driver and the workers exchange parts and events, a few kB each; workers read and write files themselves. On a
     cluster, all machines must reach data and output under the same names (a shared file system, an object store) and
@@ -67,10 +61,10 @@ def run_ray(
     _connect(ray, settings)
     try:
         _check_room(ray, needs)
-        actor = ray.remote(_Actor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
+        actor = ray.remote(Holder).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
         # A worker sees only the GPUs that Ray gives it.
-        make = (make_worker_on_node, os.getcwd(), job, "cuda" if is_gpu else "cpu")
-        yield from run_parallel([RayExecutor(ray, actor, *make) for _ in layout.devices], parts, stop)
+        make = partial(make_worker_on_node, os.getcwd(), job, "cuda" if is_gpu else "cpu")
+        yield [RayExecutor(ray, actor, make) for _ in layout.devices]
     finally:
         ray.shutdown()  # this also ends a cluster that `ray.init` has started
 
@@ -89,46 +83,36 @@ def make_worker_on_node(folder: str, job: Job, device: str) -> Worker:
     return make_worker(job, device)
 
 
-class _Actor:
-    """An object in a process of Ray."""
-
-    _held: Any = None
-
-    def call(self, make: Sequence[Any], method: str, arguments: Sequence[Any]) -> Any:
-        if self._held is None:
-            self._held = make_object(*make)
-        return getattr(self._held, method)(*arguments)
-
-
 class RayExecutor(Executor):
-    """An actor of Ray. `make` is a function that returns the object, and its arguments."""
+    """An actor of Ray. `make` returns its object."""
 
-    def __init__(self, ray: ModuleType, actor: Any, *make: Any) -> None:
+    def __init__(self, ray: ModuleType, actor: Any, make: Callable[[], Any]) -> None:
         self._ray, self._class, self._make = ray, actor, make
         self._actor: Any = None
 
     def submit(self, method: str, *arguments: Any) -> Future[Any]:
         if self._actor is None:
             self._actor = self._class.remote()
-        future: Future[Any] = Future()
+        answer: Future[Any] = Future()
 
-        def pass_on(answer: Future[Any]) -> None:
-            error = answer.exception()
+        def pass_on(done: Future[Any]) -> None:
+            error = done.exception()
             if error is None:
-                future.set_result(answer.result())
+                answer.set_result(done.result())
             elif isinstance(error, self._ray.exceptions.RayTaskError):
-                future.set_exception(error.cause or error)
+                answer.set_exception(error.cause or error)
             else:
-                future.set_exception(BrokenExecutor(f"Ray's {type(error).__name__}"))
+                answer.set_exception(BrokenExecutor(f"Ray's {type(error).__name__}"))
 
         self._actor.call.remote(self._make, method, arguments).future().add_done_callback(pass_on)
-        return future
+        return answer
 
-    def close(self) -> None:
+    def close(self) -> str:
         if self._actor is not None:
             with suppress(Exception):  # the actor may have ended with its cluster
                 self._ray.kill(self._actor)
         self._actor = None
+        return ""
 
 
 def _connect(ray: ModuleType, settings: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Run a fleet: start the engine, count its events and write the report; or count what a run would compute."""
+"""Run a fleet: count the events of its workers and write the report; or count what a run would compute."""
 
 from __future__ import annotations
 
@@ -7,52 +7,52 @@ import signal
 import time
 from collections import Counter
 from contextlib import closing
-from typing import Any, Iterable, Iterator, Sequence
+from typing import Any, Iterable, Iterator, Mapping, Sequence
 
 from cflow_torch.data.atomic import remove_stale
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.executors import describe_error
+from cflow_torch.fleet.executors import Executor, describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import complete_frames
-from cflow_torch.fleet.parallel import run_local
+from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.progress import Progress, log_line
-from cflow_torch.fleet.ray_engine import run_ray
 from cflow_torch.fleet.stop_signal import StopSignal
 from cflow_torch.fleet.work import source_name
 from cflow_torch.types import CFlowError
 
 _SHOWN_NOTES = 3  # how often a message is shown; the report names every log with this message
 _SHOWN_FAILURES = 20  # that are listed at the end; the report has them all
-_ENGINES: dict[str, Any] = {"local": run_local, "ray": run_ray}
 
 
 def run_fleet(
-    job: Job,
-    sources: Sequence[Any],
+    executors: Sequence[Executor],
+    parts: Sequence[Part],
     layout: Layout,
     shard: Shard,
-    engine: str = "local",
-    about: dict[str, Any] | None = None,
-    **engine_settings: Any,
+    output: str,
+    engine: str,
+    about: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Compute the frames of a shard that are not complete, and write a report.
 
-    Call `manifest.check_logs` first. `sources` are the logs of all shards.
+    Call `manifest.check_logs` first.
+
+    Args:
+        executors: of `Worker` objects of one job.
+        output: of that job.
+        engine: name of what made the executors, for the report.
 
     Returns:
         The report of `Counters.report` with the entries of `about`. It is also written to OUTPUT/reports/<shard>.json.
         "exit_status" is 0 if every frame of the shard is on disk, 1 if not or if the report could not be written. It is
         130 after Ctrl-C, 143 after SIGTERM and 129 after SIGHUP.
     """
-    if engine not in _ENGINES:
-        raise CFlowError(f"engine={engine!r}: give one of {', '.join(_ENGINES)}")
-    parts = shard.parts(sources, len(layout.devices))
     counters = Counters(parts)
     start = time.perf_counter()
-    with StopSignal() as stop, closing(_ENGINES[engine](job, parts, layout, stop, **engine_settings)) as events:
+    with StopSignal() as stop, closing(run_parallel(executors, parts, stop)) as events:
         try:
             _follow(events, counters, len(parts))
         except KeyboardInterrupt:
@@ -66,7 +66,7 @@ def run_fleet(
         report = {**counters.report(time.perf_counter() - start, layout, shard, engine, name), **(about or {})}
         report["exit_status"] = 128 + ended_by if ended_by else 0 if counters.is_complete else 1
         try:
-            file = report_file(job.output, shard)
+            file = report_file(output, shard)
             remove_stale(file.parent)
             write_json(file, report)
         except OSError as error:

@@ -52,10 +52,10 @@ class Worker:
         try:
             torch.zeros(1, device=device)  # fails now, not at every frame
         except (RuntimeError, AssertionError) as error:
-            raise CFlowError(f"no worker can start on {device}: {describe_error(error)}") from error
+            reason = describe_error(error)
+            raise CFlowError(f"device={device} cannot be used ({reason}): give auto, cpu, cuda or cuda:1") from error
         self._job, self._device, self._ahead = job, device, _AHEAD
         self._model: Any = make_model(job.config, device)
-        self._model.inspect = None  # the log is checked instead
         self._source: Any = None
         self._log: Any = None
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)

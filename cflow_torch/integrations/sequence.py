@@ -21,6 +21,7 @@ from cflow_torch.ground.segmentation import find_ground, has_ground
 from cflow_torch.tensors import read_positions
 from cflow_torch.types import Array, Sweep, Window
 from cflow_torch.windows.ego_motion import compensate
+from cflow_torch.windows.inspection import Inspection
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class SequenceFlow(nn.Module):
         self.num_history: int = self.model.config.num_history
         self.ground = ground
         self._has_checked_ground = False
+        self._inspect = Inspection()
 
     @torch.no_grad()
     def flows(self, sequences: Sequence[Sequence[SequenceSweep]], firsts: Sequence[int]) -> list[list[Tensor]]:
@@ -84,7 +86,10 @@ class SequenceFlow(nn.Module):
         flows: list[list[Tensor]] = [[] for _ in sequences]
         for step in range(max(map(len, windows), default=0)):
             members = [index for index, own in enumerate(windows) if step < len(own)]
-            for index, result in zip(members, self.model([windows[index][step] for index in members])):
+            of_step = [windows[index][step] for index in members]
+            results = self.model(of_step)
+            self._inspect(of_step)
+            for index, result in zip(members, results):
                 now, following = sequences[index][firsts[index] + step :][:2]
                 flows[index].append(in_axes_of_points(result.residual_flow, now, following))
         return flows

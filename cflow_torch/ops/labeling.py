@@ -225,14 +225,13 @@ def connected_components(
 
     Cost: as `label_together`.
     """
-    if engine == "kornia":
-        return connected_components_kornia(occupancy, pixels, connectivity, reach)
-    (blocks,) = label_together([(pad([occupancy]), reach)], connectivity)
+    padded = pad([occupancy])
     row, col = split_index(pixels, occupancy.shape[2])
     height = occupancy.shape[1]
-    row = torch.add(row, floor_divide(row, height), alpha=padded_size(height) - height)
-    component = blocks.of_pixel(row, col)
-    return first_of_segment(component, blocks.num_components)
+    row = torch.add(row, floor_divide(row, height), alpha=padded.shape[1] - height)
+    pixel = row * padded.shape[2] + col
+    component, bound = label_pixels(padded, pixel, row, col, connectivity, reach, engine)
+    return first_of_segment(component, bound)
 
 
 def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:

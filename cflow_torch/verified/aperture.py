@@ -6,16 +6,17 @@ the new one. One of the two suffices, because one end of the line may enter or l
 line as well, but its rear leaves the old position and its front reaches a new one. A low line of 7 m or more is a guard
 rail, which is always static.
 
-A component longer than `max_object_length` moves only if both of its ends move, like the ends of a tram. If a wall
-seems to move, one of its ends stays, or its ends are only the limits of the view. The ends of a guard rail or a noise
-barrier may keep pace with the ego vehicle, because the beams hit it at positions that are fixed in the frame of the
-vehicle. However, no vehicle is as low as a guard rail, or as long as a noise barrier.
+Both ends of a bus or a tram move, although most of it is covered. If a wall seems to move, one of its ends stays, or
+its ends are only the limits of the view. The ends of a guard rail or a noise barrier may keep pace with the ego
+vehicle, because the beams hit it at positions that are fixed in the frame of the vehicle. However, no vehicle is as low
+as a guard rail, or as long as a noise barrier. A component longer than `max_object_length` moves only if both of its
+ends move.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,9 +26,6 @@ from cflow_torch.ops.indices import constant, flat_nonzero
 from cflow_torch.verified.columns import Pixels, count_slices
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.in_place import are_covered
-
-if TYPE_CHECKING:
-    from cflow_torch.verified.component_tree import Tree
 
 _THIN = 0.3  # metres, largest standard deviation of a line across it
 _LONG = 1.0  # metres, smallest standard deviation along it
@@ -41,20 +39,18 @@ _TALL = 2
 _RAIL = 2.0
 
 
-def slides_along_itself(
-    sweeps: HeightSlicedSweeps, pixels: Pixels, groups: Groups, candidates: Tensor, travels: Tensor
-) -> Tensor:
+def slides_along_itself(sweeps: HeightSlicedSweeps, pixels: Pixels, groups: Groups, candidates: Tensor) -> Tensor:
     """Find the motions that a static line would seem to have.
 
     Args:
         pixels: K pixels.
         groups: A groups of these pixels.
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
-        travels: (A,) bool, both ends of the component move, so that it slides only if it is a rail.
 
     Returns:
-        (A, C) bool. True if the pixels of the component at t+1 form a line, this line is covered or a rail, the motion
-        points along it, and its displacement over the window is at least 1.2 m.
+        (A, C) bool. True if the pixels of the component at t+1 form a line, the motion points along it, its
+        displacement over the window is at least 1.2 m, and the line is a rail or is covered. With history, a covered
+        line does not slide if both of its ends move.
 
     Convention:
         Moments are sums of integers; all else is elementwise float64 in the written order. The pixels of a line have a
@@ -68,14 +64,17 @@ def slides_along_itself(
     newest_pixels = pixels[newest]
     at_newest = groups[newest]
     lines = principal_axes(at_newest, newest_pixels.row_col, pixel_size)
-    of_line = flat_nonzero(groups.spread(lines.is_line & ~travels))  # few pixels
-    is_covered = are_covered(sweeps, pixels[of_line], groups[of_line])
-    num_more = at_newest.sum(count_slices(newest_pixels.slices) - _TALL)
-    is_rail = (num_more < 0) & (lines.variance >= (_RAIL / pixel_size) ** 2)
-    slides = lines.is_line & (is_covered | is_rail)
-
     # The window of each component; components without pixels at t+1 are not lines.
     window = at_newest.max(newest_pixels.window, empty=0)
+    of_line = flat_nonzero(groups.spread(lines.is_line))  # few pixels
+    pixels_of_lines = pixels[of_line]
+    is_covered = are_covered(sweeps, pixels_of_lines, groups[of_line])
+    # In a pair, a wall that is visible between two occluders has such ends. With history, the static test excludes it.
+    travels = both_ends_move(sweeps, pixels_of_lines, groups[of_line]) & sweeps.has_history[window]
+    num_more = at_newest.sum(count_slices(newest_pixels.slices) - _TALL)
+    is_rail = (num_more < 0) & (lines.variance >= (_RAIL / pixel_size) ** 2)
+    slides = lines.is_line & (is_rail | is_covered & ~travels)
+
     intervals = sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)  # [B]
     travel = candidates.square().sum(2) * intervals.square().index_select(0, window)[:, None]  # [A, C], square pixels
     return slides[:, None] & lines.are_along(candidates) & (travel >= (_LEAST_TRAVEL / pixel_size) ** 2)
@@ -123,38 +122,33 @@ def _covariance(groups: Groups, row_col: Tensor) -> Tensor:
     return (count * moments[1:, 1:] - sums[:, None] * sums) / (count * count).clamp(min=1).double()
 
 
-def both_ends_move(sweeps: HeightSlicedSweeps, tree: Tree, is_long: Tensor) -> Tensor:
-    """Find the long components whose two ends both move.
+def both_ends_move(sweeps: HeightSlicedSweeps, pixels: Pixels, groups: Groups) -> Tensor:
+    """Find the components whose two ends both move.
 
     Args:
-        tree: the components.
-        is_long: (V,) bool, the components to test; each has pixels at t+1.
+        pixels: K pixels.
+        groups: A groups of these pixels; each pixel is in a group.
 
     Returns:
-        (V,) bool, False for components that are not tested. True if, between t+1 and the sweep farthest in time, the
-        ends moved at least 1.2 m on average in one direction along the component, and their displacements differ by at
-        most a tenth of their sum. At t+1, the component is at most 60 m long and has two or more slices per pixel.
+        (A,) bool. True if, between t+1 and the sweep farthest in time, the ends moved at least 1.2 m on average in one
+        direction along the component, and their displacements differ by at most a tenth of their sum. At t+1, the
+        component is at most 60 m long and has two or more slices per pixel.
 
     Convention:
         The direction of a component is y, x or one of the diagonals: the one in which its pixels at t+1 reach farthest.
         Its ends are the first and the last pixel in this direction. Ties: the first direction, and the first of sweeps
-        equally far in time. A component without pixels in that sweep does not move.
+        equally far in time. A component without pixels in that sweep or at t+1 does not move.
 
-    Cost: some passes over the pixels of long components.
+    Cost: some passes over the pixels.
     """
-    name = flat_nonzero(is_long)  # [L]
-    if name.numel() == 0:
-        return torch.zeros_like(is_long)
-    farthest = sweeps.elapsed.abs().argmax(1).index_select(0, sweeps.pixels.window)  # [P]
-    is_compared = (sweeps.pixels.step == 0) | (sweeps.pixels.step == farthest)
-    member = flat_nonzero(tree.members.spread(is_long) & is_compared.index_select(0, tree.pixel))
-    components = tree.members[member].select(name)
-    pixels = sweeps.pixels[tree.pixel[member]]
+    farthest = sweeps.elapsed.abs().argmax(1).index_select(0, pixels.window)  # [K]
+    compared = flat_nonzero((pixels.step == 0) | (pixels.step == farthest))
+    pixels = pixels[compared]
     # The components at t+1, then those in the farthest sweep.
-    in_both = Groups(components.of_item + len(name) * (pixels.step != 0), 2 * len(name))
-    is_tall = in_both.sum(count_slices(pixels.slices) - _TALL)[: len(name)] >= 0
+    in_both = Groups(groups.of_item[compared] + groups.count * (pixels.step != 0), 2 * groups.count)
+    is_tall = in_both.sum(count_slices(pixels.slices) - _TALL)[: groups.count] >= 0
     ends = _ends(in_both, pixels, sweeps.grid.pixel_size)
-    return torch.zeros_like(is_long).index_copy_(0, name, is_tall & (ends.length <= _LONGEST) & ends.move_alike())
+    return is_tall & (ends.length <= _LONGEST) & ends.move_alike()
 
 
 class _Ends(NamedTuple):

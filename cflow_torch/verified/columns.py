@@ -189,8 +189,13 @@ class Columns:
         """Tell which of M groups of K pixels have one with a reach of more than one pixel, (M,) bool."""
         if self.reach is None:
             return torch.zeros(groups.count, dtype=torch.bool, device=self.image.device)
-        reach = self.reach.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
-        return groups.any(reach > 1)
+        return groups.any(self.reach_of(pixels) > 1)
+
+    def reach_of(self, pixels: Pixels) -> Tensor:
+        """Return the reach of K pixels (`Spacing`), (K,) uint8."""
+        if self.reach is None:
+            return torch.ones_like(pixels.slices)
+        return self.reach.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
 
     def words(self, pixels: Pixels) -> Tensor:
         """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""

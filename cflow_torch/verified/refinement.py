@@ -1,21 +1,22 @@
 """Refinement: turn pixel motions into rigid motions accurate to centimetres, by generalised ICP.
 
-Registration takes a few Gauss-Newton steps on the voxels of all objects at once. The voxels of t+1 are the target, and
-those of the other sweeps are the source. Beams hit a surface at positions that are fixed in the frame of the vehicle.
-Correspondences of nearest points would align these positions, and so give the surface a wrong motion along itself.
-Therefore a correspondence counts mainly across the surface: its information matrix is the inverse of the covariance of
-the voxels around both ends.
+Registration takes a few Gauss-Newton iterations on the voxels of all objects at once. The voxels of t+1 are the
+target, and those of the other sweeps are the source. Beams hit a surface at positions that are fixed in the frame of
+the vehicle. Correspondences of nearest points would align these positions, and so give the surface a wrong motion along
+itself. Therefore a correspondence counts mainly across the surface: its information matrix is the inverse of the
+covariance of the voxels around both ends.
 
     refine
-        subpixel_motion         slow objects of pairs start to move, too
+        with_slow_objects       in pairs, objects slower than a pixel per sweep start to move
         points_of_objects       the points of the moving objects
         register_deskewed
             Registration        voxels with centroids and covariances; the target and the source
-                align           four times: correspond (move the source, find the nearest target), linearise, solve
+                align           repeatedly: correspond (move the source, find the nearest target), linearise, solve
             if points have times:
                 stretch         corrects the motion for the time between two measurements of an object
-                deskew          moves the points to the instant of their sweep
-                Registration    of the moved points
+                if the window has history:
+                    deskew          moves the points to the instant of their sweep
+                    Registration    of the moved points
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from cflow_torch.ops.linear import full, inverse, matvec, upper
 from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
-from cflow_torch.verified.subpixel_motion import NUM_STEPS, STEP_LENGTH, subpixel_motion
+from cflow_torch.verified.subpixel_motion import with_slow_objects
 from cflow_torch.verified.voxel_centroids import (
     ObjectPoints,
     Voxels,
@@ -54,9 +55,12 @@ _KERNEL = 3.0  # scale of the Geman-McClure kernel, in variances of both surface
 # The prior holds x and y near the start as firmly as two correspondences do, and the tangent of half the angle near
 # zero as firmly as five correspondences at 1 m from the centre.
 _PRIOR = (2.0, 2.0, 20.0)
-# At 0.75, the beam hits the object a quarter turn earlier than in the sweep before. To move that far around the
-# sensor, it would have to be nearer than its own length. So at smaller ratios, the seam between sweeps crosses it.
+# The least ratio of `Registration.stretch`. At 0.75, the beam hits the object a quarter turn earlier than in the sweep
+# before. To move that far around the sensor, it would have to be nearer than its own length. So at smaller ratios, the
+# seam between sweeps crosses it.
 _LEAST_STRETCH = 0.75
+_NUM_ITERATIONS = 4
+STEP_LENGTH = 1.4  # of an iteration; above 1, because the nearest voxels change with each one
 
 
 def refine(
@@ -64,8 +68,8 @@ def refine(
     objects: Objects,
     motion: Tensor,
     longest: float | None,
-    find_slow: Callable[..., Tensor] = subpixel_motion,
-    num_steps: int = NUM_STEPS,
+    add_slow: Callable[..., Tensor] = with_slow_objects,
+    num_iterations: int = _NUM_ITERATIONS,
 ) -> tuple[RigidMotion, RigidMotion]:
     """Return the final motion of objects, and their apparent motion, which differs from it if points have times.
 
@@ -74,17 +78,18 @@ def refine(
     Args:
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
         longest: metres; static objects that are longer at t+1 stay static. None = no bound.
-        find_slow: finds the motion of slow objects of pairs.
-        num_steps: number of Gauss-Newton steps.
+        add_slow: finds the motion of slow objects of pairs.
+        num_iterations: of registration.
     """
     length = objects.length_at_newest(sweeps)
-    start = find_slow(sweeps, objects, motion, length <= (math.inf if longest is None else longest))
+    flow = motion.flip(1) * sweeps.grid.pixel_size  # [G, 2], x and y, metres per sweep interval
+    start = add_slow(sweeps, objects, flow, length <= (math.inf if longest is None else longest))
     points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
-    return register_deskewed(points, sweeps, start, num_steps)
+    return register_deskewed(points, sweeps, start, num_iterations)
 
 
 def register_deskewed(
-    points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor, num_steps: int = NUM_STEPS
+    points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor, num_iterations: int = _NUM_ITERATIONS
 ) -> tuple[RigidMotion, RigidMotion]:
     """Register objects, and correct their motion per sweep interval for the times of points.
 
@@ -101,14 +106,14 @@ def register_deskewed(
     Cost: two registrations with times, else one; a few sorts of the points.
     """
     registration = Registration(points, sweeps, len(start))
-    apparent = registration.align(start, num_steps)
+    apparent = registration.align(start, num_iterations)
     if points.time is None:
         return apparent, apparent
     stretch = registration.stretch(apparent)[:, None]
     divided = replace(apparent, flow=apparent.flow / stretch)
     points = points.at(flat_nonzero(sweeps.has_history.index_select(0, points.window)))
     deskewed = Registration(deskew(points, sweeps, divided), sweeps, len(start))
-    again = deskewed.align(start / stretch, num_steps)
+    again = deskewed.align(start / stretch, num_iterations)
     is_again = Groups(points.object_id, len(start)).size() > 0
     return again.where(is_again, divided), apparent
 
@@ -118,7 +123,7 @@ class Source:
     """K voxels of t and of older sweeps, which we move to t+1."""
 
     voxel: Tensor  # (K,) int64
-    objects: Groups  # the object of each voxel; each one is in a group
+    by_object: Groups  # the voxels, grouped by object; each one is in a group
     centre: Tensor  # (2, K) float64, metres, x and y of the centre of its object at t
     offset: Tensor  # (2, K) float64, metres, x and y from that centre to the voxel
     height: Tensor  # (1, K) float64, metres, z of the voxel
@@ -130,29 +135,29 @@ class Source:
     before_t: Tensor  # (K,) float64, sweep intervals from the voxel to t
 
     @classmethod
-    def of(cls, voxels: Voxels, covariance: Tensor, objects: Groups, centre: Tensor, elapsed: Tensor) -> Source:
+    def of(cls, voxels: Voxels, covariance: Tensor, by_object: Groups, centre: Tensor, elapsed: Tensor) -> Source:
         """Select the voxels of objects with points at t, in all sweeps but t+1.
 
         Args:
             covariance: (6, V) float64, square metres, of the surface around each voxel.
-            objects: the objects of the voxels.
+            by_object: the voxels, grouped by object.
             centre: (2, G) float64, NaN for objects without points at t.
             elapsed: (B, S) float64, sweep intervals from each sweep to t+1.
         """
-        has_centre = objects.spread(~centre[0].isnan())
+        has_centre = by_object.spread(~centre[0].isnan())
         voxel = flat_nonzero(has_centre & (voxels.step > 0))
-        objects = objects[voxel]
+        by_object = by_object[voxel]
         window = voxels.window.index_select(0, voxel)
         num_steps = elapsed.shape[1]
         up = constant(((-1,), (0,), (1,)), torch.int64, voxel.device)
         noise = constant((_NOISE**2, 0.0, 0.0, _NOISE**2, 0.0, _NOISE**2), torch.float64, voxel.device)[:, None]
         position = take_columns(voxels.position, voxel)  # [3, K]
-        centre = take_columns(centre, objects.of_item)  # [2, K]
+        centre = take_columns(centre, by_object.of_item)  # [2, K]
         elapsed_of_t = elapsed[:, 1].index_select(0, window)
         elapsed = elapsed.view(-1).index_select(0, window * num_steps + voxels.step.index_select(0, voxel))
         return cls(
             voxel=voxel,
-            objects=objects,
+            by_object=by_object,
             centre=centre,
             offset=position[:2] - centre,
             height=position[2:],
@@ -171,7 +176,7 @@ class Source:
         """Select voxels by their positions in the list."""
         return Source(
             voxel=self.voxel[some],
-            objects=self.objects[some],
+            by_object=self.by_object[some],
             centre=self.centre[:, some],
             offset=self.offset[:, some],
             height=self.height[:, some],
@@ -190,7 +195,7 @@ class Correspondences:
 
     source: Tensor  # (K,) int64, voxel of the source
     target: Tensor  # (K,) int64, voxel of the target
-    objects: Groups  # the object of both
+    by_object: Groups  # the correspondences, grouped by object
     elapsed: Tensor  # (K,) float64, sweep intervals from the source to t+1
     arm: Tensor  # (2, K) float64, metres, from the centre of the object at t+1 to the moved voxel
     pull: Tensor  # (3, K) float64, metres, information times the residual from the moved voxel to the target
@@ -211,17 +216,17 @@ class Registration:
         self._target = VoxelSearch(self._voxels, flat_nonzero(self._voxels.step == 0), reach=1)
         self._covariance = covariance_of(self._voxels, sweeps.grid.pixel_size, LAYER_HEIGHT)  # [6, V]
         object_id = self._voxels.object_id
-        objects = Groups(object_id.masked_fill(object_id < 0, num_objects), num_objects)
-        at_t = objects.where(self._voxels.step == 1)
+        by_object = Groups(object_id.masked_fill(object_id < 0, num_objects), num_objects)
+        at_t = by_object.where(self._voxels.step == 1)
         self._centre = at_t.sum(self._voxels.position[:2]) / at_t.size()  # [2, G], at t; NaN without points
-        source = Source.of(self._voxels, self._covariance, objects, self._centre, sweeps.elapsed)
+        source = Source.of(self._voxels, self._covariance, by_object, self._centre, sweeps.elapsed)
         self._sources = [source[some] for some in chunks(0, len(source), object_id.device, 9)]
 
-    def align(self, start: Tensor, num_steps: int = NUM_STEPS) -> RigidMotion:
+    def align(self, start: Tensor, num_iterations: int = _NUM_ITERATIONS) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
 
-        Each Gauss-Newton step minimises the weighted residuals of the correspondences over translation and angle, with
-        a prior that keeps the translation near `start`, and the rotation near zero.
+        Each Gauss-Newton iteration minimises the weighted residuals of the correspondences over translation and angle,
+        with a prior that keeps the translation near `start`, and the rotation near zero.
 
         Args:
             start: (G, 2) float64, x and y, metres per sweep interval.
@@ -229,26 +234,26 @@ class Registration:
         Returns:
             The motion. An object without points at t keeps `start`.
 
-        Cost: 27 lookups a step for each voxel of the source.
+        Cost: 27 lookups for each voxel of the source and each iteration.
         """
         prior = constant(_PRIOR, torch.float64, start.device)[:, None]  # [3, 1]
         held = upper(torch.diag_embed(prior[:, 0])[..., None])  # [6, 1]
         start = torch.cat((start, torch.zeros_like(start[:, :1])), 1).t()  # [3, G]
         motion = start  # x, y and the tangent of half the angle, per sweep interval
-        for _ in range(num_steps):
+        for _ in range(num_iterations):
             hessian = held
-            gradient = prior * (start - motion)  # [3, G]
+            right_side = prior * (start - motion)  # [3, G]
             for source in self._sources:
                 pairs = self._correspond(source, motion)
-                equations = pairs.objects.sum(_normal_equations(pairs))  # [9, G]
+                equations = pairs.by_object.sum(_normal_equations(pairs))  # [9, G]
                 hessian = hessian + equations[:6]
-                gradient = gradient + equations[6:]
-            motion = torch.add(motion, matvec(full(inverse(hessian)), gradient), alpha=STEP_LENGTH)
+                right_side = right_side + equations[6:]
+            motion = torch.add(motion, matvec(full(inverse(hessian)), right_side), alpha=STEP_LENGTH)
         return RigidMotion(motion[:2].t(), motion[2], self._centre.nan_to_num(0.0).t())
 
     def _correspond(self, source: Source, motion: Tensor) -> Correspondences:
         """Move the source to t+1, and find the nearest voxels of the target; `motion` is (3, G), as in `align`."""
-        motion_of_voxel = take_columns(motion, source.objects.of_item)  # [3, K]
+        motion_of_voxel = take_columns(motion, source.by_object.of_item)  # [3, K]
         velocity = motion_of_voxel[:2]
         rotation = motion_of_voxel[2]
         # The object rotates about its centre, which moves on.
@@ -259,7 +264,7 @@ class Registration:
         target = self._target.nearest(source.target_start, source.target_layers, moved)  # [K], 0 = none, far away
         residual = take_columns(self._voxels.position, target) - moved
         is_near = residual.square().sum(0) <= _FARTHEST**2
-        is_same = self._voxels.object_id.index_select(0, target) == source.objects.of_item
+        is_same = self._voxels.object_id.index_select(0, target) == source.by_object.of_item
         covariance = source.covariance + take_columns(self._covariance, target)
         information = full(inverse(covariance))
         pull = matvec(information, residual)  # [3, K]
@@ -268,7 +273,7 @@ class Registration:
         return Correspondences(
             source=source.voxel,
             target=target,
-            objects=source.objects,
+            by_object=source.by_object,
             elapsed=source.elapsed,
             arm=arm,
             pull=pull * weight,
@@ -295,14 +300,16 @@ class Registration:
             pairs = self._correspond(source, motion)
             delay = time.index_select(0, pairs.target) - time.index_select(0, pairs.source)
             weight = (pairs.information[0, 0] + pairs.information[1, 1]) * pairs.elapsed
-            sums = sums + pairs.objects.sum(weight * torch.stack((pairs.elapsed, delay)))
+            sums = sums + pairs.by_object.sum(weight * torch.stack((pairs.elapsed, delay)))
         square, late = sums
         stretch = torch.where(square > 0, 1 + late / square, 1.0)
         return torch.where(stretch < _LEAST_STRETCH, 1.0, stretch)
 
 
 def _normal_equations(pairs: Correspondences) -> Tensor:
-    """Linearise the residuals of K correspondences. Return the hessian and the gradient of each, (6 + 3, K) float64.
+    """Linearise the residuals of K correspondences. Return the normal equations of each, (6 + 3, K) float64.
+
+    First comes the hessian, then the right side, which is the negative gradient.
 
     The parameters are x, y and the tangent of half the angle. A change of x or y moves the voxel by the elapsed time, a
     change of the tangent by the elapsed time times `lever`. No parameter changes z.
@@ -314,9 +321,9 @@ def _normal_equations(pairs: Correspondences) -> Tensor:
     hessian = torch.stack(
         (weight[0, 0], weight[0, 1], weighted_lever[0], weight[1, 1], weighted_lever[1], of_angle)
     )  # as in ops/linear.py
-    gradient = pairs.pull[:2]
-    torque = (lever * gradient).sum(0, keepdim=True)
-    return torch.cat((hessian * pairs.elapsed, gradient, torque)) * pairs.elapsed
+    force = pairs.pull[:2]
+    torque = (lever * force).sum(0, keepdim=True)
+    return torch.cat((hessian * pairs.elapsed, force, torque)) * pairs.elapsed
 
 
 def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion) -> ObjectPoints:

@@ -86,7 +86,8 @@ def _first_equal(shift: Tensor) -> Tensor:
     `shift` is (2, M, S, C) int64.
     """
     of_motion = shift.permute(3, 0, 2, 1).flatten(1, 2)  # [C, R, M], because long rows are compared fast
-    of_motion = F.pad(of_motion, (0, 0, 0, 0, 1, 0))  # motion 0 shifts nothing
+    nothing = torch.zeros_like(of_motion[:1])  # motion 0; torch 2.0 cannot pad if M = 0
+    of_motion = torch.cat((nothing, of_motion))
     differs = (of_motion[1:, None] != of_motion).view(torch.uint8).amax(2)  # [C, 1 + C, M]
     motion = torch.arange(len(of_motion), dtype=torch.int16, device=shift.device)[:, None]
     return torch.where(differs == 0, motion, len(motion)).amin(1).t().long()

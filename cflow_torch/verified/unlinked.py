@@ -6,7 +6,9 @@ link them. Here its pixels of one sweep are a part:
     sweep      t-2      t-1       t       t+1
     parts      [a]      [b]      [c]      [d]       c and d, or c and b, give a velocity; the other parts confirm it
 
-The linked parts are a node of the tree, like any other. Its velocity is one of its motion candidates.
+In a pair, a part is an unmatched component of t or of t+1, and no sweep confirms its velocity. So it goes with the
+nearest part of like size. The linked parts are a node of the tree, like any other. Its velocity is one of its motion
+candidates.
 """
 
 from __future__ import annotations
@@ -19,12 +21,13 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import FAR, Groups
-from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
+from cflow_torch.ops.indices import constant, draw, flat_nonzero, gather, lazy_zeros, split_index, take_columns
 from cflow_torch.ops.segments import masked_median
 from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.component_tree import Components, NodeKind, Tree
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import count_wins
+from cflow_torch.verified.unmatched import are_unmatched, components_of, sizes_of_unmatched
 
 # We chose these values on simulated highways, seeds 820 and 821.
 _LONGEST = 8.0  # metres, of a part
@@ -36,11 +39,13 @@ _ERROR_SHARE = 0.05  # ... and further for each metre that the object has moved
 _FASTEST = 60.0  # m/s, if the settings have no bound
 _LENGTHS = 2  # objects that move less than a half of the length of their part are linked by their pixels
 _LACKING = float(1 << 20)  # finest pixels, for a sweep without a part; longer than any sum of errors
+_LEAST_SIZE = 16  # of an unmatched component in a pair; smaller ones are mostly static (`confidence.json`)
+_LIKE = 2  # in a pair, the larger of two parts has at most this many times as many pixels as the other
 _NARROWEST = 0.4  # metres; a thin line that moves along itself may be a part of a longer line
 
 
 def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree, max_speed: float | None) -> Tree:
-    """Add nodes for objects that move farther than their size. Windows of two sweeps have too little evidence.
+    """Add nodes for objects that move farther than their size.
 
     Args:
         max_speed: m/s; None = 60.
@@ -48,13 +53,12 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
     Convention:
         Parts have the missing pixels of a sweep. A part of t takes its velocity from one part of t+1 or t-1. Other
         parts must lie where it puts them: at t+1, and in at least half of the older sweeps. Of the velocities of a part
-        of t, or of t+1, the one with the most sweeps wins, then the one with the smallest errors. A part belongs to its
-        first node. The velocity of a node must win more than half as many slices near its targets as it loses.
+        of t, or of t+1, the one with the most sweeps wins, then the one with the smallest errors. In a pair, parts are
+        unmatched components, and the lowest velocity wins. A part belongs to its first node. The velocity of a node
+        must win more than half as many slices near its targets as it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
-    if sweeps.num_steps == 2:
-        return tree
     parts = _Parts.of(sweeps, components)
     if len(parts) == 0:
         return tree
@@ -87,12 +91,19 @@ class _Parts(NamedTuple):
     step: Tensor  # (Q,) int64
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
     length: Tensor  # (Q,) int64, finest pixels, longer side of the bounding box
+    has_pairs: bool  # some windows have two sweeps only
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
         """Select the parts of at least two pixels that are at most `_LONGEST` long."""
+        pixel = components.missing
         parts = components.parts
-        pixels = sweeps.pixels[components.missing]
+        has_pairs = _has_pairs(sweeps)
+        if has_pairs:
+            unmatched, of_pairs = _unmatched_of_pairs(sweeps, components)
+            pixel = torch.cat((pixel, unmatched))
+            parts = parts.followed_by(of_pairs)
+        pixels = sweeps.pixels[pixel]
         extent = parts.max(pixels.row_col, empty=0) - parts.min(pixels.row_col, empty=FAR)  # [2, count]
         length = extent.amax(0) + 1
         kept = flat_nonzero((length * sweeps.grid.pixel_size <= _LONGEST) & (parts.size() >= 2))
@@ -100,10 +111,28 @@ class _Parts(NamedTuple):
         image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
         window, step = split_index(image, sweeps.num_steps)
         centre = parts.sum(pixels.row_col).double() / parts.size()
-        return cls(components.missing, parts, window, step, centre, length.index_select(0, kept))
+        return cls(pixel, parts, window, step, centre, length.index_select(0, kept), has_pairs)
 
     def __len__(self) -> int:
         return len(self.step)
+
+
+def _has_pairs(sweeps: HeightSlicedSweeps) -> bool:
+    """Tell whether any window has two sweeps only."""
+    return sweeps.num_steps == 2 or (sweeps.batch.num_windows > 1 and not bool(sweeps.has_history.all()))
+
+
+def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> tuple[Tensor, Groups]:
+    """Return the pixels of large unmatched components of pairs, (K,) int64, and group them by component and sweep."""
+    is_of_pair = ~sweeps.has_history.index_select(0, sweeps.pixels.window)
+    index = flat_nonzero(is_of_pair)
+    pixels = sweeps.pixels[index]  # all of t+1 or t
+    component = components_of(components, index)
+    of_sweep = Groups(2 * component.of_item + pixels.step, 2 * component.count)  # no pixel is of a copy
+    size = sizes_of_unmatched(sweeps, pixels, of_sweep, are_unmatched(sweeps, pixels, 1 - pixels.step))
+    large = flat_nonzero(size >= _LEAST_SIZE)
+    of_sweep = of_sweep[large]
+    return index.index_select(0, large), of_sweep.select(flat_nonzero(draw(of_sweep.of_item, of_sweep.count)))
 
 
 class _Map:
@@ -163,7 +192,11 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
     is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
-    kept = flat_nonzero(_are_best(_ranks(error, is_found, is_given), part, len(parts)))
+    rank = _ranks(error, is_found, is_given)
+    if parts.has_pairs:
+        # There, all errors are 0, and the shortest way has the lowest rank.
+        rank += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
+    kept = flat_nonzero(_are_best(rank, part, len(parts)))
     part, is_found, before_t = gather(kept, part, is_found, before_t)
     return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
 
@@ -214,18 +247,30 @@ def _centres(parts: _Parts, part: Tensor) -> Tensor:
 def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: float) -> tuple[Tensor, Tensor]:
     """Pair each part of t with the parts of t+1 and of t-1 that are neither too near nor too far: (H,) int64 each."""
     of_t = flat_nonzero(parts.step == 1)
-    step = constant(((0,), (2,)), torch.int64, of_t.device).expand(2, len(of_t))
+    steps = ((0,), (2,)) if sweeps.num_steps > 2 else ((0,),)
+    step = constant(steps, torch.int64, of_t.device).expand(-1, len(of_t))
     window = parts.window.index_select(0, of_t).expand_as(step)
     centre = take_columns(parts.centre, of_t)
-    other, is_part = cells.around(window, step, centre[:, None].expand(2, *step.shape), _REACH)  # [2, of t, 289]
+    other, is_part = cells.around(window, step, centre[:, None].expand(2, *step.shape), _REACH)  # [steps, of t, 289]
     distance = (_centres(parts, other) - centre[:, None, :, None]).square_().sum(0).sqrt_()
     seconds = (sweeps.batch.seconds - sweeps.batch.seconds[:, 1:2]).abs()[window, step]
     farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
     nearest = parts.length.index_select(0, of_t) / _LENGTHS
     is_pair = is_part & (distance <= farthest[..., None]) & (distance >= nearest[:, None])
+    if parts.has_pairs:
+        is_pair &= _are_alike(sweeps, parts, of_t, other)
     pair = flat_nonzero(is_pair)
     at, _ = split_index(pair, other.shape[2])
-    return of_t.repeat(2).index_select(0, at), other.view(-1).index_select(0, pair)
+    return of_t.repeat(len(steps)).index_select(0, at), other.view(-1).index_select(0, pair)
+
+
+def _are_alike(sweeps: HeightSlicedSweeps, parts: _Parts, of_t: Tensor, other: Tensor) -> Tensor:
+    """Tell which other parts, (..., N, M), are of like size as N parts of t, if the window is a pair. Else all are."""
+    size = parts.pixels.size()
+    own = size.index_select(0, of_t)[:, None]
+    size = size.index_select(0, other.view(-1)).view_as(other)
+    is_like = (size <= _LIKE * own) & (own <= _LIKE * size)
+    return is_like | sweeps.has_history.index_select(0, parts.window.index_select(0, of_t))[:, None]
 
 
 def _are_best(rank: Tensor, part: Tensor, num_parts: int) -> Tensor:

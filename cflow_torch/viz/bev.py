@@ -11,7 +11,7 @@ from cflow_torch.config import DenseConfig
 from cflow_torch.data.atomic import atomic_name
 from cflow_torch.types import Array, CFlowError, FlowResult, as_numpy, point_rows
 from cflow_torch.viz import style
-from cflow_torch.viz.panel import MIN_DRAWN, dot_area, draw_error, draw_flow, draw_ground, new_figure
+from cflow_torch.viz.panel import dot_area, draw_error, draw_flow, draw_ground, has_flow, new_figure
 from cflow_torch.viz.style import Figure
 
 _OUTLIERS = 0.2  # per cent of the points on each side that the view may leave out
@@ -48,9 +48,9 @@ def plot_flow(
 
     Convention:
         x (forward) points right, y (left) up, with equal scales; a long thin view gets empty space along its sides. A
-        point is moving if its residual flow is longer than `panel.MIN_DRAWN`. An arrow starts at the median position of
-        a cluster's moving points and is `panel.ARROW_STEPS` times their median flow long. Without clusters, moving
-        points near each other form one.
+        point of a `FlowResult` moves by `FlowResult.is_moving`, and one of an array if its flow is at least 0.05 m. An
+        arrow starts at the median position of a cluster's moving points and is `panel.ARROW_STEPS` times their median
+        flow long. Without clusters, moving points near each other form one.
 
     Raises:
         CFlowError: matplotlib is not installed, or an argument has the wrong shape or value.
@@ -59,9 +59,10 @@ def plot_flow(
     """
     view, position, is_floor, rest = split_sweep(points, is_ground, point_cloud_range)
     given = result_or_residual
-    cluster = None
+    cluster = moves = None
     if isinstance(given, FlowResult):
         cluster = as_numpy(given.cluster_id)[rest]
+        moves = as_numpy(given.is_moving)[rest]
         given = given.residual_flow
     residual = point_rows("residual flow", given, len(position))
     true_flow = None if truth is None else point_rows("truth", truth, len(position))[rest]
@@ -71,6 +72,7 @@ def plot_flow(
     floor = position[is_floor]
     position = position[rest]
     residual = residual[rest]
+    moves = has_flow(residual) if moves is None else moves
     if max_flow is None:
         max_flow = longest_flow(residual if true_flow is None else np.concatenate([residual, true_flow]))
 
@@ -78,9 +80,9 @@ def plot_flow(
     figure, panels = new_figure(names, view, title)
     for axes in panels[:2]:
         draw_ground(axes, floor)
-    draw_flow(panels[0], position, residual, cluster, max_flow)
+    draw_flow(panels[0], position, residual, cluster, max_flow, moves)
     style.draw_scale(panels[0])
-    style.draw_wheel(panels[0], position, np.linalg.norm(residual, axis=1) > MIN_DRAWN, max_flow, legend)
+    style.draw_wheel(panels[0], position, moves, max_flow, legend)
     if true_flow is not None:
         draw_flow(panels[1], position, true_flow, None, max_flow)
         draw_error(panels[2], position, residual, true_flow)

@@ -11,9 +11,9 @@ from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.types import CFlowError
+from cflow_torch.types import MIN_MOVING, CFlowError
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
-from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_DRAWN, MIN_ERROR
+from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_ERROR, has_flow
 from cflow_torch.viz.scene import ViewedPair, ViewerFrame
 from cflow_torch.viz.wheel import flow_to_rgb
 
@@ -80,11 +80,11 @@ class PackedDrive:
         ground = scene.is_ground
         speed = np.linalg.norm(scene.residual, axis=1)
         static = np.where(ground, GROUND, STATIC)
-        moving = ~ground & (speed > MIN_DRAWN)
+        moving = ~ground & has_flow(scene.residual)  # the page asks for P(moving), too
         entries = {
             "flow": np.where(moving, _wheel_entry(scene.residual, self.max_flow), static),
             "speed": np.where(moving, _ramp_entry(speed, self.max_flow), static),
-            "object": _object_entry(scene.position, cluster, moving, static),
+            "object": _object_entry(scene.position, cluster, ~ground & scene.is_moving, static),
         }
         if scene.confidence is not None:
             entries["confidence"] = np.where(ground, GROUND, _ramp_entry(1 - scene.confidence, 1.0))
@@ -97,7 +97,7 @@ class PackedDrive:
         error = np.linalg.norm(scene.residual - scene.truth, axis=1)
         unknown = np.where(ground, GROUND, UNKNOWN)
         known = ~ground & np.isfinite(length)
-        moves = known & (length > MIN_DRAWN)
+        moves = known & has_flow(scene.truth)
         wrong = known & (error > MIN_ERROR)
         true_entry = np.where(moves, _wheel_entry(scene.truth, self.max_flow), STATIC)
         entries["truth"] = np.where(known, true_entry, unknown)
@@ -106,7 +106,7 @@ class PackedDrive:
 
     def _arrows(self, scene: ViewedPair) -> list[dict[str, Any]]:
         """List the arrows: one per cluster with enough moving points."""
-        number, start, flow = scene.arrows()
+        number, start, flow = scene.arrows(has_flow(scene.residual))
         columns = {
             "cluster": number.tolist(),
             "start": _rounded(start),
@@ -161,6 +161,7 @@ class PackedDrive:
             "north": None if T is None else float(np.arctan2(T[1, 1], T[1, 0])),  # of the world's y axis, viewer frame
             "steps": ARROW_STEPS,
             "chances": _STEPS if "moving" in present else 0,
+            "likely": MIN_MOVING,
             "thinned": f"{shown:,} of {self.num_given:,} points are drawn: all that move, by estimate or truth, all "
             f"with an error above {MIN_ERROR:g} m, and one other point per voxel of {side:g} m ({2 * side:g} m on the "
             f"ground). Positions are rounded to {_UNIT * 100:g} cm.",

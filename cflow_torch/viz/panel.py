@@ -9,18 +9,18 @@ import torch
 
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.ops.labeling import connected_components
+from cflow_torch.types import MOVING
 from cflow_torch.viz import style
 from cflow_torch.viz.style import Axes, Figure
 from cflow_torch.viz.wheel import flow_to_rgb
 
-MIN_DRAWN = 0.08  # metres per sweep; the field's viewers draw slower points in white
 MIN_ERROR, MAX_ERROR = 0.05, 0.35  # metres, ends of the viewers' error colours; a smaller error is drawn as 0
 ARROW_STEPS = 5  # length of an arrow, sweeps
 MIN_ARROW_POINTS = 8  # a cluster with fewer moving points gets no arrow
 OBJECT_PIXEL = 0.5  # metres; without clusters, moving points in touching pixels are one object
 _MAX_PIXELS = 2048  # pixels on a side, at most; larger scenes get larger pixels
 FLOW_CAPTION = (
-    f"grey: static   colour: moves more than {MIN_DRAWN:g} m per sweep   "
+    f"grey: static   colour: moves at least {MOVING:g} m per sweep   "
     f"arrow: motion over {ARROW_STEPS} sweeps ({ARROW_STEPS / style.SWEEP_RATE:g} s at {style.SWEEP_RATE} Hz)"
 )
 EGO_OUTLINE = ((2.4, 0.0), (-1.9, 1.15), (-1.0, 0.0), (-1.9, -1.15))  # metres
@@ -85,13 +85,26 @@ def draw_ground(axes: Axes, position: np.ndarray) -> None:
     axes.scatter(position[:, 0], position[:, 1], s=dot_area(axes), color=style.GROUND, linewidths=0, zorder=1)
 
 
-def draw_flow(axes: Axes, position: np.ndarray, flow: np.ndarray, cluster: np.ndarray | None, max_flow: float) -> None:
+def has_flow(flow: np.ndarray) -> np.ndarray:
+    """(N,) bool: the flow, (N, 3) metres per sweep, is at least `MOVING`; False for NaN."""
+    return np.linalg.norm(flow, axis=1) >= MOVING
+
+
+def draw_flow(
+    axes: Axes,
+    position: np.ndarray,
+    flow: np.ndarray,
+    cluster: np.ndarray | None,
+    max_flow: float,
+    moves: np.ndarray | None = None,
+) -> None:
     """Draw static points in grey, moving points in colour, one arrow per moving cluster, and the ego vehicle.
 
     Positions (N, 3) are in metres, residual flow (N, 3) in metres per sweep; NaN is drawn as static. `cluster` is (N,),
-    -1 = none. If it is None, moving points near each other form groups. Flow of `max_flow` has full colour.
+    -1 = none. If it is None, moving points near each other form groups. Flow of `max_flow` has full colour. `moves` is
+    (N,) bool, True for moving points; None = all with a flow of at least `MOVING`.
     """
-    moves = np.linalg.norm(flow, axis=1) > MIN_DRAWN  # False for NaN
+    moves = has_flow(flow) if moves is None else moves
     dot = dot_area(axes)
     static = position[~moves]
     axes.scatter(static[:, 0], static[:, 1], s=dot, color=style.STATIC, linewidths=0, zorder=2)

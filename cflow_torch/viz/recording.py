@@ -14,7 +14,7 @@ from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
 from cflow_torch.viz.clusters import cluster_colors
-from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MIN_DRAWN
+from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, has_flow
 from cflow_torch.viz.scene import MAX_FLOW, ViewedPair, ViewerFrame
 from cflow_torch.viz.style import checked_path
 from cflow_torch.viz.wheel import flow_to_rgb
@@ -55,7 +55,7 @@ def record_log(
         The frame of `world` is the ego frame at t+1 of the first pair with poses. world/trajectory is the path of the
         vehicle, and world/tracks has the boxes of `tracks`. The frame of world/ego_vehicle is the ego frame at t+1 of
         the current pair. It holds arrows (one per moving cluster, `panel.ARROW_STEPS` sweeps long) and these points:
-        - lidar/cflow: points of t, moved by the ego motion and coloured by residual flow, grey up to `panel.MIN_DRAWN`
+        - lidar/cflow: points of t, moved by the ego motion and coloured by residual flow, grey if static
         - lidar/ground_truth: points of t with known truth, coloured by the true residual flow
         - lidar/clusters, lidar/ground: points of t, moved likewise; lidar/next_sweep: points of t+1
         Timelines: `sweep`, the index; `time`, if sweeps have time stamps.
@@ -120,7 +120,7 @@ class _Drive:
             self.trajectory.append(moved[:3, 3])
             self.log(EGO, rr.Transform3D(translation=moved[:3, 3], mat3x3=moved[:3, :3]))
         shown = position[~is_ground]
-        self._points(ESTIMATE, shown, self._color(scene.residual[~is_ground]))
+        self._points(ESTIMATE, shown, self._color(scene.residual[~is_ground], scene.is_moving[~is_ground]))
         self._points(CLUSTERS, shown, cluster_colors(shown, scene.cluster[~is_ground], _NO_CLUSTER))
         self._points(GROUND, position[is_ground], _GROUND_COLOR, _FINE_DOT)
         after = as_numpy(pc1.points)[:, :3]
@@ -129,9 +129,9 @@ class _Drive:
             self.has_truth = True
             truth = np.full_like(position, np.nan) if scene.truth is None else scene.truth
             is_known = ~is_ground & np.isfinite(truth).all(axis=1)
-            self._points(TRUTH, position[is_known], self._color(truth[is_known]))
+            self._points(TRUTH, position[is_known], self._color(truth[is_known], has_flow(truth[is_known])))
 
-        numbers, start, vector = scene.arrows()
+        numbers, start, vector = scene.arrows(scene.is_moving)
         arrows = rr.Arrows3D(
             origins=start,
             vectors=ARROW_STEPS * vector,
@@ -173,9 +173,9 @@ class _Drive:
     def _points(self, entity: str, position: np.ndarray, colors: Any, radius: float = _DOT) -> None:
         self.log(entity, self.rr.Points3D(position.astype(np.float32), colors=colors, radii=radius))
 
-    def _color(self, flow: np.ndarray) -> np.ndarray:
+    def _color(self, flow: np.ndarray, moves: np.ndarray) -> np.ndarray:
         color = flow_to_rgb(flow, self.max_flow)
-        color[np.linalg.norm(flow, axis=1) <= MIN_DRAWN] = _STATIC
+        color[~moves] = _STATIC
         return color
 
     def _layout(self) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
-from cflow_torch.viz.panel import MIN_ARROW_POINTS, MIN_DRAWN, group_medians
+from cflow_torch.viz.panel import MIN_ARROW_POINTS, group_medians
 from cflow_torch.viz.style import SWEEP_RATE
 
 MAX_FLOW = 1.5  # metres per sweep: 15 m/s at 10 Hz
@@ -28,6 +28,7 @@ class ViewedPair:
     cluster: np.ndarray  # (N,) int64, -1 = none
     confidence: np.ndarray | None  # (N,) float64, or None
     moving: np.ndarray | None  # (N,) float64, probability that a point moves, or None
+    is_moving: np.ndarray  # (N,) bool, see `FlowResult.is_moving`
     is_ground: np.ndarray  # (N,) bool
     pose: np.ndarray | None  # (4, 4) float64 `T_world_ego` of t+1, or None
 
@@ -56,13 +57,14 @@ class ViewedPair:
             cluster=as_numpy(result.cluster_id)[kept],
             confidence=None if result.confidence is None else as_numpy(result.confidence, np.float64)[kept],
             moving=None if result.moving is None else as_numpy(result.moving, np.float64)[kept],
+            is_moving=as_numpy(result.is_moving)[kept],
             is_ground=ground[kept],
             pose=None if pc1.pose is None else as_numpy(pc1.pose, np.float64),
         )
 
-    def arrows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return ids, (A,), median positions and median flows, (A, 3), of clusters with enough moving points."""
-        moving = ~self.is_ground & (np.linalg.norm(self.residual, axis=1) > MIN_DRAWN)
+    def arrows(self, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return ids, (A,), median positions and flows, (A, 3), of clusters with enough points that move, (N,) bool."""
+        moving = ~self.is_ground & moves
         columns = np.concatenate([self.position[moving], self.residual[moving]], axis=1)
         cluster, middle, count = group_medians(self.cluster[moving], columns)
         large = count >= MIN_ARROW_POINTS

@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cflow_torch.config import Config, make_config
-from cflow_torch.types import Window, point_rows
+from cflow_torch.types import MOVING, Window, point_rows
 from cflow_torch.viz import style
 from cflow_torch.viz.bev import longest_flow, view_of
-from cflow_torch.viz.panel import FLOW_CAPTION, MIN_DRAWN, draw_flow
+from cflow_torch.viz.panel import FLOW_CAPTION, draw_flow
 from cflow_torch.viz.stages import (
     ClusterCorrelation,
     KeyPointMatches,
@@ -327,7 +327,7 @@ def _busiest_view(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.nd
     """Return the corners of the view around the cell with the largest sum of match vectors, or around the vehicle."""
     flow = end - start
     middle = np.zeros(2)
-    moves = np.linalg.norm(flow, axis=1) > MIN_DRAWN
+    moves = np.linalg.norm(flow, axis=1) >= MOVING
     if moves.any():
         _, cell = np.unique(np.floor(start[moves] / _CELL).astype(np.int64), axis=0, return_inverse=True)
         cell = cell.reshape(-1)  # NumPy 2.0 gives it another shape
@@ -345,7 +345,7 @@ def _draw_matches(axes: Axes, found: KeyPointMatches, low: np.ndarray, high: np.
     flow = end - start
     max_flow = longest_flow(flow)
     color = flow_to_rgb(flow, max_flow) / 255
-    moves = np.linalg.norm(flow, axis=1) > MIN_DRAWN
+    moves = np.linalg.norm(flow, axis=1) >= MOVING
     axes.plot(*start[~moves].T, "o", color=style.FAINT, markersize=2.5, markeredgewidth=0, zorder=3)
     lines = np.stack([start, end], axis=1)[moves]
     axes.add_collection(LineCollection(lines, colors=style.INK, linewidths=1.9, alpha=0.5, zorder=4))

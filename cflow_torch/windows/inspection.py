@@ -37,7 +37,7 @@ _FEWEST_REPEATED = 100  # this many equal points are no coincidence
 
 
 class Inspection:
-    """Warns of likely mistakes in the windows of a model.
+    """Warns of likely mistakes in windows. `estimate_flow`, `FlowStream` and the integrations call it.
 
     In every window, it checks that pc1 does not repeat pc0. It makes the other checks once each, only in the first
     window of a call. Once such a window has points, it checks units, axes, ground and missing returns. Once such a

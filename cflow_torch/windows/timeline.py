@@ -148,7 +148,7 @@ def elapsed_times(window: Window, sources: Sequence[Source], config: Config) -> 
 def _nanoseconds(sweep: Sweep, name: str) -> int:
     with suppress(TypeError, ValueError, OverflowError, RuntimeError):
         stamp = int(sweep.timestamp_ns)  # type: ignore[arg-type]
-        if abs(stamp) < 1 << 63:
+        if abs(stamp) < 1 << 63 and stamp == sweep.timestamp_ns:  # 0.1 is in seconds
             return stamp
     raise CFlowError(
         f"timestamp_ns of {name} is {sweep.timestamp_ns!r}: give whole nanoseconds that fit an int64, or None for "

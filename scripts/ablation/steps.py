@@ -18,6 +18,7 @@ from run import Figures, make_parser, print_table, score_preset
 from sets import ScoredSet, make_sets
 from torch import Tensor
 
+from cflow_torch.ops.groups import Groups
 from cflow_torch.verified import changed_pixels, component_tree, confidence, paired_test, refinement
 
 
@@ -36,16 +37,16 @@ def _without_margin(*given: Any) -> confidence.MotionMargin:
     return margin._replace(is_dynamic=torch.ones_like(margin.is_dynamic))
 
 
-def _nothing_slides(sweeps: Any, pixels: Any, groups: Any, motions: Tensor, *_: Any) -> Tensor:
+def _nothing_slides(sweeps: Any, pixels: Any, groups: Any, motions: Tensor) -> Tensor:
     return torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
 
 
-def _nothing_is_slow(sweeps: Any, objects: Any, motion: Tensor, may_be_slow: Tensor) -> Tensor:
-    return motion.flip(1) * sweeps.grid.pixel_size
+def _nothing_is_slow(sweeps: Any, objects: Any, flow: Tensor, may_be_slow: Tensor) -> Tensor:
+    return flow
 
 
-def _no_ends_move(sweeps: Any, tree: Any, is_long: Tensor) -> Tensor:
-    return torch.zeros_like(is_long)
+def _no_ends_move(sweeps: Any, pixels: Any, groups: Groups) -> Tensor:
+    return torch.zeros(groups.count, dtype=torch.bool, device=groups.of_item.device)
 
 
 # For each row of the table, the steps of `VerifiedFlow` that it replaces.
@@ -59,8 +60,8 @@ STEPS: dict[str, dict[str, Any]] = {
     "no least gain": {"verify": partial(paired_test.verify, least_gain=0)},
     "no price of an object": {"select_objects": partial(component_tree.select_objects, price=0)},
     "no margin": {"motion_margin": _without_margin},
-    "no registration": {"refine": partial(refinement.refine, num_steps=0)},
-    "no slow objects of pairs": {"refine": partial(refinement.refine, find_slow=_nothing_is_slow)},
+    "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
+    "no slow objects of pairs": {"refine": partial(refinement.refine, add_slow=_nothing_is_slow)},
     "long vehicles are static": {"movable_nodes": partial(component_tree.movable_nodes, ends_move=_no_ends_move)},
 }
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -31,7 +31,6 @@ HISTORY, NEAR = 4, 50.0
 STEPS = {64: 1, 32: 2, 16: 4}  # beams -> one of how many is kept
 PANDAR64 = np.concatenate([[15, 11, 8, 5, 3], 2 - np.arange(49) / 6, -np.arange(7.0, 15), [-19, -25]])  # degrees
 SENSOR_HEIGHT = 1.45  # metres above the origin of PandaSet's points
-PUBLISHED = "0.04 to 0.06 (networks on HeLiMOS' VLP-16: other data, not comparable)"
 
 
 class ThinnedLog(LogWrapper):
@@ -83,16 +82,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", nargs="+", type=Path)
     torch.set_num_threads(1)
-    model, rows = make_model(make_config("default"), "cpu"), []
+    model = make_model(make_config("default"), "cpu")
+    ious: list[dict[str, Any]] = []
+    points: list[dict[str, Any]] = []
     for path in parser.parse_args().paths:
         log = LabelledLog(path)
-        row: dict[str, Any] = {"drive": log.log_id}
+        ious.append({"moving IoU": log.log_id})
+        points.append({"moving points per sweep": log.log_id})
         for beams, step in STEPS.items():
             scores = moving_iou(model, CachedLog(ThinnedLog(log, step), HISTORY + 3))
-            row[f"{beams} beams"] = f"{scores['iou']:.3f} ({scores['moving points']:.0f})"
-        rows.append(row)
-        print(row, flush=True)
-    print(markdown([*rows, {"drive": "published", "16 beams": PUBLISHED}]))
+            ious[-1][f"{beams} beams"] = f"{scores['iou']:.3f}"
+            points[-1][f"{beams} beams"] = f"{scores['moving points']:.0f}"
+        print(ious[-1], flush=True)
+    print(markdown(ious))
+    print(markdown(points))
 
 
 if __name__ == "__main__":

@@ -7,11 +7,15 @@ python scripts/benchmarks/boxes.py --simulated av2 waymo                   a str
 The simulated drives have the seeds 300 and 301. We chose settings on PandaSet 002, sweeps 72-79, and on simulated
 drives of the seeds 400 and 401. An object is scored in a sweep if it moves at 0.5 m/s or more, has at least 20 points,
 and is within 50 m. Its box is the box of the sweep with the largest intersection over union (IoU), seen from above.
+
+AP is the average precision of moving boxes, by their confidence: a box is right if its IoU with an object that is
+scored, and has no better box, is above the threshold. Boxes on objects that move without being scored are left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any, Dict, NamedTuple
 
@@ -29,7 +33,9 @@ from cflow_torch.data.log import Log, windows
 from cflow_torch.data.pandaset import _POSITION, _SIZE, PandaSetLog, _columns
 
 DRIVES = ((300, "street"), (301, "crossing"))
+LEAST_SPEED = 0.1  # m/s; slower objects are static
 SPEED, POINTS, RANGE = 0.5, 20, 50.0  # m/s, points and metres: least speed and points, most distance of a scored object
+THRESHOLDS = (0.4, 0.7)  # of IoU
 LIDAR = 0  # Pandar64
 _CLASSES = {
     "pedestrian": ("PEDESTRIAN", "STROLLER", "OFFICIAL_SIGNALER"),
@@ -41,23 +47,27 @@ Row = Dict[str, Any]
 
 
 class TrueBoxes(NamedTuple):
-    """The K scored objects of one sweep, in the world."""
+    """The K objects of one sweep that move, in the world."""
 
     name: list[str]
     kind: list[str]  # pedestrian, cyclist, car, truck
     size: np.ndarray  # (K, 3) metres
     pose: np.ndarray  # (K, 4, 4) `T_world_box`
     velocity: np.ndarray  # (K, 3) m/s
+    is_scored: np.ndarray  # (K,) bool; False = too slow, too few points or too far
 
     @property
     def heading(self) -> np.ndarray:
         return np.arctan2(self.pose[:, 1, 0], self.pose[:, 0, 0])
 
+    def corners(self, row: int) -> np.ndarray:
+        return corners(*self.pose[row, :2, 3], *self.size[row, :2], self.heading[row])
 
-def scored(
+
+def moving(
     boxes: Boxes, pose: np.ndarray, later: dict[str, np.ndarray], seconds: float, points: np.ndarray
 ) -> TrueBoxes:
-    """Keep the boxes that are scored.
+    """Keep the boxes that move.
 
     Args:
         boxes: of a sweep, in its ego frame.
@@ -67,7 +77,7 @@ def scored(
         points: (N, 3) in the ego frame, without ground.
     """
     poses = pose @ boxes.pose
-    rows, velocities = [], []
+    rows, velocities, is_scored = [], [], []
     for row, name in enumerate(boxes.track_id):
         if name not in later:
             continue
@@ -75,13 +85,16 @@ def scored(
         local = (points - boxes.pose[row, :3, 3]) @ boxes.pose[row, :3, :3]
         num_points = (np.abs(local) <= boxes.size[row] / 2 + 0.1).all(1).sum()
         is_near = np.hypot(*boxes.pose[row, :2, 3]) <= RANGE
-        if np.linalg.norm(velocity) >= SPEED and num_points >= POINTS and is_near:
+        if np.linalg.norm(velocity) >= LEAST_SPEED:
             rows.append(row)
             velocities.append(velocity)
+            is_scored.append(np.linalg.norm(velocity) >= SPEED and num_points >= POINTS and is_near)
     names = [CATEGORIES[boxes.category[row]] for row in rows]
     kinds = [CLASS_OF.get(name, "car") for name in names]
     ids = [boxes.track_id[row] for row in rows]
-    return TrueBoxes(ids, kinds, boxes.size[rows], poses[rows], np.reshape(velocities, (-1, 3)))
+    return TrueBoxes(
+        ids, kinds, boxes.size[rows], poses[rows], np.reshape(velocities, (-1, 3)), np.array(is_scored, bool)
+    )
 
 
 class SimulatedBoxes(SimulatedLog):
@@ -93,7 +106,7 @@ class SimulatedBoxes(SimulatedLog):
         poses = dict(zip(later.track_id, after.pose @ later.pose))
         seconds = (self.timestamps[index + 1] - self.timestamps[index]) * 1e-9
         is_ground = self.drive.sweep(index * self.step).is_ground
-        truth = scored(now, sweep.pose, poses, seconds, sweep.points[~is_ground])
+        truth = moving(now, sweep.pose, poses, seconds, sweep.points[~is_ground])
         if sweep.point_times is not None:
             truth.pose[:, :3, 3] += truth.velocity * self._mean_times(index, truth.name)[:, None]
         return truth
@@ -103,7 +116,8 @@ class SimulatedBoxes(SimulatedLog):
         returns = self.drive.returns(index * self.step)
         body = np.append(self.drive.scene.body_of_solid, -1)[returns.solid.numpy()]
         times = returns.offset_ns.numpy() * 1e-9
-        return np.array([times[body == self.drive.track_ids.index(name)].mean() for name in names])
+        bodies = [body == self.drive.track_ids.index(name) for name in names]
+        return np.array([times[each].mean() if each.any() else 0.0 for each in bodies])
 
     def _boxes(self, index: int) -> Boxes:
         boxes = self.drive.boxes(index * self.step)
@@ -122,7 +136,7 @@ class PandaSetBoxes(PandaSetLog):
         poses = dict(zip(later.track_id, self._poses[index + 1] @ later.pose))
         seconds = (self.timestamps[index + 1] - self.timestamps[index]) * 1e-9
         points = sweep.points if sweep.is_ground is None else sweep.points[~sweep.is_ground]
-        return scored(now, self._poses[index], poses, seconds, points)
+        return moving(now, self._poses[index], poses, seconds, points)
 
     def cuboids(self, index: int) -> Boxes:
         """Cuboids of a sweep in its ego frame."""
@@ -170,7 +184,7 @@ class SceneBoxes(LabelledLog):
         poses = dict(zip(later.track_id, self.sweep(index + 1).pose @ later.pose))
         seconds = (self.timestamps[index + 1] - self.timestamps[index]) * 1e-9
         points = sweep.points[~sweep.is_ground]
-        return scored(self._known[index], sweep.pose, poses, seconds, points[:, :3])
+        return moving(self._known[index], sweep.pose, poses, seconds, points[:, :3])
 
 
 def fit(start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -225,13 +239,10 @@ def score(log: Any, table: dict[str, np.ndarray], sweeps: range) -> list[Row]:
     rows: list[Row] = []
     for index in sweeps:
         chosen = np.flatnonzero(table["sweep"] == index)
-        names = ("x", "y", "length", "width", "heading")
-        found = [corners(*(float(table[name][row]) for name in names)) for row in chosen]
+        found = [found_corners(table, row) for row in chosen]
         truth = log.true_boxes(index)
-        for k in range(len(truth.name)):
-            length, width = truth.size[k, :2]
-            true = corners(*truth.pose[k, :2, 3], length, width, truth.heading[k])
-            shares = [iou(true, each) for each in found]
+        for k in np.flatnonzero(truth.is_scored):
+            shares = [iou(truth.corners(k), each) for each in found]
             best = int(np.argmax(shares)) if shares else -1
             row = {"log": log.log_id, "sweep": index, "object": truth.name[k], "kind": truth.kind[k], "iou": 0.0}
             row.update(
@@ -249,18 +260,70 @@ def score(log: Any, table: dict[str, np.ndarray], sweeps: range) -> list[Row]:
     return rows
 
 
-def summary(name: str, rows: list[Row]) -> Row:
-    """The columns of docs/applications.md."""
+def found_corners(table: dict[str, np.ndarray], row: int) -> np.ndarray:
+    """(4, 2) corners of a box of a table."""
+    return corners(*(float(table[name][row]) for name in ("x", "y", "length", "width", "heading")))
+
+
+class Detections(NamedTuple):
+    """Moving boxes of drives, and what each one is at an IoU of 0.4 and of 0.7."""
+
+    confidence: list[float]
+    is_right: list[tuple[bool, ...]]
+    num_true: int
+
+    def average_precision(self, threshold: int) -> float:
+        """Return the mean over all recalls of the best precision that is possible at this recall or a higher one."""
+        order = np.argsort(-np.array(self.confidence), kind="stable")
+        is_right = np.array([each[threshold] for each in self.is_right], bool)[order]
+        precision = np.cumsum(is_right) / np.arange(1, len(order) + 1)
+        best = np.maximum.accumulate(precision[::-1])[::-1]
+        return float(best[is_right].sum() / max(self.num_true, 1))
+
+
+def detections(drives: list[tuple[Any, dict[str, np.ndarray], range]]) -> Detections:
+    """Compare the moving boxes of drives with the objects that move."""
+    confidence: list[float] = []
+    is_right: list[tuple[bool, ...]] = []
+    num_true = 0
+    for log, table, sweeps in drives:
+        for index in sweeps:
+            truth = log.true_boxes(index)
+            num_true += int(truth.is_scored.sum())
+            ego = log.sweep(index).pose[:2, 3]
+            is_near = np.hypot(table["x"] - ego[0], table["y"] - ego[1]) <= RANGE
+            chosen = np.flatnonzero((table["sweep"] == index) & table["is_moving"] & is_near)
+            chosen = chosen[np.argsort(-table["confidence"][chosen], kind="stable")]
+            taken: list[set[int]] = [set() for _ in THRESHOLDS]
+            for row in chosen.tolist():
+                shares = np.array([iou(truth.corners(k), found_corners(table, row)) for k in range(len(truth.name))])
+                of_objects = np.where(truth.is_scored, shares, 0)
+                best = [np.where(np.isin(range(len(shares)), list(each)), 0, of_objects) for each in taken]
+                hits = [bool(len(each) and each.max() >= least) for each, least in zip(best, THRESHOLDS)]
+                for each, shares_left, hit in zip(taken, best, hits):
+                    if hit:
+                        each.add(int(shares_left.argmax()))
+                if any(hits) or of_objects.max(initial=0) >= shares.max(initial=0):  # else it is on an unscored object
+                    confidence.append(float(table["confidence"][row]))
+                    is_right.append(tuple(hits))
+    return Detections(confidence, is_right, num_true)
+
+
+def summary(name: str, rows: list[Row], found: Detections) -> Row:
+    """The columns of docs/boxes.csv."""
     ious = np.array([row["iou"] for row in rows])
     hits = [row for row in rows if row["track"] >= 0]
     size = np.array([np.abs(row["size"] / row["true"] - 1) for row in hits]).reshape(-1, 3)
     is_vehicle = np.array([row["kind"] in ("car", "truck") for row in hits], bool)
     out: Row = {"drive": name, "objects x sweeps": len(rows), "missed": len(rows) - len(hits), "IoU": ious.mean()}
-    out.update({f"> {least}, %": 100 * (ious > least).mean() for least in (0.4, 0.7)})
+    out.update({f"> {least}, %": 100 * (ious > least).mean() for least in THRESHOLDS})
+    out.update({f"AP {least}": found.average_precision(number) for number, least in enumerate(THRESHOLDS)})
     for kind in ("car", "truck", "cyclist", "pedestrian"):
         of_kind = ious[[row["kind"] == kind for row in rows]]
-        out[f"{kind}"] = f"{of_kind.mean():.3f} ({len(of_kind)})" if len(of_kind) else "-"
-    out["length, width off by %"] = " ".join(f"{100 * each:.1f}" for each in np.median(size[is_vehicle, :2], 0))
+        out[f"IoU of {kind}"] = of_kind.mean() if len(of_kind) else "-"
+        out[f"{kind}s"] = len(of_kind)
+    for axis, side in enumerate(("length", "width")):
+        out[f"{side} off by, %"] = 100 * np.median(size[is_vehicle, axis])
     out["within 15 %"] = 100 * (size[is_vehicle, :2] <= 0.15).all(1).mean()
     out["heading, degrees"] = float(np.median([row["heading"] for row in hits]))
     out["same size, %"] = constancy(hits)
@@ -299,11 +362,13 @@ def main() -> None:
     for sensor in given.simulated:
         logs = [SimulatedBoxes(sensor, seed, scene, given.num_sweeps) for seed, scene in DRIVES]
         drives.append((f"simulated {sensor}", logs))
-    print(
-        markdown(
-            [summary(name, [row for log in logs for row in score(log, *boxes_of(log, model))]) for name, logs in drives]
-        )
-    )
+    summaries = []
+    for name, logs in drives:
+        tracked = [(log, *boxes_of(log, model)) for log in logs]
+        rows = [row for each in tracked for row in score(*each)]
+        summaries.append(summary(name, rows, detections(tracked)))
+        print(f"{name} is scored", file=sys.stderr)
+    print(markdown(summaries))
 
 
 if __name__ == "__main__":

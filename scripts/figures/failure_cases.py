@@ -4,9 +4,9 @@
   python scripts/figures/failure_cases.py                         docs/pictures/limit_*.png, and the table
   python scripts/figures/failure_cases.py --only rail fast        some cases
 
-A row of the table has the mean end-point error of the named objects, in metres per sweep: its mean over the seeds, with
-the smallest and the largest in brackets, and the mean confidence. A picture shows one seed: the first setting above the
-last, each with estimate, truth and error.
+A row of the table has the mean end-point error of the named objects, in metres per sweep: its mean over the seeds, the
+smallest and the largest, and the mean confidence. A picture shows one seed: the first setting above the last, each with
+estimate, truth and error.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def print_rows(cases: Sequence[Case]) -> None:
     heading = (cases[0].staged.title, cases[0].staged.whose)
     for attempts in zip(*(case.attempts for case in cases)):
         errors, trust = np.array([(attempt.error, attempt.confidence) for attempt in attempts]).T
-        error = f"{errors.mean():.3f} ({errors.min():.3f}–{errors.max():.3f})"
+        error = " | ".join(f"{value:.3f}" for value in (errors.mean(), errors.min(), errors.max()))
         shown = "-" if np.isnan(trust).any() else f"{trust.mean():.2f}"
         print(f"| {' | '.join((*heading, attempts[0].name, error, shown))} |", flush=True)
         heading = ("", "")
@@ -162,7 +162,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=tuple(CASES), default=tuple(CASES), metavar="CASE")
     given = parser.parse_args()
     warnings.simplefilter("ignore", UserWarning)  # one of the cases leaves the ground in
-    print("| | of | setting | error, m | confidence |\n|---|---|---|---|---|")
+    print("| | of | setting | error, m | smallest | largest | confidence |\n|---|---|---|---|---|---|---|")
     for name in given.only:
         cases = [make_case(name, seed) for seed in SEEDS]
         print_rows(cases)

@@ -16,6 +16,7 @@ from matplotlib.patches import Rectangle
 
 from cflow_torch import VerifiedFlow
 from cflow_torch.data.log import window
+from cflow_torch.types import MOVING
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.changed_pixels import find_changed
 from cflow_torch.verified.columns import count_slices
@@ -25,7 +26,7 @@ from cflow_torch.verified.overhangs import add_overhung
 from cflow_torch.verified.paired_test import add_unchanged, verify
 from cflow_torch.viz import save_picture, style
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
-from cflow_torch.viz.panel import ARROW_STEPS, MIN_DRAWN, group_medians
+from cflow_torch.viz.panel import ARROW_STEPS, group_medians
 from cflow_torch.viz.wheel import flow_to_rgb, wheel_image
 from cflow_torch.windows.collation import make_batch
 
@@ -42,7 +43,7 @@ COLUMNS = (
      "dotted = group of changed pixels,\ndashed = lies under an overhang."),
     ("4  selection", "A colour is an object selected to\nmove. Grey stays static. A striped\n"
      "object lies under an overhang."),
-    ("5  flow", f"Sweep t, after refinement. Grey\nmoves at most {MIN_DRAWN:g} m per sweep.\n"
+    ("5  flow", f"Sweep t, after refinement. Grey\nmoves less than {MOVING:g} m per sweep.\n"
      f"Arrows: displacement in {ARROW_STEPS} sweeps."),
 )  # fmt: skip
 STATIC, PALE, SHADES = (172, 179, 187), (214, 219, 224), np.array([[225], [190], [145], [95], [25]]).repeat(3, 1)
@@ -64,7 +65,7 @@ def take_steps(drive: Any) -> tuple[Any, ...]:
     motion, evidence = verify(sweeps, tree, candidates.motion, config.significance)
     tree = add_unchanged(sweeps, tree, motion)
     objects = select_objects(sweeps, components, tree, evidence)
-    return sweeps, change, components, tree, objects, objects.nodes.spread(motion).any(1), model(given)[0]
+    return sweeps, change, components, tree, objects, objects.by_node.spread(motion).any(1), model(given)[0]
 
 
 def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: float) -> None:
@@ -108,7 +109,7 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
 
     flow, rows = result.residual_flow.numpy(), sweeps.batch.rows[0]
     pixel, points = sweeps.points.of_item[rows], sweeps.batch.positions[:2, rows].T.numpy()
-    fast = np.linalg.norm(flow, axis=1) > MIN_DRAWN
+    fast = result.is_moving.numpy()
     fast &= ((points >= low) & (points <= high)).all(1)
     longest = np.ceil(20 * np.linalg.norm(flow[fast], axis=1).max()) / 20
     paint(panels[4], (now, STATIC), (pixel[fast], flow_to_rgb(flow[fast], longest)))

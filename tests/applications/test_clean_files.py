@@ -163,6 +163,8 @@ def test_the_command_counts_what_it_removes_and_writes_every_format(
     assert b"property float intensity" in header
     if suffix == ".bin":
         assert "data.bin_columns=5" in text
+    if suffix != ".npy":
+        return
     (tmp_path / "clean" / "drive.ply").unlink()
     capsys.readouterr()
     assert cflow(*call) == 0 and "it is complete" in capsys.readouterr().out

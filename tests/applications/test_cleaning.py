@@ -148,7 +148,7 @@ def test_wrong_inputs_are_one_clear_error() -> None:
 
 def test_the_command_resumes_and_refuses_changed_settings(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     call = calls_on_a_drive(tmp_path)
-    settings = ("model.num_history=0", "map=true", "voxel_size=0.5", "suffix=.ply")
+    settings = ("map=true", "voxel_size=0.5", "suffix=.ply")
     assert call("clean", "clean", *settings) == 0
     (file,) = (tmp_path / "clean").glob("*.ply")
     log = ArraysLog(tmp_path / "clean" / file.stem)
@@ -163,6 +163,6 @@ def test_the_command_resumes_and_refuses_changed_settings(tmp_path: Path, capsys
     assert call("clean", "clean", *settings) == 0 and file.read_bytes() == before
     assert f"drawn in {picture}" in capsys.readouterr().out
     capsys.readouterr()
-    assert call("clean", "clean", "model.num_history=0", "remove_stopped=true") == 2
+    assert call("clean", "clean", "remove_stopped=true") == 2
     assert "remove_stopped was" in capsys.readouterr().err
     assert call("clean", "other", "suffix=.xyz") == 2 and ".ply" in capsys.readouterr().err

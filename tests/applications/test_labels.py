@@ -26,9 +26,10 @@ spatial = pytest.importorskip("scipy.spatial")
 
 KEYS = {"dufo": np.uint8, "cluster": np.int16, "dufocluster": np.int16, "nnd": np.uint8, "ground_mask": np.bool_}
 NEAR = (-25.0, -25.0, -np.inf, 25.0, 25.0, np.inf)
-ONLINE = make_config(num_history=0, point_cloud_range=NEAR)
+ONLINE = make_config(num_history=0, point_cloud_range=NEAR, pixel_sizes=(0.4, 0.2))
 SMALL = "model.point_cloud_range=[-25,-25,-inf,25,25,inf]"
-CALL = ["label", "model=default", "model.num_history=0", SMALL, "engine.workers=1", "data.check=false"]
+COARSE = "model.pixel_sizes=[0.4,0.2]"
+CALL = ["label", "model=default", "model.num_history=0", SMALL, COARSE, "engine.workers=1", "data.check=false"]
 NUM_SWEEPS = 4  # of a scene
 
 

@@ -99,7 +99,7 @@ def test_the_command_writes_masks_and_overwrites_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     call = calls_on_a_drive(tmp_path)
-    run = ("model.num_history=0", "engine.workers=1", "masks=true")
+    run = ("engine.workers=1", "masks=true")
     assert call("flow", "flow", *run) == 2 and "no calibration of cameras" in capsys.readouterr().err
     assert not list((tmp_path / "flow").glob("*/*.feather")), "it is told before anything is computed"
     camera = CAMERA._replace(T_camera_ego=AHEAD @ pose(0, 0, 0, -1.5))
@@ -109,7 +109,7 @@ def test_the_command_writes_masks_and_overwrites_them(
     flow_files = {file.stem for file in folder.parents[1].glob("*.feather")}
     assert {file.stem for file in folder.iterdir()} == flow_files and (folder.parents[1] / "tracks.parquet").exists()
     assert any(np.asarray(Image.open(file)).any() for file in folder.iterdir())
-    assert call("flow", "flow", "model.num_history=0", "engine.workers=1", "overwrite=true") == 0
+    assert call("flow", "flow", "engine.workers=1", "overwrite=true") == 0
     assert not folder.exists(), "masks of another run"
 
 

@@ -19,6 +19,7 @@ from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_con
 from cflow_torch.applications.association import VOXELS, box_of_point, boxes, link
 from cflow_torch.applications.instance_files import write_drivestudio
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
+from cflow_torch.applications.tracking import track_points
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.flow_file import read_flow
@@ -58,6 +59,31 @@ def test_a_short_occlusion_is_bridged_and_a_long_one_starts_another_track(gap: i
     table = track(log, log.results())
     assert len(set(table["id"])) == count and len(table["id"]) == 19 - gap
     assert not np.isin(table["sweep"], range(5, 5 + gap)).any()
+
+
+def test_a_track_has_the_sweeps_before_its_flow_begins_and_those_where_it_is_missing() -> None:
+    log = Staged([straight((0, 0), (0.8, 0.2)), straight((-8, 6), (0.0, 0.0))])
+    results = log.results()
+    for index in (0, 1, 2, 4):
+        results[index][1].residual_flow[:] = 0
+    table, points = track_points(log, results)
+    assert table["sweep"].tolist() == list(range(11)) and len(set(table["id"])) == 1 and table["is_moving"].all()
+    assert np.array_equal(table["cluster_id"] < 0, np.isin(table["sweep"], (0, 1, 2, 4)))
+    centre = log.middle(0)[:11, :2]
+    assert np.allclose(np.stack([table["x"], table["y"]], 1), centre, atol=0.05)
+    assert np.allclose(table["vx"], 8, atol=0.2) and np.allclose(table["age"], np.arange(11) * 0.1)
+    for index in (1, 4):
+        track_id = points[index].track_id(table["id"])
+        assert np.array_equal(track_id == table["id"][0], log.world(index)[2] == 0)
+
+
+def test_a_track_is_not_looked_for_where_it_is_hidden_or_before_it_starts_from_rest() -> None:
+    steps = [0.0] * 5 + [0.9] * 7
+    log = Staged([np.stack([np.cumsum(steps), np.zeros(12)], 1), straight((0, 9), (0.9, 0.0))])
+    log.paths[1][:4] = np.nan
+    table = track(log, log.results())
+    assert not (table["sweep"][table["y"] > 5] < 4).any(), "there are no points"
+    assert (table["sweep"][table["y"] < 5] >= 3).all(), "the car waits elsewhere"
 
 
 def test_a_car_that_stops_keeps_its_id() -> None:
@@ -168,7 +194,21 @@ def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then
     log = Hidden([straight((0, 0), (0.17, 0.0), 14)])
     table = track(log, log.results())
     assert len(table["id"]) == 13 and len(set(table["id"])) == 1
-    assert np.array_equal(table["is_confirmed"], np.arange(13) >= 7)
+    assert np.array_equal(table["is_confirmed"], np.arange(13) >= 6)
+
+
+def test_a_slow_car_that_is_ever_more_hidden_is_confirmed_if_its_flow_is_confident() -> None:
+    class Hidden(Staged):
+        """The car drives behind something that hides its front."""
+
+        def world(self, index: int) -> Any:
+            points, flow, car = super().world(index)
+            kept = (car < 0) | (points[:, 0] < 5)
+            return points[kept], flow[kept], car[kept]
+
+    log = Hidden([straight((0, 0), (0.17, 0.0), 9)])
+    assert len(set(track(log, log.results())["id"])) == 1
+    assert not len(track(log, [(index, log.result(index, 0.6)) for index in range(8)])["id"])
 
 
 def test_ids_survive_empty_sweeps_and_missing_frames() -> None:
@@ -247,6 +287,20 @@ def test_an_empty_table_comes_back_from_disk_and_a_broken_one_is_refused(tmp_pat
             read_tracks(tmp_path / name)
 
 
+def test_a_table_without_classes_is_read_and_written_for_others(tmp_path: Path) -> None:
+    log = Staged([straight((0, 0), (0.9, 0.0))])
+    table = track(log, log.results())
+    write_tracks(tmp_path / "tracks.parquet", {name: values for name, values in table.items() if name != "class"})
+    old = read_tracks(tmp_path / "tracks.parquet")
+    assert set(old["class"]) == {"unknown"} and np.array_equal(old["x"], table["x"])
+    write_kitti(tmp_path / "kitti.txt", old, log)
+    assert {line.split()[2] for line in (tmp_path / "kitti.txt").read_text().splitlines()} == {"Misc"}
+    write_drivestudio(tmp_path, old, log, "Car", None)
+    assert {each["class_name"] for each in json.loads((tmp_path / "instances_info.json").read_text()).values()} == {
+        "Car"
+    }
+
+
 def test_tracks_are_written_as_text(tmp_path: Path) -> None:
     """A car that drives to the left of a vehicle that has turned by 90 degrees to the left: ahead of the vehicle."""
     log = Staged([straight((-12, 0), (0.0, 0.9))], np.tile(pose(-20, -5, np.pi / 2, 1), (12, 1, 1)))
@@ -317,19 +371,20 @@ def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> No
 
 
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
+FAST = (SMALL, "model.num_history=0", "model.pixel_sizes=[0.4,0.2]")
 RANGE = (-20, -20, -float("inf"), 20, 20, float("inf"))
 
 
 def calls_on_a_drive(folder: Path, num_sweeps: int = 4) -> Callable[..., int]:
     """Write a small simulated drive; returns (command, folder of its output, settings) -> exit status."""
     write_av2_log(make_small_drive(num_sweeps=num_sweeps), folder / "data")
-    data = ("data=av2", f"data.root={folder / 'data'}", "data.check=false", SMALL)
+    data = ("data=av2", f"data.root={folder / 'data'}", "data.check=false", *FAST)
     return lambda command, output, *settings: cflow(command, *data, f"output={folder / output}", *settings)
 
 
 def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     call = calls_on_a_drive(tmp_path, num_sweeps=5)
-    run = ("model.num_history=0", "model.pixel_sizes=[0.4,0.2]", "engine.workers=1", "tracks=true")
+    run = ("engine.workers=1", "tracks=true")
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
     whole = read_tracks(file)
@@ -348,7 +403,8 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
         is_seen = now["is_moving"]
         assert np.array_equal(count[is_seen], now["num_points"][is_seen])
         cluster = flow[row].cluster_id.numpy()
-        for track_id, of_flow in zip(now["id"][is_seen], now["cluster_id"][is_seen]):
+        has_flow = now["cluster_id"] >= 0
+        for track_id, of_flow in zip(now["id"][has_flow], now["cluster_id"][has_flow]):
             assert (cluster[ids == track_id] == of_flow).all()
     for index in (0, 1):
         assert not list((tmp_path / "shards").glob("*/tracks.parquet")), "half of the frames are not a whole log"
@@ -357,21 +413,21 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert other.read_bytes() == file.read_bytes()
 
     before = file.read_bytes()
-    assert call("flow", "whole", *run[:3], "tracks=mot") == 0 and call("flow", "whole", *run[:3], "tracks=csv") == 2
+    assert call("flow", "whole", *run[:-1], "tracks=mot") == 0 and call("flow", "whole", *run[:-1], "tracks=csv") == 2
     assert (file.parent / "mot.txt").read_text().count("\n") == len(whole["id"])
-    assert call("flow", "whole", *run[:3], "tracks=drivestudio") == 0
+    assert call("flow", "whole", *run[:-1], "tracks=drivestudio") == 0
     poses, _, classes = read_instances(file.parent)
     assert np.isfinite(poses[:, :, 0, 0]).sum() == len(whole["id"]) and set(classes) <= {"REGULAR_VEHICLE", "BICYCLIST"}
-    assert call("flow", "whole", *run[:3], "tracks=nuscenes") == 0
+    assert call("flow", "whole", *run[:-1], "tracks=nuscenes") == 0
     detections = json.loads((file.parent / "nuscenes_detection.json").read_text())["results"]
     assert sum(map(len, detections.values())) == len(whole["id"]) and len(detections) == 5
-    assert call("flow", "whole", *run[:3], "tracks=openpcdet") == 0 and (file.parent / "result.pkl").exists()
+    assert call("flow", "whole", *run[:-1], "tracks=openpcdet") == 0 and (file.parent / "result.pkl").exists()
     for lost in (file, sorted(file.parent.glob("*.feather"))[2]):
         lost.unlink()
         assert call("flow", "whole", *run) == 0 and file.read_bytes() == before
         tables = [feather.read_table(each) for each in file.parent.glob("*.feather")]
         assert [table.column_names.count("track_id") for table in tables] == [1] * 4, "also in a frame that was missing"
-    assert call("flow", "whole", *run[:3], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
+    assert call("flow", "whole", *run[:-1], "overwrite=true") == 0 and not file.exists(), "tracks of another run"
     others = [other.name for other in file.parent.iterdir() if other.suffix != ".feather"]
     assert others == ["manifest.json"], "nor their other forms"
     capsys.readouterr()
@@ -382,7 +438,7 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
 def test_a_log_with_a_gap_has_tracks_before_and_behind_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AV2Log, "gaps", frozenset([2]))
     call = calls_on_a_drive(tmp_path, num_sweeps=6)
-    assert call("flow", "flow", "model.num_history=0", "tracks=true", "engine.workers=1") == 0
+    assert call("flow", "flow", "tracks=true", "engine.workers=1") == 0
     (file,) = (tmp_path / "flow").glob("*/tracks.parquet")
     assert len(list(file.parent.glob("*.feather"))) == 4, "the pair over the gap has no flow"
     assert set(read_tracks(file)["sweep"]) >= {0, 1, 3, 4}
@@ -393,7 +449,7 @@ def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyP
     from cflow_torch.viz import recording
 
     call, shown = calls_on_a_drive(tmp_path, 6), []
-    assert call("flow", "flow", "model.num_history=0", "tracks=true", "engine.workers=1") == 0
+    assert call("flow", "flow", "tracks=true", "engine.workers=1") == 0
     add = recording._Drive.add_tracks
     monkeypatch.setattr(recording._Drive, "add_tracks", lambda self, rows: (shown.append(rows), add(self, rows)))
     assert call("view", "view", "format=rerun", f"flow={tmp_path / 'flow'}") == 0

@@ -18,13 +18,14 @@ from omegaconf import OmegaConf
 from small_logs import write_small_log
 
 from cflow_torch import make_config
-from cflow_torch.cli import failures, flows, pairs
+from cflow_torch.cli import failures, pairs
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.eval import objective
-from cflow_torch.config import config_from
+from cflow_torch.config import Config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.viz import page
+from cflow_torch.windows import memory
 
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"
 
@@ -51,7 +52,7 @@ def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys):
     assert scores["results"]["num_frames"] == 1 and 0 < scores["results"]["three_way"]["epe_fd"] < 2
     left: Any = OmegaConf.to_container(OmegaConf.load(tmp_path / "config.yaml").model)
     region = (-20.0, -20.0, -np.inf, 20.0, 20.0, np.inf)
-    assert config_from(left) == make_config(num_history=0, point_cloud_range=region)
+    assert Config.of(left) == make_config(num_history=0, point_cloud_range=region)
     assert (tmp_path / "flow.png").read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert re.search("^mean dynamic error 0[.]", printed, re.MULTILINE)  # Python 3.8 has no k3d, which is said before
@@ -173,7 +174,7 @@ def test_a_sweeper_minimises_the_mean_dynamic_error():
     assert np.isnan(objective({"bucketed": {"mean": {"dynamic_error": None}}}))
 
 
-def test_worker_processes_give_the_results_of_one_process(log_folder, tmp_path, evaluate, monkeypatch, capsys):
+def test_worker_processes_give_the_results_of_one_process(log_folder, tmp_path, evaluate, monkeypatch):
     """Scores, times of all pairs, and a bad frame that is reported and skipped."""
     root = tmp_path / "data" / "log"
     shutil.copytree(log_folder, root)
@@ -219,7 +220,7 @@ def test_a_pair_whose_process_dies_is_tried_once_more_then_reported(log_folder, 
 
 def test_bench_keeps_freed_memory_only_if_asked(tmp_path, cflow, monkeypatch):
     calls: list[Any] = []
-    monkeypatch.setattr(flows, "keep_freed_memory", lambda: calls.append(1))
+    monkeypatch.setattr(memory, "keep_freed_memory", lambda: calls.append(1))
     data = ["data.num_sweeps=2", f"data.cache={tmp_path}", "model=paper", SMALL, "repeats=1", "batches=[1]"]
     for number, more in enumerate(([], ["keep_memory=false"])):
         assert cflow("bench", *data, *more, f"output={tmp_path / 'out'}") == 0

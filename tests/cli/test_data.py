@@ -111,7 +111,7 @@ def test_your_own_reader_by_configuration_only(mine, cflow, capsys):
     assert cflow("eval", *own, f"output={mine / 'eval'}", "data.step=2") == 2
     assert "use +data.step=2" in capsys.readouterr().err
     assert cflow("eval", *own, "modle=paper") == 2
-    assert "(did you mean model?)" in capsys.readouterr().err
+    assert "(did you mean model=paper?)" in capsys.readouterr().err
     assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=0") == 2
     assert "data.step=0: give a whole number of at least 1" in capsys.readouterr().err
     assert cflow("eval", *own, f"output={mine / 'eval'}", "+data.step=2") == 0

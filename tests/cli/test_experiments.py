@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from cflow_torch.cli.choices import FOLDER
 from cflow_torch.cli.comparison import compare
 from cflow_torch.cli.eval import objective
-from cflow_torch.config import config_from
+from cflow_torch.config import Config
 
 SCALES = (0.8, 0.4, 0.3, 0.2, 0.1)
 # Number of jobs of an experiment, and settings of the first and the last one.
@@ -48,7 +48,7 @@ def test_the_jobs_of_an_experiment_are_the_rows_of_its_table(experiment, compose
     assert len(jobs) == count
     for job, settings in zip((jobs[0], jobs[-1]), ends):
         cfg = compose("eval", f"experiment={experiment}", *job)
-        config = config_from(OmegaConf.to_container(cfg.model))
+        config = Config.of(OmegaConf.to_container(cfg.model))
         assert {name: getattr(config, name) for name in settings} == settings
         assert config.method == ("keypoints" if "densify" in settings else "dense")
         assert config.point_cloud_range[0] == (-70 if far else -35)

@@ -37,7 +37,7 @@ def test_help_explains_a_command_with_examples_and_settings(command, cflow, caps
 # Mistakes that are found without torch, then the others.
 CHEAP = (
     ("fliw", "unknown command 'fliw' (did you mean flow?): give one of demo, check, flow,"),
-    ("eval modle=paper", "unknown setting 'modle' (did you mean model?): `cflow eval --cfg job`"),
+    ("eval modle=paper", "unknown setting 'modle' (did you mean model=paper?): `cflow eval --cfg job`"),
     ("flow num_history=2", "(did you mean model.num_history?)"),
     (
         "eval model=papr",
@@ -47,6 +47,11 @@ CHEAP = (
         "eval model.densify=nearest",
         "setting 'model.densify' belongs to model=keypoints or model=paper_keypoints: give that as well",
     ),
+    ("flow range=51.2", "unknown setting 'range' (did you mean model.point_cloud_range?)"),
+    ("flow preset=live", "unknown setting 'preset' (did you mean model=live?)"),
+    ("flow model.pixel_sizes=0.2", "give a list of numbers: side s of a BEV pixel"),
+    ("eval -m model.num_history=0,-1", "num_history=-1: give a whole number of at least 0"),
+    ("eval model.num_history=0,1", "for a run with each of them (a sweep), add -m"),
     ("eval model=null", "model=null: give one of default, keypoints, live,"),
     ("eval model.num_history=-1", "num_history=-1: give a whole number of at least 0"),
     ("plot cluster=3", "setting 'cluster' belongs to picture=correlation or picture=scales: give that as well"),
@@ -69,7 +74,7 @@ CHEAP = (
     ("flow shard.index=one shard.count=3", "shard.index='one': give a whole number of at least 0"),
     ("flow engine.workers=0", "engine.workers=0: give a whole number of at least 1"),
     ("flow engine.memory=true", "engine.memory=True: give a number above 0"),
-    ("eval +model.thorough=1", "unknown setting thorough: the fields are pixel_size"),
+    ("eval +model.thorough=1", "unknown setting thorough: the fields are method"),
 )
 OTHERS = (
     ("submit version=1 masks=none data.num_sweeps=2", "none"),

@@ -55,7 +55,7 @@ def test_a_simulated_drive_of_every_sensor_is_scored_from_its_own_format(profile
     check_scores(tmp_path / "out", f"data={chosen.data_set}", f"data.root={root}", *settings)
 
 
-@pytest.mark.parametrize("profile", ["av2", "waymo"])
+@pytest.mark.parametrize("profile", ["av2", pytest.param("waymo", marks=pytest.mark.slow)])
 def test_a_simulated_drive_of_a_sensor_is_scored(profile: str, tmp_path: Path) -> None:
     data = ("data=benchmark_sensors", f"data.profile={profile}", f"data.cache={tmp_path}", "data.num_drives=1")
     check_scores(tmp_path / "out", *data, "data.num_sweeps=4")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from functools import lru_cache
 
 import numpy as np
 import pytest
 
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import open_log
-from cflow_torch.data.log import FlowLabels, Log
+from cflow_torch.data.log import CachedLog, FlowLabels, Log
 from cflow_torch.data.log_check import FOUND, RIGHT, examine
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.simulator import make_drive
@@ -17,11 +18,16 @@ from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, CFlowWarning, Sweep
 
 
+@lru_cache(maxsize=None)
+def drive_of(num_sweeps):
+    return CachedLog(make_drive(seed=1, num_sweeps=num_sweeps, profile="demo"), num_sweeps)
+
+
 class Added(Log):
     """A drive with more points in the frame of each sweep. `points` is called with the index and the pose."""
 
     def __init__(self, points, num_sweeps=16, drive=None, poses=True):
-        self.drive = drive or make_drive(seed=1, num_sweeps=num_sweeps, profile="demo")
+        self.drive = drive or drive_of(num_sweeps)
         self.log_id, self.timestamps, self.points = "ride", self.drive.timestamps, points
         self.poses = self.drive.poses if poses else None
 

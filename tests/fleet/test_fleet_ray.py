@@ -16,7 +16,8 @@ from cflow_torch import CFlowError
 from cflow_torch.fleet import ray_engine
 from cflow_torch.fleet.job import Job, Part
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.ray_engine import run_ray
+from cflow_torch.fleet.parallel import run_parallel
+from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.work import Worker
 
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install ray")
@@ -68,7 +69,8 @@ def test_a_killed_worker_is_replaced_and_a_part_that_always_kills_is_reported(fl
 
 
 def start(layout: Layout, **settings: Any) -> None:
-    next(run_ray(make_job(Path("nowhere")), [Part(0, "nothing")], layout, lambda: False, **settings))
+    with ray_executors(make_job(Path("nowhere")), layout, **settings) as executors:
+        next(run_parallel(executors, [Part(0, "nothing")], lambda: False))
 
 
 def test_ray_does_not_choose_a_gpu():

@@ -231,7 +231,7 @@ def test_a_dry_run_counts_the_frames_that_the_command_then_computes(fleet, singl
 
 def test_an_unknown_engine_and_an_output_that_cannot_be_written_are_one_line(fleet, tmp_path, capsys):
     assert command(f"data.root={fleet}", f"output={tmp_path / 'out'}", "engine.name=cloud") == 2
-    assert "local, ray" in capsys.readouterr().err
+    assert "'local', 'ray'" in capsys.readouterr().err
     (tmp_path / "file").write_text("mine")
     assert command(f"data.root={fleet}", f"output={tmp_path / 'file' / 'out'}") == 2
     assert "output=FOLDER" in capsys.readouterr().err and (tmp_path / "file").read_text() == "mine"

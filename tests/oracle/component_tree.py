@@ -22,7 +22,6 @@ class Node(NamedTuple):
     members: np.ndarray  # its pixels, ascending
     level: int  # 0 ... L - 1 in the tree, coarse to fine; L = changed pixels, L + 1 = fast objects
     parent: int  # number of the next coarser node around it, -1 = there is none
-    travels: bool  # it is longer than other objects, and both of its ends move
     velocity: tuple[float, float] = (0.0, 0.0)  # (y, x) finest pixels per interval, of fast objects
 
 
@@ -70,18 +69,17 @@ def grow(sweeps: SlicedSweeps, change: np.ndarray, config: VerifiedConfig) -> Tr
             if not is_linked(sweeps, members) or (sweeps.has_history and 20 * num_missing <= len(members)):
                 continue
             newest = sweeps.pixels[members[sweeps.pixels[members, 0] == 0], 1:]
-            metres, travels = (np.ptp(newest, axis=0).max() + 1) * sweeps.size, False
+            metres = (np.ptp(newest, axis=0).max() + 1) * sweeps.size
             if level > plain:
                 is_node = metres <= LOCAL
             else:
                 is_long = longest is not None and metres > longest
-                travels = is_long and both_ends_move(sweeps, members)
                 around = tree.levels[level - 1]
-                is_known = level == plain and (around == around[members[0]]).sum() == len(members)
-                is_node = (travels or not is_long) and not is_known
+                is_repeated = level == plain and (around == around[members[0]]).sum() == len(members)
+                is_node = (not is_long or both_ends_move(sweeps, members)) and not is_repeated
             if is_node:
                 number[members] = len(tree.nodes)
-                tree.nodes.append(Node(members, level, -1 if level > plain else node_of[members[0]], travels))
+                tree.nodes.append(Node(members, level, -1 if level > plain else node_of[members[0]]))
         node_of = number
     return tree
 

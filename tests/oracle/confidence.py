@@ -63,14 +63,19 @@ def probabilities(
     rigid: Sequence[RigidMotion],
     margins: Sequence[float],
     is_missing: np.ndarray,
+    component: np.ndarray,
 ) -> np.ndarray:
     """(2, P): of every pixel, that its motion is right, and that it moves; undefined for those of sweeps other than t.
-    Given are the object of each pixel, the motion of each object and its margin, and the missing pixels.
+    Given are the object of each pixel, the motion of each object and its margin, the missing pixels, and the component
+    of each pixel at the second finest scale.
 
-    The bins of the table: left out; unlinked, by how many slices lie in the block around; static, by the share of them
-    that is found; static beside something that moves; moving, by the margin. Each but the first has rows: not missing
-    and missing, for pairs, then with history; if it moves, near slow, near fast, far slow, far fast. A block is 1.6 m
-    wide, and its slices are found if t+1 has them where they move to. In pairs, what t+1 lacks around is missing.
+    The bins of the table: left out; static in an unmatched component, by its size; static, by the share of the
+    slices in the block around that is found; static beside something that moves; moving, by the margin. Each but the
+    first has rows, for pairs, then with history: one if unmatched, two if static, not missing and missing, and four if
+    it moves, near slow, near fast, far slow, far fast. A block is 1.6 m wide, and its slices are found if t+1 has them
+    where they move to. A pixel is unmatched if t+1 lacks a slice around it. In pairs it is then missing. A component is
+    unmatched if less than an eighth of its size is matched, the sum of the reach of its pixels of t. A missing pixel in
+    one has a bin of the first kind.
     """
     motion = np.array([*(each.flow[::-1] for each in rigid), (0.0, 0.0)])[object_of] / sweeps.size
     step, row, col = sweeps.pixels.T
@@ -81,21 +86,25 @@ def probabilities(
     for of_block, of_pixel in zip(counts, (COUNT[sweeps.slices], found)):
         np.add.at(of_block, (row // side, col // side), np.where(step == 1, of_pixel, 0))
     total, found = counts[:, row // side, col // side]
-    crowd, share, bounds = (np.array(TABLE[name]) for name in ("crowd", "share", "margin"))
-    static = 1 + 4 * (1 + len(crowd))
+    sizes, share, bounds = (np.array(TABLE[name]) for name in ("size", "share", "margin"))
+    static = 1 + 2 * (1 + len(sizes))
     beside = static + 4 * (1 + len(share))
 
     is_moving = np.zeros(sweeps.image.shape, dtype=bool)
     is_moving[tuple(sweeps.pixels.T)] = moves
     is_beside = over_squares(is_moving, 1, np.logical_or)[tuple(sweeps.pixels.T)]
+    is_unmatched = (sweeps.slices & ~sweeps.around[0, row, col]) > 0
     if not sweeps.has_history:
-        is_missing = (sweeps.slices & ~sweeps.around[0, row, col]) > 0
+        is_missing = is_unmatched
     kind = 2 * sweeps.has_history + is_missing
     bins = static + kind * (1 + len(share)) + (10 * found[:, None] >= share * total[:, None]).sum(1)
     bins[is_beside] = (beside + kind)[is_beside]
-    unlinked = 1 + kind * (1 + len(crowd)) + (total[:, None] >= crowd).sum(1)
-    bins[object_of < 0] = unlinked[object_of < 0]
-
+    for name in np.unique(component[step == 1]):
+        members = np.flatnonzero((component == name) & (step == 1))
+        reach = sweeps.reach[row, col][members]
+        if 8 * reach[~is_unmatched[members]].sum() < reach.sum():
+            lost = members[is_missing[members]]
+            bins[lost] = 1 + sweeps.has_history * (1 + len(sizes)) + (reach.sum() >= sizes).sum()
     is_far = (sweeps.middle(sweeps.pixels) ** 2).sum(1) >= TABLE["far"] ** 2
     is_fast = np.array([*(each.flow[0] ** 2 + each.flow[1] ** 2 >= TABLE["fast"] ** 2 for each in rigid), False])
     reached = (np.array([*margins, 0.0])[object_of, None] >= bounds).sum(1)

@@ -17,6 +17,7 @@ GAP, LONGEST, CELL = 0.4, 8.0, 0.8  # metres: pixels of a part, length of a part
 NEAR, REACH = 2, 8  # cells
 ERROR, SHARE = 0.7, 0.05  # metres, and metres for each metre
 NARROWEST = 0.4  # metres
+LEAST_SIZE, LIKE = 16, 2  # in a pair: pixels times their reach of an unmatched component; ratio of numbers of pixels
 
 
 def parts_of(sweeps: SlicedSweeps, is_missing: np.ndarray) -> list[np.ndarray]:
@@ -41,11 +42,27 @@ def parts_of(sweeps: SlicedSweeps, is_missing: np.ndarray) -> list[np.ndarray]:
     return parts
 
 
+def parts_of_pair(sweeps: SlicedSweeps, component: np.ndarray) -> list[np.ndarray]:
+    """Unmatched components of t and of t+1: less than an eighth of their size is matched. Each is at most 8 m long."""
+    step, row, col = sweeps.pixels.T
+    reach = sweeps.reach[row, col]
+    parts = []
+    for own, other in ((1, 0), (0, 1)):
+        is_matched = (sweeps.slices & ~sweeps.around[other, row, col]) == 0
+        found = [np.flatnonzero((step == own) & (component == name)) for name in np.unique(component[step == own])]
+        for part in found:
+            size = reach[part].sum()
+            length = (np.ptp(sweeps.pixels[part, 1:], axis=0).max() + 1) * sweeps.size
+            is_unmatched = 8 * reach[part[is_matched[part]]].sum() < size
+            if is_unmatched and size >= LEAST_SIZE and len(part) >= 2 and length <= LONGEST:
+                parts.append(part)
+    return parts
+
+
 def link_unlinked(sweeps: SlicedSweeps, is_missing: np.ndarray, tree: Tree) -> list[Node]:
     """The nodes of fast objects, of level L + 1."""
-    if not sweeps.has_history:
-        return []
-    parts = parts_of(sweeps, is_missing)
+    is_pair = not sweeps.has_history
+    parts = parts_of_pair(sweeps, tree.levels[-3:][0]) if is_pair else parts_of(sweeps, is_missing)
     step_of = [int(sweeps.pixels[part[0], 0]) for part in parts]
     centres = [sweeps.pixels[part, 1:].sum(0) / len(part) for part in parts]
     cell = max(1, round(CELL / sweeps.size))
@@ -60,16 +77,19 @@ def link_unlinked(sweeps: SlicedSweeps, is_missing: np.ndarray, tree: Tree) -> l
 
     tracks = []
     since = np.array(sweeps.elapsed) - sweeps.elapsed[1]
-    for other_step in (0, 2):
+    for other_step in (0,) if is_pair else (0, 2):
         seconds = abs(sweeps.seconds[other_step] - sweeps.seconds[1])
         farthest = (sweeps.config.max_speed or 60.0) * seconds / sweeps.size + 1
         for i in np.flatnonzero(np.array(step_of) == 1).tolist():
             for other in around(other_step, centres[i], REACH):
                 distance = np.linalg.norm(centres[other] - centres[i])
                 length = np.ptp(sweeps.pixels[parts[i], 1:], axis=0).max() + 1
-                if length / 2 <= distance <= farthest:
+                sizes = len(parts[i]), len(parts[other])
+                if length / 2 <= distance <= farthest and (not is_pair or max(sizes) <= LIKE * min(sizes)):
                     velocity = (centres[i] - centres[other]) / since[other_step]
-                    tracks.append(follow(sweeps, i, velocity, centres, since, around))
+                    rank, track = follow(sweeps, i, velocity, centres, since, around)
+                    # In a pair, all errors are 0, and the shortest way has the lowest rank.
+                    tracks.append((rank + is_pair * distance, track))
     chosen = []
     for rank, track in tracks:
         rivals = [[r for r, other in tracks if other.get(step) == track.get(step)] for step in (1, 0)]
@@ -93,7 +113,7 @@ def link_unlinked(sweeps: SlicedSweeps, is_missing: np.ndarray, tree: Tree) -> l
             continue
         won, lost = count_wins(sweeps, members, velocity, is_near=True).sum(1)
         if 2 * won > lost:
-            nodes.append(Node(members, len(tree.levels) + 1, -1, False, velocity))
+            nodes.append(Node(members, len(tree.levels) + 1, -1, velocity))
     return nodes
 
 

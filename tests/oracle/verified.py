@@ -64,7 +64,7 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     size, members = sweeps.size, [np.flatnonzero(object_of == i) for i in range(len(chosen))]
     rigid = register(sweeps, object_of, [(x * size, y * size) for y, x in motions])
     margins = [margin(sweeps, *given) for given in zip(members, rigid)]
-    of_pixels = probabilities(sweeps, object_of, rigid, [z for z, _ in margins], change[0])
+    of_pixels = probabilities(sweeps, object_of, rigid, [z for z, _ in margins], change[0], tree.levels[-3:][0])
 
     flow, ids = np.zeros(points.shape), np.full(len(points), -1, dtype=np.int64)
     score, confidence, moving = (
@@ -96,7 +96,7 @@ def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_l
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))
         own = evidence_of(*exact, z) + evidence_of(*near, near_z)
         stays = is_fast and LEAVES * exact[1] > exact[0]
-        counts = own > least and not stays and (node.travels or not slides_along_itself(sweeps, node.members, motion))
+        counts = own > least and not stays and not slides_along_itself(sweeps, node.members, motion)
         evidence.append(own if counts else 0)
     best = evidence.index(max(evidence))  # ties: the first
     return (candidates[best] if evidence[best] > 0 else (0.0, 0.0)), evidence[best]

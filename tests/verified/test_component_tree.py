@@ -92,23 +92,20 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
         found = grown(seed, longest, blocks)
         names, none = found.fast_names(), found.nodes.count
         parents = [None if parent == none else names[parent] for parent in found.nodes.children.of_item.tolist()]
-        given = list(zip(names, parents, found.nodes.travels.tolist()))
+        given = list(zip(names, parents))
         for window, tree in enumerate(found.trees):
             mine = found.sweeps.pixels.window == window
             for level, roots in enumerate(found.components.levels):
                 assert same_groups(roots.of_item[mine].numpy(), tree.levels[level])
             own = found.names(window)
-            expected = {
-                (name, None if node.parent < 0 else own[node.parent], node.travels)
-                for name, node in zip(own, tree.nodes)
-            }
+            expected = {(name, None if node.parent < 0 else own[node.parent]) for name, node in zip(own, tree.nodes)}
             of_window = (found.nodes.window == window).tolist()
             assert {node for node, is_mine in zip(given, of_window) if is_mine} == expected
             assert len(expected) == sum(of_window)
             counts += (
                 len(expected),
-                sum(parent is not None for _, parent, _ in expected),
-                sum(level > len(blocks) for (_, level), _, _ in expected),
+                sum(parent is not None for _, parent in expected),
+                sum(level > len(blocks) for (_, level), _ in expected),
             )
     assert counts[0] > 30 and counts[1] > 10 * (len(blocks) > 1) and counts[2] > 5, counts
 
@@ -130,7 +127,7 @@ def test_the_cut_equals_the_oracle(seed, of_evidence):
     for window, name, value in zip(found.nodes.window.tolist(), names, evidence.tolist()):
         evidence_of[window, name] = value
     objects = select_objects(found.sweeps, found.components, found.nodes, evidence)
-    node = objects.nodes.of_item
+    node = objects.by_node.of_item
     assert torch.equal(objects.pixels.of_item[objects.first], torch.arange(objects.count))
     assert torch.equal(objects.first, objects.first.sort().values)
     start = 0
@@ -159,7 +156,7 @@ def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_
     nodes = movable_nodes(sweeps, components, None)
     assert nodes.kind.tolist() == [0, 1, 1] and nodes.children.of_item.tolist() == [3, 0, 0]
     objects = select_objects(sweeps, components, nodes, torch.tensor([whole, 100, 100]))
-    assert objects.nodes.of_item.tolist() == ([0] if wins else [1, 2])
+    assert objects.by_node.of_item.tolist() == ([0] if wins else [1, 2])
 
 
 def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_of_it_has_no_evidence():
@@ -176,7 +173,7 @@ def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_o
     evidence = torch.zeros(nodes.count, dtype=torch.int64)
     evidence[first] = 100
     objects = select_objects(sweeps, components, nodes, evidence)
-    assert objects.nodes.of_item[objects.pixels.of_item[joined]].tolist() == [first]
+    assert objects.by_node.of_item[objects.pixels.of_item[joined]].tolist() == [first]
 
 
 @pytest.mark.parametrize("num_missing, may_move", [(0, False), (1, False), (2, True)])

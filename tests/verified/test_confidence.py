@@ -20,19 +20,19 @@ from cflow_torch.verified import confidence
 def test_the_tables_are_monotone_and_the_oracle_reads_them():
     assert oracle.TABLE == confidence.TABLE
     table = confidence.TABLE
-    crowds, shares, margins = (len(table[name]) + 1 for name in ("crowd", "share", "margin"))
+    sizes, shares, margins = (len(table[name]) + 1 for name in ("size", "share", "margin"))
     for name, falls in (("probabilities", False), ("moving", True)):
         rows, start = [], 1
-        for length in (*4 * (crowds,), *4 * (shares,), *4 * (1,), *8 * (margins,)):
+        for length in (*2 * (sizes,), *4 * (shares,), *4 * (1,), *8 * (margins,)):
             rows.append(table[name][start : start + length])
             start += length
         assert start == len(table[name]) and all(0 < p < 1 for p in table[name])
-        unlinked, static, moving = rows[:4], rows[4:8], rows[12:]
-        assert all(row == sorted(row, reverse=not falls) for row in unlinked)
+        unmatched, static, moving = rows[:2], rows[2:6], rows[10:]
+        assert all(row == sorted(row, reverse=not falls) for row in unmatched)
         assert all(row == sorted(row, reverse=falls) for row in static)
         assert all(row == sorted(row) for row in moving)
-    # With history, a missed object is in the missing pixels of a component that is not at t+1.
-    assert unlinked[3][-1] > 0.5 > max(static[2])
+    # A missed distant object is an unmatched component of many pixels, in pairs and with history.
+    assert min(row[-1] for row in unmatched) > 0.5 > max(static[2])
 
 
 def test_a_point_that_is_missing_in_another_sweep_has_bins_of_its_own(numbered):
@@ -50,9 +50,8 @@ def test_a_point_that_is_missing_in_another_sweep_has_bins_of_its_own(numbered):
             bins < confidence._Bins.static + (row + 1) * shares
         )
         assert is_static[:900].float().mean() > 0.9
-        crowds = len(confidence.TABLE["crowd"]) + 1
-        is_missing = (bins >= 1 + (row + 1) * crowds) & (bins < 1 + (row + 2) * crowds)
-        assert is_missing[900:].all()
+        sizes = len(confidence.TABLE["size"]) + 1
+        assert (bins[900:] == len(older) * sizes + sizes - 1).all()  # 40 pixels, the last bin but one
 
 
 def test_a_wall_next_to_a_pedestrian_has_less_confidence(numbered):

@@ -99,7 +99,7 @@ def test_nodes_of_changed_pixels_need_4_standard_deviations(level, num_pixels, m
     sweeps, zero = from_images(images), torch.zeros(1, dtype=torch.int64)
     every = torch.arange(sweeps.num_pixels)
     one = Groups(torch.zeros_like(every), 1)
-    tree = Tree(every, one, Groups(zero + 1, 1), zero + level, zero, zero > 0, torch.zeros(1, 2), 2)
+    tree = Tree(every, one, Groups(zero + 1, 1), zero + level, zero, torch.zeros(1, 2), 2)
     motion, _ = fast.verify(sweeps, tree, torch.tensor([[[0.0, 5.0]]], dtype=torch.float64), 1.5)
     assert motion.tolist() == [[0.0, 5.0 * moves]]
 
@@ -129,7 +129,7 @@ def slides(component: dict[int, Pixels], motion, others=None, slices: int = 1) -
     members = sweeps.pixels[own.nonzero()[:, 0]]
     one = Groups(torch.zeros_like(members.step), 1)
     motions = torch.tensor([[motion]], dtype=torch.float64)
-    return bool(slides_along_itself(sweeps, members, one, motions, torch.tensor([False])))
+    return bool(slides_along_itself(sweeps, members, one, motions))
 
 
 def test_a_rail_covered_in_place_slides_and_one_that_leaves_does_not():
@@ -200,19 +200,14 @@ def test_ends_equal_the_oracle():
     moved = stayed = 0
     for seed in range(12):
         image, number_of = long_things(seed)
-        sweeps, is_long = from_images(image), np.random.default_rng(seed).random(9) < 0.9
+        sweeps = from_images(image)
         roots = values_at(number_of, sweeps)
-        # Two levels: things by themselves, and all in one.
-        every, none = torch.arange(len(roots)), torch.zeros(10, dtype=torch.int64)
-        members = Groups(torch.cat((torch.full_like(roots, 9), roots)), 10)
-        tree = Tree(every.repeat(2), members, Groups(none + 10, 10), none, none, none > 0, torch.zeros(10, 2), 2)
-        found = both_ends_move(sweeps, tree, torch.tensor([*is_long, False]))
-        assert not found[9]
-        for number, answer in enumerate(found[:9].tolist()):
+        found = both_ends_move(sweeps, sweeps.pixels, Groups(roots, 9))
+        for number, answer in enumerate(found.tolist()):
             window = int(sweeps.pixels.window[roots == number][0])
             alone = for_oracle(sweeps, window)
             members = np.flatnonzero(number_of[window][tuple(alone.pixels.T)] == number)
-            assert answer == (bool(is_long[number]) and aperture.both_ends_move(alone, members))
+            assert answer == aperture.both_ends_move(alone, members)
             moved, stayed = moved + answer, stayed + (not answer)
     assert moved > 10 and stayed > 10
 
@@ -244,9 +239,15 @@ def test_a_tram_moves():
     assert abs(mean_flow(-SPEED, -SPEED) + SPEED) < 0.05
 
 
+def test_a_bus_that_shows_only_its_side_moves():
+    assert abs(mean_flow(SPEED, SPEED, length=12.0) - SPEED) < 0.05
+    assert abs(mean_flow(-0.5, -0.5, length=12.0) + 0.5) < 0.05
+
+
 def test_a_wall_whose_ends_move_differently_is_static():
     for low, high in ((0.0, 0.0), (SPEED, 0.0), (0.0, SPEED), (SPEED, -SPEED), (SPEED, 0.5 * SPEED)):
         assert mean_flow(low, high) == 0.0
+        assert mean_flow(low, high, length=15.0) == 0.0
 
 
 def test_a_noise_barrier_whose_visible_ends_move_is_static():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from scenes import assert_same_bits
+from scenes import assert_same_bits, flow_as_oracle
 
 from cflow_torch import Sweep, VerifiedFlow, Window
 from cflow_torch.verified.component_tree import NodeKind
@@ -66,6 +68,19 @@ def test_a_far_car_of_few_points_is_found(step, num_points):
     flow = result.residual_flow[3000:]
     assert torch.allclose(flow, torch.tensor([step, 0.0, 0.0]).expand_as(flow), atol=0.05)
     assert len(result.cluster_id[3000:].unique()) == 1 and not result.residual_flow[:3000].any()
+
+
+@pytest.mark.parametrize("step", [-2.2, 3.5])
+def test_in_a_pair_an_unmatched_component_goes_with_the_nearest_one_of_like_size(step):
+    shape = np.concatenate((front(1, 40), front(2, 40) + (14.0, 4.0, 0.0)))  # two cars
+    pair = replace(window(shape, step), pch=())
+    result = flow_as_oracle(pair, MODEL.config)
+    flow = result.residual_flow[3000:]
+    assert (flow - torch.tensor([step, 0.0, 0.0])).norm(dim=1).median() < 0.1
+    assert not result.residual_flow[:3000].any()
+    # Without the cars of t+1, there is nothing to go with.
+    lone = replace(pair, pc1=Sweep(pair.pc1.points[:3000], pose=np.eye(4)))
+    assert not MODEL([lone])[0].residual_flow.any()
 
 
 def test_objects_that_their_pixels_link_are_not_linked_again():

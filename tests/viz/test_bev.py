@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Tuple
 
@@ -66,6 +67,17 @@ def test_colours_lie_where_the_points_are(scene: Scene) -> None:
     assert np.abs(van - flow_to_rgb(VAN_FLOW, 0.6)).max() <= 1  # matplotlib cuts 128 / 255 * 255 to 127
     assert np.ptp(wall) < 20 and 150 < wall.mean() < 210
     assert nothing.tolist() == [255, 255, 255]
+
+
+def test_what_is_probably_static_is_grey_and_has_no_arrow(scene: Scene) -> None:
+    points, flow, cluster = scene
+    result = result_of(flow, cluster)
+    unlikely = replace(result, moving=torch.from_numpy(np.where(cluster == 0, 0.4, 0.6)))
+    for each, is_grey, num_arrows in ((result, False, 2), (unlikely, True, 1)):
+        figure = plot_flow(points, each, max_flow=0.6)
+        (car,) = colors_at(figure, (14.0, 21.0))
+        assert (np.ptp(car) < 30) == is_grey
+        assert sum(len(each.get_offsets()) for each in figure.axes[0].collections if hasattr(each, "U")) == num_arrows
 
 
 def test_one_arrow_per_moving_cluster(scene: Scene) -> None:

@@ -206,7 +206,7 @@ def count_of(pixels: np.ndarray, colors: np.ndarray) -> int:
     return int(are_of(pixels, colors).sum())
 
 
-def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: Path) -> None:
+def test_a_browser_shows_plays_recolours_and_cleans_a_drive(browser: Any, drive_page: Path) -> None:
     context = browser.new_context(viewport={"width": 720, "height": 480}, color_scheme="dark")
     tab, requests, errors = context.new_page(), [], []
     tab.on("request", lambda request: requests.append(request.url))
@@ -246,6 +246,24 @@ def test_a_browser_shows_plays_and_recolours_a_drive(browser: Any, drive_page: P
     tab.locator("#play").click()
     tab.wait_for_function("viewer.state.frame !== 2", timeout=20_000)
     tab.locator("#play").click()
+
+    tab.locator("#coloring").select_option("flow")
+    tab.locator("#slider").fill("0")
+    entries = [points_of(data, frame)[1]["flow"] for frame in range(3)]
+    colors = np.array([color_of(data, "flow", e) for e in np.unique(np.concatenate(entries)) if e >= FIRST])
+
+    def moving_pixels() -> np.ndarray:
+        tab.evaluate(settled)
+        return are_of(picture(tab), colors)
+
+    of_sweep = moving_pixels()
+    tab.locator("#map").select_option("all")
+    assert (moving_pixels() & ~of_sweep).sum() > 500, "objects leave a trace in the map"
+    tab.locator("#map").select_option("clean")
+    assert moving_pixels().sum() < 0.02 * of_sweep.sum()
+    tab.locator("#map").select_option("")
+    tab.locator("#threshold").fill("1")
+    assert moving_pixels().sum() < of_sweep.sum(), "what is unlikely to move is hidden"
     tab.locator("#theme").click()
     tab.evaluate(settled)
     assert picture(tab)[300, 2].min() > 200, "a light page"
@@ -290,33 +308,6 @@ def test_an_object_that_is_clicked_is_described_and_followed(browser: Any, drive
     tab.keyboard.press("Escape")
     tab.wait_for_function("viewer.state.chosen === null")
     assert tab.locator("#object").is_hidden() and errors == []
-    context.close()
-
-
-def test_a_map_loses_its_moving_points_and_a_threshold_hides_what_is_unlikely(browser: Any, drive_page: Path) -> None:
-    context = browser.new_context(viewport={"width": 720, "height": 480}, color_scheme="dark")
-    tab = context.new_page()
-    tab.goto(drive_page.as_uri())
-    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
-    for name in ("arrows", "boxes", "trails", "labels", "rings"):
-        tab.locator(f"#show-{name}").uncheck()
-    data = content_of(drive_page.read_text(encoding="utf-8"))
-    entries = [points_of(data, frame)[1]["flow"] for frame in range(3)]
-    colors = np.array([color_of(data, "flow", e) for e in np.unique(np.concatenate(entries)) if e >= FIRST])
-    tab.evaluate("document.querySelectorAll('.panel').forEach(panel => { panel.style.opacity = 0; })")
-
-    def moving_pixels() -> np.ndarray:
-        tab.evaluate("viewer.go(viewer.state.frame)")
-        return are_of(picture(tab), colors)
-
-    of_sweep = moving_pixels()
-    tab.locator("#map").select_option("all")
-    assert (moving_pixels() & ~of_sweep).sum() > 500, "objects leave a trace in the map"
-    tab.locator("#map").select_option("clean")
-    assert moving_pixels().sum() < 0.02 * of_sweep.sum()
-    tab.locator("#map").select_option("")
-    tab.locator("#threshold").fill("1")
-    assert moving_pixels().sum() < of_sweep.sum()
     context.close()
 
 

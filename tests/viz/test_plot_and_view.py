@@ -106,17 +106,25 @@ def test_missing_matplotlib_is_reported_before_the_work(cflow, monkeypatch, caps
     assert cflow("plot") == 2 and "pip install matplotlib" in capsys.readouterr().err
 
 
+@pytest.fixture(scope="module")
+def stored_flow(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The flow of the log without its second pair."""
+    folder = tmp_path_factory.mktemp("stored") / "flow"
+    data = ("data=av2", f"data.root={drive}", "data.check=false", f"output={folder}")
+    assert command_line.cflow("flow", *data, "model=paper", "engine.workers=1", SMALL) == 0
+    sorted((folder / NAME).iterdir())[1].unlink()
+    return folder
+
+
 @pytest.mark.parametrize(("form", "package", "ending"), [("html", "k3d", "html"), ("rerun", "rerun", "rrd")])
-def test_a_view_of_estimated_and_of_stored_flow(form, package, ending, cflow, tmp_path, capsys):
+def test_a_view_of_estimated_and_of_stored_flow(form, package, ending, stored_flow, cflow, tmp_path, capsys):
     pytest.importorskip(package)
     view = ("view", f"format={form}")
     assert cflow(*view, "model=paper", "data.step=2", "count=5", SMALL) == 0
     file = tmp_path / "out" / f"{NAME}.{ending}"
     assert f"{file}: 2 pairs" in capsys.readouterr().out and file.stat().st_size > 1e5
-    assert cflow("flow", "model=paper", "engine.workers=1", SMALL, f"output={tmp_path / 'flow'}") == 0
-    sorted((tmp_path / "flow" / NAME).iterdir())[1].unlink()
     file.unlink()
-    assert cflow(*view, f"flow={tmp_path / 'flow'}", "device=no_such_device") == 1, "nothing is estimated"
+    assert cflow(*view, f"flow={stored_flow}", "device=no_such_device") == 1, "nothing is estimated"
     printed = capsys.readouterr()
     assert f"{file}: 2 pairs" in printed.out and "1 failed" in printed.err and file.is_file()
     assert cflow(*view, "flow=nowhere") == 2 and "flow=nowhere is not a folder" in capsys.readouterr().err

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from cflow_torch import CorrelationFlow, FlowStream, Sweep, Window, estimate_flow, make_config
+from cflow_torch import FlowStream, Sweep, Window, estimate_flow
 from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.simulator import make_drive
 from cflow_torch.types import CFlowWarning
+from cflow_torch.windows.inspection import Inspection
 from cflow_torch.windows.returns import missing_returns
 
 
@@ -42,8 +43,7 @@ def test_returns_of_an_organised_cloud_are_transformed_alone(tmp_path, fill: flo
     assert np.allclose(sweep.points[:-500], drive.sweep(1).points + mount[:3, 3].astype(np.float32), atol=1e-5)
 
 
-@pytest.mark.parametrize("fill", [0.0, 1.5])
-@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+@pytest.mark.parametrize(("fill", "kind"), [(0.0, np.asarray), (1.5, torch.from_numpy)])
 def test_missing_returns_in_arrays_are_left_out_and_said(fill: float, kind: Any) -> None:
     """Real points get the same flow as without them, and the given arrays stay."""
     drive = make_drive(seed=1, num_sweeps=2, profile="demo")
@@ -63,4 +63,4 @@ def test_missing_returns_in_arrays_are_left_out_and_said(fill: float, kind: Any)
     assert not streamed.is_valid[-20_000:].any()
     with pytest.warns(CFlowWarning, match="20000 points of a sweep are no returns .*: leave them out"):
         sweeps = [Sweep(cloud, None, one.pose) for cloud, one in zip(filled, (pc0, pc1))]
-        CorrelationFlow(make_config("paper"))([Window(*sweeps)])
+        Inspection()([Window(*sweeps)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,7 @@ class BagLog(Log):
             for path in self._files:
                 for file in [path] if path.is_file() else path.iterdir():
                     check_file(file)
+            _check_version(self._files)
             # Bags of ROS 2 before Iron do not describe their messages. The types that we read never changed.
             types_of_old_bags = types.get_typestore(types.Stores.ROS2_HUMBLE)
             reader = rosbags.AnyReader(self._files, default_typestore=types_of_old_bags)
@@ -315,6 +317,14 @@ def _stamp(message: Any, arrived: int) -> int:
     """Return the time of a header in nanoseconds; if it is 0, the time of arrival."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
+
+
+def _check_version(files: list[Path]) -> None:
+    """Say that this version of rosbags opens files of ROS 2 only by the metadata.yaml that names them."""
+    is_old = [int(number) for number in version("rosbags").split(".")[:2]] < [0, 11]
+    for file in files if is_old else ():
+        if file.suffix in (".db3", ".mcap"):
+            raise CFlowError(f"{file} has no metadata.yaml that names it: rosbags 0.11 (Python 3.10) reads such files")
 
 
 def _bags_in(folder: Path) -> list[Path]:

@@ -19,6 +19,7 @@ from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import BatchSample, read_batch
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, FlowResult
+from cflow_torch.windows.inspection import Inspection
 
 
 class CFlow(nn.Module):
@@ -63,6 +64,7 @@ class CFlow(nn.Module):
         config = make_config(config, **{name: value for name, value in settings.items() if name in names})
         self.config = _with_history(config, num_frames)
         self.estimator = make_model(self.config, device)
+        self._inspect = Inspection()
         if output not in ("full", "valid"):
             raise CFlowError(f"output={output!r}: give 'full' or 'valid'")
         self.output = output
@@ -90,7 +92,9 @@ class CFlow(nn.Module):
         """
         samples = read_batch(batch, self.config.num_history, self.ego_T_lidar)
         self._check_history(samples)
-        results = self.estimator([sample.window for sample in samples])
+        windows = [sample.window for sample in samples]
+        results = self.estimator(windows)
+        self._inspect(windows)
         with torch.no_grad(), torch.autocast(results[0].flow.device.type, enabled=False):
             outputs = [self._output(batch, b, *pair) for b, pair in enumerate(zip(samples, results))]
         return {key: [output[key] for output in outputs] for key in outputs[0]}

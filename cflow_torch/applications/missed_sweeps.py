@@ -1,0 +1,112 @@
+"""Find moving objects in the sweeps just before their flow begins, and in short gaps of their tracks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cflow_torch.applications.association import MIN_STOPPED_SHARE
+from cflow_torch.applications.completion import SeenPoints, TrackedPoints
+from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of
+from cflow_torch.applications.track_table import Table
+from cflow_torch.transforms import transform_points
+from cflow_torch.types import FlowResult, Window, as_numpy
+
+_MARGIN = 0.2  # metres, added to length, width and height of a box
+
+
+class Box(NamedTuple):
+    """An upright box in the world around some points."""
+
+    centre: np.ndarray  # (3,) metres
+    size: np.ndarray  # (3,) metres: along the heading, across, up
+    axes: np.ndarray  # (3, 3) rows: ahead, left, up
+
+    @classmethod
+    def around(cls, points: np.ndarray, heading: float) -> Box:
+        """Enclose (M, 3) points."""
+        cos, sin = np.cos(heading), np.sin(heading)
+        axes = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+        local = points @ axes.T
+        low = local.min(0)
+        high = local.max(0)
+        return cls((low + high) / 2 @ axes, high - low, axes)
+
+    def moved(self, step: np.ndarray) -> Box:
+        """Shift the box by (3,) metres."""
+        return self._replace(centre=self.centre + step)
+
+
+class FreePoints(NamedTuple):
+    """The valid points of one sweep that belong to no track, sorted by x."""
+
+    row: np.ndarray  # (F,) int64 rows of the sweep
+    position: np.ndarray  # (F, 3) float64 metres in the world
+
+    @classmethod
+    def of(cls, sweeps: Window, result: FlowResult, points: TrackedPoints) -> FreePoints:
+        """Collect them from sweep t of a window."""
+        cloud = as_numpy(sweeps.pc0.points)[:, :3]
+        is_free = as_numpy(result.is_valid) & np.isfinite(cloud).all(axis=1)
+        is_free[points.row] = False
+        row = np.flatnonzero(is_free)
+        position = transform_points(cloud[row], pose_of(sweeps.pc0))
+        order = np.argsort(position[:, 0])
+        return cls(row[order], position[order])
+
+    def inside(self, box: Box) -> np.ndarray:
+        """(M,) int64 indices of the points in a box, `_MARGIN` larger."""
+        reach = np.hypot(*box.size[:2]) / 2 + _MARGIN
+        first, last = np.searchsorted(self.position[:, 0], box.centre[0] + [-reach, reach])
+        local = (self.position[first:last] - box.centre) @ box.axes.T
+        return first + np.flatnonzero((np.abs(local) <= (box.size + _MARGIN) / 2).all(axis=1))
+
+    def without(self, index: np.ndarray) -> FreePoints:
+        """Remove points by their indices."""
+        return FreePoints(np.delete(self.row, index), np.delete(self.position, index, axis=0))
+
+
+class SweepTracks:
+    """The tracks of one sweep of a log: their rows of the table, and their points.
+
+    Args:
+        table: rows of this sweep, sorted by id.
+        points: rows of the points of the tracks.
+        seen: positions and flow of these points.
+        timestamp_ns: time stamp of the sweep in its log.
+        free: the other points; None = no track is looked for.
+    """
+
+    def __init__(
+        self, table: Table, points: TrackedPoints, seen: SeenPoints, timestamp_ns: int, free: FreePoints | None
+    ) -> None:
+        self.points = points
+        self.seen = seen
+        self.free = free
+        self._where = {"sweep": points.sweep, "timestamp_ns": timestamp_ns}
+        self.table = {**table, **{name: np.full(len(table["id"]), value) for name, value in self._where.items()}}
+
+    def find(self, later: SweepTracks, row: int) -> bool:
+        """Look for the track in a row of a later sweep where its flow there says that it was.
+
+        We add the track to this sweep if its box holds enough points: the share that we ask of stopped objects. If the
+        box of the later sweep holds more, the object has not started yet.
+        """
+        if self.free is None:
+            return False
+        velocity = later.seen.velocity[row]
+        box = Box.around(later.seen.positions(row), later.table["heading"][row])
+        index = self.free.inside(box.moved((self.seen.seconds - later.seen.seconds) * velocity))
+        least = max(MIN_POINTS, MIN_STOPPED_SHARE * later.table["num_points"][row], len(self.free.inside(box)))
+        if len(index) < least:
+            return False
+        number = int(later.table["id"][row])
+        at = int(np.searchsorted(self.table["id"], number))
+        values = {name: column[row] for name, column in later.table.items()}
+        values.update(self._where, num_points=len(index), cluster_id=-1, is_confirmed=False)
+        self.table = {name: np.insert(column, at, values[name]) for name, column in self.table.items()}
+        self.points = self.points.followed_by(self.free.row[index], number)
+        self.seen = self.seen.insert(at, number, velocity, self.free.position[index])
+        self.free = self.free.without(index)
+        return True
