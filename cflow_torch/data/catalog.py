@@ -19,12 +19,14 @@ from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
+from cflow_torch.data.read_as import ReadAs
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.ground.segmentation import CHOICES, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, Sweep, Window
 from cflow_torch.windows.deskewing import SCANS
+from cflow_torch.windows.readings import WORLD
 
 _OF_ALL = ("find_ground", "odometry", "read_as", "own_vehicle", "deskew", "check")  # settings of every data set
 _log = logging.getLogger(__name__)
@@ -235,16 +237,21 @@ def open_log(
         _, reader = _reader(name)
         moves = "deskew" in inspect.signature(reader.__init__).parameters  # by more poses than one per sweep
         log = _open(name, source, {**settings, "deskew": deskew in ("auto", "times")} if moves else settings)
+        deskew = "off" if moves and deskew == "times" and log.is_compensated else deskew  # the reader did it
     safe_name(log.log_id, f"{source}: the log")  # names the folder of its results
     if odometry:
         from cflow_torch.data.odometry import with_poses
 
         log = with_poses(log)
-    log = read_log_as(log, read_as)
+    if read_as != "auto":
+        log = read_log_as(log, read_as)
+    judgement = DeskewedLog(log, deskew).judgement
+    if read_as == "auto" and judgement is not None and WORLD in judgement.best:
+        log = ReadAs(log, WORLD, is_found=True)
+        judgement = judgement.adopted()
     if own_vehicle is not None:
         log = OwnVehicleLog(log)
-    if deskew != "off":
-        log = DeskewedLog(log, deskew)
+    log = DeskewedLog(log, deskew, judgement)
     if find_ground is not None:
         log = GroundSegmentedLog(log, find_ground)
     if check:

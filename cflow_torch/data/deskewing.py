@@ -11,13 +11,14 @@ import numpy as np
 from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
 from cflow_torch.data.log_motion import judge_log
-from cflow_torch.transforms import relative_transform, transform_points
+from cflow_torch.transforms import poses_at, relative_transform, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, deskew_points, scan_fractions
 from cflow_torch.windows.readings import Judgement
 
 CHOICES = ("auto", "times", "off", *SCANS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
+_SLICE = 1e-4  # seconds during which we use one pose of a trajectory: 3 mm at 30 m/s
 _INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
 
 
@@ -37,6 +38,7 @@ class DeskewedLog(LogWrapper):
             azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = the scan under which
             the static world stands still best (`cflow_torch.windows.readings`). Without a clear one, points with times
             of raw points are moved by these, and others stay.
+        judgement: the comparison of these scans; None = it is made at first use.
 
     Attributes:
         reading: the `Reading` in use. It is decided at first use, from the log alone.
@@ -51,11 +53,12 @@ class DeskewedLog(LogWrapper):
           their sweeps, and divide the motion by the turns between the two measurements.
     """
 
-    def __init__(self, log: Log, deskew: str = "auto") -> None:
+    def __init__(self, log: Log, deskew: str = "auto", judgement: Judgement | None = None) -> None:
         if deskew not in CHOICES:
             raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(CHOICES)}")
         super().__init__(log)
         self._deskew = deskew
+        self._given = judgement
         self._recent = CachedLog(log, 2)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -64,25 +67,22 @@ class DeskewedLog(LogWrapper):
     @cached_property
     def reading(self) -> Reading:
         if self._deskew != "auto":
-            is_moved = self._deskew == "times" and self._has_moved_by_times()
-            return Reading("off" if is_moved else self._deskew)
-        scan = self._scans[0] if self._judged is None else self._judged.scan or self._scans[0]
-        return Reading(scan, self._note_of(scan))
+            return Reading(self._deskew)
+        judgement = self._given or (self.judgement if len(self._scans) > 1 else None)
+        scan = judgement.scan if judgement is not None else ""
+        return Reading(scan or self._scans[0], self._note_of(scan or self._scans[0]))
 
-    @property
+    @cached_property
     def judgement(self) -> Judgement | None:
-        return self._judged
+        """How well scans and readings of the poses fit; None = a sweep cannot be read, and `sweep` raises its error."""
+        try:
+            return self._given or judge_log(self.log, self._place, self._scans)
+        except (CFlowError, OSError):
+            return None
 
     def findings(self) -> list[Finding]:
         found = [Finding("de-skewing", FOUND, self.reading.note, True)] if self.reading.note else []
         return [*self.log.findings(), *found]
-
-    @cached_property
-    def _judged(self) -> Judgement | None:
-        """Compare the scans, and the readings of the poses under the best one; None if there is one scan only."""
-        if self._deskew != "auto" or len(self._scans) == 1:
-            return None
-        return judge_log(self.log, self._place, self._scans)
 
     @cached_property
     def _scans(self) -> tuple[str, ...]:
@@ -91,16 +91,14 @@ class DeskewedLog(LogWrapper):
         Logs of formats that are known to be compensated stay as they are (`Log.is_compensated`), and so do logs without
         `poses`. Times of points are expected to be those of raw points if the reader says so (`Log.has_raw_times`).
         """
+        if self._deskew != "auto":
+            return (self._deskew,)
         own = self.log.unwrapped
-        if own.is_compensated or self.poses is None or self._has_moved_by_times():
+        if own.is_compensated or self.poses is None:
             return ("off",)
         if self._recent.sweep(0).point_times is None:
             return ("off", *DIRECTIONS)
         return ("times", "off") if own.has_raw_times else ("off", "times")
-
-    def _has_moved_by_times(self) -> bool:
-        """Test whether the reader has already moved the points by their times."""
-        return self.log.unwrapped.moves_by_times and self._recent.sweep(0).point_times is not None
 
     def _place(self, index: int, sweep: Sweep, rows: np.ndarray, scan: str) -> np.ndarray:
         points = as_numpy(sweep.points)[rows, :3].astype(np.float64)
@@ -108,10 +106,9 @@ class DeskewedLog(LogWrapper):
 
     def _note_of(self, scan: str) -> str:
         """Return what the user should know of the scan that was found."""
-        expected = self._scans[0]
-        if scan == expected == "off":
+        if scan == "off" and not (self.log.unwrapped.has_raw_times and self._scans[0] == "times"):
             return ""
-        shares = {} if self._judged is None else self._judged.shares_of_scans
+        shares = {} if self.judgement is None else self.judgement.shares_of_scans
         compared = ", ".join(f"{share:.0%} with {name}" for name, share in shares.items())
         measured = f" (of the static structure, {compared} is in place some metres later)" if compared else ""
         same = f"data.deskew={scan} does the same without this line"
@@ -128,6 +125,9 @@ class DeskewedLog(LogWrapper):
         """Read a sweep under any reading, one of `CHOICES` but "auto"."""
         sweep = self._recent.sweep(index)
         if reading == "off" or sweep.pose is None:
+            return sweep
+        if reading == "times" != self._deskew and sweep.point_times is None:
+            self._note(f"sweep {index} has no times of points and stays as it is, also others", "sweeps without times")
             return sweep
         seconds = self.seconds(sweep, reading, slice(None))
         points = self.move(as_numpy(sweep.points), seconds, index, reading)
@@ -148,6 +148,8 @@ class DeskewedLog(LogWrapper):
 
     def move(self, points: np.ndarray, seconds: np.ndarray, index: int, reading: str) -> np.ndarray:
         """Move points of sweep `index`, (N, 3+), by the ego motion in the (N,) `seconds` to their measurement."""
+        if reading == "times" and self.trajectory is not None:
+            return self._move_along(self.trajectory, points, seconds, index)
         before = max(index - 1, 0)
         after = min(index, len(self) - 2)
         gaps = self._gaps[[before, after]]
@@ -155,6 +157,13 @@ class DeskewedLog(LogWrapper):
             gaps = self._interval * np.maximum(np.round(gaps / self._interval), 1)
         fraction = seconds / np.where(seconds > 0, gaps[1], gaps[0])
         return deskew_points(points, fraction, self._motion(after), self._motion(before))
+
+    def _move_along(self, trajectory: Any, points: np.ndarray, seconds: np.ndarray, index: int) -> np.ndarray:
+        """Move points by a trajectory that has more poses than one per sweep."""
+        shots, group = np.unique(np.round(seconds / _SLICE).astype(np.int64), return_inverse=True)
+        at = poses_at(self.timestamps[index] + shots * round(_SLICE * 1e9), *trajectory)
+        poses: Any = self.poses
+        return transform_each(points, (np.linalg.inv(poses[index]) @ at)[group]).astype(points.dtype)
 
     def labels(self, index: int) -> FlowLabels | None:
         labels = self.log.labels(index)

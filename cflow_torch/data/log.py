@@ -55,7 +55,6 @@ class Log(ABC):
         gaps: indices of sweeps after which the reader left out sweeps. No window reaches over a gap for its history or
             future, and `cflow flow` leaves out the pair over it.
         is_compensated: True = the format is known to be compensated for ego motion within a sweep.
-        moves_by_times: True = the reader compensates ego motion itself in sweeps that have `point_times`.
         has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
         lidar_position: (3,) metres, position of the rotating LiDAR in the frame of the points.
         has_viewpoints: True = the poses come with the clouds, which are then often in the world's frame.
@@ -77,7 +76,6 @@ class Log(ABC):
     has_viewpoints: bool = False
     # What `cflow_torch.data.deskewing` must know of a reader.
     is_compensated: bool = False
-    moves_by_times: bool = False
     has_raw_times: bool = False
     lidar_position: Any = (0.0, 0.0, 0.0)
     turn_seconds: float | None = None
@@ -100,6 +98,11 @@ class Log(ABC):
     @cached_property
     def poses(self) -> np.ndarray | None:
         """(K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown before the points are read."""
+        return None
+
+    @cached_property
+    def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """(M,) int64 nanoseconds and (M, 4, 4) float64 `T_world_ego` at these times; None = only `poses` are known."""
         return None
 
     @cached_property
@@ -308,6 +311,10 @@ class LogWrapper(Log):
     @cached_property
     def poses(self) -> np.ndarray | None:
         return self.log.poses
+
+    @cached_property
+    def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
+        return self.log.trajectory
 
     @cached_property
     def read_as(self) -> str | None:

@@ -4,19 +4,32 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Callable, NamedTuple, Sequence
+from typing import Callable, Iterator, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
 from cflow_torch.data.log import Log
 from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import turn_of
-from cflow_torch.windows.readings import GIVEN, OFF, STILL, WORLD, Judgement, difference, is_around, judge, make_pair
+from cflow_torch.types import Sweep
+from cflow_torch.windows.readings import (
+    GIVEN,
+    OFF,
+    STILL,
+    TIMES,
+    WORLD,
+    Judgement,
+    Pair,
+    difference,
+    is_around,
+    judge,
+    make_pair,
+)
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
-_LEAST_SPEED = 0.5  # metres a sweep; below, a wrong scan moves static objects by millimetres only
+# Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
+_LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
 _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
-_LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 # A step between two poses is suspect if it differs from its neighbours' by this, as a length or as a part of theirs.
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
 _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
@@ -96,43 +109,38 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     Cost: reads two sweeps per pair, and 0.1 s each.
     """
     poses = known_poses(log)
-    in_world = None if poses is None else _surrounds_poses(log, poses)
-    pairs = []
-    for first, second in choose_pairs(len(log.timestamps), poses):
+    chosen = choose_pairs(len(log.timestamps), poses)
+    sweeps = {index: log.sweep(index) for pair in chosen for index in pair}
+    pairs = partial(_make_pairs, sweeps, chosen, poses, deskew)
+    if poses is not None:
+        farthest = int(np.linalg.norm(poses[:, :2, 3], axis=1).argmax())
+        sweep = sweeps[farthest] if farthest in sweeps else log.sweep(farthest)
+        if is_around(sweep.points, poses[farthest]):
+            judgement = judge(pairs((OFF,), True))
+            if WORLD in judgement.best:
+                return judgement
+    judgement = judge(pairs(scans, False))
+    if STILL in judgement.best and log.unwrapped.has_viewpoints:
+        return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
+    return judgement
+
+
+def _make_pairs(
+    sweeps: Mapping[int, Sweep],
+    chosen: Sequence[tuple[int, int]],
+    poses: np.ndarray | None,
+    deskew: Callable[..., np.ndarray] | None,
+    scans: Sequence[str],
+    in_world: bool,
+) -> Iterator[Pair | None]:
+    for first, second in chosen:
         before = None if poses is None or first == 0 else poses[[first - 1, second - 1]]
         after = None if poses is None or second + 1 == len(poses) else poses[[first + 1, second + 1]]
-        is_fast = poses is not None and _speed(poses, first, second) >= _LEAST_SPEED
+        least = _LEAST_TIMED if TIMES in scans else _LEAST_SPEED
+        is_fast = poses is not None and difference(_motion(poses, first, second), np.eye(4)) >= least * (second - first)
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}
         shown = scans if is_fast else scans[:1]
-        pairs.append(make_pair(log.sweep(first), log.sweep(second), before, after, in_world, scans=shown, **how))
-    return judge(pairs)
-
-
-def is_in_world(log: Log) -> bool:
-    """Test whether the points of a log are in the world's frame.
-
-    They lie around the positions of the poses, or the poses come with the clouds (`ArraysLog.has_viewpoints`), and the
-    static world stands still without the poses. False for logs without `poses`, and if a sweep that we need cannot be
-    read; `sweep` will raise its error.
-
-    Cost: reads one sweep, and up to six more if one of the signs is there.
-    """
-    poses = known_poses(log)
-    has_viewpoints = log.unwrapped.has_viewpoints
-    try:
-        if poses is None or not (has_viewpoints or _surrounds_poses(log, poses)):
-            return False
-        best = judge_log(log).best
-    except (CFlowError, OSError):
-        return False
-    return WORLD in best or (has_viewpoints and STILL in best)
-
-
-def _surrounds_poses(log: Log, poses: np.ndarray) -> bool:
-    """Test whether points lie around the position of their pose, by the sweep farthest from the origin."""
-    distance = np.linalg.norm(poses[:, :2, 3], axis=1)
-    farthest = int(distance.argmax())
-    return bool(distance[farthest] >= _LEAST_DISTANCE) and is_around(log.sweep(farthest).points, poses[farthest])
+        yield make_pair(sweeps[first], sweeps[second], before, after, in_world, scans=shown, **how)
 
 
 def find_lapses(log: Log) -> list[Lapse]:

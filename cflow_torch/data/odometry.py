@@ -86,6 +86,7 @@ class PosedLog(LogWrapper):
     def __init__(self, log: Log, poses: np.ndarray) -> None:
         super().__init__(log)
         self.poses = self._given = poses
+        self.trajectory = None
 
     def sweep(self, index: int) -> Sweep:
         return replace(self.log.sweep(index), pose=self._given[index].copy())

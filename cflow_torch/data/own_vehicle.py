@@ -147,4 +147,4 @@ def _in_place(points: np.ndarray, T_other: np.ndarray, other: np.ndarray, cells:
     moved = transform_points(points, T_other)
     around = ((other > moved.min(0) - 2 * REACH) & (other < moved.max(0) + 2 * REACH)).all(1)  # the search costs less
     other = other[around]
-    return Structure(other[~_contains(cells, _cells_of(other))]).in_place(moved, np.eye(4))
+    return Structure(other[~_contains(cells, _cells_of(other))]).in_place(moved)

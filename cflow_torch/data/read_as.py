@@ -10,14 +10,14 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper
-from cflow_torch.data.log_motion import is_in_world
+from cflow_torch.data.log_motion import judge_log
 from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import as_matrix, rigid_transform, transform_points
 from cflow_torch.types import Sweep
 from cflow_torch.windows.readings import AXES, CAMERA, CAUSES, EARLY, LATE, MOUNT, OF_POSES, WORLD
 
 _OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
-_OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}  # axes of points and poses
+_OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["down"]}  # axes of points and poses
 _OF_POSES = [name for name in OF_POSES if not name.startswith(MOUNT)]
 CHANGES_POINTS = frozenset({*_OF_BOTH, *_OF_POINTS})
 """Readings under which the numbers of the points are others than those in the files."""
@@ -37,7 +37,8 @@ def read_as(log: Log, reading: str | None = "auto") -> Log:
             - "still": ignore the poses;
             - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; the first, or last, is extrapolated;
             - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
-              camera's, or the x axis points to the left, backward or to the right of that of the points;
+              camera's, or the x axis points to the left, backward or to the right of that of the points; "down": z
+              points down, and y to the right;
             - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
             - "millimetres", "centimetres": unit of the poses; "points_millimetres", "points_centimetres": of points;
             - "points_camera", "points_upside_down": points and poses have a camera's axes (x right, y down, z
@@ -46,8 +47,7 @@ def read_as(log: Log, reading: str | None = "auto") -> Log:
     if reading not in READ_AS:
         raise CFlowError(f"read_as={reading!r}: give one of {', '.join(str(one or 'null') for one in READ_AS)}")
     if reading == "auto":
-        reading = WORLD if is_in_world(log) else None
-        return log if reading is None else ReadAs(log, reading, is_found=True)
+        return ReadAs(log, WORLD, is_found=True) if WORLD in judge_log(log).best else log
     return log if reading is None else ReadAs(log, reading)
 
 
@@ -92,6 +92,14 @@ class ReadAs(LogWrapper):
         given = self.log.poses
         return None if given is None else np.array([self._pose(index, pose) for index, pose in enumerate(given)])
 
+    @cached_property
+    def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
+        given = self.log.trajectory
+        if given is None or self.read_as in (LATE, EARLY):
+            return None
+        times, poses = given
+        return times, np.array([self._convert(pose) for pose in poses])
+
     def _move(self, points: np.ndarray, index: int, pose: Any) -> np.ndarray:
         """Convert points of sweep `index`, (N, 3+), to metres in the frame of the vehicle."""
         if self.read_as == WORLD:
@@ -106,10 +114,13 @@ class ReadAs(LogWrapper):
             return None
         if self.read_as in (LATE, EARLY):
             return self._neighbour(index, 1 if self.read_as == LATE else -1)
-        given = self._given(index, pose)
+        return self._convert(self._given(index, pose))
+
+    def _convert(self, pose: np.ndarray) -> np.ndarray:
+        """Convert a pose to `T_world_ego`."""
         if self.read_as in _OF_BOTH:
-            return given @ as_matrix(_OF_BOTH[self.read_as]).T
-        return OF_POSES[self.read_as](given) if self.read_as in OF_POSES else given
+            return pose @ as_matrix(_OF_BOTH[self.read_as]).T
+        return OF_POSES[self.read_as](pose) if self.read_as in OF_POSES else pose
 
     def _neighbour(self, index: int, step: int) -> np.ndarray:
         """Return the pose of the next or last sweep; beyond the end the vehicle moves as between the two before."""

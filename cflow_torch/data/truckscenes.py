@@ -42,6 +42,7 @@ class TruckScenesLog(NuScenesLog):
 
     _categories = TRUCKSCENES_CATEGORIES
     _reference = "LIDAR_LEFT"
+    _has_times = True
     OWN_VEHICLE = Footprint(rear=-7.0, front=7.0, half_width=2.0)  # as in OpenSceneFlow
 
     def _points_of(self, file: Path) -> tuple[np.ndarray, np.ndarray | None]:

@@ -33,6 +33,7 @@ CAUSES = {
     "left": "the poses are of a frame whose x axis points to the left of the points' x axis",
     "back": "the poses are of a frame whose x axis points backward",
     "right": "the poses are of a frame whose x axis points to the right of the points' x axis",
+    "down": "the poses are of a frame whose z axis points down (x forward, y right)",
     "w_first": "the quaternions of the poses begin with w, but were read with w last",
     "w_last": "the quaternions of the poses end with w, but were read with w first",
     "millimetres": "the poses are in millimetres",
@@ -44,10 +45,11 @@ AXES = {
     "left": np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], float),  # x to the left of the vehicle
     "back": np.diag([-1.0, -1.0, 1.0]),
     "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
-    "upside_down": np.diag([1.0, -1.0, -1.0]),
+    "down": np.diag([1.0, -1.0, -1.0]),  # x forward, y right, z down, as of inertial units
 }
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
+_TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
 _NEAR_GIVEN = 0.7  # share of a reading over that as given
 _FEWEST_POINTS = 150  # of source and target; fewer do not show anything
 _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
@@ -59,6 +61,7 @@ _LEAST_SHARE = 0.1
 _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
+_TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 _EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 _HOPELESS = 0.04  # nothing fits if the share as given is below this
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
@@ -89,7 +92,7 @@ _MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, 
 OF_POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     STILL: lambda pose: np.eye(4),
     INVERTED: np.linalg.inv,
-    **{name: _moved(as_matrix(AXES[name].T)) for name in (CAMERA, "left", "back", "right")},
+    **{name: _moved(as_matrix(AXES[name].T)) for name in AXES},
     **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
     **{name: _scaled(unit) for name, unit in (("millimetres", 1e-3), ("centimetres", 1e-2))},
     **{name: _moved(as_matrix(np.eye(3), (*offset, 0))) for name, offset in _MOUNTS.items()},
@@ -130,21 +133,26 @@ class Pair:
     scans: tuple[str, ...]  # how points may move to the instant of their sweep, as `deskew`; the first one is expected
     has_motion: bool  # the poses move the structure enough to tell readings apart
 
-    def share(self, reading: str, scan: str, count: int = _MOST_POINTS, shift: float = 0.0) -> float:
-        """Return the share of the first `count` points that are in place, moved by `shift` metres along the path."""
-        path = self.transforms[GIVEN][:3, 3]
-        T = self.transforms[reading].copy()
-        T[:3, 3] += shift * path / max(float(np.linalg.norm(path)), 1e-9)
+    def share(self, scan: str, count: int = _MOST_POINTS, shift: float = 0.0) -> float:
+        """Return the share of the first `count` points in place as given, moved by `shift` metres along the path."""
+        T = self.transforms[GIVEN].copy()
+        T[:3, 3] *= 1 + shift / max(float(np.linalg.norm(T[:3, 3])), 1e-9)
         return self.target.structure(scan).share(self.source.points(scan)[:count], T)
 
     def shares_of_scans(self, scans: Sequence[str]) -> dict[str, float]:
-        return {scan: self.share(GIVEN, scan) for scan in scans}
+        count = _TIMED_POINTS if TIMES in scans else _MOST_POINTS
+        return {scan: self.share(scan, count) for scan in scans}
 
     def shares_of_poses(self, scan: str) -> dict[str, float]:
         """Return the share of each reading of the poses, by few points if it is much worse than as given."""
-        shares = {name: self.share(name, scan, _FEW_POINTS) for name in self.transforms}
+        shares = self._shares(list(self.transforms), scan, _FEW_POINTS)
         rivals = [name for name, share in shares.items() if share >= _NEAR_GIVEN * shares[GIVEN]]
-        return {**shares, **{name: self.share(name, scan) for name in rivals}}
+        return {**shares, **self._shares(rivals, scan, _MOST_POINTS)}
+
+    def _shares(self, readings: Sequence[str], scan: str, count: int) -> dict[str, float]:
+        transforms = np.stack([self.transforms[name] for name in readings])
+        shares = self.target.structure(scan).shares(self.source.points(scan)[:count], transforms)
+        return dict(zip(readings, shares.tolist()))
 
 
 @dataclass(frozen=True)
@@ -161,6 +169,10 @@ class Judgement:
     def given(self) -> float:
         """Share of structure in place as given, NaN = nothing could be compared."""
         return self.shares.get(GIVEN, float("nan"))
+
+    def adopted(self) -> Judgement:
+        """Return the judgement of the log under its best reading."""
+        return replace(self, shares={GIVEN: self.shares[self.best[0]]}, best=()) if self.best else self
 
     @property
     def offset(self) -> tuple[float, float] | None:
@@ -267,21 +279,30 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
 
 
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
-    """Return the scan under which the world stands still, and the shares of all.
+    """Return the scan under which the world stands still, and the shares of those that were compared.
 
-    If it is a direction, the turns begin behind the vehicle, unless another start is clearly better. If the structure
-    is shifted along the path, less of it must be in place: along smooth walls this is not so.
+    Points with times may be compensated already, so we move them only if they then fit at least as well. If a direction
+    fits better than its opposite, turns may begin behind the vehicle or elsewhere: we choose behind, unless another
+    start is clearly better. If the structure is shifted along the path, less of it must be in place: along smooth walls
+    this is not so.
     """
-    expected, *_ = pairs[0].scans
-    shares, clear = _compare([pair.shares_of_scans(pair.scans) for pair in pairs], expected)
+    expected, *others = pairs[0].scans
+    of_pairs = [pair.shares_of_scans(pair.scans) for pair in pairs]
+    shares, clear = _compare(of_pairs, expected)
+    if expected == TIMES:
+        return max(shares, key=shares.__getitem__), shares  # ties: the times
+    direction, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
+    if direction in DIRECTIONS and shares[direction] >= _TURN * max(shares[scan] for scan in opposite):
+        starts = [direction + start for start in STARTS]
+        of_pairs = [{**pair.shares_of_scans(starts), **each} for pair, each in zip(pairs, of_pairs)]
+        of_starts, clear = _compare(of_pairs, expected)
+        _, better = _compare([{start: each[start] for start in starts} for each in of_pairs], direction)
+        clear = clear[:1] if direction not in clear else [*better, direction]
+        shares.update({scan: of_starts[scan] for scan in clear[:1]})
     if not clear:
         return expected, shares
-    at_place, beside = (np.mean([pair.share(GIVEN, clear[0], shift=by) for pair in pairs]) for by in (0, _SHIFT))
-    if at_place < _PEAK * beside:
-        return expected, shares
-    starts = [clear[0] + start for start in STARTS] if clear[0] in DIRECTIONS else clear[:1]
-    _, better = _compare([pair.shares_of_scans(starts) for pair in pairs], clear[0])
-    return (better or clear)[0], shares
+    at_place, beside = (np.mean([pair.share(clear[0], shift=by) for pair in pairs]) for by in (0, _SHIFT))
+    return (clear[0] if at_place >= _PEAK * beside else expected), shares
 
 
 def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
@@ -290,7 +311,7 @@ def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
     of_pairs = []
     for pair in pairs:
         given = {GIVEN: pair.transforms[GIVEN]}
-        if pair.share(GIVEN, OFF) < _SEARCHED:
+        if pair.share(OFF) < _SEARCHED:
             motion = find_motion(pair.source.points(OFF)[:_MOST_POINTS], pair.target.points(OFF))
             if difference(motion, given[GIVEN]) >= _LEAST_MOTION:
                 motions.append(motion)
@@ -303,9 +324,9 @@ def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
 def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tuple[dict[str, float], list[str]]:
     """Compare the shares of readings over the pairs that show them.
 
-    A reading is clearly better than as given if it is so in the mean, and better in each pair. It may be a small
-    mistake, such as the direction of the scan or another mounting: then a smaller margin is enough, but the opposite
-    mistake must be worse than as given.
+    A reading is clearly better than as given if it is so in the mean, and better in each pair that shows it. It may be
+    a small mistake, such as the direction of the scan or another mounting: then a smaller margin is enough, but the
+    opposite mistake must be worse than as given.
 
     Returns:
         The mean share of each reading, and those that are clearly better than as given, best first.
@@ -314,11 +335,11 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
     gains: dict[str, float] = {}
     better = []
     for name in dict.fromkeys(name for each in of_pairs for name in each):
-        shown = [(each[name], each[given]) for each in of_pairs if name in each]
-        share, as_given = np.mean(shown, axis=0)
+        # In a pair that does not show it, the reading is about the same as that as given.
+        share, as_given = np.mean([(each.get(name, each[given]), each[given]) for each in of_pairs], axis=0)
         shares[name] = float(share)
         gains[name] = float(share / max(as_given, 1e-9))
-        if share >= _LEAST_SHARE and all(ours > theirs for ours, theirs in shown):
+        if share >= _LEAST_SHARE and all(each[name] > each[given] for each in of_pairs if name in each):
             better.append(name)
     clear = [name for name in better if gains[name] >= _MARGINS.get(name, _MARGIN)]
     clear = [name for name in clear if gains.get(_OPPOSITES.get(name, ""), 0) <= _OPPOSITE]

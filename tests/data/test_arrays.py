@@ -362,3 +362,14 @@ def test_a_sweep_whose_mask_does_not_fit_is_refused(folder):
     for index in (-1, 3):
         with pytest.raises(CFlowError, match="sweeps 0"):
             log.sweep(index)
+
+
+def test_clouds_in_a_folder_of_any_name_are_found_next_to_their_poses(tmp_path: Path) -> None:
+    scans = tmp_path / "drive" / "ouster_scans"
+    scans.mkdir(parents=True)
+    for index in range(3):
+        np.save(scans / f"{index}.npy", np.ones((4, 3), np.float32))
+    np.save(tmp_path / "drive" / "poses.npy", np.tile(np.eye(4), (3, 1, 1)))
+    (folder,) = find_array_logs(tmp_path)
+    log = ArraysLog(folder)
+    assert log.log_id == "drive" and log.poses is not None and len(log) == 3

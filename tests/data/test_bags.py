@@ -16,6 +16,7 @@ from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog
 from cflow_torch.data.bags.messages import cloud_columns
 from cflow_torch.data.catalog import find_sources, open_log
+from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.log import window
 from cflow_torch.data.log_check import check_log, examine
 from cflow_torch.types import CFlowWarning
@@ -37,7 +38,7 @@ def test_a_bag_comes_back(form: str, order: str, recording: TinyRecording, tmp_p
     """Poses and the mounting of the LiDAR come from TF, so every shot returns to the point that it hit."""
     path = write_bag(tmp_path, form, recording, order=order)
     assert find_sources("bags", tmp_path) == [path] == find_sources("bags", path)
-    log: Any = open_log("bags", path, check=False)
+    log: Any = open_log("bags", path, deskew="times", check=False)
     assert log.log_id == "drive" and log.topic == "/points" and log.frame == "base_link"
     assert tuple(log.timestamps) == recording.timestamps
     again = pickle.loads(pickle.dumps(log))
@@ -51,7 +52,7 @@ def test_a_bag_comes_back(form: str, order: str, recording: TinyRecording, tmp_p
     columns = log.columns(0)
     assert set(columns) == {"ring", "t"} and columns["ring"].dtype == np.uint16
     assert np.array_equal(columns["t"], recording.units(0)[0].offset_ns), "those of shots without a return are left out"
-    raw = BagLog(path, deskew=False).sweep(1).points
+    raw = BagLog(path).sweep(1).points
     assert np.allclose(raw, recording.units(1)[0].points @ MOUNT[:3, :3].T + MOUNT[:3, 3], atol=1e-4)
     assert len(window(log, 1, num_history=1).pch) == 1 and log.labels(0) is None
 
@@ -61,7 +62,7 @@ def test_a_bag_comes_back(form: str, order: str, recording: TinyRecording, tmp_p
 def test_poses_come_from_a_topic(form: str, poses: str, frame: str, recording: TinyRecording, tmp_path: Path) -> None:
     log = BagLog(write_bag(tmp_path, form, recording, poses))
     assert log.frame == frame
-    sweep, to_map = log.sweep(3), MAP_T_ODOM
+    sweep, to_map = DeskewedLog(log, "times").sweep(3), MAP_T_ODOM
     assert np.allclose(world_of(sweep) @ to_map[:3, :3].T + to_map[:3, 3], recording.world(3)[:40], atol=5e-3)
 
 

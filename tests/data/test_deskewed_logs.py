@@ -20,6 +20,7 @@ from cflow_torch.data.log import FlowLabels, Log, LogWrapper
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.street import build_street
+from cflow_torch.transforms import poses_at
 from cflow_torch.types import CFlowError, CFlowWarning, Sweep
 from cflow_torch.windows.deskewing import scan_fractions
 from cflow_torch.windows.stillness import Structure, static_rows, thinned_rows
@@ -112,9 +113,18 @@ def test_a_turn_may_begin_elsewhere(start: float, deskew: str, reading: str) -> 
     assert shares[0] < 0.85 * shares[2] and shares[1] > 0.95 * shares[2]
 
 
+@pytest.mark.parametrize(
+    ("start", "span", "reading"), [(0.0, -360.0, "clockwise_ahead"), (-90.0, 360.0, "counterclockwise_right")]
+)
+def test_a_direction_is_found_where_turns_do_not_begin_behind(start: float, span: float, reading: str) -> None:
+    """The seam of the turn hides the direction, if we only compare turns that begin behind."""
+    log = DeskewedLog(Untimed(make(speed=15.0, num_sweeps=10, start=start, span=span)))
+    assert log.reading.name == reading
+
+
 @pytest.mark.parametrize("case", ["compensated", "slow"])
 def test_compensated_and_slow_sweeps_stay_as_they_are(case: str, truth: Drive) -> None:
-    given = truth if case == "compensated" else make(speed=4.0, num_sweeps=4)
+    given = truth if case == "compensated" else make(speed=1.0, num_sweeps=4)
     log = DeskewedLog(Untimed(given))
     assert log.reading == ("off", "")
     assert np.array_equal(log.sweep(1).points, given.sweep(1).points) and log.sweep(1).point_times is None
@@ -273,3 +283,33 @@ def test_real_drives(scene: str, reading: str) -> None:
     pytest.importorskip("h5py")
     log: Any = open_log("hdf5", REAL / f"{scene}.h5", check=False)
     assert log.reading.name == reading
+
+
+class InBag(Untimed):
+    """A log as `BagLog`: raw times are expected, and its trajectory has more poses than one per sweep."""
+
+    has_raw_times = True
+
+    def __init__(self, log: Drive) -> None:
+        super().__init__(log)
+        times = np.array(log.timestamps, np.int64)
+        between = np.arange(times[0], times[-1], 10**7)
+        self.trajectory = between, poses_at(between, times, np.array(log.poses))
+
+    def sweep(self, index: int) -> Sweep:
+        return self.log.sweep(index)
+
+
+@pytest.mark.parametrize(("case", "reading"), [("raw", "times"), ("truth", "off")])
+def test_times_of_points_are_used_only_if_points_fit_better(case: str, reading: str, request: Any) -> None:
+    """Clouds of odometry programs are compensated, and still have their times."""
+    drive, truth = request.getfixturevalue(case), request.getfixturevalue("truth")
+    log = DeskewedLog(InBag(drive))
+    assert log.reading.name == reading
+    assert max(largest_error(log, truth, index) for index in (3, 5)) < 0.02, "a chord between poses is off its arc"
+
+
+def test_slow_sweeps_with_times_are_compared_too() -> None:
+    for is_deskewed in (False, True):
+        log = DeskewedLog(InBag(make(speed=3.0, is_deskewed=is_deskewed)))
+        assert log.reading.name == ("off" if is_deskewed else "times")

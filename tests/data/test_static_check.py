@@ -21,7 +21,7 @@ from cflow_torch.data.read_as import read_as
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import as_matrix, rotations_about, to_quaternions, to_rotations
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.readings import AXES, CAMERA, MOUNT, NO_READING, UNKNOWN, WORLD
+from cflow_torch.windows.readings import AXES, CAMERA, GIVEN, MOUNT, NO_READING, UNKNOWN, WORLD, _compare
 
 MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
 
@@ -126,6 +126,7 @@ POSES = {
     "back": lambda pose: pose @ as_matrix(AXES["back"]),
     "w_first": reordered((3, 0, 1, 2)),
     "w_last": reordered((1, 2, 3, 0)),
+    "down": lambda pose: pose @ as_matrix(AXES["down"]),
     "right": lambda pose: pose @ as_matrix(AXES["right"]),
 }
 WRONG_POSES = {
@@ -169,6 +170,14 @@ def test_points_in_the_world_are_found_and_moved_back(source, request):
     assert "world's frame" in text and "data.read_as=world" in text
     assert find_problems(read_as(world, "world")) == [], "what you say is not repeated"
     assert "world's frame" in find_problems(world)[0] and read_as(good) is good
+
+
+def test_a_mounting_that_one_pair_shows_weakly_is_not_named():
+    """A slight turn in one of several pairs is no evidence: in the others, both mountings are the same."""
+    straight = {GIVEN: 0.34}
+    turn = {GIVEN: 0.12, "mount 0 0.7": 0.136, "mount 0 -0.7": 0.10}
+    assert _compare([straight, turn])[1] == []
+    assert _compare([straight, {**turn, "mount 0 0.7": 0.22}])[1] == ["mount 0 0.7"]
 
 
 def test_opening_a_folder_finds_points_in_the_world(thin, tmp_path):
@@ -304,7 +313,7 @@ def camera_points(points, _):
         (lambda points, _: 100 * points, "data.read_as=points_centimetres"),
         (lambda points, _: 0.001 * points, "in metres"),
         (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
-        (lambda points, _: points @ AXES["upside_down"], "data.read_as=points_upside_down"),
+        (lambda points, _: points @ AXES["down"], "data.read_as=points_upside_down"),
         (camera_points, "data.read_as=points_camera"),
     ],
     ids=["millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera"],
@@ -321,7 +330,7 @@ def test_wrong_units_and_axes_are_recognised(source, change, found, request):
     assert found in text
     if "read_as=points" in found:
         reading = found.split("=")[-1]
-        axes = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["upside_down"]}.get(reading, np.eye(3))
+        axes = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["down"]}.get(reading, np.eye(3))
         wrong = Wrong(good, points=change, poses=each(lambda pose: pose @ as_matrix(axes)), masks=False)
         again = read_as(wrong, reading)
         assert np.allclose(again.sweep(3).points, good.sweep(3).points, atol=1e-3)

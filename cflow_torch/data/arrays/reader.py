@@ -50,7 +50,8 @@ class ArraysLog(Log):
 
     Args:
         folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
-            velodyne, clouds or pcd that does. Clouds are sorted naturally: 2 before 10.
+            velodyne, clouds or pcd that does, or one of any name if it holds poses or times.txt. Clouds are sorted
+            naturally: 2 before 10.
         poses: "auto" = poses.txt, odometry.csv or the like (`POSE_FILES`) in the folder, or KITTI's
             ../../poses/<name>.txt, if there is one, or VIEWPOINT of `.pcd` files if it is set; None = no poses; or a
             file (see `read_poses`); or a (K, 4, 4) array.
@@ -256,7 +257,10 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
     """Return the folder that holds a log's clouds, and the clouds of each suffix that has two or more."""
-    for parent in (folder, *(folder / name for name in POINT_FOLDERS)):
+    places = [folder, *(folder / name for name in POINT_FOLDERS)]
+    if folder.is_dir() and any((folder / name).exists() for name in (*POSE_FILES, "times.txt")):  # of clouds below
+        places += sorted(path for path in folder.iterdir() if path.name not in (*POINT_FOLDERS, GROUND_FOLDER))
+    for parent in places:
         kinds: dict[str, list[Path]] = {}
         if parent.is_dir():
             for path in parent.iterdir():

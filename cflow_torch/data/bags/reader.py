@@ -18,7 +18,7 @@ from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import TIME_FIELDS, seconds_after
 from cflow_torch.errors import CFlowError, import_optional
-from cflow_torch.transforms import poses_at, rigid_transform, transform_each, transform_points
+from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -44,7 +44,6 @@ _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped"
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _NEED = "bags need rosbags: pip install rosbags"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
-_SLICE = 1e-4  # seconds during which we use one pose of the vehicle: 3 mm at 30 m/s
 
 
 def find_bags(root: PathLike) -> list[Path]:
@@ -71,18 +70,18 @@ class BagLog(Log):
             frame moves, the only topic of these types, none.
         frame: name of the ego frame; None = base_link if transforms connect it to the LiDAR, else the LiDAR's own.
         ego_T_lidar: (4, 4), maps the frame of the clouds to the ego frame; None = from the transforms.
-        deskew: transform each point by the pose of the vehicle at the time of the point, if poses and times of points
-            are known; False = the clouds are already de-skewed.
 
     Attributes:
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown.
+        trajectory: times and `T_world_ego` of all transforms or messages, by which `DeskewedLog` moves points.
         timestamps: nanoseconds from the header of each cloud (if that is 0, from its arrival). Clouds before the first
             or after the last pose are left out.
-        topic, frame, deskew: the settings in use.
+        topic, frame: the settings in use.
 
-    Convention: points are in the ego frame. Poses are interpolated at the time of the cloud. The world is the root of
-        the transforms, or the world of the topic. A topic gives the poses of its `child_frame_id` if transforms connect
-        this frame to the ego frame, otherwise the poses of the ego frame. Times of points: `point_times.seconds_after`.
+    Convention: points are in the ego frame, as measured (`open_log` de-skews them). Poses are interpolated at the time
+        of the cloud. The world is the root of the transforms, or the world of the topic. A topic gives the poses of its
+        `child_frame_id` if transforms connect this frame to the ego frame, otherwise the poses of the ego frame. Times
+        of points: `point_times.seconds_after`.
 
     Cost: opening a bag reads all its clouds, poses and transforms once.
     """
@@ -96,7 +95,6 @@ class BagLog(Log):
         poses: str | None = "auto",
         frame: str | None = None,
         ego_T_lidar: Any = None,
-        deskew: bool = True,
     ) -> None:
         self.path = as_path(path)
         if is_remote(self.path):
@@ -109,7 +107,6 @@ class BagLog(Log):
             raise CFlowError(
                 f"{self.path} is a recording that was not finished: run rosbag reindex, then rename it .bag"
             )
-        self.deskew = self.moves_by_times = deskew
         self.poses: np.ndarray | None = None
         self._opened: tuple[int, Any] = (0, None)
         self._mount = None if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
@@ -129,7 +126,7 @@ class BagLog(Log):
                 poses = self._chosen(topics, _POSE_TYPES, poses, "poses")
             self.timestamps = sorted(self._arrival)
             if poses is not None:
-                self._odometry = times, matrices = self._trajectory(poses, tracks)
+                self.trajectory = times, matrices = self._find_trajectory(poses, tracks)
                 trajectory = Trajectory(matrices, times, "bag", f"{poses} of {self.path}")
                 covered = are_covered(trajectory, self.timestamps)
                 self._note(describe_uncovered(trajectory, self.timestamps, covered))
@@ -151,13 +148,8 @@ class BagLog(Log):
         if mount is None:
             mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
         points = transform_points(_points(columns), mount)
-        if self.poses is None:
-            return Sweep(points.astype(np.float32), None, None, time, times)
-        if times is not None and self.deskew:
-            shots, group = np.unique(np.round(times / _SLICE).astype(np.int64), return_inverse=True)
-            at = poses_at(time + shots * round(_SLICE * 1e9), *self._odometry)
-            points = transform_each(points, (np.linalg.inv(self.poses[index]) @ at)[group])
-        return Sweep(points.astype(np.float32), None, self.poses[index].copy(), time, times)
+        pose = None if self.poses is None else self.poses[index].copy()
+        return Sweep(points.astype(np.float32), None, pose, time, times)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the fields besides x, y, z, such as intensity and ring, of the points of sweep `index`."""
@@ -285,7 +277,7 @@ class BagLog(Log):
             )
         return dict(reversed(stamps))
 
-    def _trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:
+    def _find_trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:
         """Return (M,) int64 times of transforms or messages, and (M, 4, 4) `T_world_ego` at these times."""
         if poses == "tf":
             times, world = self._frames.change_times(self.frame), self._frames.world_of(self.frame)

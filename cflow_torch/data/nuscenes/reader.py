@@ -93,6 +93,7 @@ class NuScenesLog(Log):
 
     _categories: ClassVar[Mapping[str, str]] = NUSCENES_CATEGORIES
     _reference: ClassVar[str] = "LIDAR_TOP"  # the log has the times of this LiDAR
+    _has_times: ClassVar[bool] = False  # of points
     # 4.084 m x 1.730 m around the LiDAR at x = 0.944 m, as OpenSceneFlow has it.
     OWN_VEHICLE: ClassVar[Footprint] = Footprint(rear=-1.098, front=2.986, half_width=0.865)
 
@@ -109,7 +110,8 @@ class NuScenesLog(Log):
         self.log_id = source.name
         self._source = source
         self._root = as_path(source.root)
-        self._deskew = self.moves_by_times = deskew
+        self._deskew = deskew
+        self.is_compensated = deskew and self._has_times
         self._own_vehicle = self.OWN_VEHICLE if own_vehicle == "auto" else own_vehicle
         folder = self._root / source.version
         sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.name)
