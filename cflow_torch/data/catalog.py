@@ -17,6 +17,7 @@ from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
+from cflow_torch.data.log_motion import surrounds_poses
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import ReadAs
@@ -245,8 +246,8 @@ def open_log(
         log = with_poses(log)
     if read_as != "auto":
         log = read_log_as(log, read_as)
-    judgement = DeskewedLog(log, deskew).judgement
-    if read_as == "auto" and judgement is not None and WORLD in judgement.best:
+    judgement = DeskewedLog(log, deskew).judgement if read_as == "auto" and _may_be_in_world(log) else None
+    if judgement is not None and WORLD in judgement.best:
         log = ReadAs(log, WORLD, is_found=True)
         judgement = judgement.adopted()
     if own_vehicle is not None:
@@ -257,6 +258,14 @@ def open_log(
     if check:
         check_log(log)
     return log
+
+
+def _may_be_in_world(log: Log) -> bool:
+    """Test whether the points of a log may be in the world's frame, by one sweep."""
+    try:
+        return log.unwrapped.has_viewpoints or surrounds_poses(log)
+    except (CFlowError, OSError):
+        return False  # `sweep` raises the error
 
 
 def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:

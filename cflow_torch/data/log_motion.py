@@ -29,6 +29,7 @@ from cflow_torch.windows.readings import (
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
+_LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
 # A step between two poses is suspect if it differs from its neighbours' by this, as a length or as a part of theirs.
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
@@ -112,17 +113,27 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     chosen = choose_pairs(len(log.timestamps), poses)
     sweeps = {index: log.sweep(index) for pair in chosen for index in pair}
     pairs = partial(_make_pairs, sweeps, chosen, poses, deskew)
-    if poses is not None:
-        farthest = int(np.linalg.norm(poses[:, :2, 3], axis=1).argmax())
-        sweep = sweeps[farthest] if farthest in sweeps else log.sweep(farthest)
-        if is_around(sweep.points, poses[farthest]):
-            judgement = judge(pairs((OFF,), True))
-            if WORLD in judgement.best:
-                return judgement
+    if surrounds_poses(log):
+        judgement = judge(pairs((OFF,), True))
+        if WORLD in judgement.best:
+            return judgement
     judgement = judge(pairs(scans, False))
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
+
+
+def surrounds_poses(log: Log) -> bool:
+    """Test whether points lie around the position of their pose, by the sweep farthest from the origin.
+
+    Cost: reads that sweep if it is at least 3 m from the origin.
+    """
+    poses = known_poses(log)
+    if poses is None:
+        return False
+    distance = np.linalg.norm(poses[:, :2, 3], axis=1)
+    farthest = int(distance.argmax())
+    return bool(distance[farthest] >= _LEAST_DISTANCE) and is_around(log.sweep(farthest).points, poses[farthest])
 
 
 def _make_pairs(

@@ -317,7 +317,8 @@ def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
                 motions.append(motion)
                 given[UNKNOWN] = motion
         of_pairs.append(replace(pair, transforms=given).shares_of_poses(OFF))
-    shares, clear = _compare(of_pairs)
+    # Where a motion was not found, the vehicle may stand.
+    shares, clear = _compare([each for each in of_pairs if UNKNOWN in each] or of_pairs)
     return Judgement(shares, tuple(clear), motions[0] if clear else None)
 
 
