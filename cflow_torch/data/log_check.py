@@ -46,9 +46,22 @@ def find_problems(log: Log) -> list[str]:
 def examine(log: Log) -> list[Finding]:
     """Check everything that `cflow check` shows, in the order of its page.
 
-    Cost: reads up to 16 sweeps, and two of each step between poses that is suspect; 1 to 2 s.
+    Cost: 1 to 2 s, and reads every sweep, to tell those that are missing or damaged.
     """
-    checks = (_sensor, _found, _frame, _times, _poses, _lapses, _motion, _deskew, _repeated, _mask, _labels)
+    checks = (
+        _sensor,
+        _found,
+        _frame,
+        _times,
+        _poses,
+        _lapses,
+        _motion,
+        _deskew,
+        _repeated,
+        _unreadable,
+        _mask,
+        _labels,
+    )
     findings = _collect(CachedLog(log, _CACHED), checks, tells_errors=True)
     # Notes are complete only now, as readers note what they see in the sweeps.
     return [*findings, *(Finding("reader", FOUND, note) for note in log.notes)]
@@ -151,6 +164,22 @@ def _repeated(log: Log) -> list[Finding]:
     if any(repeats(pc0, pc1) for pc0, pc1 in zip(first, first[1:])):
         return [Finding("sweeps", WRONG, REPEATED, True)]
     return []
+
+
+def _unreadable(log: Log) -> list[Finding]:
+    """Find sweeps that cannot be read, if the first one can."""
+    log.sweep(0)
+    errors: dict[int, Exception] = {}
+    for index in range(1, len(log.timestamps)):
+        try:
+            log.sweep(index)
+        except (CFlowError, OSError) as error:
+            errors[index] = error
+    if not errors:
+        return []
+    first = min(errors)
+    count = f"{len(errors)} of {len(log.timestamps)} sweeps cannot be read"
+    return [Finding("sweeps", WRONG, f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow")]
 
 
 def _sensor(log: Log) -> list[Finding]:

@@ -18,6 +18,7 @@ from cflow_torch.data.log import CachedLog, Log, LogWrapper
 from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
 from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
+from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import as_matrix, rotations_about, to_quaternions, to_rotations
 from cflow_torch.types import CFlowWarning
@@ -367,6 +368,19 @@ def test_the_page_says_what_was_found(drive):
     late.timestamps = [*drive.timestamps[:6], *(stamp + 700_000_000 for stamp in drive.timestamps[6:])]
     times = next(one for one in examine(late) if one.topic == "times")
     assert times.status == WRONG and "0.8 s after sweep 5" in times.text
+
+
+def test_the_page_counts_sweeps_that_cannot_be_read(drive):
+    class Damaged(Wrong):
+        def sweep(self, index):
+            if index in (7, 8):
+                raise MissingFile(f"sweep {index} does not exist")
+            return super().sweep(index)
+
+    texts = [one.text for one in examine(Damaged(drive)) if one.status == WRONG and one.topic == "sweeps"]
+    assert texts == [
+        "2 of 12 sweeps cannot be read, the first is sweep 7: sweep 7 does not exist. Their pairs have no flow"
+    ]
 
 
 def test_the_page_lists_notes_of_the_reader_and_knows_its_gaps(drive):
