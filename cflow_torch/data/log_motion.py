@@ -14,6 +14,7 @@ from cflow_torch.transforms import turn_of
 from cflow_torch.types import Sweep
 from cflow_torch.windows.readings import (
     GIVEN,
+    LEAST_DISTANCE,
     OFF,
     STILL,
     TIMES,
@@ -29,7 +30,6 @@ from cflow_torch.windows.readings import (
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
-_LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
 # A step between two poses is suspect if it differs from its neighbours' by this, as a length or as a part of theirs.
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
@@ -133,7 +133,7 @@ def surrounds_poses(log: Log) -> bool:
         return False
     distance = np.linalg.norm(poses[:, :2, 3], axis=1)
     farthest = int(distance.argmax())
-    return bool(distance[farthest] >= _LEAST_DISTANCE) and is_around(log.sweep(farthest).points, poses[farthest])
+    return bool(distance[farthest] >= LEAST_DISTANCE) and is_around(log.sweep(farthest).points, poses[farthest])
 
 
 def _make_pairs(

@@ -50,8 +50,8 @@ def find_unmatched(
         num_scales: 1 = dilated components of the second finest scale; 2 = where these are matched, those of the finest
             scale, because a barrier may touch a car.
 
-    Convention: the size is the sum of the reach of the pixels of a sweep, because pixels with a larger
-        reach have fewer neighbours. So a car has a similar size for a sparse sensor as for a dense one.
+    Convention: the size is the sum of the reach of the pixels of a sweep, because pixels with a larger reach have fewer
+        neighbours. So a car has a similar size for a sparse sensor as for a dense one.
     """
     levels = components.levels[:-1][-2:][:num_scales]
     num_originals = len(levels[0].of_item)

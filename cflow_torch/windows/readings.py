@@ -54,6 +54,7 @@ _NEAR_GIVEN = 0.7  # share of a reading over that as given
 _FEWEST_POINTS = 150  # of source and target; fewer do not show anything
 _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
 _LEAST_MOTION, _ARM = 0.2, 20.0  # metres; poses that move points 20 m away by less do not show anything
+LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 _LEAST_DIFFERENCE = 0.05  # metres; a pair shows only the readings that move these points otherwise by this
 # The best share must exceed the share as given by this factor (`_MARGINS` has others), and be at least `_LEAST_SHARE`.
 _MARGIN = 1.3
@@ -387,7 +388,7 @@ def is_around(points: Array, pose: np.ndarray) -> bool:
     least 3 m from the origin.
     """
     position = pose[:2, 3]
-    if np.linalg.norm(position) < 3:
+    if np.linalg.norm(position) < LEAST_DISTANCE:
         return False
     xy = as_numpy(points)[:, :2].astype(np.float64)
     xy = xy[np.isfinite(xy).all(1)]
