@@ -196,7 +196,7 @@ def open_log(
     odometry: bool = False,
     check: bool = True,
     deskew: Any = "auto",
-    read_as: str | None = "auto",
+    read_as: str | None | Sequence[str] = "auto",
     own_vehicle: str | None = "auto",
     **settings: Any,
 ) -> Log:
@@ -209,7 +209,7 @@ def open_log(
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
-        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`. Or a
+        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`; or a
             value of `deskew`: "times", "clockwise", ...
         own_vehicle: "auto" = leave out returns that ride along with the vehicle, see `OwnVehicleLog`; None = keep them.
         deskew: how to move points to the instant of their sweep, see `cflow_torch.data.deskewing.DeskewedLog`; False

@@ -105,10 +105,10 @@ class Log(ABC):
         """(M,) int64 nanoseconds and (M, 4, 4) float64 `T_world_ego` at these times; None = only `poses` are known."""
         return None
 
-    @cached_property
-    def read_as(self) -> str | None:
-        """The reading under which points and poses are converted, see `cflow_torch.data.read_as`."""
-        return None
+    @property
+    def readings(self) -> tuple[str, ...]:
+        """The readings under which points and poses are converted, in this order, see `cflow_torch.data.read_as`."""
+        return ()
 
     @property
     def judgement(self) -> Judgement | None:
@@ -316,9 +316,9 @@ class LogWrapper(Log):
     def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
         return self.log.trajectory
 
-    @cached_property
-    def read_as(self) -> str | None:
-        return self.log.read_as
+    @property
+    def readings(self) -> tuple[str, ...]:
+        return self.log.readings
 
     @property
     def judgement(self) -> Judgement | None:
