@@ -7,8 +7,8 @@ from typing import Callable, Iterable, List
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
-from cflow_torch.data.log import CachedLog, Log
-from cflow_torch.data.log_motion import find_lapses, judge_log, known_poses
+from cflow_torch.data.log import CachedLog, Log, known_poses
+from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import ReadAs
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.types import Sweep, as_numpy

@@ -8,13 +8,11 @@ from typing import Callable, Iterator, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.log import Log
-from cflow_torch.errors import CFlowError
+from cflow_torch.data.log import Log, known_poses
 from cflow_torch.transforms import turn_of
 from cflow_torch.types import Sweep
 from cflow_torch.windows.readings import (
     GIVEN,
-    LEAST_DISTANCE,
     OFF,
     STILL,
     TIMES,
@@ -22,7 +20,6 @@ from cflow_torch.windows.readings import (
     Judgement,
     Pair,
     difference,
-    is_around,
     judge,
     make_pair,
 )
@@ -44,17 +41,6 @@ class Lapse(NamedTuple):
     sweep: int  # index of the sweep whose pose is wrong, or before which the poses jump
     metres: float  # how much the step differs from those around it; a rotation counts at 10 m
     is_single: bool  # True: only this pose is wrong; False: all later poses are shifted
-
-
-def known_poses(log: Log) -> np.ndarray | None:
-    """Return the poses that a log knows without reading points, (K, 4, 4) float64; None = it knows none."""
-    try:
-        poses = log.poses
-    except CFlowError:
-        return None
-    if poses is None or np.shape(poses) != (len(log.timestamps), 4, 4) or not np.isfinite(poses).all():
-        return None
-    return np.asarray(poses, np.float64)
 
 
 def choose_pairs(num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int] = ()) -> list[tuple[int, int]]:
@@ -118,7 +104,7 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     chosen = choose_pairs(len(log.timestamps), poses, () if steps is None else steps.suspects)
     sweeps = {index: log.sweep(index) for pair in chosen for index in pair}
     pairs = partial(_make_pairs, sweeps, chosen, poses, deskew)
-    if surrounds_poses(log):
+    if log.surrounds_poses:
         judgement = judge(pairs((OFF,), True))
         if WORLD in judgement.best:
             return judgement
@@ -126,19 +112,6 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
-
-
-def surrounds_poses(log: Log) -> bool:
-    """Test whether points lie around the position of their pose, by the sweep farthest from the origin.
-
-    Cost: reads that sweep if it is at least 3 m from the origin.
-    """
-    poses = known_poses(log)
-    if poses is None:
-        return False
-    distance = np.linalg.norm(poses[:, :2, 3], axis=1)
-    farthest = int(distance.argmax())
-    return bool(distance[farthest] >= LEAST_DISTANCE) and is_around(log.sweep(farthest).points, poses[farthest])
 
 
 def _make_pairs(

@@ -9,7 +9,7 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper, points_surround_poses
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import halfway, rigid_transform, transform_points
@@ -57,8 +57,16 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
     if reading not in READ_AS:
         raise CFlowError(f"read_as={reading!r}: give one of {', '.join(str(one or 'null') for one in READ_AS)}")
     if reading == "auto":
-        return ReadAs(log, WORLD, is_found=True) if WORLD in judge_log(log).best else log
+        return ReadAs(log, WORLD, is_found=True) if _is_in_world(log) else log
     return log if reading is None else ReadAs(log, reading)
+
+
+def _is_in_world(log: Log) -> bool:
+    """Test whether the points of a log are in the world's frame; by one sweep, if it is not there."""
+    try:
+        return (log.unwrapped.has_viewpoints or log.surrounds_poses) and WORLD in judge_log(log).best
+    except (CFlowError, OSError):
+        return False  # `sweep` raises the error
 
 
 class ReadAs(LogWrapper):
@@ -75,6 +83,10 @@ class ReadAs(LogWrapper):
     @property
     def readings(self) -> tuple[str, ...]:
         return (*self.log.readings, self.reading)
+
+    @cached_property
+    def surrounds_poses(self) -> bool:
+        return points_surround_poses(self)
 
     def sweep(self, index: int) -> Sweep:
         sweep = self.log.sweep(index)

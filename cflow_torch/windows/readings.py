@@ -183,10 +183,6 @@ class Judgement:
         """Share of structure in place as given, NaN = nothing could be compared."""
         return self.shares.get(GIVEN, float("nan"))
 
-    def adopted(self) -> Judgement:
-        """Return the judgement of the log under its best reading."""
-        return replace(self, shares={GIVEN: self.shares[self.best[0]]}, best=()) if self.best else self
-
     def __str__(self) -> str:
         """What is wrong, "" = nothing."""
         if not self.best:
