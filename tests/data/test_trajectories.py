@@ -274,3 +274,30 @@ def test_far_points_keep_their_precision(tmp_path) -> None:
     sweep = ArraysLog(tmp_path).sweep(1)
     assert sweep.points.dtype == np.float64 and np.array_equal(sweep.points, points)
     assert np.allclose(sweep.point_times, np.linspace(0, 0.1, 50), atol=1e-6)
+
+
+def test_tables_may_hold_texts_and_lines_of_nan(tmp_path) -> None:
+    """As `rostopic echo -p` writes, with a lost pose: it is interpolated. Without times, its sweep is left out."""
+    clouds(tmp_path)
+    names = "%time,field.header.frame_id,field.pose.position.x,y,z,field.pose.orientation.x,qy,qz,qw,twist.linear.x"
+    table = [line(k, str(stamp), "t x y z qx qy qz qw", ",").split(",") for k, stamp in enumerate(STAMPS)]
+    rows_of = [",".join([each[0], "odom", *each[1:], "6.5"]) for each in table]
+    rows_of[5] = rows_of[5].replace(",0.5,", ",nan,")
+    (tmp_path / "odom.csv").write_text("\n".join([names, *rows_of]))
+    assert np.allclose(ArraysLog(tmp_path).poses[:, 0, 3], range(12), atol=1e-5)
+    (tmp_path / "odom.csv").unlink()
+    matrices = POSES[:, :3].reshape(12, 12).copy()
+    matrices[4, 3] = np.nan
+    named = [f"{stamp}.npy {row}" for stamp, row in zip(STAMPS, rows(matrices))]
+    (tmp_path / "poses.txt").write_text("\n".join(named))
+    with pytest.warns(CFlowWarning, match="1 of 12 sweeps have a pose of NaN .* left out"):
+        log = ArraysLog(tmp_path)
+    assert np.allclose(log.poses, np.delete(POSES, 4, 0)) and log.gaps == {3}
+
+
+def test_clouds_of_a_second_sensor_are_said(tmp_path) -> None:
+    for name in ("front", "rear"):
+        clouds(tmp_path / name)
+    (tmp_path / "poses.txt").write_text("\n".join(EXACT))
+    with pytest.warns(CFlowWarning, match="we read the clouds in front; there are others in rear"):
+        ArraysLog(tmp_path)

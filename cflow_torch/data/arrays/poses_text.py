@@ -31,6 +31,7 @@ _TIMES = {"time", "sec", "nsec"}
 _LONGEST_GAP_NS = 500_000_000  # longest time between two poses over which we interpolate
 _FEWEST_COVERED = 0.5  # share of sweeps at a pose, if poses are farther apart than that
 _TOLERANCE_NS = 1_000_000  # by which programs round times
+_FEWEST_NUMBERS = 7  # of a pose
 _TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test for poses and times
 _TESTED = 8192  # bytes of a file that tell what it holds
 
@@ -38,7 +39,8 @@ _TESTED = 8192  # bytes of a file that tell what it holds
 class Trajectory(NamedTuple):
     """K poses, and their `source` for messages."""
 
-    poses: np.ndarray  # (K, 4, 4) float64 `T_world_frame`; the file does not say which frame
+    # (K, 4, 4) float64 `T_world_frame`; the file does not say which frame. Without times, NaN where the file has NaN.
+    poses: np.ndarray
     times_ns: np.ndarray | None  # (K,) int64 nanoseconds, ascending; None if the format has no times
     layout: str  # "kitti", "tum" or "matrix"
     source: str
@@ -112,15 +114,20 @@ def _poses_of(content: bytes, path: Path) -> Trajectory:
         words = words.reshape(-1, 16)
         columns = 16
     has_time = not _TIMES.isdisjoint(roles) if roles else columns in (8, 13, 17)
-    if has_time:  # programs write a line twice; without times, lines repeat if the vehicle stands
-        words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]
     if not roles and columns in (7, 8) and len(names) in (0, 8):
         roles = dict(zip(("time", "x", "y", "z", "qx", "qy", "qz", "qw")[8 - columns :], range(columns)))
+    is_known = np.isfinite(words.astype(np.float64)).all(axis=1)
+    if not is_known.any():
+        raise CFlowError(f"{path} has no line of finite numbers")
+    if has_time:  # programs write a line twice; without times, lines repeat if the vehicle stands
+        words = words[is_known & np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]
+        is_known = np.ones(len(words), bool)
+    poses = np.full((len(words), 4, 4), np.nan)
     if roles:
-        poses = _poses_of_columns(names, roles, words, path)
+        poses[is_known] = _poses_of_columns(names, roles, words[is_known], path)
     elif columns in (12, 13, 16, 17):
-        matrices = words[:, columns % 4 :].astype(np.float64).reshape(len(words), -1, 4)
-        poses = checked_poses(matrices, str(path))
+        matrices = words[is_known, columns % 4 :].astype(np.float64).reshape(-1, columns // 4, 4)
+        poses[is_known] = checked_poses(matrices, str(path))
         roles = {"time": 0} if has_time else {}
     else:
         raise CFlowError(
@@ -289,31 +296,40 @@ def _table_of(content: bytes, path: Path) -> tuple[list[str], np.ndarray]:
     """Read a table in a text file: the names of its columns, and its (K, C) words, which are finite numbers.
 
     Names are those of the last line before the numbers, also if it begins with "#". They are empty if this line does
-    not have one name for each column. K and C are at least 1.
+    not have one name for each column. Columns of texts, such as the names of frames, are left out. K and C are at
+    least 1.
     """
     with file_errors(path, "every line must have the same number of numbers"):
         lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
-        start = next((k for k, line in enumerate(lines) if _are_numbers(_split(line))), len(lines))
+        start = next((k for k, line in enumerate(lines) if _is_row(_split(line))), len(lines))
         names = re.split("[,;]", lines[start - 1].lstrip("#")) if start else []
         names = names if len(names) > 1 or not start else lines[start - 1].lstrip("#").split()
         words = np.array([_split(line) for line in lines[start:] if line[0] != "#"], str)
         if any(line[0] != "#" for line in lines[: max(start - 1, 0)]) or words.ndim != 2 or not start < len(lines):
             raise ValueError("it is empty, or has text before its numbers" if start else "its lines differ in length")
-        values = words.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise CFlowError(f"{path} has numbers that are not finite")
-    return names if len(names) == words.shape[1] else [], words
+        columns = [column for column, word in enumerate(words[0]) if _is_number(word)]
+        names = [names[column] for column in columns] if len(names) == words.shape[1] else []
+        words = words[:, columns]
+        words.astype(np.float64)  # raises the error
+    return names, words
 
 
 def _split(line: str) -> list[str]:
     return re.split(r"[\s,;]+", line.rstrip(",; "))
 
 
-def _are_numbers(words: list[str]) -> bool:
+def _is_row(words: list[str]) -> bool:
+    """Test whether words are a row of numbers, or a pose with a few texts."""
+    num_numbers = sum(map(_is_number, words))
+    return num_numbers == len(words) or num_numbers >= _FEWEST_NUMBERS
+
+
+def _is_number(word: str) -> bool:
     try:
-        return bool([float(word) for word in words])
+        float(word)
     except ValueError:
         return False
+    return True
 
 
 def _ascending(path: Path, words: Sequence[str]) -> np.ndarray:

@@ -106,6 +106,13 @@ class ArraysLog(Log):
         self.files = _one_suffix(self.folder, suffix)
         self.bin_layout = self._find_bin_layout(bin_columns)
         self._bin_columns: Any = self.bin_layout if bin_columns == "auto" else bin_columns
+        others = (
+            []
+            if self.files[0].parent in _usual_places(self.folder)
+            else [path.name for path in _below(self.folder)][1:]
+        )
+        if others:
+            self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
         self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         self.lidar_position = self.ego_T_lidar[:3, 3]
@@ -224,37 +231,53 @@ class ArraysLog(Log):
         return fitting[0]
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
+        source = trajectory.source
+        rows = np.arange(len(self.files))
         if trajectory.times_ns is not None and stamps is not None:
-            covered = poses_text.are_covered(trajectory, stamps)
-            self._note(poses_text.describe_uncovered(trajectory, stamps, covered))
-            kept = np.flatnonzero(covered)
-            self.files, self.timestamps = [self.files[k] for k in kept], [stamps[k] for k in kept]
-            self.gaps = frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
-            self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
-            return poses_text.covered_poses(trajectory, self.timestamps)
-        rows = self._rows(len(trajectory.poses), f"poses in {trajectory.source}")
-        if rows is None:
-            raise CFlowError(
-                f"{trajectory.source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, "
-                "or poses with times (TUM) and the times of the sweeps in times.txt"
-            )
-        steps = np.diff(rows)
-        self.gaps |= set(np.flatnonzero(steps > np.median(steps)).tolist())
-        return trajectory.poses[rows]
+            is_known = poses_text.are_covered(trajectory, stamps)
+            self._note(poses_text.describe_uncovered(trajectory, stamps, is_known))
+            poses = poses_text.covered_poses(trajectory, np.array(stamps)[is_known])
+        else:
+            given = self._rows(len(trajectory.poses), f"poses in {source}")
+            if given is None:
+                raise CFlowError(
+                    f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
+                    "with times (TUM) and the times of the sweeps in times.txt"
+                )
+            rows = given
+            is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2))
+            if not is_known.all():
+                self._note(f"{(~is_known).sum()} of {len(rows)} sweeps have a pose of NaN in {source} and are left out")
+            poses = trajectory.poses[rows][is_known]
+        kept = np.flatnonzero(is_known)
+        self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
+        self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
+        is_gap = (np.diff(kept) > 1) | (np.diff(rows[kept]) > np.median(np.diff(rows)))
+        self.gaps = frozenset(np.flatnonzero(is_gap).tolist())
+        return poses
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
     """Return the folder that holds a log's clouds, and the clouds of each suffix that has two or more."""
-    for parent in (folder, *(folder / name for name in POINT_FOLDERS)):
+    for parent in _usual_places(folder):
         kinds = _kinds(parent)
         if kinds:
             return parent, kinds
-    below = {path: _kinds(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
-    below = {path: kinds for path, kinds in below.items() if kinds and path.name != GROUND_FOLDER}
+    below = _below(folder)
     has_tables = any((folder / name).exists() for name in (*POSE_FILES, "times.txt"))
     if has_tables or (len(below) == 1 and any(find_tables(folder))):
         return next(iter(below.items()), (folder, {}))
     return folder, {}
+
+
+def _usual_places(folder: Path) -> list[Path]:
+    return [folder, *(folder / name for name in POINT_FOLDERS)]
+
+
+def _below(folder: Path) -> dict[Path, dict[str, list[Path]]]:
+    """Return the folders below a log's that hold clouds, and these of each suffix."""
+    kinds = {path: _kinds(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+    return {path: kinds for path, kinds in kinds.items() if kinds and path.name != GROUND_FOLDER}
 
 
 def _kinds(folder: Path) -> dict[str, list[Path]]:
