@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,13 +22,6 @@ _SLICE = 1e-4  # seconds during which we use one pose of a trajectory: 3 mm at 3
 _INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
 
 
-class Reading(NamedTuple):
-    """How the sweeps of a log are read."""
-
-    name: str  # one of `CHOICES` but "auto"
-    note: str = ""  # what "auto" found, for the user; "" = nothing to tell
-
-
 class DeskewedLog(LogWrapper):
     """A log whose points are moved by the ego motion to the instant of their sweep, see `deskew_points`.
 
@@ -40,7 +33,7 @@ class DeskewedLog(LogWrapper):
             of raw points are moved by these, and others stay.
 
     Attributes:
-        reading: the `Reading` in use. It is decided at first use, from the log alone.
+        scan: how the sweeps are read, one of `CHOICES` but "auto". It is decided at first use, from the log alone.
 
     Convention:
         - The motion between neighbouring poses has a constant velocity and rotation rate. Before the first and after
@@ -63,12 +56,9 @@ class DeskewedLog(LogWrapper):
         return {**self.__dict__, "_recent": CachedLog(self.log, 2)}
 
     @cached_property
-    def reading(self) -> Reading:
-        if self._deskew != "auto":
-            return Reading(self._deskew)
-        judgement = self.judgement if len(self._scans) > 1 else None
-        scan = judgement.scan if judgement is not None else ""
-        return Reading(scan or self._scans[0], self._note_of(scan or self._scans[0]))
+    def scan(self) -> str:
+        judgement = self.judgement if self._deskew == "auto" and len(self._scans) > 1 else None
+        return self._scans[0] if judgement is None or not judgement.scan else judgement.scan
 
     @cached_property
     def judgement(self) -> Judgement | None:
@@ -79,8 +69,8 @@ class DeskewedLog(LogWrapper):
             return None
 
     def findings(self) -> list[Finding]:
-        found = [Finding("de-skewing", FOUND, self.reading.note, True)] if self.reading.note else []
-        return [*self.log.findings(), *found]
+        note = self._note_of(self.scan) if self._deskew == "auto" else ""
+        return [*self.log.findings(), *([Finding("de-skewing", FOUND, note, True)] if note else [])]
 
     @cached_property
     def _scans(self) -> tuple[str, ...]:
@@ -117,7 +107,7 @@ class DeskewedLog(LogWrapper):
         return f"{moved}{measured}. {same}, data.deskew=off leaves the points as they are"
 
     def sweep(self, index: int) -> Sweep:
-        return self.read(index, self.reading.name)
+        return self.read(index, self.scan)
 
     def read(self, index: int, reading: str) -> Sweep:
         """Read a sweep under any reading, one of `CHOICES` but "auto"."""
@@ -165,7 +155,7 @@ class DeskewedLog(LogWrapper):
 
     def labels(self, index: int) -> FlowLabels | None:
         labels = self.log.labels(index)
-        reading = self.reading.name
+        reading = self.scan
         stored = self._recent.sweep(index) if labels is not None and reading != "off" else None
         if labels is None or stored is None or stored.pose is None:
             return labels

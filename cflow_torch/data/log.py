@@ -16,6 +16,7 @@ from cflow_torch.errors import MissingFile, warn
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
 from cflow_torch.windows.readings import LEAST_DISTANCE, Judgement, is_around
 
+_GAP, _LONGEST_STEP = 2.5, 0.45  # a gap is longer than so many usual intervals, and seconds
 _Log = TypeVar("_Log", bound="Log")
 
 
@@ -214,6 +215,15 @@ class Log(ABC):
             raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self) - 1}, you asked for {index}")
         return self.timestamps[index]
 
+    def _with_gaps_in_time(self, known: Sequence[int] = ()) -> frozenset[int]:
+        """Return the gaps, and those after which no sweep follows for long, which we tell. Stamps are nanoseconds."""
+        steps = np.diff(self.timestamps) * 1e-9
+        gaps = [gap for gap in gaps_in(steps) if gap not in known]
+        if gaps:
+            first = f"the first is {steps[gaps[0]]:.2g} s long, after sweep {gaps[0]}"
+            self._note(f"it has {len(gaps)} gaps between sweeps ({first}); no window reaches over them")
+        return frozenset({*known, *gaps})
+
     def _check_count(self, where: Any) -> None:
         """Refuse a log without a pair of sweeps; `where` begins the message."""
         if len(self.timestamps) < 2:
@@ -229,6 +239,13 @@ def known_poses(log: Log) -> np.ndarray | None:
     if poses is None or np.shape(poses) != (len(log.timestamps), 4, 4) or not np.isfinite(poses).all():
         return None
     return np.asarray(poses, np.float64)
+
+
+def gaps_in(steps: np.ndarray) -> list[int]:
+    """Return the indices of sweeps after which none follows for long, from the (K-1,) seconds between sweeps."""
+    if not len(steps):
+        return []
+    return np.flatnonzero((steps > _GAP * np.median(steps)) & (steps > _LONGEST_STEP)).tolist()  # type: ignore[no-any-return]
 
 
 def points_surround_poses(log: Log) -> bool:

@@ -7,7 +7,7 @@ from typing import Callable, Iterable, List
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
-from cflow_torch.data.log import CachedLog, Log, known_poses
+from cflow_torch.data.log import CachedLog, Log, gaps_in, known_poses
 from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import ReadAs
 from cflow_torch.errors import CFlowError, warn
@@ -18,8 +18,6 @@ from cflow_torch.windows.readings import MOUNTS, NO_READING, STILL, TURNED, UNKN
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
-_GAP = 2.5  # usual intervals between sweeps; a longer one is a gap
-_LONGEST_GAP = 0.5  # seconds
 _TOPICS = (
     *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
     *("labels", "reader"),
@@ -243,12 +241,12 @@ def _times(log: Log) -> list[Finding]:
     usual = float(np.median(interval))
     if usual <= 0 or (interval <= 0).any():
         return [Finding("times", WRONG, "times of sweeps do not ascend: give the time of each sweep")]
-    gaps = np.flatnonzero((interval > _GAP * usual) & (interval > _LONGEST_GAP))
+    gaps = gaps_in(interval)
     text = f"{1 / usual:.1f} Hz"
-    if len(gaps):
-        longest = int(gaps[interval[gaps].argmax()])
+    if gaps:
+        longest = max(gaps, key=interval.__getitem__)
         text += f"; {len(gaps)} gaps, the longest of {interval[longest]:.1f} s after sweep {longest}"
-        if set(gaps.tolist()) <= log.gaps:
+        if set(gaps) <= log.gaps:
             return [Finding("times", FOUND, f"{text}. No window reaches over them")]
         return [Finding("times", WRONG, f"{text}: split the log there")]
     if not 0.01 <= usual <= 1:

@@ -123,7 +123,7 @@ _MARGINS = {
 }
 
 
-class Cloud:
+class ScannedStructure:
     """The static structure of a sweep, thinned: `points` gives it at the instant of the sweep, for each scan."""
 
     def __init__(self, points: Callable[[str], np.ndarray]) -> None:
@@ -139,8 +139,8 @@ class Pair:
     are in the world's frame.
     """
 
-    source: Cloud
-    target: Cloud
+    source: ScannedStructure
+    target: ScannedStructure
     transforms: dict[str, np.ndarray]  # reading of the poses -> (4, 4) float64, source to target
     scans: tuple[str, ...]  # how points may move to the instant of their sweep, as `deskew`; the first one is expected
     has_motion: bool  # the poses move the structure enough to tell readings apart
@@ -247,9 +247,9 @@ def make_pair(
     return Pair(clouds[0], clouds[1], transforms, tuple(scans), has_motion)
 
 
-def _cloud(sweep: Sweep, centre: np.ndarray, move: Callable[[Sweep, np.ndarray, str], np.ndarray]) -> Cloud:
+def _cloud(sweep: Sweep, centre: np.ndarray, move: Callable[[Sweep, np.ndarray, str], np.ndarray]) -> ScannedStructure:
     rows = structure_rows(sweep, centre)
-    return Cloud(lambda scan: (_as_it_is if scan == OFF else move)(sweep, rows, scan) - centre)
+    return ScannedStructure(lambda scan: (_as_it_is if scan == OFF else move)(sweep, rows, scan) - centre)
 
 
 def _transforms(poses: np.ndarray, before: np.ndarray | None, after: np.ndarray | None) -> dict[str, np.ndarray]:

@@ -288,8 +288,8 @@ def test_poses_of_another_rate_are_interpolated(tmp_path):
     with pytest.raises(CFlowError, match="clocks differ by about 999.973 s"):
         ArraysLog(folder)
     gap = poses_text.Trajectory(truth[:2], np.array([0, 10**9]), "tum", "x")
-    assert np.array_equal(poses_text.covered_poses(gap, [0, 10**9]), gap.poses), "a pose at its time is kept"
-    assert poses_text.are_covered(gap, [0, 5 * 10**8, 10**9 + 10**6, 10**9 + 10**7]).tolist() == [1, 0, 1, 0]
+    assert np.array_equal(poses_text.fit_to_sweeps(gap, [0, 10**9])[0], gap.poses), "a pose at its time is kept"
+    assert poses_text.fit_to_sweeps(gap, [0, 5 * 10**8, 10**9 + 10**6, 10**9 + 10**7])[1].tolist() == [1, 0, 1, 0]
 
 
 def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):

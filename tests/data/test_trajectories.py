@@ -301,3 +301,10 @@ def test_clouds_of_a_second_sensor_are_said(tmp_path) -> None:
     (tmp_path / "poses.txt").write_text("\n".join(EXACT))
     with pytest.warns(CFlowWarning, match="we read the clouds in front; there are others in rear"):
         ArraysLog(tmp_path)
+
+
+def test_a_gap_in_the_times_splits_a_folder(tmp_path) -> None:
+    late = [stamp + 2 * 10**9 * (k > 5) for k, stamp in enumerate(STAMPS)]
+    with pytest.warns(CFlowWarning, match="it has 1 gaps between sweeps .the first is 2.1 s long, after sweep 5"):
+        log = ArraysLog(clouds(tmp_path, late))
+    assert log.gaps == {5} and len(window(log, 7, num_history=4).pch) == 1

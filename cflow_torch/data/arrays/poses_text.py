@@ -82,7 +82,8 @@ def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
     """
     tables = sorted(path for path in folder.iterdir() if path.suffix.lower() in _TABLES and path.name[0] != ".")
     folders = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
-    poses = [path for path in tables if _start_of(path, _poses_of) is not None]
+    starts = {path: _start_of(path, _poses_of) for path in tables}
+    poses = [path for path, start in starts.items() if start is not None and len(start.poses) > 1]
     times = [path for path in tables if re.search("time|stamp", path.stem.lower())]
     times = [path for path in times if _start_of(path, _times_of) is not None]
     for path in folders:
@@ -230,50 +231,57 @@ def write_times(path: PathLike, times_ns: Sequence[int]) -> None:
     np.savetxt(path, [f"{Decimal(int(time)).scaleb(-9):.9f}" for time in times_ns], "%s")
 
 
-def are_covered(trajectory: Trajectory, times_ns: Sequence[int]) -> np.ndarray:
-    """Test at which (M,) nanoseconds a trajectory has poses, (M,) bool.
+def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.ndarray, np.ndarray, str]:
+    """Interpolate a trajectory at the times of sweeps: positions linearly, rotations at a constant rate.
 
-    It has none more than a millisecond before the first pose or after the last one, nor within a gap of more than half
-    a second. Poses that are all more than half a second apart, and no time at all, are a `CFlowError`.
+    Args:
+        trajectory: poses with times.
+        times_ns: M nanoseconds.
+
+    Returns:
+        (K, 4, 4) float64 poses of the sweeps that have one; which sweeps these are, (M,) bool; and how many have none,
+        and where, "" if all have one. At exactly the time of a pose, the result is this pose, unchanged.
+
+    Raises:
+        CFlowError: no sweep has a pose, or poses are mostly more than half a second apart.
+
+    Convention: a sweep has no pose more than a millisecond before the first pose or after the last one, and within a
+        gap of more than half a second.
     """
     known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
-    covered = _neighbours(known, wanted)[2]
+    before, after, covered = _neighbours(known, wanted)
     is_rare = bool(np.median(np.diff(known)) > _LONGEST_GAP_NS) and covered.mean() < _FEWEST_COVERED
     if is_rare or not covered.any():
-        name, where = trajectory.source, f"the sweeps are at {wanted[0]} ... {wanted[-1]} ns"
-        if (wanted < known[0]).all() or (wanted > known[-1]).all():
-            lag = wanted[len(wanted) // 2] - known[len(known) // 2]
-            raise CFlowError(
-                f"{name} covers {known[0]} ... {known[-1]} ns, and {where}: the clocks differ by about "
-                f"{lag * 1e-9:.6g} s. Both must count from the same time; shift the times of one, or pass no poses"
-            )
-        rate = np.median(np.diff(known)) * 1e-9
-        raise CFlowError(f"{name} has a pose every {rate:.3g} s; between poses, we interpolate up to 0.5 s; {where}")
-    return covered
+        raise CFlowError(_describe_misfit(trajectory.source, known, wanted))
+    left, right, time = before[covered], after[covered], wanted[covered]
+    share = np.where(left == right, 0.0, (time - known[left]) / np.maximum(known[right] - known[left], 1))
+    poses = interpolate_poses(trajectory.poses[left], trajectory.poses[right], share)
+    return poses, covered, _describe_uncovered(trajectory.source, known, wanted, covered)
 
 
-def describe_uncovered(trajectory: Trajectory, times_ns: Sequence[int], covered: np.ndarray) -> str:
+def _describe_misfit(source: str, known: np.ndarray, wanted: np.ndarray) -> str:
+    where = f"the sweeps are at {wanted[0]} ... {wanted[-1]} ns"
+    if (wanted < known[0]).all() or (wanted > known[-1]).all():
+        lag = wanted[len(wanted) // 2] - known[len(known) // 2]
+        return (
+            f"{source} covers {known[0]} ... {known[-1]} ns, and {where}: the clocks differ by about "
+            f"{lag * 1e-9:.6g} s. Both must count from the same time; shift the times of one, or pass no poses"
+        )
+    rate = np.median(np.diff(known)) * 1e-9
+    return f"{source} has a pose every {rate:.3g} s; between poses, we interpolate up to 0.5 s; {where}"
+
+
+def _describe_uncovered(source: str, known: np.ndarray, wanted: np.ndarray, covered: np.ndarray) -> str:
     """Say how many sweeps have no pose, and where; "" if all have one."""
-    known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)[~covered]
-    early, late = int((wanted < known[0]).sum()), int((wanted > known[-1]).sum())
-    places = ((early, "before the first pose"), (late, "after the last pose"), (len(wanted) - early - late, "in gaps"))
+    lost = wanted[~covered]
+    if not len(lost):
+        return ""
+    early, late = int((lost < known[0]).sum()), int((lost > known[-1]).sum())
+    in_gaps = len(lost) - early - late
+    places = ((early, "before the first pose"), (late, "after the last pose"), (in_gaps, "in gaps"))
     where = ", ".join(f"{count} {place}" for count, place in places if count)
-    gaps = f" of more than {_LONGEST_GAP_NS * 1e-9:g} s without poses" if early + late < len(wanted) else ""
-    text = (
-        f"{len(wanted)} of {len(times_ns)} sweeps have no pose in {trajectory.source} and are left out: {where}{gaps}"
-    )
-    return text if len(wanted) else ""
-
-
-def covered_poses(trajectory: Trajectory, times_ns: Sequence[int]) -> np.ndarray:
-    """Interpolate poses at (M,) nanoseconds that `are_covered`: positions linearly, rotations at a constant rate.
-
-    At exactly the time of a pose, the result is this pose, unchanged.
-    """
-    known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
-    before, after, _ = _neighbours(known, wanted)
-    share = np.where(before == after, 0.0, (wanted - known[before]) / np.maximum(known[after] - known[before], 1))
-    return interpolate_poses(trajectory.poses[before], trajectory.poses[after], share)
+    gaps = f" of more than {_LONGEST_GAP_NS * 1e-9:g} s without poses" if in_gaps else ""
+    return f"{len(lost)} of {len(wanted)} sweeps have no pose in {source} and are left out: {where}{gaps}"
 
 
 def _neighbours(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

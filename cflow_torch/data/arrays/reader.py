@@ -120,7 +120,7 @@ class ArraysLog(Log):
         stamps = self._times(times, trajectory)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        self.gaps = frozenset()
+        self.gaps = self._with_gaps_in_time() if self._has_times and trajectory is None else frozenset()
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
         if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
@@ -234,9 +234,8 @@ class ArraysLog(Log):
         source = trajectory.source
         rows = np.arange(len(self.files))
         if trajectory.times_ns is not None and stamps is not None:
-            is_known = poses_text.are_covered(trajectory, stamps)
-            self._note(poses_text.describe_uncovered(trajectory, stamps, is_known))
-            poses = poses_text.covered_poses(trajectory, np.array(stamps)[is_known])
+            poses, is_known, note = poses_text.fit_to_sweeps(trajectory, stamps)
+            self._note(note)
         else:
             given = self._rows(len(trajectory.poses), f"poses in {source}")
             if given is None:
@@ -253,7 +252,8 @@ class ArraysLog(Log):
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
         self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
         is_gap = (np.diff(kept) > 1) | (np.diff(rows[kept]) > np.median(np.diff(rows)))
-        self.gaps = frozenset(np.flatnonzero(is_gap).tolist())
+        gaps = np.flatnonzero(is_gap).tolist()
+        self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
         return poses
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import Trajectory, are_covered, covered_poses, describe_uncovered
+from cflow_torch.data.arrays.poses_text import Trajectory, fit_to_sweeps
 from cflow_torch.data.bags.messages import Frames, cloud_columns, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import find_folders
@@ -24,7 +24,6 @@ from cflow_torch.types import Sweep
 SUFFIXES = (".bag", ".mcap", ".db3")
 _ACTIVE = ".active"  # of a recording that was not finished
 _PART = re.compile("(.+)_([0-9]+)")  # recorders number the parts of a bag from 0
-_LONGEST_STEP = 0.45  # seconds between sweeps; more, and 2.5 times as much as usual, is a gap
 SEARCH_DEPTH = 3
 _CLOUD = "sensor_msgs/msg/PointCloud2"
 _LIVOX = tuple(f"{name}/msg/CustomMsg" for name in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces"))
@@ -128,13 +127,11 @@ class BagLog(Log):
             if poses is not None:
                 self.trajectory = times, matrices = self._find_trajectory(poses, tracks)
                 trajectory = Trajectory(matrices, times, "bag", f"{poses} of {self.path}")
-                covered = are_covered(trajectory, self.timestamps)
-                self._note(describe_uncovered(trajectory, self.timestamps, covered))
-                self.timestamps = [time for time, has_pose in zip(self.timestamps, covered) if has_pose]
+                self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
+                self._note(note)
+                self.timestamps = [time for time, has_pose in zip(self.timestamps, is_covered) if has_pose]
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
-            if poses is not None:
-                self.poses = covered_poses(trajectory, self.timestamps)
-            self.gaps = self._find_gaps()
+            self.gaps = self._with_gaps_in_time()
             self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
             mount = self._mount
             if mount is None:
@@ -218,15 +215,6 @@ class BagLog(Log):
                 text = f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. {used}"
                 self._note(f"{text}; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)", "missing link")
         return lidar
-
-    def _find_gaps(self) -> frozenset[int]:
-        """Return the indices of the sweeps after which no sweep follows for long, and say so."""
-        steps = np.diff(self.timestamps) * 1e-9
-        gaps = np.flatnonzero(steps > max(_LONGEST_STEP, 2.5 * float(np.median(steps))))
-        if len(gaps):
-            first = f"the first is {steps[gaps[0]]:.2g} s long, after sweep {gaps[0]}"
-            self._note(f"it has {len(gaps)} gaps between sweeps ({first}); no window reaches over them")
-        return frozenset(gaps.tolist())
 
     def _scan(self) -> tuple[dict[int, int], dict[str, list[Any]]]:
         """Read all messages once. Return the arrival time of each cloud and the pose samples of each topic."""
