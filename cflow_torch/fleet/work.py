@@ -234,6 +234,11 @@ def _stage(frame: _Frame, name: str) -> Iterator[None]:
     frame.seconds[name] = time.perf_counter() - start
 
 
+def open_quickly(job: Job, source: Any) -> Log:
+    """Open a log for its name and times, without what takes long."""
+    return open_log(job.reader, source, **{**job.settings, "check": False, "odometry": False, "read_as": None})
+
+
 def source_name(source: Any) -> str:
     """Return the name of a log that is not open."""
     return str(getattr(source, "scene", None) or getattr(source, "stem", None) or source)
