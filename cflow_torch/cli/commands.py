@@ -579,9 +579,6 @@ class Bench(Command):
     batches: tuple[int, ...] = setting(
         (1, 8), "batch sizes for which windows per second are measured", kind=int, low=1, several=True
     )
-    keep_memory: bool = setting(
-        True, "false = give freed memory back to the system, as other programs do; commands keep it, which is faster"
-    )
 
 
 class ListSettings(Words):
