@@ -31,6 +31,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
+def test_every_folder_with_code_is_a_package_of_the_wheel() -> None:
+    named = re.findall(r'"(cflow_torch[.\w]*)",', (ROOT / "pyproject.toml").read_text().partition("\npackages")[2])
+    folders = {file.parent.relative_to(ROOT) for file in ROOT.glob("cflow_torch/**/*.py")}
+    folders |= {Path("cflow_torch") / file.parent.relative_to(ROOT) for file in ROOT.glob("configs/**/*.py")}
+    assert named == sorted(".".join(folder.parts) for folder in folders)
+
+
+@pytest.mark.slow
 def test_the_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     """No oracle, no benchmark's targets, no test, no script."""
     patterns = ("cflow_torch/**/*.py", "configs/**/*.py", "configs/**/*.yaml")

@@ -604,11 +604,11 @@ class ListSettings(Words):
 class Info(Words):
     """Prints the versions of cflow_torch and of the packages that it uses, the system, the processor and the GPUs.
 
-    --full adds torch's report about the system, and names the optional packages that are not installed.
+    The last line names the optional packages that are not installed. If the bug is one of a GPU, please add the output
+    of `python -m torch.utils.collect_env`.
 
     examples:
       cflow info            paste the output into a bug report
-      cflow info --full     for a bug of the installation or of a GPU
       cflow --version       prints the version only
     """
 
