@@ -132,8 +132,12 @@ def _serve(connection: Any, make: Callable[[], Any]) -> None:
             except Exception as error:
                 answer = (None, error, traceback.format_exc())
             connection.send(answer)
+    except (EOFError, OSError):
+        pass  # the parent has ended
+    except BaseException:  # SystemExit of a library, or an answer that cannot be pickled
+        traceback.print_exc()
     finally:
-        os._exit(1)  # also after a SystemExit of a library: threads of the object may still run
+        os._exit(1)  # threads of the object may still run
 
 
 def _end_with_parent() -> None:
