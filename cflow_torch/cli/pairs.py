@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from queue import SimpleQueue
 from typing import Any, Callable, Iterator, Sequence, Tuple
@@ -99,10 +100,9 @@ def _estimate_elsewhere(
         raise sweeps
     executor = idle.get()
     try:
-        try:
+        with suppress(BrokenExecutor):
             return (sweeps, *executor.call("estimate", sweeps))
-        except BrokenExecutor:
-            return (sweeps, *executor.call("estimate", sweeps))
+        return (sweeps, *executor.call("estimate", sweeps))
     except BrokenExecutor as error:
         raise CFlowError(f"2 worker processes died on it, the last one: {error}") from None
     finally:
