@@ -198,34 +198,20 @@ class Flow(FlowFiles):
 
     Each file has one row per point of sweep t. Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of
     objects, pose_t{x,y,z}_m ego motion (float32, metres per sweep, axes of the ego frame at t+1), cluster_id, score,
-    is_valid. There is also a column confidence, unless model=paper or keypoints. contents=[residual,is_valid] writes
-    only these columns. Files are then much smaller; ego motion and total flow follow from the poses. The content points
-    adds x, y, z of the points of sweep t.
+    is_valid. There are also the columns confidence and moving, unless model=paper or keypoints. docs/applications.md
+    describes the files of tracks=, labels= and masks=.
 
     OUTPUT/config.yaml contains settings and versions; OUTPUT/reports has the report. Run the command again to resume.
     Results of other logs in OUTPUT stay. After Ctrl-C, SIGTERM or SIGHUP the run finishes the frames that it has begun.
     The exit status is 0 if every frame is complete, 1 if one is missing, 2 if the call was wrong, and 128 + n after
-    signal number n. The report has the times of all stages; verbose=true prints them.
-
-    result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep but the last. The
-    viewers of OpenSceneFlow read it there. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a
-    log are complete: one row per moving object and sweep, with id, box and velocity. Its flow files get a column
-    track_id, the id of each point, -1 = none. tracks=mot and tracks=kitti add
-    OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats. tracks=drivestudio adds instances_info.json and
-    frame_instances.json, which DriveStudio's loaders read, tracks=nuscenes adds nuscenes_detection.json and
-    nuscenes_tracking.json, and tracks=openpcdet adds result.pkl, OpenPCDet's table of boxes. labels=semantickitti
-    writes OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per
-    point of each sweep, 251 = moves (flow of 0.05 m per sweep, P(moving) of 0.5), 9 = static, 0 = a sweep without flow,
-    such as the last one.
-
-    masks=true writes OUTPUT/<log id>/masks/<camera>/<image>.png, 255 = dynamic, 0 = static, for the images nearest to
-    the sweeps of Argoverse 2, PandaSet, nuScenes and KITTI (extra `viz`).
+    signal number n.
 
     examples:
       cflow flow data=av2 data.root=/data/av2/val output=outputs/val
       cflow flow /data/drive_1 /data/drive_2                          several paths of one format
       cflow flow data=av2 data.root=/data/av2/val dry_run=true        counts the frames
       cflow flow model=paper model.pixel_sizes=[0.2] engine.workers=8
+      cflow flow /data/drive contents=[residual,is_valid]             much smaller files
       cflow flow shard.index=2 shard.count=16 ...                     one of 16 processes, on any machine
       cflow flow engine=ray engine.address=auto ...                   on a Ray cluster
       cflow flow data=av2 data.root=s3://bucket/val output=s3://bucket/flow
@@ -238,10 +224,12 @@ class Flow(FlowFiles):
     output: str = setting("outputs/flow", "folder, or address in an object store")
     contents: Any = setting(
         AUTO,
-        "columns of each file, such as [points, residual, is_valid]; auto = all that the method has, without points",
+        "columns of each file, such as [points, residual, is_valid]; auto = all but points (x, y, z of sweep t)",
         several=True,
     )
-    result_name: str | None = _path("key under which the total flow is also written into HDF5 scenes; null = none")
+    result_name: str | None = _path(
+        "key under which HDF5 scenes also get the total flow, as OpenSceneFlow's viewers read it"
+    )
     tracks: bool | str = setting(
         False,
         "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti, "
