@@ -456,10 +456,8 @@ class View(Command):
 
     The extra `html` makes pages. A page has a timeline of sweeps. It shows the points of sweep t, coloured by residual
     flow, speed, object, confidence, P(moving) and, if the log has labels, truth or error. It also shows an arrow per
-    moving cluster, and the boxes, trails, ids and speeds of tracks. Click on an object for more. flow=FOLDER shows the
-    output of `cflow flow`, and its tracks, instead of new estimates. format=rerun writes a recording OUTPUT/<log
-    id>.rrd for the viewer rerun instead of a page, with all points and sweep t+1 (extra `rerun`). show=true opens the
-    files at the end. OUTPUT/config.yaml contains the settings and versions.
+    moving cluster, and the boxes, trails, ids and speeds of tracks. Click on an object for more. A recording has all
+    points and sweep t+1 (extra `rerun`).
 
     examples:
       cflow view                                                   a simulated street, no data needed
@@ -514,13 +512,10 @@ class Clean(Command):
     """Writes logs without dynamic objects: OUTPUT/<log id>, a folder of point clouds, poses, times and ground masks.
 
     data=arrays reads such a folder. A point is dynamic if its flow is at least 0.05 m per sweep and P(moving) at least
-    0.5. remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car.
-    map=true also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them,
-    <log id>.png. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other
-    columns of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True
-    = not in the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing
-    logs. OUTPUT/config.yaml has settings and versions, and OUTPUT/<log id>.json those of the log. Results of other logs
-    in OUTPUT stay.
+    0.5. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other columns
+    of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True = not
+    in the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing logs.
+    Results of other logs in OUTPUT stay.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag
@@ -540,7 +535,9 @@ class Clean(Command):
     suffix: str | None = _path(
         "format of the clouds: .npy | .ply | .pcd | .bin | ...; null = that of the log's own clouds, else .npy"
     )
-    map: bool = setting(False, "also write the static points in the world, one per voxel, to <log id>.ply")
+    map: bool = setting(
+        False, "also write the static points in the world, one per voxel, to <log id>.ply, and a picture"
+    )
     voxel_size: float = _above_0(0.1, "side of a voxel of the map, in metres")
 
 
