@@ -27,7 +27,7 @@ _SHARE = 0.75  # quantile over the sweeps of where an edge is seen; points of ot
 _STRAY = 0.003  # share of the points of one sweep that are beyond an edge
 FLOW_NOISE = 0.2  # m/s, standard deviation
 _ANCHOR_NOISE, _FREE_NOISE = 0.15, 0.3  # standard deviation of a box: metres, plus a share of what is not seen
-_DEPTH = 0.12  # metres from the median of the visible points of a person or a cyclist to the middle; simulated drives
+_DEPTHS = (0.12, 0.07)  # metres from what is seen of a person, of a cyclist back to the middle; from simulated drives
 _CENTROID_NOISE = 1.0  # metres, standard deviation of the mean of the visible points
 _MIN_SPEED = 0.5  # m/s; slower objects keep their heading
 _ROUNDS, _ROBUST_ROUNDS = 3, 3
@@ -100,8 +100,9 @@ class Edges(NamedTuple):
         """Place boxes of (R, 3) size on the visible points.
 
         The visible edges of a vehicle are those that face the sensor. What is not seen of its box lies beyond the
-        others. If the sensor is beside it, a part may be missing at either end. The middle of a person or a cyclist
-        lies behind the median of the visible points, which a few points of a wall do not move.
+        others. If the sensor is beside it, a part may be missing at either end. People and cyclists are round: their
+        middle lies a little behind what is seen. For a person, this is the median of the points, which a few points of
+        a wall do not move. A cyclist has fewer points at one end than at the other, so we take the middle of the ends.
 
         Returns:
             (R, 3) centres, along the axes of the boxes, and their (R,) standard deviations, metres.
@@ -109,9 +110,10 @@ class Edges(NamedTuple):
         missing = (size - (self.high - self.low)) / 2
         facing = (self.view / (size / 2)).clamp(-1, 1)
         shift = -facing * missing.clamp(min=0)
-        is_person = (kind <= CYCLIST)[:, None]
-        behind = -_DEPTH * F.normalize(self.view[:, :2])
-        centre = torch.where(is_person, self.median[:, :2] + behind, (self.middle + shift)[:, :2])
+        visible = torch.where((kind == PEDESTRIAN)[:, None], self.median, self.middle)[:, :2]
+        depth = visible.new_tensor(_DEPTHS)[kind.clamp(max=CYCLIST)]
+        behind = visible - depth[:, None] * F.normalize(self.view[:, :2])
+        centre = torch.where((kind <= CYCLIST)[:, None], behind, (self.middle + shift)[:, :2])
         noise = _ANCHOR_NOISE + _FREE_NOISE * missing[:, :2].abs().amax(1)
         return torch.cat([centre, self.middle[:, 2:]], 1), noise
 
