@@ -87,7 +87,7 @@ def _claim(cfg: Clean, log: Log, output: Path, is_new: bool) -> None:
 
 
 def _record(cfg: Clean, log: Log) -> dict[str, Any]:
-    """Return what the clean points follow from: settings, versions, the sweeps of the log, and how its flow was made."""
+    """Return what the clean points follow from: settings, versions, sweeps, and the method of stored flow."""
     settings = settings_record(cfg)
     settings["data"].pop("root", None)  # several logs, which may be elsewhere tomorrow
     made = {"versions": versions(), "log": describe_log(log)}
