@@ -91,15 +91,13 @@ class _Parts(NamedTuple):
     step: Tensor  # (Q,) int64
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
     length: Tensor  # (Q,) int64, finest pixels, longer side of the bounding box
-    has_pairs: bool  # some windows have two sweeps only
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
         """Select the parts of at least two pixels that are at most `_LONGEST` long."""
         pixel = components.missing
         parts = components.parts
-        has_pairs = _has_pairs(sweeps)
-        if has_pairs:
+        if sweeps.batch.has_pairs:
             unmatched, of_pairs = _unmatched_of_pairs(sweeps, components)
             pixel = torch.cat((pixel, unmatched))
             parts = parts.followed_by(of_pairs)
@@ -111,15 +109,10 @@ class _Parts(NamedTuple):
         image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
         window, step = split_index(image, sweeps.num_steps)
         centre = parts.sum(pixels.row_col).double() / parts.size()
-        return cls(pixel, parts, window, step, centre, length.index_select(0, kept), has_pairs)
+        return cls(pixel, parts, window, step, centre, length.index_select(0, kept))
 
     def __len__(self) -> int:
         return len(self.step)
-
-
-def _has_pairs(sweeps: HeightSlicedSweeps) -> bool:
-    """Tell whether any window has two sweeps only."""
-    return sweeps.num_steps == 2 or (sweeps.batch.num_windows > 1 and not bool(sweeps.has_history.all()))
 
 
 def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> tuple[Tensor, Groups]:
@@ -192,7 +185,7 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
     rank = _ranks(error, is_found, is_given)
-    if parts.has_pairs:
+    if sweeps.batch.has_pairs:
         # There, all errors are 0, and the shortest way has the lowest rank.
         rank += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
     kept = flat_nonzero(_are_best(rank, part, len(parts)))
@@ -256,7 +249,7 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
     farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
     nearest = parts.length.index_select(0, of_t) / _LENGTHS
     is_pair = is_part & (distance <= farthest[..., None]) & (distance >= nearest[:, None])
-    if parts.has_pairs:
+    if sweeps.batch.has_pairs:
         is_pair &= _are_alike(sweeps, parts, of_t, other)
     pair = flat_nonzero(is_pair)
     at, _ = split_index(pair, other.shape[2])
