@@ -51,11 +51,12 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         max_speed: m/s; None = 60.
 
     Convention:
-        Parts have the missing pixels of a sweep. A part of t takes its velocity from one part of t+1 or t-1. Other
-        parts must lie where it puts them: at t+1, and in at least half of the older sweeps. Of the velocities of a part
-        of t, or of t+1, the one with the most sweeps wins, then the one with the smallest errors. In a pair, parts are
-        unmatched components, and the lowest velocity wins. A part belongs to its first node. The velocity of a node
-        must win more than half as many slices near its targets as it loses.
+        Parts have the pixels of a sweep that are missing, or that every other sweep lacks. A part of t takes its
+        velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least half of
+        the older sweeps. Of the velocities of a part of t, or of t+1, the one with the most sweeps wins, then the one
+        with the smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part
+        belongs to its first node. The velocity of a node must win more than half as many slices near its targets as it
+        loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
@@ -83,7 +84,7 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
 
 
 class _Parts(NamedTuple):
-    """Parts: missing pixels of one sweep that lie together. There are Q parts of K pixels."""
+    """Parts: pixels of one sweep that may be fast and lie together. There are Q parts of K pixels."""
 
     pixel: Tensor  # (K,) int64, positions in the list of pixels
     pixels: Groups  # these K pixels, grouped by part
@@ -95,7 +96,7 @@ class _Parts(NamedTuple):
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
         """Select the parts of at least two pixels that are at most `_LONGEST` long."""
-        pixel = components.missing
+        pixel = components.fast
         parts = components.parts
         if sweeps.batch.has_pairs:
             unmatched, of_pairs = _unmatched_of_pairs(sweeps, components)
