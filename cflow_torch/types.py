@@ -311,27 +311,9 @@ class FlowResult:
         positions = {} if points is None else dict(zip("xyz", self._positions(points).T))
         return pandas.DataFrame({**positions, **self.columns()})
 
-    def to_open3d(self, points: Array) -> Any:
-        """Return an `open3d.t.geometry.PointCloud` with an attribute for every field that is not None.
-
-        `points` are the points of pc0, (N, 3+), in metres. It is a `CFlowError` if Open3D is not installed, or if the
-        number of points differs.
-
-        Example:
-            >>> cloud = result.to_open3d(points)
-            >>> cloud.point.colors = flow_to_rgb(result.residual_flow.numpy(), 1.0)  # of cflow_torch.viz
-        """
-        need = "to_open3d needs Open3D: pip install open3d; numpy() returns the same as arrays"
-        cloud = import_optional("open3d", need).t.geometry.PointCloud(
-            np.ascontiguousarray(self._positions(points), np.float32)
-        )
-        for name, values in self.numpy().items():
-            cloud.point[name] = values.reshape(len(values), -1)
-        return cloud
-
     def objects(
         self,
-        points: Array,
+        points: Array | Sweep,
         sweep_interval: float = 0.1,
         min_speed: float = 0.5,
         min_points: int = 10,
@@ -340,7 +322,7 @@ class FlowResult:
         """List the moving objects at t+1.
 
         Args:
-            points: (N, 3+) of pc0, metres, as you passed them.
+            points: (N, 3+) of pc0, metres, as you passed them; or the sweep t, for example `window.pc0`.
             sweep_interval: seconds from sweep t to sweep t+1.
             min_speed: m/s; slower clusters are left out.
             min_points: clusters with fewer points are left out; most of them are small parts of the static world.
@@ -369,6 +351,7 @@ class FlowResult:
             )
         if not sweep_interval > 0:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds between two sweeps, for example 0.1")
+        points = points.points if isinstance(points, Sweep) else points
         values = self.numpy()
         clusters = _Clusters.of(as_numpy(self.cluster_id))
         objects = np.zeros(len(clusters.id), _OBJECT).view(Objects)

@@ -18,8 +18,8 @@ from cflow_torch.types import Sweep
 _RUN_IN = 5  # sweeps
 _FEWEST_POINTS = 100
 _NEED = (
-    "there are no poses, and estimating them needs KISS-ICP: pip install kiss-icp, or pass poses (for arrays "
-    "T_ego1_ego0, for a folder poses.txt)"
+    "there are no poses, and estimating them needs KISS-ICP (extra odometry): pip install kiss-icp, or pass poses "
+    "(for arrays T_ego1_ego0, for a folder poses.txt)"
 )
 _MAX_RANGE = 100.0  # metres; KISS-ICP's own default, which also sets its voxel size (a hundredth)
 

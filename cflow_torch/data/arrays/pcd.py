@@ -46,7 +46,7 @@ def pcd_viewpoint(content: bytes) -> np.ndarray | None:
 
 
 def pypcd4() -> Any:
-    return import_optional("pypcd4", "PCD files need pypcd4: pip install pypcd4")
+    return import_optional("pypcd4", "PCD files need pypcd4 (extra clouds): pip install pypcd4")
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], int]:

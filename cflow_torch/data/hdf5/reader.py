@@ -218,7 +218,7 @@ def sweep_names(scene: Any) -> dict[int, str]:
 
 
 def import_h5py() -> Any:
-    return import_optional("h5py", "HDF5 scenes need h5py: pip install h5py")
+    return import_optional("h5py", "HDF5 scenes need h5py (extra hdf5): pip install h5py")
 
 
 def open_scene(file: Path) -> Any:
