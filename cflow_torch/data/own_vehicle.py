@@ -13,7 +13,7 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.stillness import REACH, Structure, cell_keys
+from cflow_torch.windows.stillness import REACH, Structure, are_finite, cell_keys
 
 _NEAR, _CELL = 2.7, 0.25  # metres from the origin along x and y, and side of a cell
 _LEAST_MOTION, _FEWEST_SWEEPS, _MOST_SWEEPS = 2.0, 3, 4  # metres between the compared sweeps, and their number
@@ -112,7 +112,7 @@ def _spread(positions: np.ndarray) -> list[int]:
 def _structure(sweep: Sweep) -> np.ndarray:
     """Return the finite points of a sweep that are not ground, (N, 3) float64."""
     points = as_numpy(sweep.points)[:, :3].astype(np.float64)
-    finite = np.isfinite(points).all(1)
+    finite = are_finite(points)
     if (_are_near(points) & finite).sum() < _FEWEST_POINTS:
         return points[:0]
     mask = find_ground(points, "grid") if sweep.is_ground is None else sweep.is_ground
@@ -120,7 +120,7 @@ def _structure(sweep: Sweep) -> np.ndarray:
 
 
 def _are_near(points: np.ndarray) -> np.ndarray:
-    return (np.abs(points[:, :2]) < _NEAR).all(1)  # type: ignore[no-any-return]  # False for NaN
+    return (np.abs(points[:, 0]) < _NEAR) & (np.abs(points[:, 1]) < _NEAR)  # False for NaN
 
 
 def _cells_of(points: np.ndarray) -> np.ndarray:

