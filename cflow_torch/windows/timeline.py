@@ -18,7 +18,7 @@ from cflow_torch.windows.validation import have_same_points, keep_nearest
 _FARTHEST_POSE = 100.0
 
 
-class Source(NamedTuple):
+class SourceSweep(NamedTuple):
     """A sweep other than t+1 from which we estimate the flow."""
 
     name: str  # for errors: "pc0", "pch1", ...
@@ -72,7 +72,7 @@ class Timeline:
         return Timeline(sorted(entries, key=lambda entry: entry.step), table)
 
 
-def _side(sources: Sequence[Source], is_past: bool) -> list[Source]:
+def _side(sources: Sequence[SourceSweep], is_past: bool) -> list[SourceSweep]:
     """List the sweeps of one side of t+1. The future side has t, too, first."""
     if is_past:
         return [source for source in sources if source.intervals > 0]
@@ -80,7 +80,7 @@ def _side(sources: Sequence[Source], is_past: bool) -> list[Source]:
 
 
 def _entries(
-    window: Window, index: int, sources: Sequence[Source], interval: float | None, farthest: float
+    window: Window, index: int, sources: Sequence[SourceSweep], interval: float | None, farthest: float
 ) -> Iterator[Entry]:
     """Yield t+1 and the other sweeps of one side of a window, with their transforms to t+1."""
     yield Entry(0, index, "pc1", window.pc1, None, interval)
@@ -95,7 +95,7 @@ def _entries(
         yield Entry(step, index, name, sweep, T_ego1_ego, interval)
 
 
-def source_sweeps(window: Window, config: Config) -> list[Source]:
+def source_sweeps(window: Window, config: Config) -> list[SourceSweep]:
     """List pc0, the history, then the sweeps after t+1. We skip repeats of a listed sweep and, after t+1, of pc1."""
     if len(window.pcf) > config.num_future:
         raise CFlowError(
@@ -108,13 +108,13 @@ def source_sweeps(window: Window, config: Config) -> list[Source]:
             "some sweeps of the window have a pose and some do not: give the pose of every sweep, or of none "
             "(then all points must already be in the frame of t+1)"
         )
-    sources: list[Source] = []
+    sources: list[SourceSweep] = []
     num_past = 1 + len(window.pch)
     for step, (name, sweep) in enumerate(named_sweeps(window)[1:], 1):
         is_future = step > num_past
         earlier = [source.sweep for source in sources] + ([window.pc1] if is_future else [])
         if not any(_is_same(sweep, other) for other in earlier):
-            sources.append(Source(name, sweep, num_past - step if is_future else step))
+            sources.append(SourceSweep(name, sweep, num_past - step if is_future else step))
     return sources
 
 
@@ -127,7 +127,7 @@ def _is_same(a: Sweep, b: Sweep) -> bool:
     return have_same_points(a, b)
 
 
-def elapsed_times(window: Window, sources: Sequence[Source], config: Config) -> list[tuple[float, float]]:
+def elapsed_times(window: Window, sources: Sequence[SourceSweep], config: Config) -> list[tuple[float, float]]:
     """Return the time from each source to t+1 in sweep intervals and in seconds, negative for sources after t+1.
 
     We take the time from the time stamps if all sweeps have one, otherwise from `sweep_interval`.

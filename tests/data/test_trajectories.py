@@ -157,9 +157,9 @@ def test_names_are_milliseconds() -> None:
     assert times_of_names(["1700000000123", "1700000000223"]) == [1_700_000_000_123_000_000, 1_700_000_000_223_000_000]
 
 
-def test_other_names_are_no_times() -> None:
-    for names in (["000001", "000002"], ["frame1", "frame2"], ["000_001", "000_002"], ["1.5", "a"], ["2024_01_05"] * 2):
-        assert times_of_names(names) is None
+@pytest.mark.parametrize("first", ["000001", "frame1", "000_001", "2024_01_05", "0000000000001", "0000000000000000001"])
+def test_other_names_are_no_times(first: str) -> None:
+    assert times_of_names([first, first[:-1] + "2"]) is None and times_of_names(["1.5", "a"]) is None
 
 
 def test_a_missing_sweep_shortens_windows_and_fails_its_pairs(tmp_path) -> None:
@@ -235,6 +235,15 @@ def test_poses_are_found_under_any_name_and_said(tmp_path, below, name) -> None:
     with pytest.raises(CFlowError, match=f"several files for poses: .*{name}.*choose one"):
         ArraysLog(tmp_path)
     assert ArraysLog(tmp_path, poses=None).poses is None
+
+
+def test_a_long_file_of_matrices_is_found(tmp_path) -> None:
+    clouds(tmp_path / "points", range(90))
+    poses = np.tile(np.eye(4), (90, 1, 1)) + np.arange(90)[:, None, None] * (np.arange(16).reshape(4, 4) == 3)
+    (tmp_path / "lidar.txt").write_text("\n".join(rows(poses.reshape(360, 4), " " * 8)))
+    (tmp_path / "extrinsics.txt").write_text("\n".join(rows(np.eye(4))))  # a single one is a calibration
+    assert (tmp_path / "lidar.txt").stat().st_size > 8192
+    assert np.array_equal(ArraysLog(tmp_path).poses, poses)
 
 
 def test_a_folder_with_a_file_per_pose_and_a_file_of_times(tmp_path) -> None:

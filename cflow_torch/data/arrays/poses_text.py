@@ -97,7 +97,10 @@ def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
     """Parse the first lines of a file; None = this is not possible."""
     try:
         start = read_start(path, _TESTED)
-        return parse(start[: start.rfind(b"\n") + 1] if len(start) == _TESTED else start, path)
+        if len(start) == _TESTED:  # whole lines, and whole matrices of four
+            lines = start.splitlines(keepends=True)[:-1]
+            start = b"".join(lines[: len(lines) // 4 * 4])
+        return parse(start, path)
     except (CFlowError, OSError):
         return None
 

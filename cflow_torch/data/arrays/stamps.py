@@ -9,7 +9,7 @@ from typing import Sequence
 
 _UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))  # sizes of unix times, and the ns of their unit; else seconds
 _DATE = re.compile(r"(?<!\d)(\d{4})\D?(\d\d)\D?(\d\d)\D(\d\d)\D?(\d\d)\D?(\d\d)(?:\D(\d+))?")
-_STAMP = re.compile(r"(?<!\d)(\d{13}|\d{16,18}|[0-8]\d{18})(?!\d)")
+_STAMP = re.compile(r"(?<!\d)([1-9]\d{12}|[1-9]\d{15,17}|[1-8]\d{18})(?!\d)")  # no numbers with zeros in front
 # Seconds and a fraction: unix seconds anywhere in a name, or the only number of a name.
 _SECONDS = (re.compile(r"(?<!\d)(\d{9,10})[._](\d+)(?!\d)"), re.compile(r"^\D*(\d{1,10})\.(\d+)$"))
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
