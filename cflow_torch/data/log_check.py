@@ -83,11 +83,14 @@ def _found(log: Log) -> list[Finding]:
 
 
 def _frame(log: Log) -> list[Finding]:
-    reading, problem = frame_problem(log.sweep(0).points)
-    if not problem:
-        return [Finding("frame", RIGHT, "metres, around the vehicle, z up", True)]
-    fix = f"; {_setting(log, reading)} converts them" if reading else ""
-    return [Finding("frame", WRONG, f"in the first sweep {problem}{fix}", True)]
+    """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame."""
+    places = {"first": 0} if known_poses(log) is not None else {"first": 0, "last": len(log.timestamps) - 1}
+    for name, index in places.items():
+        reading, problem = frame_problem(log.sweep(index).points)
+        if problem:
+            fix = f"; {_setting(log, reading)} converts them" if reading else ""
+            return [Finding("frame", WRONG, f"in the {name} sweep {problem}{fix}", True)]
+    return [Finding("frame", RIGHT, "metres, around the vehicle, z up", True)]
 
 
 def _motion(log: Log) -> list[Finding]:

@@ -385,6 +385,14 @@ def test_wrong_units_and_axes_are_recognised(source, change, found, request):
         assert find_problems(again) == []
 
 
+def test_points_in_the_world_without_poses_are_told_by_the_last_sweep(drive):
+    def far(points, pose):
+        return to_world(points, as_matrix(np.eye(3), 20 * (pose[:3, 3] - drive.sweep(0).pose[:3, 3])) @ pose)
+
+    (problem,) = find_problems(Wrong(drive, far, poses=lambda _: None))
+    assert "in the last sweep the points lie around x = " in problem
+
+
 def test_masks_and_repeated_sweeps_are_recognised(drive):
     assert "invert the mask" in find_problems(Wrong(drive, masks=np.logical_not))[0]
     repeated = Wrong(drive, order=[0, 0, *range(2, 12)])
