@@ -132,6 +132,18 @@ def test_other_clocks_are_named_and_late_poses_counted(tmp_path) -> None:
                 assert len(BagLog(path)) == 5
 
 
+def test_clouds_of_another_clock_are_shifted_by_the_times_of_arrival(tmp_path) -> None:
+    """A LiDAR that counts from its start: the bag knows when each message arrived."""
+    bag = Recorder(tmp_path / "boot")
+    bag.mount()
+    bag.drive()
+    bag.clouds(stamp=lambda stamp: stamp - bag.stamps[0] + 55 * 10**9)
+    path = bag.close()
+    with pytest.warns(CFlowWarning, match="different clocks .* by the times of arrival"):
+        log = BagLog(path)
+    assert list(log.timestamps) == list(bag.stamps) and world(log, bag.recording) < 5e-3
+
+
 def test_repeated_stamps_are_named(tmp_path) -> None:
     same = Recorder(tmp_path / "same")
     same.mount()

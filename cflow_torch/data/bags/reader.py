@@ -41,6 +41,7 @@ _CONVERTERS = {
 _REPAIR = "a recording that was cut off is repaired by rosbag reindex (.bag), mcap recover (.mcap) or sqlite3 (.db3)"
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped" for name in ("", "WithCovariance")))
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 
@@ -116,6 +117,7 @@ class BagLog(Log):
             self.topic = self._chosen(
                 topics, (_CLOUD,) if has_clouds and not topic else (_CLOUD, *_LIVOX), topic, "topic"
             )
+            self._shift = 0  # nanoseconds from the header of a cloud to its time
             self._arrival, tracks = self._scan()
             self.frame = frame or self._ego_frame()
             if poses == "auto":
@@ -127,6 +129,7 @@ class BagLog(Log):
             if poses is not None:
                 self.trajectory = times, matrices = self._find_trajectory(poses, tracks)
                 trajectory = Trajectory(matrices, times, "bag", f"{poses} of {self.path}")
+                self._set_clock(times)
                 self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
                 self._note(note)
                 self.timestamps = [time for time, has_pose in zip(self.timestamps, is_covered) if has_pose]
@@ -156,7 +159,7 @@ class BagLog(Log):
     def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
         columns = self._cloud(time)
-        times = find_times(columns, time, self._period, _points(columns), self._note)
+        times = find_times(columns, time - self._shift, self._period, _points(columns), self._note)
         if times is None or times.seconds is None:
             return columns, None
         kept = ~times.is_stray
@@ -220,6 +223,7 @@ class BagLog(Log):
         """Read all messages once. Return the arrival time of each cloud and the pose samples of each topic."""
         self._lidar = ""
         self._child: dict[str, str] = {}
+        self._pose_delays: list[int] = []  # nanoseconds from the times of poses and transforms to their arrival
         stamps: list[tuple[int, int]] = []  # of each cloud: its header's, and its arrival
         parents: dict[str, str] = {}
         links: dict[str, list[Any]] = {}
@@ -233,12 +237,14 @@ class BagLog(Log):
                 self._lidar = self._lidar or message.header.frame_id.lstrip("/")
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
+                    self._pose_delays.append(arrived - _stamp(link, arrived))
                     child, T = link.child_frame_id.lstrip("/"), link.transform  # ROS 1 allows a leading slash
                     parents[child] = link.header.frame_id.lstrip("/")
                     links.setdefault(child, []).append(sample(_stamp(link, arrived), T.translation, T.rotation))
             else:
                 pose = getattr(message.pose, "pose", message.pose)
                 at = sample(_stamp(message, arrived), pose.position, pose.orientation)
+                self._pose_delays.append(arrived - _stamp(message, arrived))
                 tracks.setdefault(connection.topic, []).append(at)
                 self._child[connection.topic] = getattr(message, "child_frame_id", "").lstrip("/")
         self._frames = Frames(parents, links)
@@ -257,6 +263,20 @@ class BagLog(Log):
                 f"{repeated} clouds repeat the time stamp of an earlier one and are left out; was it played twice?"
             )
         return dict(reversed(stamps))
+
+    def _set_clock(self, pose_times: np.ndarray) -> None:
+        """Shift the times of clouds to the clock of the poses, by the times of arrival, if the two do not overlap."""
+        first, last = self.timestamps[0], self.timestamps[-1]
+        shift = _middle([arrived - time for time, arrived in self._arrival.items()]) - _middle(self._pose_delays)
+        if (last >= pose_times[0] and first <= pose_times[-1]) or abs(shift) < _ANOTHER_CLOCK:
+            return
+        self._shift = shift
+        self._arrival = {time + shift: arrived for time, arrived in self._arrival.items()}
+        self.timestamps = sorted(self._arrival)
+        self._note(
+            f"the times of its clouds and of its poses have different clocks ({shift * 1e-9:+.6g} s by the times of "
+            "arrival), so we shift those of the clouds"
+        )
 
     def _find_trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:
         """Return (M,) int64 times of transforms or messages, and (M, 4, 4) `T_world_ego` at these times."""
@@ -284,9 +304,13 @@ class BagLog(Log):
             clouds = [connection for connection in reader.connections if connection.topic == self.topic]
             for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
                 message = reader.deserialize(data, connection.msgtype)
-                if self._use_arrival or _stamp(message, arrived) == time:
+                if self._use_arrival or _stamp(message, arrived) + self._shift == time:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
+
+
+def _middle(values: list[int]) -> int:
+    return sorted(values)[len(values) // 2] if values else 0
 
 
 def _points(columns: dict[str, np.ndarray]) -> np.ndarray:
