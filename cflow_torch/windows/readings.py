@@ -288,13 +288,14 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
         turn, of_turns = _find_turn(moving)
         of_pairs = [{**each, TURNED: share} for each, share in zip(of_pairs, of_turns)]
     shares, clear = _compare(of_pairs)
+    judgement = Judgement(shares, turn=turn, scan=scan, shares_of_scans=shares_of_scans)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
-        return Judgement(shares, (WORLD,), None, turn, scan, shares_of_scans)
+        return replace(judgement, best=(WORLD,))
     if clear or shares[GIVEN] >= _HOPELESS:
-        return Judgement(shares, _equals(clear, shares), None, turn, scan, shares_of_scans)
+        return replace(judgement, best=_equals(clear, shares))
     # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
     is_hopeless = len(moving) > 1 or bool(_judge_motion(moving).best)
-    return Judgement(shares, (NO_READING,) if is_hopeless else (), None, turn, scan, shares_of_scans)
+    return replace(judgement, best=(NO_READING,)) if is_hopeless else judgement
 
 
 def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...]:

@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, read_columns, write_cloud
+from cflow_torch.data.arrays.folder import find_array_logs
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
-from cflow_torch.data.arrays.reader import ArraysLog, find_array_logs, natural_key
+from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.writer import write_array_log
+from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
 
 STAMP = 1_700_000_000_123_456_789

@@ -11,7 +11,8 @@ import pytest
 from cflow_torch import CFlowError
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.cloud_file import write_cloud
-from cflow_torch.data.arrays.reader import ArraysLog, find_array_logs
+from cflow_torch.data.arrays.folder import find_array_logs
+from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.log import Log, window
 from cflow_torch.transforms import as_matrix, rotations_about

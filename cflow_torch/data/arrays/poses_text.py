@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, Callable, Mapping, NamedTuple, Sequence
+from typing import Mapping, NamedTuple, Sequence
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import PathLike, as_path, read_bytes, read_start
+from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.transforms import (
     as_matrix,
     interpolate_poses,
@@ -32,8 +32,6 @@ _LONGEST_GAP_NS = 500_000_000  # longest time between two poses over which we in
 _FEWEST_COVERED = 0.5  # share of sweeps at a pose, if poses are farther apart than that
 _TOLERANCE_NS = 1_000_000  # by which programs round times
 _FEWEST_NUMBERS = 7  # of a pose
-_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test for poses and times
-_TESTED = 8192  # bytes of a file that tell what it holds
 
 
 class Trajectory(NamedTuple):
@@ -62,7 +60,7 @@ def read_poses(path: PathLike) -> Trajectory:
     """
     path = as_path(path)
     if path.is_dir():
-        files = _files_of_poses(path)
+        files = files_of_poses(path)
         poses = [read_poses(file).poses for file in files]
         if not files or any(len(each) != 1 for each in poses):
             raise CFlowError(f"{path} is a folder: its .txt files must have one pose each")
@@ -72,44 +70,14 @@ def read_poses(path: PathLike) -> Trajectory:
         return Trajectory(checked_poses(matrices, str(path)), None, "matrix", str(path))
     with file_errors(path):
         content = read_bytes(path)
-    return _poses_of(content, path)
+    return parse_poses(content, path)
 
 
-def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Find what holds poses in a folder, files or folders with a file per pose, and files of times, by their contents.
-
-    Files of times also say so in their name, because a column of numbers may be anything. We read the start of each.
-    """
-    tables = sorted(path for path in folder.iterdir() if path.suffix.lower() in _TABLES and path.name[0] != ".")
-    folders = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
-    starts = {path: _start_of(path, _poses_of) for path in tables}
-    poses = [path for path, start in starts.items() if start is not None and len(start.poses) > 1]
-    times = [path for path in tables if re.search("time|stamp", path.stem.lower())]
-    times = [path for path in times if _start_of(path, _times_of) is not None]
-    for path in folders:
-        files = _files_of_poses(path)
-        first = _start_of(files[0], _poses_of) if len(files) > 1 else None
-        poses += [path] if first is not None and len(first.poses) == 1 else []
-    return poses, times
-
-
-def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
-    """Parse the first lines of a file; None = this is not possible."""
-    try:
-        start = read_start(path, _TESTED)
-        if len(start) == _TESTED:  # whole lines, and whole matrices of four
-            lines = start.splitlines(keepends=True)[:-1]
-            start = b"".join(lines[: len(lines) // 4 * 4])
-        return parse(start, path)
-    except (CFlowError, OSError):
-        return None
-
-
-def _files_of_poses(folder: Path) -> list[Path]:
+def files_of_poses(folder: Path) -> list[Path]:
     return sorted((path for path in folder.iterdir() if path.suffix == ".txt"), key=lambda path: natural_key(path.stem))
 
 
-def _poses_of(content: bytes, path: Path) -> Trajectory:
+def parse_poses(content: bytes, path: Path) -> Trajectory:
     """Return the poses in the content of a text file."""
     names, words = _table_of(content, path)
     roles = _roles(names)
@@ -209,10 +177,10 @@ def read_times(path: PathLike) -> np.ndarray:
     path = as_path(path)
     with file_errors(path):
         content = read_bytes(path)
-    return _times_of(content, path)
+    return parse_times(content, path)
 
 
-def _times_of(content: bytes, path: Path) -> np.ndarray:
+def parse_times(content: bytes, path: Path) -> np.ndarray:
     with file_errors(path):
         lines = [line for line in content.decode("utf-8-sig").splitlines() if line.strip() and line.strip()[0] != "#"]
     dates = nanoseconds_of_dates(lines)

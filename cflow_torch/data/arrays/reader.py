@@ -10,38 +10,31 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_columns, read_table
+from cflow_torch.data.arrays.cloud_file import read_columns, read_table
+from cflow_torch.data.arrays.folder import (
+    GROUND_FOLDER,
+    POSE_FILES,
+    find_clouds,
+    find_tables,
+    only_one,
+    other_folders,
+    resolve,
+)
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
-from cflow_torch.data.arrays.poses_text import Trajectory, find_tables
+from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import find_folders, natural_key
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes, read_start
+from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start
 from cflow_torch.data.point_times import find_times
 from cflow_torch.tensors import resolution
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 
-POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
-POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
-GROUND_FOLDER = "ground"
 _VIEWPOINT = "VIEWPOINT"
 _COARSEST = 1e-3  # metres
-SEARCH_DEPTH = 4
-_OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-
-
-def find_array_logs(root: PathLike) -> list[Path]:
-    """Find the folders of all logs, at most four levels below a folder, sorted.
-
-    A log has two or more clouds of one suffix, in its folder or in a subfolder of `POINT_FOLDERS`.
-    """
-    what = "a folder with one point cloud per file, or a folder of such"
-    is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
-    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed)
 
 
 class ArraysLog(Log):
@@ -103,17 +96,13 @@ class ArraysLog(Log):
         if bin_columns != "auto" and (type(bin_columns) is not int or bin_columns < 3):
             raise CFlowError(f"bin_columns={bin_columns!r}: pass 'auto' or an integer of at least 3")
         self.log_id = self.folder.resolve().name
-        self.files = _one_suffix(self.folder, suffix)
+        self.files = find_clouds(self.folder, suffix)
         self.bin_layout = self._find_bin_layout(bin_columns)
         self._bin_columns: Any = self.bin_layout if bin_columns == "auto" else bin_columns
-        others = (
-            []
-            if self.files[0].parent in _usual_places(self.folder)
-            else [path.name for path in _below(self.folder)][1:]
-        )
+        others = other_folders(self.folder, self.files[0].parent)
         if others:
             self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
-        self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
+        self._ground = resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         self.lidar_position = self.ego_T_lidar[:3, 3]
         trajectory, are_of_lidar = self._trajectory(poses, calibration)
@@ -168,14 +157,14 @@ class ArraysLog(Log):
         if poses is not None and not is_path_like(poses):
             return Trajectory(poses_text.checked_poses(np.asarray(poses), "poses"), None, "matrix", "poses"), False
         kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
-        file = _resolve(self.folder, poses, POSE_FILES, "poses", kitti)
+        file = resolve(self.folder, poses, POSE_FILES, "poses", kitti)
         if file is None and poses == "auto":
-            file = _only(find_tables(self.folder)[0], self.folder, "poses")
+            file = only_one(find_tables(self.folder)[0], self.folder, "poses")
             self._note(f"its poses are those of {file.name}" if file else "")
         if file is None:
             return self._viewpoints() if poses == "auto" else None, False
         trajectory = poses_text.read_poses(file)
-        chosen = _resolve(self.folder, calibration, ("calib.txt",), "calibration")
+        chosen = resolve(self.folder, calibration, ("calib.txt",), "calibration")
         if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
             return trajectory, False
         T_cam_lidar = poses_text.read_calibration(chosen)
@@ -198,7 +187,7 @@ class ArraysLog(Log):
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
         count = len(self.files)
-        file = _resolve(self.folder, times, ("times.txt",), "times")
+        file = resolve(self.folder, times, ("times.txt",), "times")
         if file is not None:
             stamps = poses_text.read_times(file)
             rows = self._rows(len(stamps), f"times in {file}")
@@ -211,7 +200,7 @@ class ArraysLog(Log):
         if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
             return trajectory.times_ns.tolist()
         tables = find_tables(self.folder)[1] if times == "auto" else []
-        file = _only([table for table in tables if len(poses_text.read_times(table)) == count], self.folder, "times")
+        file = only_one([table for table in tables if len(poses_text.read_times(table)) == count], self.folder, "times")
         self._note(f"the times of its sweeps are those of {file.name}" if file else "")
         return None if file is None else poses_text.read_times(file).tolist()
 
@@ -257,80 +246,11 @@ class ArraysLog(Log):
         return poses
 
 
-def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
-    """Return the folder that holds a log's clouds, and the clouds of each suffix that has two or more."""
-    for parent in _usual_places(folder):
-        kinds = _kinds(parent)
-        if kinds:
-            return parent, kinds
-    below = _below(folder)
-    has_tables = any((folder / name).exists() for name in (*POSE_FILES, "times.txt"))
-    if has_tables or (len(below) == 1 and any(find_tables(folder))):
-        return next(iter(below.items()), (folder, {}))
-    return folder, {}
-
-
-def _usual_places(folder: Path) -> list[Path]:
-    return [folder, *(folder / name for name in POINT_FOLDERS)]
-
-
-def _below(folder: Path) -> dict[Path, dict[str, list[Path]]]:
-    """Return the folders below a log's that hold clouds, and these of each suffix."""
-    kinds = {path: _kinds(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
-    return {path: kinds for path, kinds in kinds.items() if kinds and path.name != GROUND_FOLDER}
-
-
-def _kinds(folder: Path) -> dict[str, list[Path]]:
-    """Return the clouds in a folder, of each suffix that has two or more."""
-    kinds: dict[str, list[Path]] = {}
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS and path.name[0] != ".":
-            kinds.setdefault(path.suffix.lower(), []).append(path)
-    return {suffix: files for suffix, files in kinds.items() if len(files) > 1}
-
-
-def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
-    parent, kinds = _clouds(folder)
-    if suffix is not None:
-        kinds = {kind: files for kind, files in kinds.items() if kind == "." + suffix.lower().lstrip(".")}
-    if not kinds:
-        raise CFlowError(
-            f"{folder} and its subfolders {', '.join(POINT_FOLDERS)} have fewer than two point clouds "
-            f"({suffix or ', '.join(SUFFIXES)}); scene flow needs two or more"
-        )
-    if len(kinds) > 1:
-        raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
-    files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
-    stamps = times_of_names([path.stem for path in files])
-    return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
-
-
-def _resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
-    """Return the file or folder that a setting names, or that "auto" finds; None = none."""
-    if setting is None:
-        return None
-    if setting == "auto":
-        found = [parent for parent in (*(folder / name for name in names), *elsewhere) if parent.exists()]
-        return _only(found, folder, what)
-    path = as_path(setting)
-    path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
-    if not path.exists():
-        raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder}")
-    return path
-
-
-def _only(found: Sequence[Path], folder: Path, what: str) -> Path | None:
-    if len(found) > 1:
-        several = ", ".join(path.name for path in found)
-        raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with {what}=...")
-    return found[0] if found else None
-
-
 def _in_single(points: np.ndarray) -> np.ndarray:
     """Return points as float32, unless this type holds them by millimetres only, as in a map's frame."""
     if points.dtype == np.float32:
         return points
-    farthest = float(np.nanmax(np.abs(points), initial=0))
+    farthest = float(np.abs(points[np.isfinite(points)]).max(initial=0))
     return points if resolution(np.dtype(np.float32), farthest) > _COARSEST else points.astype(np.float32)
 
 

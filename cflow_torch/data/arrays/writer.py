@@ -8,8 +8,8 @@ from typing import Any, Mapping, NamedTuple
 import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
+from cflow_torch.data.arrays.folder import GROUND_FOLDER
 from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
-from cflow_torch.data.arrays.reader import GROUND_FOLDER
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
 from cflow_torch.transforms import to_quaternions, transform_points

@@ -1,0 +1,144 @@
+"""What a folder of point clouds holds: the clouds of logs, and the files of poses, times and masks next to them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Callable, Sequence
+
+import numpy as np
+
+from cflow_torch.data.arrays.cloud_file import SUFFIXES
+from cflow_torch.data.arrays.poses_text import files_of_poses, parse_poses, parse_times
+from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.folders import find_folders, natural_key
+from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start
+from cflow_torch.types import CFlowError
+
+POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
+POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
+GROUND_FOLDER = "ground"
+SEARCH_DEPTH = 4
+_OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
+_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test for poses and times
+_TESTED = 8192  # bytes of a file that tell what it holds
+
+
+def find_array_logs(root: PathLike) -> list[Path]:
+    """Find the folders of all logs, at most four levels below a folder, sorted.
+
+    A log has two or more clouds of one suffix: in its folder, in a subfolder of `POINT_FOLDERS`, or in one of any name
+    next to poses or times.
+    """
+    what = "a folder with one point cloud per file, or a folder of such"
+    is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
+    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed)
+
+
+def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
+    """Return the folder that holds a log's clouds, and the clouds of each suffix that has two or more."""
+    for parent in _usual_places(folder):
+        kinds = _kinds(parent)
+        if kinds:
+            return parent, kinds
+    below = _below(folder)
+    has_tables = any((folder / name).exists() for name in (*POSE_FILES, "times.txt"))
+    if has_tables or (len(below) == 1 and any(find_tables(folder))):
+        return next(iter(below.items()), (folder, {}))
+    return folder, {}
+
+
+def _usual_places(folder: Path) -> list[Path]:
+    return [folder, *(folder / name for name in POINT_FOLDERS)]
+
+
+def _below(folder: Path) -> dict[Path, dict[str, list[Path]]]:
+    """Return the folders below a log's that hold clouds, and these of each suffix."""
+    kinds = {path: _kinds(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+    return {path: kinds for path, kinds in kinds.items() if kinds and path.name != GROUND_FOLDER}
+
+
+def other_folders(folder: Path, parent: Path) -> list[str]:
+    """Return the names of folders that hold clouds as the one that is read, if it has not one of the usual names."""
+    return [] if parent in _usual_places(folder) else [path.name for path in _below(folder) if path != parent]
+
+
+def _kinds(folder: Path) -> dict[str, list[Path]]:
+    """Return the clouds in a folder, of each suffix that has two or more."""
+    kinds: dict[str, list[Path]] = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS and path.name[0] != ".":
+            kinds.setdefault(path.suffix.lower(), []).append(path)
+    return {suffix: files for suffix, files in kinds.items() if len(files) > 1}
+
+
+def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
+    """Return the clouds of a log in order, by the times in their names, else by their numbers.
+
+    Fewer than two clouds, and several kinds of clouds without a `suffix`, are a `CFlowError`.
+    """
+    parent, kinds = _clouds(folder)
+    if suffix is not None:
+        kinds = {kind: files for kind, files in kinds.items() if kind == "." + suffix.lower().lstrip(".")}
+    if not kinds:
+        raise CFlowError(
+            f"{folder} and its subfolders {', '.join(POINT_FOLDERS)} have fewer than two point clouds "
+            f"({suffix or ', '.join(SUFFIXES)}); scene flow needs two or more"
+        )
+    if len(kinds) > 1:
+        raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
+    files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
+    stamps = times_of_names([path.stem for path in files])
+    return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
+
+
+def resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what: str, *elsewhere: Path) -> Path | None:
+    """Return the file or folder that a setting names, or that "auto" finds; None = none."""
+    if setting is None:
+        return None
+    if setting == "auto":
+        found = [parent for parent in (*(folder / name for name in names), *elsewhere) if parent.exists()]
+        return only_one(found, folder, what)
+    path = as_path(setting)
+    path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
+    if not path.exists():
+        raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder}")
+    return path
+
+
+def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:
+    """Return the only file that was found; None = none. Several are a `CFlowError`."""
+    if len(found) > 1:
+        several = ", ".join(path.name for path in found)
+        raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with {what}=...")
+    return found[0] if found else None
+
+
+def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Find what holds poses in a folder, files or folders with a file per pose, and files of times, by their contents.
+
+    Files of times also say so in their name, because a column of numbers may be anything. We read the start of each.
+    """
+    tables = sorted(path for path in folder.iterdir() if path.suffix.lower() in _TABLES and path.name[0] != ".")
+    folders = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+    starts = {path: _start_of(path, parse_poses) for path in tables}
+    poses = [path for path, start in starts.items() if start is not None and len(start.poses) > 1]
+    times = [path for path in tables if re.search("time|stamp", path.stem.lower())]
+    times = [path for path in times if _start_of(path, parse_times) is not None]
+    for path in folders:
+        files = files_of_poses(path)
+        first = _start_of(files[0], parse_poses) if len(files) > 1 else None
+        poses += [path] if first is not None and len(first.poses) == 1 else []
+    return poses, times
+
+
+def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
+    """Parse the first lines of a file; None = this is not possible."""
+    try:
+        start = read_start(path, _TESTED)
+        if len(start) == _TESTED:  # whole lines, and whole matrices of four
+            lines = start.splitlines(keepends=True)[:-1]
+            start = b"".join(lines[: len(lines) // 4 * 4])
+        return parse(start, path)
+    except (CFlowError, OSError):
+        return None
