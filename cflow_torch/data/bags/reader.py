@@ -100,9 +100,7 @@ class BagLog(Log):
         if is_remote(self.path):
             raise CFlowError(f"{self.path} is remote: bags are read from this machine only; copy it here")
         self._files = _parts(self.path)
-        part = _PART.fullmatch(self.path.resolve().stem) if len(self._files) > 1 else None
-        self.log_id = self.path.resolve().name if self.path.is_dir() else self.path.resolve().stem
-        self.log_id = part[1] if part and self.path.is_file() else self.log_id
+        self.log_id = _name_of(self.path, len(self._files) > 1)
         if self.path.suffix == _ACTIVE:
             raise CFlowError(
                 f"{self.path} is a recording that was not finished: run rosbag reindex, then rename it .bag"
@@ -113,41 +111,52 @@ class BagLog(Log):
         hint = f"is it a complete bag of ROS 1 (.bag), ROS 2 (folder) or MCAP? {_REPAIR}"
         with file_errors(f"{self.path}", hint):
             topics = {connection.topic: connection.msgtype for connection in self._reader().connections}
-            has_clouds = _CLOUD in topics.values() or not set(_LIVOX) & set(topics.values())
-            self.topic = self._chosen(
-                topics, (_CLOUD,) if has_clouds and not topic else (_CLOUD, *_LIVOX), topic, "topic"
-            )
+            self.topic = self._cloud_topic(topics, topic)
             self._shift = 0  # nanoseconds from the header of a cloud to its time
             self._arrival, tracks = self._scan()
             self.frame = frame or self._ego_frame()
-            if poses == "auto":
-                has_tf = len(self._frames.change_times(self.frame)) > 1
-                poses = "tf" if has_tf else self._chosen(topics, _POSE_TYPES, None, "poses") if tracks else None
-            elif poses not in (None, "tf"):
-                poses = self._chosen(topics, _POSE_TYPES, poses, "poses")
             self.timestamps = sorted(self._arrival)
-            if poses is not None:
-                self.trajectory = times, matrices = self._find_trajectory(poses, tracks)
-                trajectory = Trajectory(matrices, times, "bag", f"{poses} of {self.path}")
-                self._set_clock(times)
-                self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
-                self._note(note)
-                self.timestamps = [time for time, has_pose in zip(self.timestamps, is_covered) if has_pose]
+            self._check_count(f"{self.path}: {self.topic}")
+            source = self._pose_source(topics, poses, bool(tracks))
+            if source is not None:
+                self._use_poses(source, tracks)
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             self.gaps = self._with_gaps_in_time()
             self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
-            mount = self._mount
-            if mount is None:
-                mount = self._frames.between(self.frame, self._lidar, np.array(self.timestamps[:1]))[0]
-            self.lidar_position = mount[:3, 3]
+            self.lidar_position = self._mount_at(self.timestamps[0])[:3, 3]
+
+    def _cloud_topic(self, topics: dict[str, str], name: str | None) -> str:
+        """Return the topic of the clouds; without a name, Livox' messages count only if there are no others."""
+        has_clouds = _CLOUD in topics.values() or not set(_LIVOX) & set(topics.values())
+        return self._chosen(topics, (_CLOUD,) if has_clouds and not name else (_CLOUD, *_LIVOX), name, "topic")
+
+    def _pose_source(self, topics: dict[str, str], poses: str | None, has_tracks: bool) -> str | None:
+        """Return "tf" or the topic of the poses; None = there are none."""
+        if poses == "auto" and len(self._frames.change_times(self.frame)) > 1:
+            return "tf"
+        if poses in (None, "tf") or (poses == "auto" and not has_tracks):
+            return None if poses == "auto" else poses
+        return self._chosen(topics, _POSE_TYPES, None if poses == "auto" else poses, "poses")
+
+    def _use_poses(self, source: str, tracks: dict[str, list[Any]]) -> None:
+        """Take the poses of "tf" or of a topic, and keep the sweeps that have one."""
+        self.trajectory = times, matrices = self._find_trajectory(source, tracks)
+        self._set_clock(times)
+        trajectory = Trajectory(matrices, times, "bag", f"{source} of {self.path}")
+        self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
+        self._note(note)
+        self.timestamps = [time for time, has_pose in zip(self.timestamps, is_covered) if has_pose]
+
+    def _mount_at(self, time: int) -> np.ndarray:
+        """Return `T_ego_lidar` at a time, (4, 4) float64."""
+        if self._mount is not None:
+            return self._mount
+        return self._frames.between(self.frame, self._lidar, np.array([time]))[0]  # type: ignore[no-any-return]
 
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
         columns, times = self._timed_cloud(time)
-        mount = self._mount
-        if mount is None:
-            mount = self._frames.between(self.frame, self._lidar, np.array([time]))[0]
-        points = transform_points(_points(columns), mount)
+        points = transform_points(_points(columns), self._mount_at(time))
         pose = None if self.poses is None else self.poses[index].copy()
         return Sweep(points.astype(np.float32), None, pose, time, times)
 
@@ -238,9 +247,10 @@ class BagLog(Log):
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
                     self._pose_delays.append(arrived - _stamp(link, arrived))
-                    child, T = link.child_frame_id.lstrip("/"), link.transform  # ROS 1 allows a leading slash
+                    child = link.child_frame_id.lstrip("/")  # ROS 1 allows a leading slash
                     parents[child] = link.header.frame_id.lstrip("/")
-                    links.setdefault(child, []).append(sample(_stamp(link, arrived), T.translation, T.rotation))
+                    at = sample(_stamp(link, arrived), link.transform.translation, link.transform.rotation)
+                    links.setdefault(child, []).append(at)
             else:
                 pose = getattr(message.pose, "pose", message.pose)
                 at = sample(_stamp(message, arrived), pose.position, pose.orientation)
@@ -307,6 +317,15 @@ class BagLog(Log):
                 if self._use_arrival or _stamp(message, arrived) + self._shift == time:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
+
+
+def _name_of(path: Path, has_parts: bool) -> str:
+    """Return the name of a bag; that of a file with parts has no number."""
+    stem = path.resolve().stem
+    part = _PART.fullmatch(stem) if has_parts else None
+    if path.is_dir():
+        return path.resolve().name
+    return part[1] if part else stem
 
 
 def _middle(values: list[int]) -> int:
