@@ -313,7 +313,7 @@ class FlowResult:
 
     def objects(
         self,
-        points: Array,
+        points: Array | Sweep,
         sweep_interval: float = 0.1,
         min_speed: float = 0.5,
         min_points: int = 10,
@@ -322,7 +322,7 @@ class FlowResult:
         """List the moving objects at t+1.
 
         Args:
-            points: (N, 3+) of pc0, metres, as you passed them.
+            points: (N, 3+) of pc0, metres, as you passed them; or the sweep t, for example `window.pc0`.
             sweep_interval: seconds from sweep t to sweep t+1.
             min_speed: m/s; slower clusters are left out.
             min_points: clusters with fewer points are left out; most of them are small parts of the static world.
@@ -351,6 +351,7 @@ class FlowResult:
             )
         if not sweep_interval > 0:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds between two sweeps, for example 0.1")
+        points = points.points if isinstance(points, Sweep) else points
         values = self.numpy()
         clusters = _Clusters.of(as_numpy(self.cluster_id))
         objects = np.zeros(len(clusters.id), _OBJECT).view(Objects)

@@ -53,6 +53,26 @@ def test_importing_loads_nothing_heavy_and_changes_nothing():
     assert not set(done.stdout.split()) & set(HEAVY)
 
 
+def test_messages_about_missing_packages_name_their_extra():
+    project = (PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8")
+    listed = re.search(r"\[project.optional-dependencies\](.*?)\n\[", project, re.DOTALL).group(1)
+    packages = {}
+    for extra, members in re.findall(r"^(\w+) = \[(.+)$", listed, re.MULTILINE):
+        for package in re.findall(r'"([\w-]+)[><=;]', members):
+            packages.setdefault(package.lower(), set()).add(extra)
+    assert packages["scipy"] == {"label"} and packages["k3d"] == {"html"}
+    silent = []
+    for file in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
+            text = node.value if is_text and "\n" not in node.value else ""  # no docstrings
+            for package in re.findall(r"pip install '?([\w-]+)", text):
+                named = packages.get(package.lower(), ())
+                if named and not any(re.search(rf"extras? [\w, ]*{extra}", text) for extra in named):
+                    silent.append(f"{file.relative_to(PACKAGE)}: {text}")
+    assert not silent, silent
+
+
 # Phrases of a private dialect, see "Style" in CONTRIBUTING.md.
 WORDS = "what stands|what moves|of equals|says? nothing|at hand|whoever|mend(s|ed|ing)?|creep|doubt"
 PHRASES = re.compile(rf"\b({WORDS}|(?<!there )is no (?!longer|wider))\b", re.IGNORECASE)

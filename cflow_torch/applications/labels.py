@@ -89,7 +89,9 @@ def find_labels(
 
     Cost: reads the log twice. Each sweep takes a nearest-neighbour search of all points, and two of the moving points.
     """
-    tree: Callable[..., Any] = import_optional("scipy.spatial", "labels need SciPy: pip install scipy").cKDTree
+    tree: Callable[..., Any] = import_optional(
+        "scipy.spatial", "labels need SciPy (extra label): pip install scipy"
+    ).cKDTree
     log = CachedLog(log, 3)
     dynamic: list[DynamicPoints] = []
     groups: list[np.ndarray] = []

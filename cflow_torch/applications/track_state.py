@@ -78,7 +78,7 @@ class TrackStates(NamedTuple):
     def add_evidence(self, index: Tensor, confidence: Tensor) -> None:
         """Add the log-odds of the (K,) confidence of this sweep's flow; NaN = the method has none."""
         odds = torch.logit(confidence, 0.01).nan_to_num(_NO_CONFIDENCE)
-        self.evidence[index] += odds * (self.size[index, :2].amin(1) >= _THIN)
+        self.evidence[index] += odds * (self.size[index].amin(1) >= _THIN)
 
     def write(self, index: Tensor, **columns: Any) -> None:
         """Overwrite columns of the indexed tracks in place."""

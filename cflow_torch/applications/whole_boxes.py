@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from cflow_torch.applications.association import rotate_about_z
@@ -26,6 +27,7 @@ _SHARE = 0.75  # quantile over the sweeps of where an edge is seen; points of ot
 _STRAY = 0.003  # share of the points of one sweep that are beyond an edge
 FLOW_NOISE = 0.2  # m/s, standard deviation
 _ANCHOR_NOISE, _FREE_NOISE = 0.15, 0.3  # standard deviation of a box: metres, plus a share of what is not seen
+_DEPTHS = (0.12, 0.07)  # metres from what is seen of a person, of a cyclist back to the middle; from simulated drives
 _CENTROID_NOISE = 1.0  # metres, standard deviation of the mean of the visible points
 _MIN_SPEED = 0.5  # m/s; slower objects keep their heading
 _ROUNDS, _ROBUST_ROUNDS = 3, 3
@@ -57,6 +59,7 @@ class Edges(NamedTuple):
 
     low: Tensor  # (R, 3)
     high: Tensor  # (R, 3)
+    median: Tensor  # (R, 3) of the points, along each axis
     sensor: Tensor  # (R, 3)
 
     @classmethod
@@ -64,9 +67,11 @@ class Edges(NamedTuple):
         """Turn points (P, 3) of R objects into the axes of boxes with (R,) headings; few points are strays."""
         local = turned(points, -heading[row])
         count = len(heading)
-        ends = [torch.stack(quantiles(local[:, axis], row, count, _STRAY, 1 - _STRAY)) for axis in range(3)]
-        low, high = torch.stack(ends, 2)
-        return cls(low, high, turned(sensor, -heading))
+        shares = (_STRAY, 1 - _STRAY, 0.5)
+        low, high, median = torch.stack(
+            [torch.stack(quantiles(local[:, axis], row, count, *shares)) for axis in range(3)], 2
+        )
+        return cls(low, high, median, turned(sensor, -heading))
 
     @property
     def middle(self) -> Tensor:
@@ -80,11 +85,11 @@ class Edges(NamedTuple):
 
     def at(self, rows: Tensor) -> Edges:
         """Select rows."""
-        return Edges(self.low[rows], self.high[rows], self.sensor[rows])
+        return Edges(*(values[rows] for values in self))
 
     def relative_to(self, origin: Tensor) -> Edges:
         """Shift the origin to (R, 3) points, along the axes of the boxes."""
-        return Edges(self.low - origin, self.high - origin, self.sensor - origin)
+        return Edges(*(values - origin for values in self))
 
     def is_seen(self) -> Tensor:
         """(R, 2) bool: the sensor looks at a long side, which shows the length; at an end, which shows the width."""
@@ -95,8 +100,9 @@ class Edges(NamedTuple):
         """Place boxes of (R, 3) size on the visible points.
 
         The visible edges of a vehicle are those that face the sensor. What is not seen of its box lies beyond the
-        others. If the sensor is beside it, a part may be missing at either end. People and cyclists are round, so they
-        are in the middle of their points.
+        others. If the sensor is beside it, a part may be missing at either end. People and cyclists are round: their
+        middle lies a little behind what is seen. For a person, this is the median of the points, which a few points of
+        a wall do not move. A cyclist has fewer points at one end than at the other, so we take the middle of the ends.
 
         Returns:
             (R, 3) centres, along the axes of the boxes, and their (R,) standard deviations, metres.
@@ -104,9 +110,12 @@ class Edges(NamedTuple):
         missing = (size - (self.high - self.low)) / 2
         facing = (self.view / (size / 2)).clamp(-1, 1)
         shift = -facing * missing.clamp(min=0)
-        shift[:, 2] = 0
-        shift[kind <= CYCLIST] = 0
-        return self.middle + shift, _ANCHOR_NOISE + _FREE_NOISE * missing[:, :2].abs().amax(1)
+        visible = torch.where((kind == PEDESTRIAN)[:, None], self.median, self.middle)[:, :2]
+        depth = visible.new_tensor(_DEPTHS)[kind.clamp(max=CYCLIST)]
+        behind = visible - depth[:, None] * F.normalize(self.view[:, :2])
+        centre = torch.where((kind <= CYCLIST)[:, None], behind, (self.middle + shift)[:, :2])
+        noise = _ANCHOR_NOISE + _FREE_NOISE * missing[:, :2].abs().amax(1)
+        return torch.cat([centre, self.middle[:, 2:]], 1), noise
 
 
 def whole_boxes(sightings: Sightings) -> WholeBoxes:

@@ -22,10 +22,11 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
+from cflow_torch.data.paths import as_path
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.changes import check_same_run
-from cflow_torch.fleet.manifest import describe_log
+from cflow_torch.fleet.manifest import MANIFEST, describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
@@ -86,10 +87,19 @@ def _claim(cfg: Clean, log: Log, output: Path, is_new: bool) -> None:
 
 
 def _record(cfg: Clean, log: Log) -> dict[str, Any]:
-    """Return what the clean points follow from: settings, versions and the sweeps of the log."""
+    """Return what the clean points follow from: settings, versions, sweeps, and the method of stored flow."""
     settings = settings_record(cfg)
     settings["data"].pop("root", None)  # several logs, which may be elsewhere tomorrow
-    return {**settings, "versions": versions(), "log": describe_log(log)}
+    made = {"versions": versions(), "log": describe_log(log)}
+    if cfg.flow is not None:
+        settings.pop("model")  # it is not used
+        made["flow_by"] = _method_of_flow(as_path(cfg.flow) / log.log_id / MANIFEST)
+    return {**settings, **made}
+
+
+def _method_of_flow(manifest: Path) -> Any:
+    """Return the settings of the method that made the flow files of a log; None = they have no manifest."""
+    return read_json(manifest).get("run", {}).get("method") if manifest.exists() else None
 
 
 def _record_file(folder: Path) -> Path:

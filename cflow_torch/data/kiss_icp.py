@@ -38,7 +38,9 @@ class KissICPLog(Log):
 
     def __init__(self, root: PathLike, loader: str, sequence: str | None = None) -> None:
         self.root = as_path(root)
-        datasets = import_optional("kiss_icp.datasets", "KISS-ICP's loaders need it: pip install kiss-icp")
+        datasets = import_optional(
+            "kiss_icp.datasets", "KISS-ICP's loaders need it (extra odometry): pip install kiss-icp"
+        )
         names = sorted(set(datasets.available_dataloaders()) - set(_OTHERS))
         if loader not in names:
             other = f", or use data={_OTHERS[loader]}" if loader in _OTHERS else ""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Sequence
 
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.data.log import Log, LogWrapper
+from cflow_torch.data.log import Log, LogWrapper, points_surround_poses
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import Sweep
@@ -17,8 +18,8 @@ from cflow_torch.types import Sweep
 _RUN_IN = 5  # sweeps
 _FEWEST_POINTS = 100
 _NEED = (
-    "there are no poses, and estimating them needs KISS-ICP: pip install kiss-icp, or pass poses (for arrays "
-    "T_ego1_ego0, for a folder poses.txt)"
+    "there are no poses, and estimating them needs KISS-ICP (extra odometry): pip install kiss-icp, or pass poses "
+    "(for arrays T_ego1_ego0, for a folder poses.txt)"
 )
 _MAX_RANGE = 100.0  # metres; KISS-ICP's own default, which also sets its voxel size (a hundredth)
 
@@ -87,6 +88,10 @@ class PosedLog(LogWrapper):
         super().__init__(log)
         self.poses = self._given = poses
         self.trajectory = None
+
+    @cached_property
+    def surrounds_poses(self) -> bool:
+        return points_surround_poses(self)
 
     def sweep(self, index: int) -> Sweep:
         return replace(self.log.sweep(index), pose=self._given[index].copy())

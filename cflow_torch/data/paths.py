@@ -57,7 +57,8 @@ def as_path(path: PathLike) -> Path:
     except (ImportError, ValueError) as error:  # the error names a missing package
         raise CFlowError(
             f"{path} cannot be opened: fsspec has no file system {scheme}:// ({error}). Is it spelled correctly? "
-            "Remote paths need pip install universal_pathlib fsspec, and the package of their file system"
+            "Remote paths need the extra remote (pip install universal_pathlib fsspec), and the package of their file "
+            "system"
         ) from error
     found: Any = UPath(f"{scheme}://{path[match.end() :].rstrip('/')}")
     return found  # type: ignore[no-any-return]

@@ -98,5 +98,7 @@ def _labels(points: np.ndarray, min_cluster_size: int) -> np.ndarray:
     """(N,) int64 label of each of (N, 3) points: 0 ... L - 1, -1 = noise."""
     if len(points) <= min_cluster_size:  # the library cannot build its tree from so few points
         return np.full(len(points), -1, dtype=np.int64)
-    hdbscan = import_optional("hdbscan", "clustering='hdbscan' needs the hdbscan package: pip install hdbscan")
+    hdbscan = import_optional(
+        "hdbscan", "clustering='hdbscan' needs the hdbscan package (extra hdbscan): pip install hdbscan"
+    )
     return hdbscan.HDBSCAN(min_cluster_size=min_cluster_size).fit_predict(points).astype(np.int64)

@@ -36,7 +36,7 @@ def ray_executors(
     have the same versions of cflow_torch, torch and numpy. A node that differs is refused. Workers that do not fit into
     the cluster start when there is room. Ray chooses the GPUs. `cli.commands.Ray` explains the settings.
     """
-    ray = import_optional("ray", "engine=ray needs Ray: pip install ray")
+    ray = import_optional("ray", "engine=ray needs Ray (extra ray): pip install ray")
     is_gpu = layout.devices[0].startswith("cuda")
     needs = {
         "CPU": int(not is_gpu) if num_cpus == AUTO else num_cpus,

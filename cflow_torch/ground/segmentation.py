@@ -145,7 +145,7 @@ def _stack(clouds: Sequence[Array], device: Any) -> tuple[Tensor, Tensor]:
 
 def _patchwork(positions: Tensor, sweep: Tensor, num_sweeps: int) -> Tensor:
     """Segment by Patchwork++, (N,) bool. We shift each cloud in z to the sensor height of its default settings."""
-    need = "method='patchwork' needs Patchwork++: pip install pypatchworkpp, or method='grid'"
+    need = "method='patchwork' needs Patchwork++ (extra ground): pip install pypatchworkpp, or method='grid'"
     pypatchworkpp = import_optional("pypatchworkpp", need)
     points, inside = millimetres(positions)
     plane = near_plane(points, sweep, inside, num_sweeps)

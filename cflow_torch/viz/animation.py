@@ -140,7 +140,7 @@ def _write_mp4(path: Path, figures: Iterator[Figure], frames_per_second: float) 
     from matplotlib import rc_context
     from matplotlib.animation import FFMpegWriter
 
-    need = ".mp4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or save a .gif"
+    need = ".mp4 needs imageio-ffmpeg (extra video): pip install imageio-ffmpeg, or save a .gif"
     imageio_ffmpeg = import_optional("imageio_ffmpeg", need)
     first = next(figures)
     options = "-pix_fmt yuv420p -crf 18 -movflags +faststart -f mp4"

@@ -118,7 +118,9 @@ def load_k3d() -> str:
     found = find_spec("k3d")
     script = Path(found.origin or "").parent / "static" / "standalone.js" if found else None
     if script is None or not script.is_file():
-        raise CFlowError("pages need k3d (Python 3.9 or newer): pip install 'k3d>=3.2', or give format=rerun")
+        raise CFlowError(
+            "pages need k3d (extra html, Python 3.9 or newer): pip install 'k3d>=3.2', or give format=rerun"
+        )
     return _packed_file(script)
 
 

@@ -89,7 +89,9 @@ def record_log(
 
 def load_rerun() -> Any:
     """Import rerun; a missing package is a `CFlowError`."""
-    return import_optional("rerun", "recordings need rerun-sdk (Python 3.9 or newer): pip install 'rerun-sdk>=0.23'")
+    return import_optional(
+        "rerun", "recordings need rerun-sdk (extra rerun, Python 3.9 or newer): pip install 'rerun-sdk>=0.23'"
+    )
 
 
 class _Drive:

@@ -33,7 +33,7 @@ def checked_path(path: str | Path, *endings: str) -> Path:
 
 def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
     """Create an empty white figure without touching pyplot's state; a missing matplotlib is a `CFlowError`."""
-    import_optional("matplotlib", "pictures need matplotlib: pip install matplotlib")
+    import_optional("matplotlib", "pictures need matplotlib (extra viz): pip install matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -2,6 +2,8 @@
 
 python scripts/benchmarks/boxes.py --pandaset DATA/002                     sequences with cuboids in every sweep
 python scripts/benchmarks/boxes.py --scene DATA/panda-002-c.h5 DATA/002    an HDF5 scene, cuboids of some of its sweeps
+python scripts/benchmarks/boxes.py --kitti DATA/kitti-0000-c2.h5 KITTI 127   an HDF5 scene from sweep 127 of tracking
+                                                           sequence 0000; KITTI has label_02/0000.txt and calib/0000.txt
 python scripts/benchmarks/boxes.py --simulated av2 waymo                   a street and a crossing each
 
 The simulated drives have the seeds 300 and 301. We chose settings on PandaSet 002, sweeps 72-79, and on simulated
@@ -43,6 +45,9 @@ _CLASSES = {
     "truck": ("BUS", "BOX_TRUCK", "TRUCK", "TRUCK_CAB", "LARGE_VEHICLE", "VEHICULAR_TRAILER", "ARTICULATED_BUS"),
 }
 CLASS_OF = {name: kind for kind, names in _CLASSES.items() for name in names}
+_KITTI = {"Pedestrian": "PEDESTRIAN", "Person": "PEDESTRIAN", "Cyclist": "BICYCLIST", "Truck": "TRUCK"}
+_SHAKING = 10  # sweeps over which we take the velocities of KITTI's boxes
+_IMAGE = (1242, 375)  # pixels, width and height of KITTI's camera 2
 Row = Dict[str, Any]
 
 
@@ -187,6 +192,62 @@ class SceneBoxes(LabelledLog):
         return moving(self._known[index], sweep.pose, poses, seconds, points[:, :3])
 
 
+class KITTIBoxes(LabelledLog):
+    """A part of KITTI's tracking sequence 0000 in HDF5, with its boxes, from `first` of the sequence.
+
+    KITTI labels what is in the image of camera 2. Its boxes shake, so we take velocities over a second.
+    """
+
+    def __init__(self, scene: Path, folder: Path, first: int) -> None:
+        super().__init__(scene)
+        lines = (line.split() for line in (folder / "calib" / "0000.txt").read_text().splitlines())
+        calibration = {line[0].rstrip(":"): np.array(line[1:], float) for line in lines if line}
+        rectify = np.eye(4)
+        rectify[:3, :3] = calibration["R0_rect"].reshape(3, 3)
+        to_camera = np.vstack([calibration["Tr_velo_to_cam"].reshape(3, 4), [0, 0, 0, 1]])
+        T_camera_ego = rectify @ to_camera
+        self._projection = calibration["P2"].reshape(3, 4) @ T_camera_ego
+        self._tracks: dict[str, dict[int, np.ndarray]] = {}  # track -> sweep -> (4, 4) T_world_box
+        self._kinds: dict[str, tuple[int, np.ndarray]] = {}  # track -> category and size
+        for line in (folder / "label_02" / "0000.txt").read_text().splitlines():
+            frame, name, kind, *values = line.split()
+            index = int(frame) - first
+            if kind != "DontCare" and 0 <= index < len(self.timestamps):
+                height, width, length, x, y, z, turn = map(float, values[7:14])
+                middle = np.linalg.inv(T_camera_ego) @ [x, y - height / 2, z, 1]
+                pose = np.eye(4)
+                heading = -turn - np.pi / 2
+                pose[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
+                pose[:3, 3] = middle[:3]
+                self._tracks.setdefault(name, {})[index] = self.sweep(index).pose @ pose
+                category = _KITTI.get(kind, "REGULAR_VEHICLE")
+                self._kinds[name] = CATEGORIES.index(category), np.array([length, width, height])
+
+    def true_boxes(self, index: int) -> TrueBoxes:
+        sweep = self.sweep(index)
+        names = [name for name, track in self._tracks.items() if index in track]
+        later = {}
+        for name in names:
+            near = [each for each in self._tracks[name] if abs(each - index) <= _SHAKING // 2]
+            if len(near) > _SHAKING // 2:
+                first, last = self._tracks[name][near[0]], self._tracks[name][near[-1]]
+                later[name] = self._tracks[name][index].copy()
+                later[name][:3, 3] += (last - first)[:3, 3] / (near[-1] - near[0])
+        poses = np.array([self._tracks[name][index] for name in names]).reshape(-1, 4, 4)
+        size = np.array([self._kinds[name][1] for name in names]).reshape(-1, 3)
+        boxes = Boxes(names, [self._kinds[name][0] for name in names], size, np.linalg.inv(sweep.pose) @ poses)
+        seconds = (self.timestamps[1] - self.timestamps[0]) * 1e-9
+        return moving(boxes, sweep.pose, later, seconds, sweep.points[~sweep.is_ground][:, :3])
+
+    def is_labelled(self, index: int, position: np.ndarray) -> np.ndarray:
+        """(R,) bool: (R, 3) positions in the world are in the image."""
+        T_ego_world = np.linalg.inv(self.sweep(index).pose)
+        local = position @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+        u, v, depth = self._projection[:, :3] @ local.T + self._projection[:, 3:]
+        inside = (u >= 0) & (u < _IMAGE[0] * depth) & (v >= 0) & (v < _IMAGE[1] * depth)
+        return (depth > 0) & inside
+
+
 def fit(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Fit a rotation about z and a translation to (N, 3) points and where they go; (4, 4)."""
     a, b = start - start.mean(0), end - end.mean(0)
@@ -292,7 +353,10 @@ def detections(drives: list[tuple[Any, dict[str, np.ndarray], range]]) -> Detect
             num_true += int(truth.is_scored.sum())
             ego = log.sweep(index).pose[:2, 3]
             is_near = np.hypot(table["x"] - ego[0], table["y"] - ego[1]) <= RANGE
-            chosen = np.flatnonzero((table["sweep"] == index) & table["is_moving"] & is_near)
+            is_counted = (table["sweep"] == index) & table["is_moving"] & is_near
+            if isinstance(log, KITTIBoxes):
+                is_counted &= log.is_labelled(index, np.stack([table[name] for name in "xyz"], 1))
+            chosen = np.flatnonzero(is_counted)
             chosen = chosen[np.argsort(-table["confidence"][chosen], kind="stable")]
             taken: list[set[int]] = [set() for _ in THRESHOLDS]
             for row in chosen.tolist():
@@ -352,6 +416,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pandaset", nargs="*", default=(), type=Path, help="sequence folders")
     parser.add_argument("--scene", nargs=2, action="append", default=[], type=Path, metavar=("H5", "SEQUENCE"))
+    parser.add_argument("--kitti", nargs=3, action="append", default=[], metavar=("H5", "KITTI", "FIRST"))
     parser.add_argument("--simulated", nargs="*", default=(), choices=SENSORS, metavar="SENSOR")
     parser.add_argument("--num-sweeps", type=int, default=20, help="of a simulated drive")
     given = parser.parse_args()
@@ -359,6 +424,8 @@ def main() -> None:
     model = make_model(make_config("default"), "auto")
     drives: list[tuple[str, list[Any]]] = [(path.name, [PandaSetBoxes(path)]) for path in given.pandaset]
     drives += [(scene.stem, [SceneBoxes(scene, sequence)]) for scene, sequence in given.scene]
+    for scene, folder, first in given.kitti:
+        drives.append((Path(scene).stem, [KITTIBoxes(Path(scene), Path(folder), int(first))]))
     for sensor in given.simulated:
         logs = [SimulatedBoxes(sensor, seed, scene, given.num_sweeps) for seed, scene in DRIVES]
         drives.append((f"simulated {sensor}", logs))

@@ -172,3 +172,20 @@ def test_the_command_counts_what_it_removes_and_writes_a_map_that_is_missing(
         file = tmp_path / "clean" / "drive.ply"
         assert b"property float intensity" in file.read_bytes()[:300]
         file.unlink()
+
+
+def test_clean_clouds_of_an_earlier_flow_are_not_taken_for_complete(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    write_drive(tmp_path / "drive", ".npy")
+    np.savetxt(tmp_path / "drive" / "poses.txt", np.tile(np.eye(4)[:3].reshape(12), (4, 1)))
+    data = (tmp_path / "drive", "data.find_ground=null", "data.check=false")
+    flow = ("flow", *data, f"output={tmp_path / 'flow'}", "model.num_history=0")
+    clean = ("clean", *data, f"output={tmp_path / 'clean'}", f"flow={tmp_path / 'flow'}")
+    assert cflow(*flow) == 0 and cflow(*clean) == 0 and cflow(*clean) == 0
+    assert "it is complete" in capsys.readouterr().out
+    assert cflow(*flow, "model.significance=2", "overwrite=true") == 0
+    assert cflow(*clean) != 0
+    message = capsys.readouterr().err
+    assert "flow_by.significance was 1.5, is 2.0" in message and "overwrite=true" in message
+    assert cflow(*clean, "overwrite=true") == 0

@@ -140,6 +140,22 @@ def test_parts_of_a_wall_that_grow_or_jump_are_not_tracks() -> None:
     assert len(set(table["id"])) == 1 and np.all(table["y"] < 2)
 
 
+def test_a_strip_that_one_beam_draws_is_not_a_track_unless_it_goes_far() -> None:
+    class Strip(Staged):
+        """One beam hits each car."""
+
+        def world(self, index: int) -> Any:
+            points, flow, car = super().world(index)
+            kept = (car < 0) | (points[:, 2] < 0.1)
+            return points[kept], flow[kept], car[kept]
+
+    near, far = straight((0, 0), (0.17, 0.0)), straight((0, 5), (0.9, 0.0))
+    assert len(set(track(Staged([near, far]), Staged([near, far]).results())["id"])) == 2
+    log = Strip([near, far])
+    table = track(log, log.results())
+    assert len(set(table["id"])) == 1 and np.all(table["y"] > 4), "the one that moves by more than its length"
+
+
 def test_two_cars_in_one_cluster_keep_their_ids() -> None:
     log = Staged([straight((0, 0), (0.8, 0.0)), straight((0, 2.2), (0.8, 0.0))])
     results = log.results()

@@ -114,6 +114,32 @@ def test_points_of_other_objects_in_some_sweeps_change_nothing() -> None:
     assert np.abs(boxes.motion.position - clean.motion.position)[:, :2].max() < 0.12
 
 
+def test_a_person_stands_behind_the_points_that_are_seen_and_a_wall_beside_changes_little() -> None:
+    path = straight((-3, 6), 1.4, 0.0, 30)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 40)
+    wall = np.column_stack([np.linspace(-0.2, 0.2, 12), np.full(12, 0.7), np.linspace(0, 2, 12)])
+
+    def half(index: int, _: np.ndarray) -> np.ndarray:
+        """The half of a body, 0.34 m wide, that faces the sensor at the origin."""
+        facing = angle + np.arctan2(-path[index, 1], -path[index, 0])
+        outline = 0.17 * np.stack([np.cos(facing), np.sin(facing)], 1)
+        return np.concatenate([np.column_stack([outline, np.full(40, z)]) for z in np.linspace(0, 1.7, 6)])
+
+    alone = whole_boxes(seen([path], (0.0, 0.0), half))
+    assert set(alone.kind.tolist()) == {PEDESTRIAN}
+    assert np.abs(alone.motion.position[:, :2].numpy() - path[:, :2]).max() < 0.03
+    beside = whole_boxes(seen([path], (0.0, 0.0), lambda index, points: np.concatenate([half(index, points), wall])))
+    assert np.abs(beside.motion.position[:, :2].numpy() - path[:, :2]).max() < 0.06
+
+
+def test_a_cyclist_is_placed_behind_the_middle_of_what_is_seen() -> None:
+    path = straight((-5, 5), 5.0, 0.0)
+    boxes = whole_boxes(seen([path], (0.0, 0.0), lambda index, points: points[points[:, 1] < -0.27], (1.8, 0.56, 1.7)))
+    assert set(boxes.kind.tolist()) == {CYCLIST}
+    offset = boxes.motion.position[:, :2].numpy() - path[:, :2]
+    assert np.allclose(offset[8:12, 1], -0.28 + 0.07, atol=0.02), "seen from the side"
+
+
 def test_kinds_follow_from_size_and_speed() -> None:
     cases = [
         (PEDESTRIAN, (0.6, 0.5, 1.7), 1.4),

@@ -158,6 +158,7 @@ def test_a_result_is_printed_in_one_line(result):
 def test_objects_are_the_moving_objects_of_the_simulator(drive, result):
     """Objects with 50 points or more; the articulated lorry is left out because it is not a rigid body."""
     objects = result.objects(drive.sweep(3).points)
+    assert np.array_equal(result.objects(drive.sweep(3)), objects), "the sweep will do, too"
     assert len(objects) and (np.diff(objects["id"]) > 0).all()
     assert (np.linalg.norm(objects["velocity"], axis=1) >= 0.5).all()
     T, before, after = np.linalg.inv(drive.poses[4]) @ drive.poses[3], drive.boxes(3), drive.boxes(4)

@@ -95,8 +95,8 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
         given = list(zip(names, parents))
         for window, tree in enumerate(found.trees):
             mine = found.sweeps.pixels.window == window
-            for level, roots in enumerate(found.components.levels):
-                assert same_groups(roots.of_item[mine].numpy(), tree.levels[level])
+            for level, roots in enumerate(tree.levels):
+                assert same_groups(found.components.of_level(level).of_item[mine].numpy(), roots)
             own = found.names(window)
             expected = {(name, None if node.parent < 0 else own[node.parent]) for name, node in zip(own, tree.nodes)}
             of_window = (found.nodes.window == window).tolist()
@@ -112,9 +112,11 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
 
 def test_scales_are_nested():
     found = grown(0, density=0.04)
-    for coarse, fine in zip(found.components.levels, found.components.levels[1:]):
-        assert torch.equal(found.components.tree.children.of_item[fine.of_item], coarse.of_item)
-    assert found.components.size.sum() == len(found.components.tree.pixel)
+    components = found.components
+    levels = [components.of_level(level) for level in range(components.num_levels)]
+    for coarse, fine in zip(levels, levels[1:]):
+        assert torch.equal(components.children.of_item[fine.of_item], coarse.of_item)
+    assert components.size.sum() == sum(len(level.of_item) for level in levels) + len(components.changed)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

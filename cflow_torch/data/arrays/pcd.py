@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.column_names import distinct_names
+from cflow_torch.data.column_names import distinct_names
 from cflow_torch.errors import import_optional
 
 LONGEST_HEADER = 65536  # bytes
@@ -46,7 +46,7 @@ def pcd_viewpoint(content: bytes) -> np.ndarray | None:
 
 
 def pypcd4() -> Any:
-    return import_optional("pypcd4", "PCD files need pypcd4: pip install pypcd4")
+    return import_optional("pypcd4", "PCD files need pypcd4 (extra clouds): pip install pypcd4")
 
 
 def _header(content: bytes) -> tuple[dict[str, list[str]], int]:

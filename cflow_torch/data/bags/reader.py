@@ -16,7 +16,7 @@ from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
-from cflow_torch.data.point_times import TIME_FIELDS, seconds_after
+from cflow_torch.data.point_times import find_times
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep
@@ -42,7 +42,7 @@ _CONVERTERS = {
 _REPAIR = "a recording that was cut off is repaired by rosbag reindex (.bag), mcap recover (.mcap) or sqlite3 (.db3)"
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped" for name in ("", "WithCovariance")))
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_NEED = "bags need rosbags: pip install rosbags"
+_NEED = "bags need rosbags (extra bags): pip install rosbags"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 
 
@@ -159,18 +159,11 @@ class BagLog(Log):
     def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
         columns = self._cloud(time)
-        points, names = _points(columns), [name for name in TIME_FIELDS if name in columns]
-        found = [seconds_after(columns[name], time, self._period, points) for name in names]
-        usable = [times for times in found if times.seconds is not None]
-        for times in usable[:1] or found:
-            self._note(times.note, "times of points")
-        if not usable or usable[0].seconds is None:
+        times = find_times(columns, time, self._period, _points(columns), self._note)
+        if times is None or times.seconds is None:
             return columns, None
-        kept = ~usable[0].is_stray
-        if not kept.all():
-            text = f"{(~kept).sum()} of {len(kept)} points of the sweep at {time} ns have stray times and are left out"
-            self._note(text + ", also in other sweeps", "stray times")
-        return {name: values[kept] for name, values in columns.items()}, usable[0].seconds[kept]
+        kept = ~times.is_stray
+        return {name: values[kept] for name, values in columns.items()}, times.seconds[kept]
 
     def _reader(self) -> Any:
         """Return the open bag. Each process opens it itself, also after a fork or unpickling."""
