@@ -271,6 +271,13 @@ def test_poses_of_missing_sweeps_are_skipped_by_number(tmp_path) -> None:
         ArraysLog(tmp_path)
 
 
+def test_a_trajectory_of_another_rate_is_not_taken_by_number(tmp_path) -> None:
+    clouds(tmp_path, range(12))
+    (tmp_path / "gt_tum.txt").write_text("\n".join(line(k, f"{k}") for k in range(100)))
+    with pytest.raises(CFlowError, match="has 100 poses for 12 sweeps: pass one each, or poses with times"):
+        ArraysLog(tmp_path)
+
+
 def test_poses_that_are_too_rare_are_named(tmp_path) -> None:
     (clouds(tmp_path) / "poses.txt").write_text("\n".join(EXACT[::10]))
     with pytest.raises(CFlowError, match="has a pose every 1 s; between poses, we interpolate up to 0.5 s"):

@@ -35,6 +35,7 @@ from cflow_torch.windows.returns import missing_returns
 
 _VIEWPOINT = "VIEWPOINT"
 _COARSEST = 1e-3  # metres
+_LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
 class ArraysLog(Log):
@@ -207,14 +208,15 @@ class ArraysLog(Log):
     def _rows(self, count: int, what: str) -> np.ndarray | None:
         """Return the row of each file in a table of `count` rows, one per sweep; None = the table does not fit.
 
-        If files are missing, their numbers tell the rows, from 0 or 1 on, and we say so.
+        If files are missing, their numbers tell the rows, from 0 or 1 on, and we say so. The last number must be near
+        the end of the table, else the table is of another rate.
         """
         if count == len(self.files):
             return np.arange(count)
         digits = [re.findall(r"\d+", path.stem) for path in self.files]
         numbers = np.array([int(runs[-1][-9:]) if runs else -1 for runs in digits])
         fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
-        if len(fitting) != 1 or len(set(numbers)) < len(numbers):
+        if len(fitting) != 1 or len(set(numbers)) < len(numbers) or fitting[0].max() < _LEAST_REACH * count:
             return None
         self._note(f"it has {count} {what} for {len(self.files)} sweeps, so each takes that of its number")
         return fitting[0]
@@ -230,7 +232,7 @@ class ArraysLog(Log):
             if given is None:
                 raise CFlowError(
                     f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
-                    "with times (TUM) and the times of the sweeps in times.txt"
+                    "with times (TUM) and the times of the sweeps in times.txt, or no poses"
                 )
             rows = given
             is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2))
