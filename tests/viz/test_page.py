@@ -185,7 +185,11 @@ def drive_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-LIST_FITS = "document.querySelector('#objects').scrollWidth <= document.querySelector('#objects').clientWidth"
+LIST_FITS = """(() => {
+  document.querySelector("#list td").textContent = "pedestrian #116";  // the longest kind
+  const panel = document.querySelector("#objects");
+  return panel.scrollWidth <= panel.clientWidth;
+})()"""
 
 
 # Where the ids of tracks point to, away from the edges.
