@@ -144,6 +144,14 @@ def interpolate_poses(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarr
     return as_matrix(rotation, poses0[:, :3, 3] + fraction[:, None] * (poses1[:, :3, 3] - poses0[:, :3, 3]))
 
 
+def halfway(poses0: np.ndarray, poses1: np.ndarray) -> np.ndarray:
+    """Return the (K, 4, 4) float64 poses midway between pairs: mean positions, half of the shorter rotation."""
+    first = poses0[:, :3, :3]
+    quaternions = to_quaternions(np.swapaxes(first, 1, 2) @ poses1[:, :3, :3])
+    rotation = first @ to_rotations(quaternions + (1, 0, 0, 0))  # unit quaternions bisect their angle
+    return as_matrix(rotation, (poses0[:, :3, 3] + poses1[:, :3, 3]) / 2)
+
+
 def transform_points(points: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Return (N, 3) float64 points transformed by the rigid motion `T`, (4, 4) float64."""
     return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]

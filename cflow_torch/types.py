@@ -311,24 +311,6 @@ class FlowResult:
         positions = {} if points is None else dict(zip("xyz", self._positions(points).T))
         return pandas.DataFrame({**positions, **self.columns()})
 
-    def to_open3d(self, points: Array) -> Any:
-        """Return an `open3d.t.geometry.PointCloud` with an attribute for every field that is not None.
-
-        `points` are the points of pc0, (N, 3+), in metres. It is a `CFlowError` if Open3D is not installed, or if the
-        number of points differs.
-
-        Example:
-            >>> cloud = result.to_open3d(points)
-            >>> cloud.point.colors = flow_to_rgb(result.residual_flow.numpy(), 1.0)  # of cflow_torch.viz
-        """
-        need = "to_open3d needs Open3D: pip install open3d; numpy() returns the same as arrays"
-        cloud = import_optional("open3d", need).t.geometry.PointCloud(
-            np.ascontiguousarray(self._positions(points), np.float32)
-        )
-        for name, values in self.numpy().items():
-            cloud.point[name] = values.reshape(len(values), -1)
-        return cloud
-
     def objects(
         self,
         points: Array | Sweep,

@@ -41,7 +41,6 @@ COMMANDS = {
     "plot": ("plot/flow.png",),
     "view count=1": ("view/*.html",),
 }
-NEED_PACKAGE = ("tests/test_distribution.py", "tests/integrations/test_hubconf.py")  # these read the checkout
 
 
 def main() -> int:
@@ -63,7 +62,7 @@ def main() -> int:
             return 0
         for name in ("cflow_torch", "configs"):  # so that the tests can only import the wheel
             shutil.rmtree(source / name)
-        tests = ["tests", "-m", "not slow", *(f"--ignore={file}" for file in NEED_PACKAGE)]
+        tests = ["tests", "-m", "not slow", "--ignore=tests/test_distribution.py"]  # it reads the checkout
         return subprocess.run([python, "-m", "pytest", *tests], cwd=source, env=environment()).returncode
 
 

@@ -161,6 +161,7 @@ def _batch(positions: torch.Tensor, image: torch.Tensor, elapsed: torch.Tensor) 
         num_newest=0,
         num_windows=elapsed.shape[0],
         num_steps=elapsed.shape[1],
+        has_pairs=bool(((elapsed != 0).sum(1) == 1).any()),
         elapsed=elapsed,
         seconds=elapsed * 0.1,
         origin=torch.zeros((*elapsed.shape, 3), dtype=torch.float64),

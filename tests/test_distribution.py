@@ -26,11 +26,20 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*MADE))
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(target), str(source)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=target)
-    assert done.returncode == 0, done.stdout + done.stderr
+    printed = done.stdout + done.stderr
+    assert done.returncode == 0 and "deprecated" not in printed, printed
     (built,) = target.glob("*.whl")
     return built
 
 
+def test_every_folder_with_code_is_a_package_of_the_wheel() -> None:
+    named = re.findall(r'"(cflow_torch[.\w]*)",', (ROOT / "pyproject.toml").read_text().partition("\npackages")[2])
+    folders = {file.parent.relative_to(ROOT) for file in ROOT.glob("cflow_torch/**/*.py")}
+    folders |= {Path("cflow_torch") / file.parent.relative_to(ROOT) for file in ROOT.glob("configs/**/*.py")}
+    assert named == sorted(".".join(folder.parts) for folder in folders)
+
+
+@pytest.mark.slow
 def test_the_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
     """No oracle, no benchmark's targets, no test, no script."""
     patterns = ("cflow_torch/**/*.py", "configs/**/*.py", "configs/**/*.yaml")

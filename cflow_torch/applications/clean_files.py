@@ -105,11 +105,11 @@ def _keeps_form(log: Log, suffix: str) -> bool:
     """Test whether the numbers of points in the files of a folder of clouds can stay as they are."""
     own = log.unwrapped
     has_numbers = isinstance(own, ArraysLog) and np.array_equal(own.ego_T_lidar, np.eye(4))
-    return has_numbers and own_suffix(log).lower() == suffix.lower() and log.read_as not in CHANGES_POINTS
+    return has_numbers and own_suffix(log).lower() == suffix.lower() and CHANGES_POINTS.isdisjoint(log.readings)
 
 
 def _viewpoint(log: Log, suffix: str) -> str | None:
     """Return the frame of the points in `.pcd` files whose VIEWPOINT has the pose, as the log has it; None = none."""
     if suffix.lower() != ".pcd" or not log.unwrapped.has_viewpoints:
         return None
-    return "world" if log.read_as == WORLD else "sensor"
+    return "world" if WORLD in log.readings else "sensor"

@@ -27,7 +27,7 @@ def task(cfg: Bench) -> None:
     windows = _windows(log, cfg.pairs, model.config)
     ensure_writable(output)
     report = {"log": log.log_id, **measure(model, windows, cfg.repeats, cfg.batches), "machine": machine()}
-    report.update(versions=versions(), model=model.config.as_dict(), keep_memory=cfg.keep_memory)
+    report.update(versions=versions(), model=model.config.as_dict())
     print(format_report(report))
     write_json(output / "bench.json", report)
     print(f"written to {output / 'bench.json'}")

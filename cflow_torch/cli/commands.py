@@ -198,34 +198,20 @@ class Flow(FlowFiles):
 
     Each file has one row per point of sweep t. Columns: flow_t{x,y,z}_m total flow, residual_t{x,y,z}_m motion of
     objects, pose_t{x,y,z}_m ego motion (float32, metres per sweep, axes of the ego frame at t+1), cluster_id, score,
-    is_valid. There is also a column confidence, unless model=paper or keypoints. contents=[residual,is_valid] writes
-    only these columns. Files are then much smaller; ego motion and total flow follow from the poses. The content points
-    adds x, y, z of the points of sweep t.
+    is_valid. There are also the columns confidence and moving, unless model=paper or keypoints. docs/applications.md
+    describes the files of tracks=, labels= and masks=.
 
     OUTPUT/config.yaml contains settings and versions; OUTPUT/reports has the report. Run the command again to resume.
     Results of other logs in OUTPUT stay. After Ctrl-C, SIGTERM or SIGHUP the run finishes the frames that it has begun.
     The exit status is 0 if every frame is complete, 1 if one is missing, 2 if the call was wrong, and 128 + n after
-    signal number n. The report has the times of all stages; verbose=true prints them.
-
-    result_name=NAME also writes the total flow into the HDF5 scenes, as key NAME of every sweep but the last. The
-    viewers of OpenSceneFlow read it there. tracks=true also writes OUTPUT/<log id>/tracks.parquet when all frames of a
-    log are complete: one row per moving object and sweep, with id, box and velocity. Its flow files get a column
-    track_id, the id of each point, -1 = none. tracks=mot and tracks=kitti add
-    OUTPUT/<log id>/mot.txt or kitti.txt, the tracks in these formats. tracks=drivestudio adds instances_info.json and
-    frame_instances.json, which DriveStudio's loaders read, tracks=nuscenes adds nuscenes_detection.json and
-    nuscenes_tracking.json, and tracks=openpcdet adds result.pkl, OpenPCDet's table of boxes. labels=semantickitti
-    writes OUTPUT/sequences/<log id>/predictions/000000.label ... when all frames of a log are complete: an int32 per
-    point of each sweep, 251 = moves (flow of 0.05 m per sweep, P(moving) of 0.5), 9 = static, 0 = a sweep without flow,
-    such as the last one.
-
-    masks=true writes OUTPUT/<log id>/masks/<camera>/<image>.png, 255 = dynamic, 0 = static, for the images nearest to
-    the sweeps of Argoverse 2, PandaSet, nuScenes and KITTI (extra `viz`).
+    signal number n.
 
     examples:
       cflow flow data=av2 data.root=/data/av2/val output=outputs/val
       cflow flow /data/drive_1 /data/drive_2                          several paths of one format
       cflow flow data=av2 data.root=/data/av2/val dry_run=true        counts the frames
       cflow flow model=paper model.pixel_sizes=[0.2] engine.workers=8
+      cflow flow /data/drive contents=[residual,is_valid]             much smaller files
       cflow flow shard.index=2 shard.count=16 ...                     one of 16 processes, on any machine
       cflow flow engine=ray engine.address=auto ...                   on a Ray cluster
       cflow flow data=av2 data.root=s3://bucket/val output=s3://bucket/flow
@@ -238,10 +224,12 @@ class Flow(FlowFiles):
     output: str = setting("outputs/flow", "folder, or address in an object store")
     contents: Any = setting(
         AUTO,
-        "columns of each file, such as [points, residual, is_valid]; auto = all that the method has, without points",
+        "columns of each file, such as [points, residual, is_valid]; auto = all but points (x, y, z of sweep t)",
         several=True,
     )
-    result_name: str | None = _path("key under which the total flow is also written into HDF5 scenes; null = none")
+    result_name: str | None = _path(
+        "key under which HDF5 scenes also get the total flow, as OpenSceneFlow's viewers read it"
+    )
     tracks: bool | str = setting(
         False,
         "true = also write the moving objects of each complete log to <log id>/tracks.parquet; mot, kitti, "
@@ -468,10 +456,8 @@ class View(Command):
 
     The extra `html` makes pages. A page has a timeline of sweeps. It shows the points of sweep t, coloured by residual
     flow, speed, object, confidence, P(moving) and, if the log has labels, truth or error. It also shows an arrow per
-    moving cluster, and the boxes, trails, ids and speeds of tracks. Click on an object for more. flow=FOLDER shows the
-    output of `cflow flow`, and its tracks, instead of new estimates. format=rerun writes a recording OUTPUT/<log
-    id>.rrd for the viewer rerun instead of a page, with all points and sweep t+1 (extra `rerun`). show=true opens the
-    files at the end. OUTPUT/config.yaml contains the settings and versions.
+    moving cluster, and the boxes, trails, ids and speeds of tracks. Click on an object for more. A recording has all
+    points and sweep t+1 (extra `rerun`).
 
     examples:
       cflow view                                                   a simulated street, no data needed
@@ -526,13 +512,10 @@ class Clean(Command):
     """Writes logs without dynamic objects: OUTPUT/<log id>, a folder of point clouds, poses, times and ground masks.
 
     data=arrays reads such a folder. A point is dynamic if its flow is at least 0.05 m per sweep and P(moving) at least
-    0.5. remove_stopped=true tracks objects and also removes those that move at another time, such as a waiting car.
-    map=true also writes OUTPUT/<log id>.ply, the static points in the world, one per voxel, and a picture of them,
-    <log id>.png. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other
-    columns of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True
-    = not in the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing
-    logs. OUTPUT/config.yaml has settings and versions, and OUTPUT/<log id>.json those of the log. Results of other logs
-    in OUTPUT stay.
+    0.5. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other columns
+    of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True = not
+    in the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing logs.
+    Results of other logs in OUTPUT stay.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag
@@ -552,7 +535,9 @@ class Clean(Command):
     suffix: str | None = _path(
         "format of the clouds: .npy | .ply | .pcd | .bin | ...; null = that of the log's own clouds, else .npy"
     )
-    map: bool = setting(False, "also write the static points in the world, one per voxel, to <log id>.ply")
+    map: bool = setting(
+        False, "also write the static points in the world, one per voxel, to <log id>.ply, and a picture"
+    )
     voxel_size: float = _above_0(0.1, "side of a voxel of the map, in metres")
 
 
@@ -579,9 +564,6 @@ class Bench(Command):
     batches: tuple[int, ...] = setting(
         (1, 8), "batch sizes for which windows per second are measured", kind=int, low=1, several=True
     )
-    keep_memory: bool = setting(
-        True, "false = give freed memory back to the system, as other programs do; commands keep it, which is faster"
-    )
 
 
 class ListSettings(Words):
@@ -607,11 +589,11 @@ class ListSettings(Words):
 class Info(Words):
     """Prints the versions of cflow_torch and of the packages that it uses, the system, the processor and the GPUs.
 
-    --full adds torch's report about the system, and names the optional packages that are not installed.
+    The last line names the optional packages that are not installed. If the bug is one of a GPU, please add the output
+    of `python -m torch.utils.collect_env`.
 
     examples:
       cflow info            paste the output into a bug report
-      cflow info --full     for a bug of the installation or of a GPU
       cflow --version       prints the version only
     """
 

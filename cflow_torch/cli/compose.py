@@ -109,8 +109,7 @@ def run_job(name: str, composed: Any) -> Any:
         settings = replace(settings, data=_complete(settings))
         from cflow_torch.windows.memory import keep_freed_memory  # imports torch, which takes seconds
 
-        if getattr(settings, "keep_memory", True):
-            keep_freed_memory()
+        keep_freed_memory()
         return import_module(f"cflow_torch.cli.{name}").task(settings)
 
 

@@ -58,7 +58,7 @@ from cflow_torch.fleet.manifest import (
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
-from cflow_torch.fleet.work import source_name
+from cflow_torch.fleet.work import open_quickly, source_name
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, FlowResult
 
@@ -86,15 +86,9 @@ class FlowRun(NamedTuple):
 
     def logs(self) -> Iterator[Log]:
         """Open the logs of this shard one by one, without what takes time."""
-        cheap = {"check": False, "odometry": False, "read_as": None}
-        sources = self.sources._replace(settings={**self.sources.settings, **cheap})
         for part in self.parts:
-            with suppress(Exception), sources.open(part.source) as log:  # the worker reports the error
+            with suppress(Exception), open_quickly(self.job, part.source) as log:  # the worker reports the error
                 yield log
-
-    def log_ids(self) -> Iterator[str]:
-        """Yield the ids of the logs of this shard, which name their folders."""
-        return (log.log_id for log in self.logs())
 
 
 def compute(
@@ -154,8 +148,8 @@ def _check_output(cfg: FlowFiles, flow: FlowRun, check: Callable[[Any, FlowRun],
     names = [source_name(part.source) for part in flow.parts]
     check_logs(output, names, flow.job.identity, cfg.resume, cfg.overwrite, is_alone)
     if cfg.overwrite and is_alone and not cfg.dry_run:
-        for log_id in flow.log_ids():
-            clear_log(output / log_id)
+        for log in flow.logs():
+            clear_log(output / log.log_id)
 
 
 def _useful_workers(cfg: FlowFiles, flow: FlowRun, layout: Layout) -> Layout:

@@ -14,24 +14,20 @@ from cflow_torch.errors import CFlowError
 
 
 def task(arguments: list[str]) -> None:
-    if arguments not in ([], ["--short"], ["--full"]):
-        raise CFlowError(f"info takes --short (the default) or --full, got {' '.join(arguments)}: cflow info")
-    is_full = arguments == ["--full"]
-    print(f"cflow_torch {cflow_torch.__version__} in {Path(cflow_torch.__file__).parent}", flush=True)
-    if is_full:
-        from torch.utils.collect_env import get_pretty_env_info  # takes seconds
-
-        print(get_pretty_env_info())
+    if arguments:
+        raise CFlowError(f"info takes nothing, got {' '.join(arguments)}: cflow info")
+    print(f"cflow_torch {cflow_torch.__version__} in {Path(cflow_torch.__file__).parent}")
     print(f"Python {platform.python_version()} on {platform.platform()}")
     print(f"processor {processor()}, cores {os.cpu_count()}")
     for file in sorted(Path("/proc/driver/nvidia/gpus").glob("*/information")):  # of NVIDIA's driver for Linux
         print("GPU", file.read_text().partition("\n")[0].partition(":")[2].strip())
+    missing = []
     for name in sorted(_requirements() - {"cflow_torch"}):
         try:
             print(name, metadata.version(name))
         except metadata.PackageNotFoundError:
-            if is_full:
-                print(name, "not installed")
+            missing.append(name)
+    print("not installed:", ", ".join(missing) or "nothing")
 
 
 def processor() -> str:

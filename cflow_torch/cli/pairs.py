@@ -6,12 +6,13 @@ Threads would not help: a window is thousands of small operations, and only one 
 from __future__ import annotations
 
 import os
-from collections import deque
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
-from itertools import cycle
+from queue import SimpleQueue
 from typing import Any, Callable, Iterator, Sequence, Tuple
 
+import numpy as np
 import torch
 
 from cflow_torch.cli.failures import Failures, collect_failures
@@ -20,6 +21,7 @@ from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.fleet.executors import ProcessExecutor
 from cflow_torch.fleet.machine import choose_layout, frames_per_worker
 from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
+from cflow_torch.fleet.work import run_ahead
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.setting import AUTO
 from cflow_torch.stages import TimedModel
@@ -57,21 +59,18 @@ def _answers(pairs: Sequence[LogPair], model: TimedModel) -> Iterator[tuple[LogP
     if count < 2:
         yield from zip(Progress(pairs), (partial(_estimate, model, sweeps) for sweeps in windows))
         return
-    make = partial(_Estimator, method)
-    executors = [ProcessExecutor(make) for _ in range(count)]
-    waiting: deque[Answer] = deque()
-    in_order = iter(Progress(pairs))
+    executors = [ProcessExecutor(partial(_Estimator, method)) for _ in range(count)]
+    idle: SimpleQueue[ProcessExecutor] = SimpleQueue()
+    for executor in executors:
+        idle.put(executor)
+    threads = ThreadPoolExecutor(count)
     try:
-        for executor, sweeps in zip(cycle(executors), windows):
-            is_read = isinstance(sweeps, Window)
-            future = executor.submit("estimate", sweeps) if is_read else None
-            waiting.append(partial(_answer, model, sweeps, future, make))
-            if len(waiting) > _AHEAD * count:
-                yield next(in_order), waiting.popleft()
-        yield from zip(in_order, waiting)
+        answers = run_ahead(threads, partial(_estimate_elsewhere, idle), windows, _AHEAD * count)
+        yield from zip(Progress(pairs), (partial(_answer, model, answer) for answer in answers))
     finally:
         for executor in executors:
             executor.close()
+        threads.shutdown()
 
 
 def _windows(pairs: Sequence[LogPair], config: Config) -> Iterator[Window | Exception]:
@@ -93,22 +92,25 @@ def _estimate(model: TimedModel, sweeps: Window | Exception) -> tuple[Window, Fl
         return sweeps, model([sweeps])[0]
 
 
-def _answer(
-    model: TimedModel, sweeps: Window | Exception, future: Future[Any] | None, make: Callable[[], Any]
-) -> tuple[Window, FlowResult]:
-    """Wait for the estimate of a worker process. If the process ends, try once more, in another one, alone."""
-    if future is None or isinstance(sweeps, Exception):
-        raise sweeps  # type: ignore[misc]  # without a future, it is the error of reading
+def _estimate_elsewhere(
+    idle: SimpleQueue[ProcessExecutor], sweeps: Window | Exception
+) -> tuple[Window, dict[str, np.ndarray], Any]:
+    """Estimate a window in an idle worker process. If the process ends, try once more, in another one."""
+    if isinstance(sweeps, Exception):
+        raise sweeps
+    executor = idle.get()
     try:
-        arrays, seconds = future.result()
-    except BrokenExecutor:
-        alone = ProcessExecutor(make)
-        try:
-            arrays, seconds = alone.submit("estimate", sweeps).result()
-        except BrokenExecutor:
-            raise CFlowError(f"2 worker processes died on it, the last one: {alone.close()}") from None
-        finally:
-            alone.close()
+        with suppress(BrokenExecutor):
+            return (sweeps, *executor.call("estimate", sweeps))
+        return (sweeps, *executor.call("estimate", sweeps))
+    except BrokenExecutor as error:
+        raise CFlowError(f"2 worker processes died on it, the last one: {error}") from None
+    finally:
+        idle.put(executor)
+
+
+def _answer(model: TimedModel, answer: Future[Any]) -> tuple[Window, FlowResult]:
+    sweeps, arrays, seconds = answer.result()
     model.pairs.append(seconds)
     return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 

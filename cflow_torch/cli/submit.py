@@ -64,7 +64,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
     wanted = [frame for log in logs for frame in frames.plan_log(log, listed)]
     if not wanted:
         raise CFlowError("there is no frame to submit: the logs are too short, or the list names none of their sweeps")
-    if version.is_masked and masks is None and any(frames.log_mask(f.log, f.index) is None for f in wanted):
+    if version.is_masked and masks is None and any(f.log.eval_mask(f.index) is None for f in wanted):
         print("no masks given: the official rule is applied, which can differ by a point from the server's masks")
     plan: Plan = []
     failures: Failures = []

@@ -17,17 +17,14 @@ from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
-from cflow_torch.data.log_motion import surrounds_poses
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
-from cflow_torch.data.read_as import ReadAs
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.ground.segmentation import CHOICES, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, Sweep, Window
 from cflow_torch.windows.deskewing import SCANS
-from cflow_torch.windows.readings import WORLD
 
 _OF_ALL = ("find_ground", "odometry", "read_as", "own_vehicle", "deskew", "check")  # settings of every data set
 _log = logging.getLogger(__name__)
@@ -196,7 +193,7 @@ def open_log(
     odometry: bool = False,
     check: bool = True,
     deskew: Any = "auto",
-    read_as: str | None = "auto",
+    read_as: str | None | Sequence[str] = "auto",
     own_vehicle: str | None = "auto",
     **settings: Any,
 ) -> Log:
@@ -209,7 +206,7 @@ def open_log(
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
         odometry: estimate poses with kiss-icp if the log has none.
         check: warn of likely mistakes, see `check_log`.
-        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`. Or a
+        read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`; or a
             value of `deskew`: "times", "clockwise", ...
         own_vehicle: "auto" = leave out returns that ride along with the vehicle, see `OwnVehicleLog`; None = keep them.
         deskew: how to move points to the instant of their sweep, see `cflow_torch.data.deskewing.DeskewedLog`; False
@@ -244,28 +241,15 @@ def open_log(
         from cflow_torch.data.odometry import with_poses
 
         log = with_poses(log)
-    if read_as != "auto":
-        log = read_log_as(log, read_as)
-    judgement = DeskewedLog(log, deskew).judgement if read_as == "auto" and _may_be_in_world(log) else None
-    if judgement is not None and WORLD in judgement.best:
-        log = ReadAs(log, WORLD, is_found=True)
-        judgement = judgement.adopted()
+    log = read_log_as(log, read_as)
     if own_vehicle is not None:
         log = OwnVehicleLog(log)
-    log = DeskewedLog(log, deskew, judgement)
+    log = DeskewedLog(log, deskew)
     if find_ground is not None:
         log = GroundSegmentedLog(log, find_ground)
     if check:
         check_log(log)
     return log
-
-
-def _may_be_in_world(log: Log) -> bool:
-    """Test whether the points of a log may be in the world's frame, by one sweep."""
-    try:
-        return log.unwrapped.has_viewpoints or surrounds_poses(log)
-    except (CFlowError, OSError):
-        return False  # `sweep` raises the error
 
 
 def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:

@@ -38,7 +38,6 @@ class DeskewedLog(LogWrapper):
             azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = the scan under which
             the static world stands still best (`cflow_torch.windows.readings`). Without a clear one, points with times
             of raw points are moved by these, and others stay.
-        judgement: the comparison of these scans; None = it is made at first use.
 
     Attributes:
         reading: the `Reading` in use. It is decided at first use, from the log alone.
@@ -53,12 +52,11 @@ class DeskewedLog(LogWrapper):
           their sweeps, and divide the motion by the turns between the two measurements.
     """
 
-    def __init__(self, log: Log, deskew: str = "auto", judgement: Judgement | None = None) -> None:
+    def __init__(self, log: Log, deskew: str = "auto") -> None:
         if deskew not in CHOICES:
             raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(CHOICES)}")
         super().__init__(log)
         self._deskew = deskew
-        self._given = judgement
         self._recent = CachedLog(log, 2)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -68,7 +66,7 @@ class DeskewedLog(LogWrapper):
     def reading(self) -> Reading:
         if self._deskew != "auto":
             return Reading(self._deskew)
-        judgement = self._given or (self.judgement if len(self._scans) > 1 else None)
+        judgement = self.judgement if len(self._scans) > 1 else None
         scan = judgement.scan if judgement is not None else ""
         return Reading(scan or self._scans[0], self._note_of(scan or self._scans[0]))
 
@@ -76,7 +74,7 @@ class DeskewedLog(LogWrapper):
     def judgement(self) -> Judgement | None:
         """How well scans and readings of the poses fit; None = a sweep cannot be read, and `sweep` raises its error."""
         try:
-            return self._given or judge_log(self.log, self._place, self._scans)
+            return judge_log(self.log, self._place, self._scans)
         except (CFlowError, OSError):
             return None
 

@@ -1,9 +1,10 @@
-"""Find the folders that are logs."""
+"""Find the folders that are logs, and sort their files."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Callable
+from typing import Any, Callable
 
 from cflow_torch.errors import CFlowError
 
@@ -26,3 +27,8 @@ def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Tes
         children = (child for folder in level if folder not in logs for child in folder.iterdir())
         level = [c for c in children if not c.name.startswith(".") and is_passed(c) and c.is_dir()]
     return sorted(found)
+
+
+def natural_key(name: str) -> tuple[Any, ...]:
+    """Return a key for sorting that compares digits in names as numbers: 2 before 10."""
+    return tuple((0, int(run), run) if run.isdecimal() else (1, 0, run) for run in re.findall(r"\d+|\D+", name))

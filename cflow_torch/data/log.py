@@ -14,7 +14,7 @@ from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
 from cflow_torch.errors import MissingFile, warn
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
-from cflow_torch.windows.readings import Judgement
+from cflow_torch.windows.readings import LEAST_DISTANCE, Judgement, is_around
 
 _Log = TypeVar("_Log", bound="Log")
 
@@ -105,10 +105,15 @@ class Log(ABC):
         """(M,) int64 nanoseconds and (M, 4, 4) float64 `T_world_ego` at these times; None = only `poses` are known."""
         return None
 
+    @property
+    def readings(self) -> tuple[str, ...]:
+        """The readings under which points and poses are converted, in this order, see `cflow_torch.data.read_as`."""
+        return ()
+
     @cached_property
-    def read_as(self) -> str | None:
-        """The reading under which points and poses are converted, see `cflow_torch.data.read_as`."""
-        return None
+    def surrounds_poses(self) -> bool:
+        """Whether points lie around the positions of their poses, see `points_surround_poses`."""
+        return points_surround_poses(self)
 
     @property
     def judgement(self) -> Judgement | None:
@@ -215,6 +220,30 @@ class Log(ABC):
             raise CFlowError(f"{where} has {len(self.timestamps)} sweeps; scene flow needs two or more")
 
 
+def known_poses(log: Log) -> np.ndarray | None:
+    """Return the poses that a log knows without reading points, (K, 4, 4) float64; None = it knows none."""
+    try:
+        poses = log.poses
+    except CFlowError:
+        return None
+    if poses is None or np.shape(poses) != (len(log.timestamps), 4, 4) or not np.isfinite(poses).all():
+        return None
+    return np.asarray(poses, np.float64)
+
+
+def points_surround_poses(log: Log) -> bool:
+    """Test whether points lie around the position of their pose, by the sweep that is farthest from the origin.
+
+    Cost: reads this sweep if it is at least 3 m from the origin.
+    """
+    poses = known_poses(log)
+    if poses is None:
+        return False
+    distance = np.linalg.norm(poses[:, :2, 3], axis=1)
+    farthest = int(distance.argmax())
+    return bool(distance[farthest] >= LEAST_DISTANCE) and is_around(log.sweep(farthest).points, poses[farthest])
+
+
 def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> Window:
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
@@ -316,9 +345,13 @@ class LogWrapper(Log):
     def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
         return self.log.trajectory
 
+    @property
+    def readings(self) -> tuple[str, ...]:
+        return self.log.readings
+
     @cached_property
-    def read_as(self) -> str | None:
-        return self.log.read_as
+    def surrounds_poses(self) -> bool:
+        return self.log.surrounds_poses
 
     @property
     def judgement(self) -> Judgement | None:

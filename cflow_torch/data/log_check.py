@@ -7,13 +7,14 @@ from typing import Callable, Iterable, List
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
-from cflow_torch.data.log import CachedLog, Log
-from cflow_torch.data.log_motion import find_lapses, judge_log, known_poses
+from cflow_torch.data.log import CachedLog, Log, known_poses
+from cflow_torch.data.log_motion import find_lapses, judge_log
+from cflow_torch.data.read_as import ReadAs
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import NO_READING, STILL, UNKNOWN, WORLD
+from cflow_torch.windows.readings import MOUNTS, NO_READING, STILL, TURNED, UNKNOWN, WORLD, Judgement
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
@@ -87,12 +88,15 @@ def _frame(log: Log) -> list[Finding]:
     reading, problem = frame_problem(log.sweep(0).points)
     if not problem:
         return [Finding("frame", RIGHT, "metres, around the vehicle, z up", True)]
-    fix = f"; data.read_as={reading} converts them" if reading else ""
+    fix = f"; {_setting(log, reading)} converts them" if reading else ""
     return [Finding("frame", WRONG, f"in the first sweep {problem}{fix}", True)]
 
 
 def _motion(log: Log) -> list[Finding]:
-    judgement = log.judgement or judge_log(log)
+    reading, _ = frame_problem(log.sweep(0).points)
+    if reading:  # the poses are judged in the frame that the points will have
+        log = ReadAs(log, reading)
+    judgement = judge_log(log) if reading else log.judgement or judge_log(log)
     if not judgement.shares:
         return []
     has_poses = log.sweep(0).pose is not None
@@ -103,17 +107,29 @@ def _motion(log: Log) -> list[Finding]:
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
         fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
-    elif judgement.offset is not None:
-        x, y = judgement.offset
-        place = f"x = {x:g} m" if x else f"y = {y:g} m"
-        why, fix = "in turns,", f"pass data.ego_T_lidar with about {place} (data=arrays or hdf5)"
     elif name == NO_READING:
         why, fix = "", "check that the poses belong to this log, their times, units and quaternions"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
-        fix = " or ".join(f"data.read_as={each}" for each in judgement.best)
+        fix = " or ".join(_fix(log, judgement, each) for each in judgement.best)
         fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
+
+
+def _fix(log: Log, judgement: Judgement, name: str) -> str:
+    """Return the setting that reads the log as found."""
+    if name == TURNED:
+        turn = np.degrees(judgement.turn)
+        return f"data.ego_T_lidar with a rotation of about {turn:.0f} degrees about z (data=arrays, hdf5 or bags)"
+    if name not in MOUNTS:
+        return _setting(log, name)
+    x, y = MOUNTS[name]
+    return f"data.ego_T_lidar with about {f'x = {x:g} m' if x else f'y = {y:g} m'} (data=arrays, hdf5 or bags)"
+
+
+def _setting(log: Log, reading: str) -> str:
+    readings = [*log.readings, reading]
+    return f"data.read_as=[{','.join(readings)}]" if len(readings) > 1 else f"data.read_as={reading}"
 
 
 def _lapses(log: Log) -> list[Finding]:

@@ -8,13 +8,11 @@ from typing import Callable, Iterator, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.log import Log
-from cflow_torch.errors import CFlowError
+from cflow_torch.data.log import Log, known_poses
 from cflow_torch.transforms import turn_of
 from cflow_torch.types import Sweep
 from cflow_torch.windows.readings import (
     GIVEN,
-    LEAST_DISTANCE,
     OFF,
     STILL,
     TIMES,
@@ -22,7 +20,6 @@ from cflow_torch.windows.readings import (
     Judgement,
     Pair,
     difference,
-    is_around,
     judge,
     make_pair,
 )
@@ -34,6 +31,7 @@ _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle sta
 # A step between two poses is suspect if it differs from its neighbours' by this, as a length or as a part of theirs.
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
 _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
+_FEWEST_POSES = 5  # that tell a usual step
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
 
 
@@ -45,38 +43,30 @@ class Lapse(NamedTuple):
     is_single: bool  # True: only this pose is wrong; False: all later poses are shifted
 
 
-def known_poses(log: Log) -> np.ndarray | None:
-    """Return the poses that a log knows without reading points, (K, 4, 4) float64; None = it knows none."""
-    try:
-        poses = log.poses
-    except CFlowError:
-        return None
-    if poses is None or np.shape(poses) != (len(log.timestamps), 4, 4) or not np.isfinite(poses).all():
-        return None
-    return np.asarray(poses, np.float64)
-
-
-def choose_pairs(num_sweeps: int, poses: np.ndarray | None) -> list[tuple[int, int]]:
+def choose_pairs(num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int] = ()) -> list[tuple[int, int]]:
     """Choose pairs of sweeps that show wrong readings best, up to four, in order.
 
     With poses, these are the pairs over which the vehicle turns most, in which it is fastest, and whose motion differs
     most from that one sweep earlier, and later, because they show poses that are early or late. The sweeps of a pair
-    are up to five apart, and up to 6.4 m, because readings differ more over a longer motion. Without poses, and if the
-    vehicle does not move, they are neighbours spread over the log.
+    are up to five apart, and up to 6.4 m, because readings differ more over a longer motion. No pair and no neighbour
+    of it reaches over the steps `jumps`, if others are left. Without poses, and if the vehicle does not move, they are
+    neighbours spread over the log.
     """
     firsts = range(num_sweeps - 1)
-    pairs = [] if poses is None else [(first, _partner(poses, first)) for first in firsts]
+    pairs = [] if poses is None else [(first, _partner(poses, first, jumps)) for first in firsts]
     if poses is None or max(difference(_motion(poses, *pair), np.eye(4)) for pair in pairs) < _LEAST_MOTION:
         spread = {min(num_sweeps * part // 6, num_sweeps - 2) for part in (1, 3, 5)}
         return [(first, first + 1) for first in sorted(spread)]
-    inner = [pair for pair in pairs if pair[0] > 0 and pair[1] + 1 < num_sweeps]  # with poses before and after
+    smooth = [pair for pair in pairs if pair[0] not in jumps] or pairs
+    inner = [pair for pair in smooth if pair[0] > 0 and pair[1] + 1 < num_sweeps]  # with poses before and after
+    inner = [pair for pair in inner if not {pair[0] - 1, pair[1]} & set(jumps)] or inner
     changes = [partial(_change, poses, -1), partial(_change, poses, 1)] if inner else []
     criteria = (partial(_turn, poses), partial(_speed, poses), *changes)
-    return sorted({max(inner or pairs, key=lambda pair: criterion(*pair)) for criterion in criteria})
+    return sorted({max(inner or smooth, key=lambda pair: criterion(*pair)) for criterion in criteria})
 
 
-def _partner(poses: np.ndarray, first: int) -> int:
-    last = min(first + _MOST_SWEEPS, len(poses) - 1)
+def _partner(poses: np.ndarray, first: int, jumps: Sequence[int]) -> int:
+    last = min([first + _MOST_SWEEPS, len(poses) - 1, *(step for step in jumps if step > first)])
     near = np.linalg.norm(poses[first + 1 : last + 1, :3, 3] - poses[first, :3, 3], axis=1) < _LONGEST_STEP
     return first + 1 + max(int(near.cumprod().sum()) - 1, 0)
 
@@ -110,10 +100,11 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     Cost: reads two sweeps per pair, and 0.1 s each.
     """
     poses = known_poses(log)
-    chosen = choose_pairs(len(log.timestamps), poses)
+    steps = steps_of(log)
+    chosen = choose_pairs(len(log.timestamps), poses, () if steps is None else steps.suspects)
     sweeps = {index: log.sweep(index) for pair in chosen for index in pair}
     pairs = partial(_make_pairs, sweeps, chosen, poses, deskew)
-    if surrounds_poses(log):
+    if log.surrounds_poses:
         judgement = judge(pairs((OFF,), True))
         if WORLD in judgement.best:
             return judgement
@@ -121,19 +112,6 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
-
-
-def surrounds_poses(log: Log) -> bool:
-    """Test whether points lie around the position of their pose, by the sweep farthest from the origin.
-
-    Cost: reads that sweep if it is at least 3 m from the origin.
-    """
-    poses = known_poses(log)
-    if poses is None:
-        return False
-    distance = np.linalg.norm(poses[:, :2, 3], axis=1)
-    farthest = int(distance.argmax())
-    return bool(distance[farthest] >= LEAST_DISTANCE) and is_around(log.sweep(farthest).points, poses[farthest])
 
 
 def _make_pairs(
@@ -154,15 +132,26 @@ def _make_pairs(
         yield make_pair(sweeps[first], sweeps[second], before, after, in_world, scans=shown, **how)
 
 
-def find_lapses(log: Log) -> list[Lapse]:
-    """Find poses that are wrong, and jumps of the poses, in the order of the log.
+class Steps(NamedTuple):
+    """The steps between neighbouring poses, and what those around each let expect."""
 
-    A step between neighbouring poses is suspect if it differs from the steps around it. We read the two sweeps of the
-    most suspect steps, and compare the points under the step and under that of the neighbours.
-    """
+    given: np.ndarray  # (K-1, 4, 4), maps each sweep to the next
+    usual: np.ndarray  # (K-1, 4, 4), of the median rotation and speed of the steps around it
+    excess: np.ndarray  # (K-1,) metres by which a step differs, rotations at 10 m
+
+    @property
+    def suspects(self) -> list[int]:
+        """Indices of steps that differ much from those around them, up to four, largest first."""
+        limit = _SUSPECT + _SUSPECT_SHARE * np.linalg.norm(self.usual[:, :3, 3], axis=1)
+        order = np.argsort(-self.excess, kind="stable")[:_NUM_SUSPECTS]
+        return [int(k) for k in order if self.excess[k] > limit[k]]
+
+
+def steps_of(log: Log) -> Steps | None:
+    """Return the steps between the poses of a log; None = there are too few poses."""
     poses = known_poses(log)
-    if poses is None or len(poses) < 5:
-        return []
+    if poses is None or len(poses) < _FEWEST_POSES:
+        return None
     steps = np.linalg.inv(poses[1:]) @ poses[:-1]
     interval = np.diff(np.asarray(log.timestamps, np.float64)).clip(1e-9)
     rate = steps[:, :3, 3] / interval[:, None]
@@ -174,15 +163,25 @@ def find_lapses(log: Log) -> list[Lapse]:
         usual[index, :3, 3] = np.median(rate[around], 0) * interval[index]
     excess = np.linalg.norm(steps[:, :3, 3] - usual[:, :3, 3], axis=1)
     excess += _ARM * np.linalg.norm(steps[:, :2, 0] - usual[:, :2, 0], axis=1)
-    limit = _SUSPECT + _SUSPECT_SHARE * np.linalg.norm(usual[:, :3, 3], axis=1)
-    suspects = [int(k) for k in np.argsort(-excess, kind="stable")[:_NUM_SUSPECTS] if excess[k] > limit[k]]
-    wrong = sorted(k for k in suspects if _contradicted(log, k, steps[k], usual[k]))
+    return Steps(steps, usual, excess)
+
+
+def find_lapses(log: Log) -> list[Lapse]:
+    """Find poses that are wrong, and jumps of the poses, in the order of the log.
+
+    A step between neighbouring poses is suspect if it differs from the steps around it. We read the two sweeps of the
+    most suspect steps, and compare the points under the step and under that of the neighbours.
+    """
+    steps = steps_of(log)
+    if steps is None:
+        return []
+    wrong = sorted(k for k in steps.suspects if _contradicted(log, k, steps.given[k], steps.usual[k]))
     lapses: list[Lapse] = []
     for step in wrong:
         if lapses and lapses[-1].sweep == step and not lapses[-1].is_single:
             lapses[-1] = lapses[-1]._replace(is_single=True)  # away from, and back to the trajectory
         else:
-            lapses.append(Lapse(step + 1, float(excess[step]), False))
+            lapses.append(Lapse(step + 1, float(steps.excess[step]), False))
     return lapses
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Sequence
 
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.data.log import Log, LogWrapper
+from cflow_torch.data.log import Log, LogWrapper, points_surround_poses
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import Sweep
@@ -87,6 +88,10 @@ class PosedLog(LogWrapper):
         super().__init__(log)
         self.poses = self._given = poses
         self.trajectory = None
+
+    @cached_property
+    def surrounds_poses(self) -> bool:
+        return points_surround_poses(self)
 
     def sweep(self, index: int) -> Sweep:
         return replace(self.log.sweep(index), pose=self._given[index].copy())

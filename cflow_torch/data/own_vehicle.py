@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
-from cflow_torch.data.log import FlowLabels, LogWrapper
-from cflow_torch.data.log_motion import known_poses
+from cflow_torch.data.log import FlowLabels, LogWrapper, known_poses
 from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import transform_points

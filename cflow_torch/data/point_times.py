@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Callable, Mapping, NamedTuple
 
 import numpy as np
 
-TIME_FIELDS = ("t", "time", "timestamp", "offset", "offset_time", "time_stamp")
+from cflow_torch.data.column_names import time_columns
+
 _UNITS = (10**9, 10**6, 10**3, 1)  # nanoseconds in s, ms, us and ns
 # Seconds in which the middle half of the points is measured. The range is below a factor of 1000, so one unit fits.
 _SHORTEST_HALF, _LONGEST_HALF = 0.0015, 1.4
@@ -25,14 +26,38 @@ class PointTimes(NamedTuple):
     note: str  # what we assumed, or why there are no times; "" = nothing to say
 
 
+def find_times(
+    columns: Mapping[str, np.ndarray],
+    stamp_ns: int | None,
+    period: float | None,
+    points: np.ndarray | None,
+    tell: Callable[[str, str], None],
+) -> PointTimes | None:
+    """Return the times in the columns of a cloud, by the first usable one; None = there are none.
+
+    `tell` is called with what we assume or leave out, and the kind of this text. Other arguments: `seconds_after`.
+    """
+    found = [seconds_after(columns[name], stamp_ns, period, points) for name in time_columns(columns)]
+    usable = [times for times in found if times.seconds is not None]
+    for times in usable[:1] or found:
+        tell(times.note, "times of points")
+    if not usable:
+        return None
+    is_stray = usable[0].is_stray
+    if is_stray.any():
+        text = f"{is_stray.sum()} of {len(is_stray)} points of a sweep have stray times and are left out"
+        tell(text + ", also in other sweeps", "stray times")
+    return usable[0]
+
+
 def seconds_after(
-    values: np.ndarray, stamp_ns: int, period: float | None = None, points: np.ndarray | None = None
+    values: np.ndarray, stamp_ns: int | None, period: float | None = None, points: np.ndarray | None = None
 ) -> PointTimes:
     """Convert times of any unit and clock to seconds after the stamp of their sweep.
 
     Args:
         values: (N,) integers or floats.
-        stamp_ns: time of the sweep, nanoseconds.
+        stamp_ns: time of the sweep, nanoseconds; None = unknown.
         period: seconds between the sweeps of the log; None = unknown.
         points: (N, 2+) in the frame of the LiDAR, which tell how far it turned in a sweep; None = once.
 
@@ -71,9 +96,10 @@ def seconds_after(
     seconds = ticks * (unit * 1e-9)
     reach = max(1.1 * min(period or _LONGEST_PERIOD, _LONGEST_PERIOD), 3e-9 * half * unit)
     is_stray |= ~(np.abs(seconds) <= reach)
-    lag, note = _lag(centre, unit, stamp_ns) * 1e-9, ""
+    lag, note = _lag(centre, unit, stamp_ns or 0) * 1e-9, ""
     if abs(lag) > _LARGEST_LAG:
-        note = f"times of points have another clock than the sweeps ({lag:+.6g} s), so the first one is at the stamp"
+        if stamp_ns is not None:
+            note = f"times of points have another clock than the sweeps ({lag:+.6g} s), so the first is at the stamp"
         lag = -float(seconds[~is_stray].min())
     return PointTimes(seconds + lag, is_stray, note)
 

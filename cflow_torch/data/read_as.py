@@ -4,51 +4,69 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Sequence
 
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper, points_surround_poses
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.errors import CFlowError
-from cflow_torch.transforms import as_matrix, rigid_transform, transform_points
+from cflow_torch.transforms import halfway, rigid_transform, transform_points
 from cflow_torch.types import Sweep
-from cflow_torch.windows.readings import AXES, CAMERA, CAUSES, EARLY, LATE, MOUNT, OF_POSES, WORLD
+from cflow_torch.windows.readings import AXES, CAMERA, CAUSES, HALF_EARLY, HALF_LATE, MOUNT, OF_POSES, SHIFTS, WORLD
 
-_OF_POINTS = {"points_millimetres": 1e-3, "points_centimetres": 1e-2}  # the points have this unit, the poses metres
-_OF_BOTH = {"points_camera": AXES[CAMERA], "points_upside_down": AXES["down"]}  # axes of points and poses
+_OF_POINTS = {  # what converts points as stored to metres, x forward and z up
+    "points_millimetres": 1e-3 * np.eye(3),
+    "points_centimetres": 1e-2 * np.eye(3),
+    "points_camera": AXES[CAMERA],
+    "points_upside_down": AXES["down"],
+}
 _OF_POSES = [name for name in OF_POSES if not name.startswith(MOUNT)]
-CHANGES_POINTS = frozenset({*_OF_BOTH, *_OF_POINTS})
+CHANGES_POINTS = frozenset(_OF_POINTS)
 """Readings under which the numbers of the points are others than those in the files."""
-READ_AS = ("auto", None, WORLD, LATE, EARLY, *_OF_POSES, *_OF_BOTH, *_OF_POINTS)
+READ_AS = ("auto", None, WORLD, *SHIFTS, *_OF_POSES, *_OF_POINTS)
 
 
-def read_as(log: Log, reading: str | None = "auto") -> Log:
+def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
     """Return a log that is read in another way.
 
     Args:
         log: any log.
-        reading: None = as it is. "auto" = the same, unless the points are in the world's frame: then "world". What
-            else is allowed:
+        reading: None = as it is. "auto" = the same, unless the points are in the world's frame: then "world". Several
+            are used one after the other. What else is allowed:
 
             - "world": points are in the world's frame, and we move them to the frame of the vehicle;
             - "inverted": poses are T_ego_world;
             - "still": ignore the poses;
             - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; the first, or last, is extrapolated;
+              "half_late", "half_early": it is halfway there;
             - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
               camera's, or the x axis points to the left, backward or to the right of that of the points; "down": z
               points down, and y to the right;
             - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
-            - "millimetres", "centimetres": unit of the poses; "points_millimetres", "points_centimetres": of points;
-            - "points_camera", "points_upside_down": points and poses have a camera's axes (x right, y down, z
-              forward), or z points down and y to the right.
+            - "millimetres", "centimetres": unit of the poses;
+            - "points_millimetres", "points_centimetres", "points_camera", "points_upside_down": unit or axes of the
+              points (a camera's: x right, y down, z forward; upside down: y to the right). The poses stay, so give
+              ("points_camera", "camera") if they have these axes, too.
     """
+    if isinstance(reading, Sequence) and not isinstance(reading, str):
+        for each in reading:
+            log = read_as(log, each)
+        return log
     if reading not in READ_AS:
         raise CFlowError(f"read_as={reading!r}: give one of {', '.join(str(one or 'null') for one in READ_AS)}")
     if reading == "auto":
-        return ReadAs(log, WORLD, is_found=True) if WORLD in judge_log(log).best else log
+        return ReadAs(log, WORLD, is_found=True) if _is_in_world(log) else log
     return log if reading is None else ReadAs(log, reading)
+
+
+def _is_in_world(log: Log) -> bool:
+    """Test whether the points of a log are in the world's frame; by one sweep, if it is not there."""
+    try:
+        return (log.unwrapped.has_viewpoints or log.surrounds_poses) and WORLD in judge_log(log).best
+    except (CFlowError, OSError):
+        return False  # `sweep` raises the error
 
 
 class ReadAs(LogWrapper):
@@ -59,8 +77,16 @@ class ReadAs(LogWrapper):
 
     def __init__(self, log: Log, reading: str, is_found: bool = False) -> None:
         super().__init__(log)
-        self.read_as: str = reading
+        self.reading = reading
         self.is_reading_found = is_found
+
+    @property
+    def readings(self) -> tuple[str, ...]:
+        return (*self.log.readings, self.reading)
+
+    @cached_property
+    def surrounds_poses(self) -> bool:
+        return points_surround_poses(self)
 
     def sweep(self, index: int) -> Sweep:
         sweep = self.log.sweep(index)
@@ -70,7 +96,7 @@ class ReadAs(LogWrapper):
 
     def _labels(self, index: int) -> FlowLabels | None:
         labels = self.log.labels(index)
-        if labels is None or self.read_as not in (WORLD, *_OF_BOTH, *_OF_POINTS):
+        if labels is None or self.reading not in (WORLD, *_OF_POINTS):
             return labels
         sweep, pose1 = self.log.sweep(index), self.log.sweep(index + 1).pose
         points = np.asarray(sweep.points)[:, :3].astype(np.float64)
@@ -81,9 +107,9 @@ class ReadAs(LogWrapper):
         return Log.labels(self, index)
 
     def findings(self) -> list[Finding]:
-        what = CAUSES.get(self.read_as, f"the log is read as {self.read_as}")
-        said = Finding("frame", RIGHT, f"as you say, {what} (read_as={self.read_as})")
-        used = f"we move them to that of the vehicle. data.read_as={self.read_as} does the same without this line"
+        what = CAUSES.get(self.reading, f"the log is read as {self.reading}")
+        said = Finding("frame", RIGHT, f"as you say, {what} (read_as={self.reading})")
+        used = f"we move them to that of the vehicle. data.read_as={self.reading} does the same without this line"
         found = Finding("frame", FOUND, f"{what}, so {used}", True)
         return [*self.log.findings(), found if self.is_reading_found else said]
 
@@ -95,32 +121,30 @@ class ReadAs(LogWrapper):
     @cached_property
     def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
         given = self.log.trajectory
-        if given is None or self.read_as in (LATE, EARLY):
+        if given is None or self.reading in SHIFTS:
             return None
         times, poses = given
         return times, np.array([self._convert(pose) for pose in poses])
 
     def _move(self, points: np.ndarray, index: int, pose: Any) -> np.ndarray:
         """Convert points of sweep `index`, (N, 3+), to metres in the frame of the vehicle."""
-        if self.read_as == WORLD:
+        if self.reading == WORLD:
             return transform_points(points[:, :3], np.linalg.inv(self._given(index, pose)))
-        if self.read_as in _OF_BOTH:
-            return transform_points(points[:, :3], as_matrix(_OF_BOTH[self.read_as]))
-        return points[:, :3] * _OF_POINTS.get(self.read_as, 1.0)
+        return points[:, :3] @ _OF_POINTS[self.reading].T if self.reading in _OF_POINTS else points[:, :3]
 
     def _pose(self, index: int, pose: Any) -> np.ndarray | None:
         """Convert the pose of sweep `index`."""
         if pose is None:
             return None
-        if self.read_as in (LATE, EARLY):
-            return self._neighbour(index, 1 if self.read_as == LATE else -1)
+        if self.reading in SHIFTS:
+            neighbour = self._neighbour(index, SHIFTS[self.reading])
+            is_half = self.reading in (HALF_LATE, HALF_EARLY)
+            return halfway(self._given(index, pose)[None], neighbour[None])[0] if is_half else neighbour
         return self._convert(self._given(index, pose))
 
     def _convert(self, pose: np.ndarray) -> np.ndarray:
         """Convert a pose to `T_world_ego`."""
-        if self.read_as in _OF_BOTH:
-            return pose @ as_matrix(_OF_BOTH[self.read_as]).T
-        return OF_POSES[self.read_as](pose) if self.read_as in OF_POSES else pose
+        return OF_POSES[self.reading](pose) if self.reading in OF_POSES else pose
 
     def _neighbour(self, index: int, step: int) -> np.ndarray:
         """Return the pose of the next or last sweep; beyond the end the vehicle moves as between the two before."""
@@ -133,5 +157,5 @@ class ReadAs(LogWrapper):
         if pose is None:
             pose = self.log.sweep(index).pose if self.log.poses is None else self.log.poses[index]
         if pose is None:
-            raise CFlowError(f"log {self.log_id}: sweep {index} has no pose, which read_as={self.read_as} needs")
+            raise CFlowError(f"log {self.log_id}: sweep {index} has no pose, which read_as={self.reading} needs")
         return rigid_transform(pose, f"pose of sweep {index}")

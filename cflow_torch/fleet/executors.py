@@ -1,14 +1,15 @@
-"""Executors: each holds one object, such as a `Worker`, and calls its methods, one call at a time, as futures."""
+"""Executors: each holds one object, such as a `Worker`, and calls its methods, one call at a time."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
+import traceback
 from abc import ABC, abstractmethod
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from threading import Thread
-from typing import Any, Callable, Sequence
+from concurrent.futures import BrokenExecutor
+from threading import Lock, Thread
+from typing import Any, Callable
 
 from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.stop_signal import SIGNALS
@@ -18,56 +19,41 @@ class CannotStart(CFlowError):
     """The object of an executor could not be made, so no call can succeed."""
 
 
-class Holder:
-    """Makes an object at the first call and keeps it."""
-
-    held: Any = None
-
-    def call(self, make: Callable[[], Any], method: str, arguments: Sequence[Any]) -> Any:
-        """Call a method of the object that `make` returns. Errors of `make` become `CannotStart`."""
-        if self.held is None:
-            try:
-                self.held = make()
-            except Exception as error:
-                raise CannotStart(describe_error(error)) from error
-        return getattr(self.held, method)(*arguments)
-
-
 class Executor(ABC):
-    """Holds one object. A call makes it if there is none yet, or if it was lost or closed."""
-
-    timeout: float | None = None  # seconds after which a call without an answer is hopeless
+    """Holds one object. A call makes it if there is none yet, or if it was lost."""
 
     @abstractmethod
-    def submit(self, method: str, *arguments: Any) -> Future[Any]:
-        """Call a method of the object. Errors of the future: `BrokenExecutor` if the object is lost, `CannotStart`, and
-        those of the method."""
+    def call(self, method: str, *arguments: Any) -> Any:
+        """Call a method of the object. `BrokenExecutor` if the object is lost, `CannotStart` if it cannot be made."""
 
     @abstractmethod
-    def close(self) -> str:
-        """End the object, even during a call. Return in words how its process has ended, "" if there is none."""
+    def close(self) -> None:
+        """End the object, even during a call in another thread. There are no further calls."""
 
 
 class InlineExecutor(Executor):
-    """An object of this process. A call returns when it is done. `make` returns the object."""
+    """An object of this process. `make` returns the object."""
 
     def __init__(self, make: Callable[[], Any]) -> None:
         self._make = make
-        self._holder = Holder()
+        self._held: Any = None
 
-    def submit(self, method: str, *arguments: Any) -> Future[Any]:
-        answer: Future[Any] = Future()
+    def call(self, method: str, *arguments: Any) -> Any:
+        if self._held is None:
+            try:
+                self._held = self._make()
+            except Exception as error:
+                raise CannotStart(describe_error(error)) from error
         try:
-            answer.set_result(self._holder.call(self._make, method, arguments))
-        except Exception as error:
-            answer.set_exception(error)
-        return answer
+            return getattr(self._held, method)(*arguments)
+        except BrokenExecutor:
+            self.close()
+            raise
 
-    def close(self) -> str:
-        if self._holder.held is not None:
-            self._holder.held.close()
-        self._holder = Holder()
-        return ""
+    def close(self) -> None:
+        if self._held is not None:
+            self._held.close()
+        self._held = None
 
 
 class ProcessExecutor(Executor):
@@ -75,59 +61,83 @@ class ProcessExecutor(Executor):
 
     Args:
         make: called in the process; returns the object. It is pickled, like the arguments and results of calls.
-        timeout: see `Executor`.
+        timeout: seconds after which a call without an answer is hopeless; None = never.
     """
 
     def __init__(self, make: Callable[[], Any], timeout: float | None = None) -> None:
         self._make = make
-        self._pool: Any = None
-        self.timeout = timeout
+        self._timeout = timeout
+        self._lock = Lock()  # of the fields below, for `close` in another thread
+        self._process: Any = None
+        self._connection: Any = None
+        self._is_closed = False
 
-    def submit(self, method: str, *arguments: Any) -> Future[Any]:
-        how = ""
-        for _ in range(2):
-            if self._pool is None:
-                context = multiprocessing.get_context("spawn")  # threads and CUDA do not survive a fork
-                self._pool = ProcessPoolExecutor(1, context, _begin)
-            try:
-                return self._pool.submit(_call, self._make, method, arguments)  # type: ignore[no-any-return]
-            except (BrokenExecutor, OSError) as error:  # the process has ended since the last call, or cannot start
-                how = describe_error(error)
-                self.close()
-        answer: Future[Any] = Future()
-        answer.set_exception(BrokenExecutor(how))
+    def call(self, method: str, *arguments: Any) -> Any:
+        try:
+            connection = self._connect()
+            connection.send((method, arguments))
+            if connection.poll(self._timeout):
+                answer, error, trace = connection.recv()
+            else:
+                answer, error, trace = None, BrokenExecutor(f"no answer for {self._timeout:g} s"), ""
+        except (EOFError, OSError) as reason:  # the process has ended, or cannot start
+            raise BrokenExecutor(self._end() or describe_error(reason)) from None
+        if isinstance(error, BrokenExecutor):
+            self._end()
+        if error is not None:
+            raise error from RuntimeError(f"in a worker process:\n{trace}")
         return answer
 
-    def close(self) -> str:
-        if self._pool is None:
+    def close(self) -> None:
+        with self._lock:
+            self._is_closed = True
+        self._end()
+
+    def _connect(self) -> Any:
+        """Return the connection to the process, which is started if there is none."""
+        with self._lock:
+            if self._is_closed:
+                raise BrokenExecutor("closed")
+            if self._process is None:
+                context = multiprocessing.get_context("spawn")  # threads and CUDA do not survive a fork
+                self._connection, theirs = context.Pipe()
+                process = context.Process(target=_serve, args=(theirs, self._make))
+                process.start()
+                theirs.close()  # so that the end of the process ends the connection
+                self._process = process
+            return self._connection
+
+    def _end(self) -> str:
+        """End the process, if there is one, and say in words how it has ended."""
+        with self._lock:
+            process, self._process = self._process, None
+        if process is None:
             return ""
-        pool, self._pool = self._pool, None
-        processes = list((pool._processes or {}).values())
-        for process in processes:  # Python 3.14 has kill_workers instead
-            process.kill()
-            process.join()
-        # Threads of the pool must not wait for the rest of a message of a dead process, or for it to read one.
-        pool._result_queue._writer.close()
-        pool._call_queue.cancel_join_thread()
-        pool.shutdown()
-        return "".join(_ending(process.exitcode) for process in processes)
+        process.kill()
+        process.join()
+        return _ending(process.exitcode)
 
 
-_holder = Holder()  # of a process that `ProcessExecutor` has started
-
-
-def _call(make: Callable[[], Any], method: str, arguments: Sequence[Any]) -> Any:
-    try:
-        return _holder.call(make, method, arguments)
-    except SystemExit:  # of a library; the pool would raise it in the parent
-        os._exit(1)
-
-
-def _begin() -> None:
-    """Begin a process: the parent receives signals as well, and says when to stop."""
+def _serve(connection: Any, make: Callable[[], Any]) -> None:
+    """Answer calls in a process. The parent receives signals as well, and says when to stop."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
+    executor = InlineExecutor(make)
+    try:
+        while True:
+            method, arguments = connection.recv()
+            try:
+                answer: Any = (executor.call(method, *arguments), None, "")
+            except Exception as error:
+                answer = (None, error, traceback.format_exc())
+            connection.send(answer)
+    except (EOFError, OSError):
+        pass  # the parent has ended
+    except BaseException:  # SystemExit of a library, or an answer that cannot be pickled
+        traceback.print_exc()
+    finally:
+        os._exit(1)  # threads of the object may still run
 
 
 def _end_with_parent() -> None:

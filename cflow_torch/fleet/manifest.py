@@ -68,7 +68,7 @@ def check_logs(
 
     `resume` continues an earlier run of the same identity. `overwrite` replaces the results of other runs. It is
     allowed only if you are `alone`, that is, if no other shard works on these logs. A worker checks a log again when it
-    has opened it (`claim_log`); in an object store, which takes a while for each log, we leave it to the workers.
+    has opened it (`check_log`); in an object store, which takes a while for each log, we leave it to the workers.
     """
     forget_listings(output)
     if (overwrite and alone) or (resume and is_remote(output)):
@@ -82,17 +82,29 @@ def check_logs(
             raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
 
 
-def claim_log(folder: Path, log: Log, identity: Mapping[str, Any]) -> None:
-    """Make sure that the frames in a log's folder were computed from this log, and write its manifest.
+def check_log(folder: Path, log: Log, identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Make sure that the frames in a log's folder were computed from this log, and return its manifest.
 
     A log that has changed since, or another log of its name, is a `CFlowError`. Cost: reads three sweeps.
     """
-    now = {"run": dict(identity), **describe_log(log)}
+    manifest = {"run": dict(identity), **describe_log(log)}
     before = _read(folder / MANIFEST)
-    if before is None or (before.get("run") != identity and not complete_frames(folder)):
-        write_text(folder / MANIFEST, _text(now))
-    before = _read(folder / MANIFEST) or {}  # another process may have been quicker
-    _check_run(folder, before, identity, _OVERWRITE)
+    if before is not None and (before.get("run") == identity or complete_frames(folder)):
+        _check_manifest(folder, before, manifest)
+    return manifest
+
+
+def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Write the manifest of `check_log`, unless there is one. Call this before the first frame is written."""
+    before = _read(folder / MANIFEST)
+    if before is None or (before.get("run") != manifest["run"] and not complete_frames(folder)):
+        write_text(folder / MANIFEST, _text(manifest))
+        before = _read(folder / MANIFEST)  # another process may have been quicker
+    _check_manifest(folder, before or {}, manifest)
+
+
+def _check_manifest(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    _check_run(folder, before, now["run"], _OVERWRITE)
     is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
     both = now["sweeps"].keys() & (before.get("sweeps") or {}).keys()
     if not is_same or any(before["sweeps"][key] != now["sweeps"][key] for key in both):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from concurrent.futures import TimeoutError as NoAnswer
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -14,7 +13,7 @@ from threading import Event as Flag
 from threading import Thread
 from typing import Any, Callable, Generator, Iterator, Sequence
 
-from cflow_torch.fleet.executors import CannotStart, Executor, InlineExecutor, ProcessExecutor, describe_error
+from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.work import Worker, make_worker, source_name
@@ -115,7 +114,7 @@ def _do(executor: Executor, part: Part, stop: Callable[[], bool]) -> Iterator[Ev
                 missing.discard(event.timestamp)  # type: ignore[arg-type]
             yield event
         return
-    except _Lost as error:
+    except BrokenExecutor as error:
         if stop():
             return
         yield Noted(part.number, name, f"a worker died ({error}): its frames are tried again, one by one")
@@ -128,31 +127,14 @@ def _do(executor: Executor, part: Part, stop: Callable[[], bool]) -> Iterator[Ev
                     yield event
                 elif not event.todo:  # its file was written just before the first worker died
                     yield Done(part.number, stamp, {})
-        except _Lost as error:
+        except BrokenExecutor as error:
             of_frame = name if stamp is None else f"{name}/{stamp}"
             yield Failed(part.number, of_frame, f"its worker died again ({error}): {_REMEDY}", stamp)
 
 
-class _Lost(Exception):
-    """The worker of an executor has ended; the text says how."""
-
-
 def _events(executor: Executor, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
     """Yield the events of a part."""
-    asked: Part | None = part
-    while True:
-        try:
-            event = executor.submit("next_event", asked, stop()).result(executor.timeout)
-        except CannotStart:
-            raise
-        except Exception as error:
-            ending = executor.close()
-            if isinstance(error, NoAnswer):
-                ending = f"no answer for {executor.timeout:g} s"
-            raise _Lost(
-                ending if isinstance(error, (NoAnswer, BrokenProcessPool)) else describe_error(error)
-            ) from error
-        if event is None:
-            return
+    event = executor.call("next_event", part, stop())
+    while event is not None:
         yield event
-        asked = None
+        event = executor.call("next_event", None, stop())

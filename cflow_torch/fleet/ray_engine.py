@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import signal
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -15,7 +15,7 @@ from typing import Any, Callable, Iterator
 
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.errors import CFlowError, import_optional
-from cflow_torch.fleet.executors import Executor, Holder, describe_error
+from cflow_torch.fleet.executors import Executor, InlineExecutor, describe_error
 from cflow_torch.fleet.job import Job
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import make_identity
@@ -61,7 +61,7 @@ def ray_executors(
     _connect(ray, settings)
     try:
         _check_room(ray, needs)
-        actor = ray.remote(Holder).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
+        actor = ray.remote(InlineExecutor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
         # A worker sees only the GPUs that Ray gives it.
         make = partial(make_worker_on_node, os.getcwd(), job, "cuda" if is_gpu else "cpu")
         yield [RayExecutor(ray, actor, make) for _ in layout.devices]
@@ -89,30 +89,33 @@ class RayExecutor(Executor):
     def __init__(self, ray: ModuleType, actor: Any, make: Callable[[], Any]) -> None:
         self._ray, self._class, self._make = ray, actor, make
         self._actor: Any = None
+        self._is_closed = False
 
-    def submit(self, method: str, *arguments: Any) -> Future[Any]:
+    def call(self, method: str, *arguments: Any) -> Any:
+        if self._is_closed:
+            raise BrokenExecutor("closed")
         if self._actor is None:
-            self._actor = self._class.remote()
-        answer: Future[Any] = Future()
+            self._actor = self._class.remote(self._make)
+        try:
+            return self._ray.get(self._actor.call.remote(method, *arguments))
+        except self._ray.exceptions.RayTaskError as error:
+            reason = error.cause or error
+            if isinstance(reason, BrokenExecutor):
+                self._end()
+            raise reason from error
+        except self._ray.exceptions.RayError as error:
+            self._end()
+            raise BrokenExecutor(f"Ray's {type(error).__name__}") from error
 
-        def pass_on(done: Future[Any]) -> None:
-            error = done.exception()
-            if error is None:
-                answer.set_result(done.result())
-            elif isinstance(error, self._ray.exceptions.RayTaskError):
-                answer.set_exception(error.cause or error)
-            else:
-                answer.set_exception(BrokenExecutor(f"Ray's {type(error).__name__}"))
+    def close(self) -> None:
+        self._is_closed = True
+        self._end()
 
-        self._actor.call.remote(self._make, method, arguments).future().add_done_callback(pass_on)
-        return answer
-
-    def close(self) -> str:
-        if self._actor is not None:
+    def _end(self) -> None:
+        actor, self._actor = self._actor, None
+        if actor is not None:
             with suppress(Exception):  # the actor may have ended with its cluster
-                self._ray.kill(self._actor)
-        self._actor = None
-        return ""
+                self._ray.kill(actor)
 
 
 def _connect(ray: ModuleType, settings: dict[str, Any]) -> None:

@@ -10,7 +10,6 @@ from contextlib import closing
 from typing import Any, Iterable, Iterator, Mapping, Sequence
 
 from cflow_torch.data.atomic import remove_stale
-from cflow_torch.data.catalog import open_log
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.executors import Executor, describe_error
@@ -20,7 +19,7 @@ from cflow_torch.fleet.manifest import complete_frames
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.stop_signal import StopSignal
-from cflow_torch.fleet.work import source_name
+from cflow_torch.fleet.work import open_quickly, source_name
 from cflow_torch.types import CFlowError
 
 _SHOWN_NOTES = 3  # how often a message is shown; the report names every log with this message
@@ -101,8 +100,7 @@ def count_frames(job: Job, parts: Iterable[Part]) -> Iterator[tuple[str, int, in
     """
     for part in parts:
         try:
-            settings = {**job.settings, "check": False, "odometry": False, "read_as": None}
-            with open_log(job.reader, part.source, **settings) as log:
+            with open_quickly(job, part.source) as log:
                 stamps = {int(log.timestamps[i]) for i in part.frames(len(log.timestamps) - 1) if i not in log.gaps}
                 complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
                 yield log.log_id, len(stamps), len(stamps - complete)

@@ -7,7 +7,7 @@ from collections import deque
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, Callable, Generator, Iterable, Iterator
@@ -24,7 +24,7 @@ from cflow_torch.data.paths import as_path, safe_name
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.executors import describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
-from cflow_torch.fleet.manifest import claim_log, complete_frames, frame_file
+from cflow_torch.fleet.manifest import check_log, claim_log, complete_frames, frame_file
 from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -93,8 +93,7 @@ class Worker:
             stamps = {i: stamp for i, stamp in stamps.items() if stamp == part.only}
         complete = set() if self._job.redo else complete_frames(folder)
         todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
-        if todo or complete:
-            claim_log(folder, log, self._job.identity)
+        manifest: Any = check_log(folder, log, self._job.identity) if todo or complete else None
         remove_stale(folder)
         yield Opened(part.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
         checks = bool(self._job.settings.get("check", True))
@@ -102,7 +101,8 @@ class Worker:
             with suppress(Exception):  # if a sweep cannot be read, its frames fail below
                 for text in find_problems(log):
                     yield Noted(part.number, log.log_id, text)
-        for frame in self._pass(log, folder, todo, stop):
+        claim = lru_cache(partial(claim_log, folder, manifest))  # once, before the first frame
+        for frame in self._pass(log, partial(self._write, folder, claim), todo, stop):
             name = f"{log.log_id}/{frame.timestamp}"
             if checks and frame.is_repetition:
                 yield Noted(part.number, name, "the next sweep has the same points")
@@ -127,14 +127,16 @@ class Worker:
             self._source, self._log = source, CachedLog(log, self._job.config.num_sweeps)
         return self._log  # type: ignore[no-any-return]
 
-    def _pass(self, log: Log, folder: Path, todo: Iterable[int], stop: Callable[[], bool]) -> Iterator[_Frame]:
+    def _pass(
+        self, log: Log, write: Callable[[_Frame], _Frame], todo: Iterable[int], stop: Callable[[], bool]
+    ) -> Iterator[_Frame]:
         """Pass frames through the reading thread, this thread and the writing thread."""
         size, ahead = self._job.batch, self._ahead * self._job.batch
         begun = takewhile(lambda _: not stop(), todo)
         frames = (future.result() for future in run_ahead(self._reader, partial(self._read, log), begun, ahead))
         batches = takewhile(lambda _: not stop(), iter(lambda: list(islice(frames, size)), []))
         computed = (frame for batch in batches for frame in self._compute(batch))
-        for future in run_ahead(self._writer, partial(self._write, folder), computed, ahead):
+        for future in run_ahead(self._writer, write, computed, ahead):
             yield future.result()
 
     def _read(self, log: Log, index: int) -> _Frame:
@@ -175,11 +177,12 @@ class Worker:
         except RuntimeError as error:
             raise BrokenExecutor(f"{self._device} can no longer be used: {describe_error(error)}") from error
 
-    def _write(self, folder: Path, frame: _Frame) -> _Frame:
+    def _write(self, folder: Path, claim: Callable[[], None], frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
             result, frame.content = frame.content, None
             file = frame_file(folder, frame.timestamp)
             with _stage(frame, "write"):
+                claim()
                 write_flow(file, result, self._job.contents, frame.points)
             frame.points = None
         return frame
@@ -229,6 +232,11 @@ def _stage(frame: _Frame, name: str) -> Iterator[None]:
     except Exception as error:
         frame.content = error
     frame.seconds[name] = time.perf_counter() - start
+
+
+def open_quickly(job: Job, source: Any) -> Log:
+    """Open a log for its name and times, without what takes long."""
+    return open_log(job.reader, source, **{**job.settings, "check": False, "odometry": False, "read_as": None})
 
 
 def source_name(source: Any) -> str:

@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, split_index
+from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, index_dtype, split_index
 from cflow_torch.ops.kornia_engine import connected_components_kornia
 from cflow_torch.ops.segments import first_of_segment
 
@@ -44,14 +44,13 @@ class Blocks:
 
     side: int  # pixels per side of a block
     cols: int  # blocks per row
-    first: Tensor  # () int64, no component of these images has a smaller number
     num_components: int  # V, larger than the number of every component
-    component: Tensor  # (all blocks,) int64, 0 ... V - 1; undefined for blocks without set pixels
+    component: Tensor  # (all blocks,) int32 or int64, 0 ... V - 1; undefined for blocks without set pixels
 
     def of_pixel(self, row: Tensor, col: Tensor) -> Tensor:
         """Component of the pixels at (row, col), (P,) int64. Rows continue from one padded image to the next."""
         block = floor_divide(row, self.side) * self.cols + floor_divide(col, self.side)
-        return self.component.index_select(0, block)
+        return self.component.index_select(0, block).long()
 
 
 def pad(images: Sequence[Tensor]) -> Tensor:
@@ -100,13 +99,7 @@ def label_together(images: Sequence[tuple[Tensor, int]], connectivity: int = 8) 
     nodes = flat_nonzero(masks.bool())  # [V]; on the CPU ten times faster than `masks != 0`
     first_blocks = constant(tuple(accumulate(lengths[:-1])), torch.int64, masks.device)  # of all sets but the first
     components = _components(masks, nodes, kinds, first_blocks).split(lengths)
-    first = [nodes.new_zeros(())]
-    if len(kinds) > 1:
-        first += torch.searchsorted(nodes, first_blocks).unbind()
-    return [
-        Blocks(kind.side, kind.cols, number, len(nodes), component)
-        for kind, number, component in zip(kinds, first, components)
-    ]
+    return [Blocks(kind.side, kind.cols, len(nodes), component) for kind, component in zip(kinds, components)]
 
 
 class _Kind(NamedTuple):
@@ -128,12 +121,13 @@ class _Kind(NamedTuple):
 
 
 def _components(masks: Tensor, nodes: Tensor, kinds: tuple[_Kind, ...], first_blocks: Tensor) -> Tensor:
-    """Return the component of each block, (blocks,) int64; undefined for blocks without set pixels. Args: `_links`."""
-    node_of_block = torch.empty(masks.shape, dtype=torch.int64, device=masks.device)
-    node_of_block.scatter_(0, nodes, torch.arange(len(nodes), device=masks.device))
+    """Return the component of each block, (blocks,); undefined for blocks without set pixels. Args: `_links`."""
+    dtype = index_dtype(len(nodes), masks.device)
+    node_of_block = torch.empty(masks.shape, dtype=dtype, device=masks.device)
+    node_of_block.scatter_(0, nodes, torch.arange(len(nodes), dtype=dtype, device=masks.device))
     node, block = _links(masks, nodes, kinds, first_blocks)
-    root = union_find(len(nodes), node, node_of_block.index_select(0, block))
-    return node_of_block.scatter_(0, nodes, root)
+    root = union_find(len(nodes), node, node_of_block.index_select(0, block).long())
+    return node_of_block.scatter_(0, nodes, root.to(dtype))
 
 
 def _links(masks: Tensor, nodes: Tensor, kinds: tuple[_Kind, ...], first_blocks: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from cflow_torch.data.categories import CATEGORY_INDEX
-from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.simulator.car_park import build_car_park
 from cflow_torch.simulator.crossing import build_crossing
 from cflow_torch.simulator.highway import build_highway
@@ -20,7 +20,7 @@ from cflow_torch.simulator.motion import SceneMotion
 from cflow_torch.simulator.narrow import build_narrow
 from cflow_torch.simulator.objects import own_truck
 from cflow_torch.simulator.profiles import PROFILES, WEATHER, in_weather
-from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid, Recording, UnitReturns
+from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid, UnitReturns
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile
 from cflow_torch.simulator.street import build_street
@@ -41,7 +41,7 @@ _RASTER_STEP = 0.3  # metres per cell of the ground raster, as in Argoverse 2
 T = TypeVar("T")
 
 
-class Drive(Recording):
+class Drive(Log):
     """A drive through a simulated scene.
 
     Each sweep is simulated on demand from its own random stream, so sweeps do not depend on the order of the calls. In
@@ -62,6 +62,8 @@ class Drive(Recording):
         calibration: sensor name -> (4, 4) float64 `T_ego_sensor`.
         track_ids: one UUID per body of the scene; only bodies with a category are annotated.
     """
+
+    poses: np.ndarray
 
     def __init__(self, scene: Scene, profile: LidarProfile, seed: int, num_sweeps: int, log_id: str) -> None:
         self.log_id = log_id

@@ -1,14 +1,10 @@
-"""The interface between simulated drives and the writers of data formats."""
+"""What a simulated drive has for writers, besides sweeps and labels: boxes, ground heights, returns of each LiDAR."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Mapping, Sequence
 
 import numpy as np
-
-from cflow_torch.data.log import Log
 
 
 @dataclass(frozen=True)
@@ -71,33 +67,3 @@ class UnitReturns:
     radial_velocity: np.ndarray
     num_rings: int
     num_columns: int
-
-
-class Recording(Log):
-    """A log with all that writers need: ground masks, true flow, calibration, returns of each LiDAR, and boxes."""
-
-    poses: np.ndarray
-    """(num_sweeps, 4, 4) float64 `T_world_ego` at each time stamp."""
-    calibration: Mapping[str, np.ndarray]
-    """Sensor name -> (4, 4) float64 `T_ego_sensor`."""
-
-    @abstractmethod
-    def units(self, index: int) -> Sequence[UnitReturns]:
-        """Returns of each LiDAR in sweep `index`. Their points, transformed to the ego frame and concatenated in this
-        order, are the points of `sweep(index)`, and `labels(index)` has the same rows."""
-
-    @abstractmethod
-    def elevations(self, unit: str) -> np.ndarray:
-        """(num_rings,) float64 radians, elevation of each ring of the LiDAR named `unit`, lowest first."""
-
-    @abstractmethod
-    def boxes(self, index: int) -> AnnotationBoxes:
-        """Annotation boxes of sweep `index`."""
-
-    @abstractmethod
-    def channels(self, index: int) -> Mapping[str, np.ndarray]:
-        """(N,) uint8 intensity, uint8 laser_number, int32 offset_ns of every point; only the av2 writer calls it."""
-
-    @abstractmethod
-    def ground_raster(self) -> GroundGrid:
-        """Ground height of the whole drive; only the av2 writer calls it."""

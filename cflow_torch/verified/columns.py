@@ -231,6 +231,26 @@ class Columns:
         words = words | words.index_select(0, left) | words.index_select(0, right)
         return words | words.index_select(0, above) | words.index_select(0, below)
 
+    def beside(self, values: Tensor) -> Tensor:
+        """Return the values to the left and right of each column, above and below, (4, C + 1); `values` is (C + 1,).
+
+        `values[0]`, of the empty column, stands for places without a column.
+        """
+        return values.index_select(0, self._neighbours.view(-1)).view(4, -1)
+
+    def sum_around(self, values: Tensor) -> Tensor:
+        """Sum four numbers of each column over the 3 x 3 columns around it, (C + 1, 4) int16; the first row is 0.
+
+        The four numbers of a column are one word of eight bytes, so a lookup takes all four (float32 took three times
+        as long). Sums must fit into 16 bits.
+        """
+        left, right, above, below = self._neighbours
+        for before, after in ((left, right), (above, below)):
+            words = values.view(torch.int64)[:, 0]
+            for side in (before, after):
+                values = values + words.index_select(0, side).view(torch.int16).view(-1, 4)
+        return values
+
     def _or_within_reach(self, words: Tensor) -> Tensor:
         """Return the slices within the reach of each column, in the bits of those of the pixels, (C + 1, W) int64."""
         around = self._or_within_pixels(words)

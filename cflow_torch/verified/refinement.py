@@ -11,7 +11,8 @@ covariance of the voxels around both ends.
         points_of_objects       the points of the moving objects
         register_deskewed
             Registration        voxels with centroids and covariances; the target and the source
-                align           repeatedly: correspond (move the source, find the nearest target), linearise, solve
+                align           repeatedly: correspond (move the source, find the nearest target), linearise, solve.
+                                The first half of the iterations uses a sample of large objects.
             if points have times:
                 stretch         corrects the motion for the time between two measurements of an object
                 if the window has history:
@@ -23,7 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Callable
+from typing import Callable, Iterator
 
 import torch
 from torch import Tensor
@@ -60,6 +61,7 @@ _PRIOR = (2.0, 2.0, 20.0)
 # seam between sweeps crosses it.
 _LEAST_STRETCH = 0.75
 _NUM_ITERATIONS = 4
+_SAMPLE = 256  # voxels of an object, about, in the first half of the iterations
 STEP_LENGTH = 1.4  # of an iteration; above 1, because the nearest voxels change with each one
 
 
@@ -172,8 +174,8 @@ class Source:
     def __len__(self) -> int:
         return len(self.voxel)
 
-    def __getitem__(self, some: slice) -> Source:
-        """Select voxels by their positions in the list."""
+    def __getitem__(self, some: slice | Tensor) -> Source:
+        """Select voxels by their positions in the list, a slice or (L,) int64."""
         return Source(
             voxel=self.voxel[some],
             by_object=self.by_object[some],
@@ -187,6 +189,16 @@ class Source:
             elapsed_of_t=self.elapsed_of_t[some],
             before_t=self.before_t[some],
         )
+
+    def chunks(self) -> Iterator[Source]:
+        """Split the voxels into chunks that suit the device."""
+        return (self[some] for some in chunks(0, len(self), self.voxel.device, 9))
+
+    def sample(self, voxels: Voxels) -> Source:
+        """Keep every n-th diagonal plane of voxels of each object; n is the least that keeps about `_SAMPLE`."""
+        every = -(-self.by_object.size() // _SAMPLE)  # [G]
+        plane = voxels.diagonal_plane().index_select(0, self.voxel)  # [K]
+        return self[flat_nonzero(plane % self.by_object.spread(every) == 0)]
 
 
 @dataclass(frozen=True)
@@ -219,14 +231,15 @@ class Registration:
         by_object = Groups(object_id.masked_fill(object_id < 0, num_objects), num_objects)
         at_t = by_object.where(self._voxels.step == 1)
         self._centre = at_t.sum(self._voxels.position[:2]) / at_t.size()  # [2, G], at t; NaN without points
-        source = Source.of(self._voxels, self._covariance, by_object, self._centre, sweeps.elapsed)
-        self._sources = [source[some] for some in chunks(0, len(source), object_id.device, 9)]
+        self._source = Source.of(self._voxels, self._covariance, by_object, self._centre, sweeps.elapsed)
+        self._sample = self._source.sample(self._voxels)
 
     def align(self, start: Tensor, num_iterations: int = _NUM_ITERATIONS) -> RigidMotion:
         """Refine the motion of every object, and estimate its rotation.
 
         Each Gauss-Newton iteration minimises the weighted residuals of the correspondences over translation and angle,
-        with a prior that keeps the translation near `start`, and the rotation near zero.
+        with a prior that keeps the translation near `start`, and the rotation near zero. The first half of the
+        iterations uses a sample of about 256 voxels of each object.
 
         Args:
             start: (G, 2) float64, x and y, metres per sweep interval.
@@ -240,11 +253,12 @@ class Registration:
         held = upper(torch.diag_embed(prior[:, 0])[..., None])  # [6, 1]
         start = torch.cat((start, torch.zeros_like(start[:, :1])), 1).t()  # [3, G]
         motion = start  # x, y and the tangent of half the angle, per sweep interval
-        for _ in range(num_iterations):
+        for iteration in range(num_iterations):
             hessian = held
             right_side = prior * (start - motion)  # [3, G]
-            for source in self._sources:
-                pairs = self._correspond(source, motion)
+            source = self._sample if iteration < num_iterations // 2 else self._source
+            for some in source.chunks():
+                pairs = self._correspond(some, motion)
                 equations = pairs.by_object.sum(_normal_equations(pairs))  # [9, G]
                 hessian = hessian + equations[:6]
                 right_side = right_side + equations[6:]
@@ -296,7 +310,7 @@ class Registration:
         assert time is not None
         motion = torch.cat((rigid.flow.t(), rigid.rotation[None]))
         sums = torch.zeros_like(motion[:2])
-        for source in self._sources:
+        for source in self._source.chunks():
             pairs = self._correspond(source, motion)
             delay = time.index_select(0, pairs.target) - time.index_select(0, pairs.source)
             weight = (pairs.information[0, 0] + pairs.information[1, 1]) * pairs.elapsed

@@ -51,11 +51,12 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         max_speed: m/s; None = 60.
 
     Convention:
-        Parts have the missing pixels of a sweep. A part of t takes its velocity from one part of t+1 or t-1. Other
-        parts must lie where it puts them: at t+1, and in at least half of the older sweeps. Of the velocities of a part
-        of t, or of t+1, the one with the most sweeps wins, then the one with the smallest errors. In a pair, parts are
-        unmatched components, and the lowest velocity wins. A part belongs to its first node. The velocity of a node
-        must win more than half as many slices near its targets as it loses.
+        Parts have the pixels of a sweep that are missing, or that every other sweep lacks. A part of t takes its
+        velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least half of
+        the older sweeps. Of the velocities of a part of t, or of t+1, the one with the most sweeps wins, then the one
+        with the smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part
+        belongs to its first node. The velocity of a node must win more than half as many slices near its targets as it
+        loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
@@ -83,7 +84,7 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
 
 
 class _Parts(NamedTuple):
-    """Parts: missing pixels of one sweep that lie together. There are Q parts of K pixels."""
+    """Parts: pixels of one sweep that may be fast and lie together. There are Q parts of K pixels."""
 
     pixel: Tensor  # (K,) int64, positions in the list of pixels
     pixels: Groups  # these K pixels, grouped by part
@@ -91,15 +92,13 @@ class _Parts(NamedTuple):
     step: Tensor  # (Q,) int64
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
     length: Tensor  # (Q,) int64, finest pixels, longer side of the bounding box
-    has_pairs: bool  # some windows have two sweeps only
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
         """Select the parts of at least two pixels that are at most `_LONGEST` long."""
-        pixel = components.missing
+        pixel = components.fast
         parts = components.parts
-        has_pairs = _has_pairs(sweeps)
-        if has_pairs:
+        if sweeps.batch.has_pairs:
             unmatched, of_pairs = _unmatched_of_pairs(sweeps, components)
             pixel = torch.cat((pixel, unmatched))
             parts = parts.followed_by(of_pairs)
@@ -111,15 +110,10 @@ class _Parts(NamedTuple):
         image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
         window, step = split_index(image, sweeps.num_steps)
         centre = parts.sum(pixels.row_col).double() / parts.size()
-        return cls(pixel, parts, window, step, centre, length.index_select(0, kept), has_pairs)
+        return cls(pixel, parts, window, step, centre, length.index_select(0, kept))
 
     def __len__(self) -> int:
         return len(self.step)
-
-
-def _has_pairs(sweeps: HeightSlicedSweeps) -> bool:
-    """Tell whether any window has two sweeps only."""
-    return sweeps.num_steps == 2 or (sweeps.batch.num_windows > 1 and not bool(sweeps.has_history.all()))
 
 
 def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> tuple[Tensor, Groups]:
@@ -192,7 +186,7 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
     rank = _ranks(error, is_found, is_given)
-    if parts.has_pairs:
+    if sweeps.batch.has_pairs:
         # There, all errors are 0, and the shortest way has the lowest rank.
         rank += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
     kept = flat_nonzero(_are_best(rank, part, len(parts)))
@@ -256,7 +250,7 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
     farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
     nearest = parts.length.index_select(0, of_t) / _LENGTHS
     is_pair = is_part & (distance <= farthest[..., None]) & (distance >= nearest[:, None])
-    if parts.has_pairs:
+    if sweeps.batch.has_pairs:
         is_pair &= _are_alike(sweeps, parts, of_t, other)
     pair = flat_nonzero(is_pair)
     at, _ = split_index(pair, other.shape[2])

@@ -53,11 +53,12 @@ def find_unmatched(
     Convention: the size is the sum of the reach of the pixels of a sweep, because pixels with a larger reach have fewer
         neighbours. So a car has a similar size for a sparse sensor as for a dense one.
     """
-    levels = components.levels[:-1][-2:][:num_scales]
-    num_originals = len(levels[0].of_item)
+    dilated = range(components.num_levels - 1)[-2:][:num_scales]
+    levels = [components.of_level(level) for level in dilated]
+    num_originals = len(components.plain.of_item)
     original = index.clamp(max=num_originals - 1)
     of_level = torch.stack([level.of_item.index_select(0, original) for level in levels])  # [L, K]
-    none = 2 * components.tree.count
+    none = 2 * components.count
     of_sweep = torch.where(index < num_originals, 2 * of_level + pixels.step, none)
     component = Groups(of_sweep.view(-1), none)
     reach = sweeps.columns.reach_of(pixels)

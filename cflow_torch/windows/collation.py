@@ -48,6 +48,7 @@ class Batch:
     num_newest: int  # number of points of t+1, which come first and are never warped
     num_windows: int  # B
     num_steps: int  # S, number of sweeps of the longest window
+    has_pairs: bool  # some windows have two sweeps only
     # (B, S) float64, time k from each sweep to t+1 in sweep intervals: a displacement is k times the flow. 0 for step 0
     # and for sweeps that a window lacks, negative for sweeps after t+1.
     elapsed: Tensor
@@ -126,6 +127,7 @@ def make_batch(
         num_newest=num_newest,
         num_windows=num_windows,
         num_steps=num_steps,
+        has_pairs=bool(((timeline.table[0] != 0).sum(1) == 1).any()),
         elapsed=elapsed,
         seconds=seconds,
         origin=torch.stack(origin, 2),

@@ -59,6 +59,7 @@ class Inspection:
             _, problem = frame_problem(first.pc0.points)
             if problem:
                 warn(problem)
+                self._has_seen_structure = True  # in another frame, readings of the poses mean nothing
             elif first.pc0.is_ground is None and has_ground(first.pc0.points):
                 warn(_GROUND)
             _, num_missing = without_missing(first.pc0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from cflow_torch.ground.plane import REACH
 from cflow_torch.ground.segmentation import has_ground, is_upside_down
 from cflow_torch.types import Array, as_numpy
 from cflow_torch.windows.readings import AXES, CAMERA
@@ -12,6 +11,7 @@ from cflow_torch.windows.readings import AXES, CAMERA
 _FEWEST = 100  # points
 # Extent of the middle nine tenths of the points, in the units of the points. Clouds in metres have 5 to 200.
 _SMALLEST, _LARGEST, _MILLIMETRES = 2.0, 1000.0, 10_000.0
+_FAR = 50.0  # metres; a LiDAR has more than a twentieth of its points nearer than this
 _MOST_POINTS = 20_000
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
 
@@ -30,13 +30,14 @@ def frame_problem(points: Array) -> tuple[str, str]:
     extent = high - low
     widest = float(extent[:2].max())
     farthest = float(np.abs(middle[:2]).max())
+    nearest = float(np.quantile(np.hypot(positions[:, 0], positions[:, 1]), 0.05))
     spans = f"nine tenths of the points span {widest:.4g} m"
     if widest >= _LARGEST:
         unit = "millimetres" if widest >= _MILLIMETRES else "centimetres"
         return f"points_{unit}", f"{spans}: they seem to be in {unit}, give points in metres"
     if max(widest, farthest) < _SMALLEST:
         return "", f"{spans}: are they in metres?"
-    if farthest >= REACH:
+    if nearest >= _FAR:
         where = f"the points lie around x = {middle[0]:.6g} m, y = {middle[1]:.6g} m"
         return "", f"{where}: give points in the frame of the LiDAR or of the vehicle, not of a map"
     if is_upside_down(positions):

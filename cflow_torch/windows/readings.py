@@ -13,7 +13,7 @@ from typing import Any, Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, to_quaternions, to_rotations
+from cflow_torch.transforms import as_matrix, halfway, rigid_transform, rotations_about, to_quaternions, to_rotations
 from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS
 from cflow_torch.windows.stillness import Structure, structure_rows
@@ -21,7 +21,11 @@ from cflow_torch.windows.stillness import Structure, structure_rows
 GIVEN = "as given"
 OFF, TIMES = "off", "times"  # scans: the points stay, or move by their times
 STILL, WORLD, INVERTED, LATE, EARLY, CAMERA = "still", "world", "inverted", "late", "early", "camera"
-MOUNT, UNKNOWN, NO_READING = "mount", "unknown", "none"
+HALF_LATE, HALF_EARLY = "half_late", "half_early"
+SHIFTS = {LATE: 1, EARLY: -1, HALF_LATE: 1, HALF_EARLY: -1}
+"""Readings of poses of another time, and the neighbour whose pose is right, or that from which the other half comes."""
+MOUNT, UNKNOWN, TURNED, NO_READING = "mount", "unknown", "turned", "none"
+_FRAME = "the poses are of a frame whose"
 # What each reading says. The settings are values of `read_as` in `cflow_torch.data.catalog.open_log`.
 CAUSES = {
     WORLD: "the points are in the world's frame",
@@ -29,11 +33,13 @@ CAUSES = {
     STILL: "the static world stands still without the poses, so they are of another log, or the points are compensated",
     LATE: "the poses are one sweep late (sweep i has the pose of sweep i - 1)",
     EARLY: "the poses are one sweep early (sweep i has the pose of sweep i + 1)",
+    HALF_LATE: "the poses are half a sweep late (or the times of the sweeps are half a sweep early)",
+    HALF_EARLY: "the poses are half a sweep early (or the times of the sweeps are half a sweep late)",
     CAMERA: "the poses are of a camera (x right, y down, z forward)",
-    "left": "the poses are of a frame whose x axis points to the left of the points' x axis",
-    "back": "the poses are of a frame whose x axis points backward",
-    "right": "the poses are of a frame whose x axis points to the right of the points' x axis",
-    "down": "the poses are of a frame whose z axis points down (x forward, y right)",
+    "left": f"{_FRAME} x axis points to the left of the points' x axis",
+    "back": f"{_FRAME} x axis points backward",
+    "right": f"{_FRAME} x axis points to the right of the points' x axis",
+    "down": f"{_FRAME} z axis points down (x forward, y right)",
     "w_first": "the quaternions of the poses begin with w, but were read with w last",
     "w_last": "the quaternions of the poses end with w, but were read with w first",
     "millimetres": "the poses are in millimetres",
@@ -47,6 +53,7 @@ AXES = {
     "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
     "down": np.diag([1.0, -1.0, -1.0]),  # x forward, y right, z down, as of inertial units
 }
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
@@ -64,11 +71,12 @@ _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading h
 _SHIFT, _PEAK = 0.15, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 _EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
+_OBLIQUE = np.radians(10)  # least angle between axes that are turned and those with a name
 _HOPELESS = 0.04  # nothing fits if the share as given is below this
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
 # The search for an unknown motion correlates occupied cells of a square.
 _CELL, _CELLS = 0.1, 640  # metres, and cells along a side
-_TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4])
+_TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4]).tolist()
 _FARTHEST_SHIFT = 5.0  # metres
 
 
@@ -84,7 +92,7 @@ def _moved(stored_T_ego: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     return lambda pose: pose @ stored_T_ego
 
 
-_MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, metres
+MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, metres
     f"{MOUNT} {x:g} {y:g}": (x, y)
     for size in (0.7, 1.4, 2.7, 4.0)
     for x, y in ((size, 0), (-size, 0), (0, size), (0, -size))
@@ -95,20 +103,23 @@ OF_POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     INVERTED: np.linalg.inv,
     **{name: _moved(as_matrix(AXES[name].T)) for name in AXES},
     **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
-    **{name: _scaled(unit) for name, unit in (("millimetres", 1e-3), ("centimetres", 1e-2))},
-    **{name: _moved(as_matrix(np.eye(3), (*offset, 0))) for name, offset in _MOUNTS.items()},
+    **{name: _scaled(unit) for name, unit in _UNITS.items()},
+    **{name: _moved(as_matrix(np.eye(3), (*offset, 0))) for name, offset in MOUNTS.items()},
 }
 # Readings that differ little from another one, and the opposite mistakes: if the one is right, the other doubles it.
 _OPPOSITES = {
     LATE: EARLY,
     EARLY: LATE,
-    **{name: f"{MOUNT} {0 - x:g} {0 - y:g}" for name, (x, y) in _MOUNTS.items()},
+    HALF_LATE: HALF_EARLY,
+    HALF_EARLY: HALF_LATE,
+    **{name: f"{MOUNT} {0 - x:g} {0 - y:g}" for name, (x, y) in MOUNTS.items()},
     **{scan: next(other for other in DIRECTIONS if not scan.startswith(other)) for scan in SCANS},
 }
 # Small mistakes make a small difference. Vehicles of the same speed stand still without the ego motion: up to 1.56.
 _MARGINS = {
-    **dict.fromkeys((WORLD, OFF, TIMES, *SCANS, *_MOUNTS), 1.1),
-    **dict.fromkeys((STILL, "millimetres", "centimetres"), 1.7),
+    **dict.fromkeys((WORLD, OFF, TIMES, HALF_LATE, HALF_EARLY, *SCANS, *MOUNTS), 1.1),
+    **dict.fromkeys((STILL, *_UNITS), 1.7),
+    "down": 1.15,  # up to 0.99 for right poses, as it changes little on a straight road
 }
 
 
@@ -163,6 +174,7 @@ class Judgement:
     shares: dict[str, float]  # reading -> 0 ... 1; empty = nothing could be compared
     best: tuple[str, ...] = ()  # readings of the poses that fit clearly better than as given; equal ones together
     motion: np.ndarray | None = None  # of `UNKNOWN`: T_target_source of the first pair
+    turn: float = 0.0  # of `TURNED`: azimuth of the points' x axis in the frame of the poses, radians
     scan: str = ""  # the scan under which this holds; "" = not compared
     shares_of_scans: Mapping[str, float] = field(default_factory=dict)
 
@@ -170,15 +182,6 @@ class Judgement:
     def given(self) -> float:
         """Share of structure in place as given, NaN = nothing could be compared."""
         return self.shares.get(GIVEN, float("nan"))
-
-    def adopted(self) -> Judgement:
-        """Return the judgement of the log under its best reading."""
-        return replace(self, shares={GIVEN: self.shares[self.best[0]]}, best=()) if self.best else self
-
-    @property
-    def offset(self) -> tuple[float, float] | None:
-        """x and y of the points' origin in the frame of the poses, metres, if another mounting is best; else None."""
-        return _MOUNTS.get(self.best[0]) if self.best else None
 
     def __str__(self) -> str:
         """What is wrong, "" = nothing."""
@@ -190,11 +193,19 @@ class Judgement:
             return f"the sweeps fit under no reading of the poses (only {self.given:.2f} of the structure is in place)"
         if self.motion is not None:
             return f"the sensor moves by about {np.hypot(*self.motion[:2, 3]):.1f} m between two sweeps {share}"
-        if self.offset is not None:
-            x, y = self.offset
-            where = f"{abs(x):g} m {'behind' if x < 0 else 'ahead of'}" if x else f"{abs(y):g} m beside"
-            return f"the points' origin is about {where} that of the poses {share}"
-        return f"{', or '.join(CAUSES[each] for each in self.best)} {share}"
+        return f"{', or '.join(map(self._cause, self.best))} {share}"
+
+    def _cause(self, name: str) -> str:
+        if name == TURNED:
+            side = "left" if self.turn > 0 else "right"
+            return (
+                f"the points' x axis points about {abs(np.degrees(self.turn)):.0f} degrees to the {side} of the poses'"
+            )
+        if name not in MOUNTS:
+            return CAUSES[name]
+        x, y = MOUNTS[name]
+        where = f"{abs(x):g} m {'behind' if x < 0 else 'ahead of'}" if x else f"{abs(y):g} m beside"
+        return f"the points' origin is about {where} that of the poses"
 
 
 def _as_it_is(sweep: Sweep, rows: np.ndarray, scan: str) -> np.ndarray:
@@ -245,7 +256,12 @@ def _transforms(poses: np.ndarray, before: np.ndarray | None, after: np.ndarray 
     """Return T_1_0 under each reading of the poses, (2, 4, 4), that moves points otherwise than as given."""
     T = _between(poses)
     read = {name: _between([convert(pose) for pose in poses]) for name, convert in OF_POSES.items()}
-    read.update({name: _between(other) for name, other in ((LATE, after), (EARLY, before)) if other is not None})
+    for whole, half, other in ((LATE, HALF_LATE, after), (EARLY, HALF_EARLY, before)):
+        if other is not None:
+            read.update({whole: _between(other), half: _between(halfway(poses, other))})
+    for name in _UNITS:  # under them the vehicle still moves, else they say no more than `STILL`
+        if np.linalg.norm(read[name][:3, 3]) < _LEAST_DIFFERENCE:
+            del read[name]
     shown = {name: other for name, other in read.items() if name == STILL or difference(T, other) >= _LEAST_DIFFERENCE}
     return {GIVEN: T, **shown}
 
@@ -266,17 +282,49 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
         return _judge_motion(usable)
     fast = [pair for pair in moving if len(pair.scans) > 1]
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
-    shares, clear = _compare([pair.shares_of_poses(scan) for pair in moving])
-    equal = [name for name in clear if shares[name] >= _EQUAL * shares[clear[0]] and name not in _OPPOSITES]
+    of_pairs = [pair.shares_of_poses(scan) for pair in moving]
+    turn = 0.0
+    if np.mean([each[GIVEN] for each in of_pairs]) < _LEAST_SHARE and not any(WORLD in each for each in of_pairs):
+        turn, of_turns = _find_turn(moving)
+        of_pairs = [{**each, TURNED: share} for each, share in zip(of_pairs, of_turns)]
+    shares, clear = _compare(of_pairs)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
-        best = [WORLD]
-    elif clear:
-        best = clear[:1] if clear[0] in _OPPOSITES else equal
-    else:
-        # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
-        is_hopeless = shares[GIVEN] < _HOPELESS and (len(moving) > 1 or bool(_judge_motion(moving).best))
-        best = [NO_READING] if is_hopeless else []
-    return Judgement(shares, tuple(best), None, scan, shares_of_scans)
+        return Judgement(shares, (WORLD,), None, turn, scan, shares_of_scans)
+    if clear or shares[GIVEN] >= _HOPELESS:
+        return Judgement(shares, _equals(clear, shares), None, turn, scan, shares_of_scans)
+    # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
+    is_hopeless = len(moving) > 1 or bool(_judge_motion(moving).best)
+    return Judgement(shares, (NO_READING,) if is_hopeless else (), None, turn, scan, shares_of_scans)
+
+
+def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the best of the readings, best first, and those that are about as good; small mistakes only with others.
+
+    Of mountings, only one is named.
+    """
+    best = [name for name in clear if shares[name] >= _EQUAL * shares[clear[0]]]
+    best = [name for name in best if (name in _OPPOSITES) == (clear[0] in _OPPOSITES)]
+    other_mountings = [name for name in best if name in MOUNTS][1:]
+    return tuple(name for name in best if name not in other_mountings)
+
+
+def _find_turn(pairs: Sequence[Pair]) -> tuple[float, list[float]]:
+    """Return the azimuth of the points' x axis in the frame of the poses, radians, and the share of each pair under it.
+
+    It is the angle between the motion of the poses and that under which the points fit best. The shares are 0 if it is
+    nearly a multiple of 90 degrees, because such readings have names.
+    """
+    turned = 0j
+    for pair in pairs:
+        given = pair.transforms[GIVEN]
+        source = pair.source.points(OFF)[:_MOST_POINTS] @ given[:3, :3].T  # a turn of the axes keeps rotations about z
+        motion = find_motion(source, pair.target.points(OFF), turns=(0.0,))
+        turned += complex(*given[:2, 3]) * complex(*motion[:2, 3]).conjugate()
+    turn = float(np.angle(turned))
+    Y = as_matrix(rotations_about(2, turn))
+    read = [replace(pair, transforms={GIVEN: Y.T @ pair.transforms[GIVEN] @ Y}) for pair in pairs]
+    is_oblique = abs((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4) > _OBLIQUE
+    return turn, [pair.share(OFF) if is_oblique else 0.0 for pair in read]
 
 
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
@@ -348,7 +396,7 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
     return shares, sorted(clear, key=gains.__getitem__, reverse=True)
 
 
-def find_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def find_motion(source: np.ndarray, target: np.ndarray, turns: Sequence[float] = _TURNS) -> np.ndarray:
     """Find the rotation and shift in the plane that brings most points of the source into cells of the target.
 
     Both are (N, 3) float64, metres. Return (4, 4) float64. Each rotation costs one correlation by FFT, 10 ms.
@@ -358,7 +406,7 @@ def find_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     steps = np.r_[0 : reach + 1, -reach:0]
     most = -1.0
     found = np.eye(4)
-    for turn in _TURNS:
+    for turn in turns:
         T = as_matrix(rotations_about(2, turn))
         turned = np.fft.rfft2(_image(source @ T[:3, :3].T, 0))
         counts = np.fft.irfft2(image * np.conj(turned), (_CELLS, _CELLS))[np.ix_(steps, steps)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,33 +28,32 @@ def structure_rows(sweep: Sweep, centre: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
     mask: Any = sweep.is_ground
     if mask is not None and len(points) and as_numpy(mask).mean() < _LEAST_GROUND:
         mask = None
-    rows = static_rows(replace(sweep, points=points, is_ground=mask))
+    rows = static_rows(points, mask)
     rows = rows[_are_in_tall_columns(points[rows])]
     rows = rows[thinned_rows(points[rows])]
     return rows[np.random.default_rng(0).permutation(len(rows))]
 
 
-def static_rows(sweep: Sweep) -> np.ndarray:
-    """Return the rows of a sweep that are finite, not ground, and 3 to 40 m from the origin, (K,) int64, ascending.
+def static_rows(points: np.ndarray, is_ground: Any = None) -> np.ndarray:
+    """Return the rows of points that are finite, not ground, and 3 to 40 m from the origin, (K,) int64, ascending.
 
     Without a ground mask, the ground is found by the method "grid". Moving objects are included: they are few, and
     equally wrong under every reading.
     """
-    points = as_numpy(sweep.points)[:, :3].astype(np.float64)
     distance = np.hypot(points[:, 0], points[:, 1])
-    keep = np.isfinite(points).all(axis=1) & (distance > NEAREST) & (distance < FARTHEST)
-    is_ground: Any = find_ground(points, "grid") if sweep.is_ground is None else sweep.is_ground
-    return np.flatnonzero(keep & ~as_numpy(is_ground))
+    keep = np.isfinite(points[:, :3]).all(axis=1) & (distance > NEAREST) & (distance < FARTHEST)
+    mask: Any = find_ground(points, "grid") if is_ground is None else is_ground
+    return np.flatnonzero(keep & ~as_numpy(mask))
 
 
 def _are_in_tall_columns(points: np.ndarray) -> np.ndarray:
     """Test which points, (N, 3), lie in a column of 0.8 m that holds points 0.35 m above one another, (N,) bool."""
     cell = np.floor(points[:, :2] / _COLUMN).astype(np.int64) @ np.array((1 << 20, 1))
-    order = np.lexsort((points[:, 2], cell))
+    order = np.argsort(cell, kind="stable")
     start = np.flatnonzero(np.diff(cell[order], prepend=np.iinfo(np.int64).min))  # of each column
     count = np.diff(start, append=len(order))
     height = points[order, 2]
-    is_tall = height[start + count - 1] - height[start] >= _TALL
+    is_tall = np.maximum.reduceat(height, start) - np.minimum.reduceat(height, start) >= _TALL
     result = np.empty(len(points), bool)
     result[order] = np.repeat(is_tall, count)
     return result

@@ -79,9 +79,17 @@ def _sums(result: FlowResult, frame: EvalFrame, num_bins: int) -> np.ndarray:
 def fit(sums: np.ndarray) -> dict[str, list[float]]:
     """Probability of each bin in both tables: share of points, made monotonic along each row of a table."""
     table = confidence.TABLE
+    biases = len(table["bias"])
     sizes, shares, margins = (1 + len(table[name]) for name in ("size", "share", "margin"))
-    # Lengths of rows, and whether the confidence falls along them: the more is unmatched, the worse.
-    rows = [(1, False), *2 * [(sizes, True)], *4 * [(shares, False)], *4 * [(1, False)], *8 * [(margins, False)]]
+    # Lengths of rows, and whether the confidence falls along them: the more is unmatched or biased, the worse.
+    rows = [
+        (1, False),
+        (biases, True),
+        *2 * [(sizes, True)],
+        *4 * [(shares, False)],
+        *4 * [(1, False)],
+        *8 * [(margins, False)],
+    ]
     first_moving = len(rows) - 8
     result: dict[str, list[float]] = {name: [] for name in TABLES}
     start = 0

@@ -72,7 +72,7 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
     """Draw one drive, a step in each panel. The view is `width` metres wide and begins at the corner `low`."""
     sweeps, change, components, nodes, objects, moves, result = take_steps(drive)
     pixels, size, levels = sweeps.pixels, sweeps.grid.pixel_size, nodes.num_levels
-    own, node_of_member = len(components.levels[0].of_item), nodes.members.of_item
+    own, node_of_member = len(components.plain.of_item), nodes.members.of_item
     high = np.array(low) + (width, width * HIGH / WIDE)
     corners = pixels.row_col.flip(0).T.numpy() * size + sweeps.grid.lower[:2]  # lower left ones
 

@@ -218,21 +218,13 @@ def test_a_pair_whose_process_dies_is_tried_once_more_then_reported(log_folder, 
     assert name.endswith(str(stamps[1])) and "2 worker processes died on it, the last one: signal 9" in message
 
 
-def test_bench_keeps_freed_memory_only_if_asked(tmp_path, cflow, monkeypatch):
+def test_bench_keeps_freed_memory_and_writes_what_it_prints(tmp_path, cflow, capsys, monkeypatch):
     calls: list[Any] = []
     monkeypatch.setattr(memory, "keep_freed_memory", lambda: calls.append(1))
-    data = ["data.num_sweeps=2", f"data.cache={tmp_path}", "model=paper", SMALL, "repeats=1", "batches=[1]"]
-    for number, more in enumerate(([], ["keep_memory=false"])):
-        assert cflow("bench", *data, *more, f"output={tmp_path / 'out'}") == 0
-        report = json.loads((tmp_path / "out" / "bench.json").read_text())
-        assert len(calls) == 1 and report["keep_memory"] is (number == 0)
-
-
-def test_bench_writes_what_it_prints(tmp_path, cflow, capsys):
     data = ["data.num_sweeps=3", f"data.cache={tmp_path}", "model=paper", SMALL, "pairs=5", "repeats=1", "batches=[2]"]
     assert cflow("bench", *data, f"output={tmp_path / 'out'}") == 0
     report = json.loads((tmp_path / "out" / "bench.json").read_text())
-    assert report["windows"] == 2, "the log has two pairs"
+    assert report["windows"] == 2 and len(calls) == 1, "the log has two pairs"
     assert report["model"]["method"] == "dense" and report["peak_bytes"] > 2**20
     seconds, batch = report["seconds"], report["batches"]["2"]
     assert seconds["pairs"] == 2 and 0 < seconds["min"] <= seconds["median"] <= seconds["max"]

@@ -85,3 +85,12 @@ def test_a_folder_has_one_layout_which_is_said(tmp_path, recwarn: Any) -> None:
     assert len(ArraysLog(tmp_path / "5", bin_columns=5).sweep(0).points) == 2400
     with pytest.raises(CFlowError, match="not a multiple"):
         ArraysLog(tmp_path / "5", bin_columns=7).sweep(0)
+
+
+def test_a_log_may_mix_numbers_of_columns(tmp_path) -> None:
+    """A file whose size fits the layout of the log by chance is still recognised."""
+    tables = [street(4), street(4), street(5), street(5)]
+    for number, table in enumerate(tables):
+        table.tofile(tmp_path / f"{number}.bin")
+    for sweep, table in zip(ArraysLog(tmp_path), tables):
+        assert np.array_equal(sweep.points, table[:, :3])

@@ -107,7 +107,7 @@ def test_a_turn_may_begin_elsewhere(start: float, deskew: str, reading: str) -> 
     shares = []
     for given in (raw, log, truth):
         sweeps = [given.sweep(index) for index in (2, 6)]
-        source, target = (np.asarray(sweep.points)[static_rows(sweep)] for sweep in sweeps)
+        source, target = (np.asarray(sweep.points)[static_rows(sweep.points, sweep.is_ground)] for sweep in sweeps)
         T = np.linalg.inv(sweeps[1].pose) @ sweeps[0].pose
         shares.append(Structure(target).share(source[thinned_rows(source)], T))
     assert shares[0] < 0.85 * shares[2] and shares[1] > 0.95 * shares[2]

@@ -147,19 +147,6 @@ def test_a_data_frame_has_a_row_per_point(drive, result, monkeypatch):
         result.to_pandas()
 
 
-def test_an_open3d_cloud_has_all_fields(drive, result, monkeypatch):
-    points = drive.sweep(3).points
-    monkeypatch.setitem(sys.modules, "open3d.t.geometry", None)
-    with pytest.raises(CFlowError, match="pip install open3d"):
-        result.to_open3d(points)
-    monkeypatch.undo()
-    pytest.importorskip("open3d")
-    cloud = result.to_open3d(points)
-    assert np.array_equal(cloud.point.positions.numpy(), points)
-    for name, values in result.numpy().items():
-        assert np.array_equal(cloud.point[name].numpy().reshape(values.shape), values), name
-
-
 def test_a_result_is_printed_in_one_line(result):
     in_cluster = result.cluster_id[result.cluster_id >= 0]
     counts = f"{len(result.flow)} points, {int(result.is_valid.sum())} valid, {len(in_cluster)} in"

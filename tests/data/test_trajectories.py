@@ -10,8 +10,11 @@ import pytest
 
 from cflow_torch import CFlowError
 from cflow_torch.data.arrays import poses_text
-from cflow_torch.data.arrays.reader import ArraysLog, times_of_names
+from cflow_torch.data.arrays.cloud_file import write_cloud
+from cflow_torch.data.arrays.reader import ArraysLog, find_array_logs
+from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.log import Log, window
+from cflow_torch.transforms import as_matrix, rotations_about
 from cflow_torch.types import CFlowWarning, Sweep
 
 START, COUNT = 1_700_000_000_123_456_789, 12
@@ -139,6 +142,8 @@ SHIFTED = [1_700_000_000_050_000_000 + k * 50_000_000 for k in range(24)]
         lambda stamp: seconds(stamp).replace(".", "_"),
         lambda stamp: f"{stamp // 10**9}_{stamp % 10**9}" if stamp != 1_700_000_001_000_000_000 else "1700000001_0",
         lambda stamp: f"cloud_{stamp / 1e9:.6f}",
+        lambda stamp: f"scan_0001_{stamp // 10**9}.{stamp % 10**9 // 1000:06d}",
+        lambda stamp: f"{np.datetime64(stamp, 'us' if stamp < 10**17 else 'ns')}".replace("T", "_").replace(":", "-"),
         str,
     ],
 )
@@ -146,6 +151,10 @@ def test_names_are_times_and_sort_the_clouds(tmp_path, name: Any) -> None:
     log = ArraysLog(clouds(tmp_path / "a", [name(stamp) for stamp in SHIFTED]))
     assert np.abs(np.subtract(log.timestamps, SHIFTED)).max() < 1000, "a float has steps of 240 ns"
     assert [sweep.points[0, 0] for sweep in log] == list(range(1, 25))
+
+
+def test_names_are_milliseconds() -> None:
+    assert times_of_names(["1700000000123", "1700000000223"]) == [1_700_000_000_123_000_000, 1_700_000_000_223_000_000]
 
 
 def test_other_names_are_no_times() -> None:
@@ -169,3 +178,126 @@ def test_a_vehicle_that_stands_has_a_pose_in_every_line(tmp_path: Path) -> None:
     """Lines without times may be equal. Only a line with a time can be a repetition."""
     np.savetxt(tmp_path / "poses.txt", np.tile(np.eye(4)[:3].reshape(12), (4, 1)))
     assert poses_text.read_poses(tmp_path / "poses.txt").poses.shape == (4, 4, 4)
+
+
+POSES = as_matrix(rotations_about(2, 3 + 0.1 * np.arange(12)) @ rotations_about(0, 0.02), np.arange(36).reshape(12, 3))
+ANGLES = [(0.02, 0, (3 + 0.1 * k + np.pi) % (2 * np.pi) - np.pi) for k in range(12)]  # roll, pitch, yaw
+
+
+DEGREES = [(*pose[:3, 3], *np.degrees(angles)) for pose, angles in zip(POSES, ANGLES)]
+
+
+def rows(table: Any, separator: str = " ") -> list[str]:
+    return [separator.join(f"{value:.17g}" for value in row) for row in table]
+
+
+LAYOUTS = {
+    "13 numbers": rows([(k, *pose[:3].reshape(-1)) for k, pose in enumerate(POSES)]),
+    "17 numbers": rows([(k, *pose.reshape(-1)) for k, pose in enumerate(POSES)]),
+    "16 numbers": rows(POSES.reshape(12, 16), ","),
+    "four lines": rows(POSES.reshape(48, 4)),
+    "radians": ["t,x,y,z,roll,pitch,yaw", *rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ",")],
+    "degrees": ["x y z roll_deg pitch_deg yaw_deg", *rows(DEGREES)],
+    "large angles": ["id,x,y,z,roll,pitch,heading", *rows([(k, *row) for k, row in enumerate(DEGREES)], ",")],
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layouts_of_poses(tmp_path, layout) -> None:
+    (tmp_path / "poses.csv").write_text("\n".join(LAYOUTS[layout]))
+    read = poses_text.read_poses(tmp_path / "poses.csv")
+    assert np.allclose(read.poses, POSES, atol=1e-12)
+    has_times = layout in ("13 numbers", "17 numbers", "radians")
+    assert (read.times_ns is not None) == has_times and (not has_times or read.times_ns[2] == 2 * 10**9)
+
+
+def test_a_plane_pose_and_a_pose_without_a_time(tmp_path) -> None:
+    (tmp_path / "odometry.csv").write_text("time,x,y,yaw\n1,2,3,0.5\n2,3,4,0.5\n")
+    (tmp_path / "poses.txt").write_text("2 3 0 0 0 0.6 0.8\n3 4 0 0 0 0.6 0.8\n")
+    plane, untimed = (poses_text.read_poses(tmp_path / name) for name in ("odometry.csv", "poses.txt"))
+    assert np.allclose(plane.poses[0], as_matrix(rotations_about(2, 0.5), (2, 3, 0)))
+    assert untimed.times_ns is None and np.allclose(untimed.poses[1, :3, 3], (3, 4, 0))
+    assert np.allclose(untimed.poses[1, :2, 0], (1 - 2 * 0.36, 2 * 0.6 * 0.8))
+
+
+@pytest.mark.parametrize(
+    ("below", "name"), [(".", "gt_tum.txt"), ("points", "glim.csv"), ("any_folder", "optimized.tum")]
+)
+def test_poses_are_found_under_any_name_and_said(tmp_path, below, name) -> None:
+    clouds(tmp_path / below)
+    (tmp_path / name).write_text("\n".join(EXACT))
+    (tmp_path / "notes.txt").write_text("1 2 3\n4 5 6\n")
+    assert find_array_logs(tmp_path) == [tmp_path]
+    with pytest.warns(CFlowWarning, match=f"its poses are those of {name}"):
+        log = ArraysLog(tmp_path)
+    assert np.allclose(log.poses[:, 0, 3], range(12), atol=1e-5)
+    (tmp_path / "second_tum.txt").write_text("\n".join(EXACT))
+    with pytest.raises(CFlowError, match=f"several files for poses: .*{name}.*choose one"):
+        ArraysLog(tmp_path)
+    assert ArraysLog(tmp_path, poses=None).poses is None
+
+
+def test_a_folder_with_a_file_per_pose_and_a_file_of_times(tmp_path) -> None:
+    clouds(tmp_path / "points", range(12))
+    (tmp_path / "ego_pose").mkdir()
+    for k, pose in enumerate(POSES):
+        np.savetxt(tmp_path / "ego_pose" / f"{k}.txt", pose, "%.17g")
+    dates = [f"2023-11-14 22:13:{20 + k}.5" for k in range(12)]
+    (tmp_path / "timestamps.txt").write_text("\n".join(dates))
+    log = ArraysLog(tmp_path)
+    assert np.allclose(log.poses, POSES) and log.timestamps[1] == 1_700_000_001_500_000_000
+    assert log.notes == ["its poses are those of ego_pose", "the times of its sweeps are those of timestamps.txt"]
+
+
+def test_poses_of_missing_sweeps_are_skipped_by_number(tmp_path) -> None:
+    clouds(tmp_path, [f"{k:06d}" for k in range(12) if k != 7])
+    (tmp_path / "poses.txt").write_text("\n".join(rows(POSES[:, :3].reshape(12, 12))))
+    with pytest.warns(CFlowWarning, match="12 poses in .* for 11 sweeps, so each takes that of its number"):
+        log = ArraysLog(tmp_path)
+    assert np.allclose(log.poses, np.delete(POSES, 7, 0)) and log.gaps == {6}
+    (tmp_path / "000011.npy").unlink()
+    (tmp_path / "000000.npy").unlink()  # 1 to 10: counted from 0 or from 1?
+    with pytest.raises(CFlowError, match="12 poses for 9 sweeps"):
+        ArraysLog(tmp_path)
+
+
+def test_poses_that_are_too_rare_are_named(tmp_path) -> None:
+    (clouds(tmp_path) / "poses.txt").write_text("\n".join(EXACT[::10]))
+    with pytest.raises(CFlowError, match="has a pose every 1 s; between poses, we interpolate up to 0.5 s"):
+        ArraysLog(tmp_path)
+
+
+def test_far_points_keep_their_precision(tmp_path) -> None:
+    points = np.random.default_rng(0).random((50, 3)) + (6.9e5, 5.33e6, 500)
+    for k in range(2):
+        write_cloud(tmp_path / f"{k}.ply", points, {"GpsTime": 2.9e8 + 0.1 * k + np.linspace(0, 0.1, 50)})
+    sweep = ArraysLog(tmp_path).sweep(1)
+    assert sweep.points.dtype == np.float64 and np.array_equal(sweep.points, points)
+    assert np.allclose(sweep.point_times, np.linspace(0, 0.1, 50), atol=1e-6)
+
+
+def test_tables_may_hold_texts_and_lines_of_nan(tmp_path) -> None:
+    """As `rostopic echo -p` writes, with a lost pose: it is interpolated. Without times, its sweep is left out."""
+    clouds(tmp_path)
+    names = "%time,field.header.frame_id,field.pose.position.x,y,z,field.pose.orientation.x,qy,qz,qw,twist.linear.x"
+    table = [line(k, str(stamp), "t x y z qx qy qz qw", ",").split(",") for k, stamp in enumerate(STAMPS)]
+    rows_of = [",".join([each[0], "odom", *each[1:], "6.5"]) for each in table]
+    rows_of[5] = rows_of[5].replace(",0.5,", ",nan,")
+    (tmp_path / "odom.csv").write_text("\n".join([names, *rows_of]))
+    assert np.allclose(ArraysLog(tmp_path).poses[:, 0, 3], range(12), atol=1e-5)
+    (tmp_path / "odom.csv").unlink()
+    matrices = POSES[:, :3].reshape(12, 12).copy()
+    matrices[4, 3] = np.nan
+    named = [f"{stamp}.npy {row}" for stamp, row in zip(STAMPS, rows(matrices))]
+    (tmp_path / "poses.txt").write_text("\n".join(named))
+    with pytest.warns(CFlowWarning, match="1 of 12 sweeps have a pose of NaN .* left out"):
+        log = ArraysLog(tmp_path)
+    assert np.allclose(log.poses, np.delete(POSES, 4, 0)) and log.gaps == {3}
+
+
+def test_clouds_of_a_second_sensor_are_said(tmp_path) -> None:
+    for name in ("front", "rear"):
+        clouds(tmp_path / name)
+    (tmp_path / "poses.txt").write_text("\n".join(EXACT))
+    with pytest.warns(CFlowWarning, match="we read the clouds in front; there are others in rear"):
+        ArraysLog(tmp_path)

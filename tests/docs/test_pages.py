@@ -110,6 +110,13 @@ def test_commands_and_python_run_in_the_order_of_the_page(page: str, names: dict
         printed = capfd.readouterr().out
         assert re.search(r"object \d+ at \[.*\] m: \d+\.\d m/s", printed) and re.search(r"object \d+: .* m/s", printed)
         assert Path("flow.png").is_file() and 0 < len(read_cloud("clean_map.ply")) < len(read_cloud("map.ply"))
+    if page == PAGES[2]:
+        scores = json.loads(Path("outputs/eval/results.json").read_text())["results"]["three_way"]
+        names_of = {"EPE_FD": "epe_fd", "EPE_BS": "epe_bs", "EPE_FS": "epe_fs", "IoU": "dynamic_iou"}
+        stated = re.findall(r"(EPE_\w\w|IoU) (\d\.\d+)", (ROOT / page).read_text(encoding="utf-8"))
+        assert {name: float(value) for name, value in stated} == {
+            name: pytest.approx(scores[key], abs=1e-3) for name, key in names_of.items()
+        }
 
 
 def test_three_commands_of_the_readme_make_actors_and_a_clean_map(folder: Path, capfd: Any) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import os
+import multiprocessing
 import signal
+import threading
 import time
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NoAnswer
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +21,7 @@ from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import LogWrapper
 from cflow_torch.fleet import parallel, work
-from cflow_torch.fleet.executors import CannotStart, Executor, Holder, ProcessExecutor
+from cflow_torch.fleet.executors import CannotStart, Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.parallel import run_parallel
@@ -85,6 +87,16 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
     assert any("the sensor moves" in text for _, text in notes), "the log is checked by the part of its first frame"
 
 
+def test_a_log_whose_frames_all_fail_leaves_no_files(source, tmp_path):
+    stamps = AV2Log(source).timestamps
+    worker = Worker(make_job(tmp_path), "cpu")
+    model, worker._model = worker._model, FailingModel(stamps, lambda: ValueError("odd"))
+    events = list(worker.run(Part(0, source)))
+    assert [type(event) for event in events[-5:]] == [Failed] * 5 and not any(tmp_path.iterdir())
+    worker._model = model
+    assert isinstance(list(worker.run(Part(0, source)))[-1], Done) and len(flow_files(tmp_path)) == 5
+
+
 def test_a_lost_gpu_ends_its_worker(source, tmp_path, monkeypatch):
     worker = Worker(make_job(tmp_path, batch=1), "cpu")
     worker._model = FailingModel(AV2Log(source).timestamps, lambda: RuntimeError("assert"))
@@ -129,20 +141,16 @@ class HereExecutor(Executor):
             raise Death
         return Worker._read(self.worker, log, index)
 
-    def submit(self, method: str, *arguments: Any) -> Any:
-        future: Future[Any] = Future()
+    def call(self, method: str, *arguments: Any) -> Any:
         try:
             self.worker = self.worker or self.start()
-            future.set_result(getattr(self.worker, method)(*arguments))
+            return getattr(self.worker, method)(*arguments)
         except Death:
-            future.set_exception(BrokenExecutor("SIGSEGV"))
-        except Exception as error:
-            future.set_exception(error)
-        return future
+            self.worker = None
+            raise BrokenExecutor("SIGSEGV") from None
 
-    def close(self) -> str:
+    def close(self) -> None:
         self.worker = None
-        return ""
 
 
 def parts_of(sources: Sequence[Any]) -> list[Part]:
@@ -199,10 +207,8 @@ def test_frames_that_all_kill_are_all_reported(fleet, single, tmp_path):
 
 def test_a_log_that_cannot_be_opened_alive_is_left(source, tmp_path):
     class Deadly(HereExecutor):
-        def submit(self, method: str, *arguments: Any) -> Any:
-            future: Future[Any] = Future()
-            future.set_exception(BrokenExecutor("SIGSEGV"))
-            return future
+        def call(self, method: str, *arguments: Any) -> Any:
+            raise BrokenExecutor("SIGSEGV")
 
     died, failed = run_parallel([Deadly(make_job(tmp_path))], parts_of([source]), never)
     assert died == Noted(0, source.name, AGAIN)
@@ -222,7 +228,7 @@ def test_workers_that_die_at_their_start_are_started_twice_for_each_log(fleet, t
 def test_a_worker_that_cannot_start_ends_the_run(fleet, tmp_path):
     class Gone(HereExecutor):
         def start(self) -> Worker:
-            return Holder().call(lambda: Worker(self.job, "nowhere"), "run", ())
+            return InlineExecutor(lambda: Worker(self.job, "nowhere")).call("run")
 
     parts = parts_of(sorted(fleet.iterdir()))
     with pytest.raises(CFlowError, match="nowhere"):
@@ -248,61 +254,95 @@ def test_an_error_outside_of_frames_fails_only_its_part(fleet, single, tmp_path,
 
 
 class SilentExecutor(HereExecutor):
-    """Its first calls are not answered."""
+    """Its calls are not answered before it is closed."""
 
-    def __init__(self, job: Job, num_silent: int) -> None:
+    def __init__(self, job: Job) -> None:
         super().__init__(job)
-        self.num_silent = num_silent
+        self.is_closed = threading.Event()
 
-    def submit(self, method: str, *arguments: Any) -> Any:
-        self.num_silent -= 1
-        return Future() if self.num_silent >= 0 else super().submit(method, *arguments)
+    def call(self, method: str, *arguments: Any) -> Any:
+        self.is_closed.wait()
+        raise BrokenExecutor("closed")
+
+    def close(self) -> None:
+        self.is_closed.set()
 
 
 def test_a_stop_does_not_wait_for_a_worker_that_hangs(source, tmp_path, monkeypatch):
     monkeypatch.setattr(parallel, "_GRACE_S", 1.0)
     start = time.monotonic()
     stop = lambda: time.monotonic() > start + 1  # noqa: E731
-    assert not list(run_parallel([SilentExecutor(make_job(tmp_path), 1)], parts_of([source]), stop))
-    assert time.monotonic() - start < 20
+    executor = SilentExecutor(make_job(tmp_path))
+    assert not list(run_parallel([executor], parts_of([source]), stop))
+    assert time.monotonic() - start < 20 and executor.is_closed.is_set()
 
 
-def test_a_silent_worker_is_replaced(source, single, tmp_path):
-    parts = parts_of([source])
-    executor = SilentExecutor(make_job(tmp_path), 1)
-    executor.timeout = 1.0
-    counters = count(run_parallel([executor], parts, never), parts)
-    assert counters.is_complete and counters.times_noted(AGAIN.replace("SIGSEGV", "no answer for 1 s")) == 1
-    assert len(flow_files(tmp_path)) == 5 and flow_files(tmp_path).items() <= single.items()
+# The objects of processes are made by texts, because a process that imports this file imports torch, too.
 
 
 def test_a_process_passes_answers_and_errors():
-    # As texts, because a process that imports this file imports torch, too.
     executor = ProcessExecutor(partial(eval, "[3, 2, 1]"))
     try:
-        assert executor.submit("pop").result(60) == 1
-        assert executor.submit("index", 3).result(60) == 0, "the same object"
-        with pytest.raises(ValueError, match="not in list"):
-            executor.submit("remove", 7).result(60)
-        (process,) = executor._pool._processes.values()
-        os.kill(process.pid, signal.SIGKILL)
-        with pytest.raises(BrokenExecutor):
-            [executor.submit("index", 3).result(60) for _ in range(1000)]
-        assert "signal 9, Killed" in executor.close()
-        assert executor.submit("pop").result(60) == 1, "another process"
-        executor.close()
-        assert executor.submit("pop").result(60) == 1, "another process"
-        executor.close()
-        leaver = ProcessExecutor(partial(eval, "__import__('sys')"))
-        with pytest.raises(BrokenExecutor):
-            leaver.submit("exit", "out").result(60)
-        assert leaver.close() == "exit status 1"
+        assert executor.call("pop") == 1
+        assert executor.call("index", 3) == 0, "the same object"
+        with pytest.raises(ValueError, match="not in list") as caught:
+            executor.call("remove", 7)
+        assert "in a worker process" in str(caught.value.__cause__)
     finally:
         executor.close()
+    with pytest.raises(BrokenExecutor, match="closed"):
+        executor.call("pop")
     executor = ProcessExecutor(partial(eval, "1 / 0"))
     with pytest.raises(CannotStart, match="ZeroDivisionError"):
-        executor.submit("pop").result(60)
+        executor.call("pop")
     executor.close()
+
+
+def test_a_process_that_ends_is_replaced_and_says_how_it_ended():
+    executor = ProcessExecutor(partial(eval, "__import__('os')"))
+    try:
+        first = executor.call("getpid")
+        with pytest.raises(BrokenExecutor, match="^exit status 3$"):
+            executor.call("_exit", 3)
+        second = executor.call("getpid")
+        with pytest.raises(BrokenExecutor, match="signal 9, Killed"):
+            executor.call("kill", second, signal.SIGKILL)
+        assert len({first, second, executor.call("getpid")}) == 3
+    finally:
+        executor.close()
+
+
+def test_a_process_whose_library_exits_or_loses_its_gpu_ends():
+    leaver = ProcessExecutor(partial(eval, "__import__('sys')"))
+    with pytest.raises(BrokenExecutor, match="^exit status 1$"):
+        leaver.call("exit", "out")
+    loser = ProcessExecutor(partial(eval, "(_ for _ in ())"))
+    with pytest.raises(BrokenExecutor, match="no GPU"):
+        loser.call("throw", BrokenExecutor("no GPU"))
+    assert not multiprocessing.active_children()
+
+
+def test_a_silent_process_is_ended_and_replaced():
+    executor = ProcessExecutor(partial(eval, "__import__('os')"), timeout=5.0)
+    try:
+        first = executor.call("getpid")
+        with pytest.raises(BrokenExecutor, match="no answer for 5 s"):
+            executor.call("kill", first, signal.SIGSTOP)
+        assert executor.call("getpid") != first
+    finally:
+        executor.close()
+
+
+def test_a_close_ends_a_call_of_another_thread():
+    executor = ProcessExecutor(partial(eval, "__import__('time')"))
+    with ThreadPoolExecutor(1) as thread:
+        assert thread.submit(executor.call, "perf_counter").result(60) > 0
+        call = thread.submit(executor.call, "sleep", 600)
+        with pytest.raises(NoAnswer):
+            call.result(0.2)
+        executor.close()
+        with pytest.raises(BrokenExecutor):
+            call.result(60)
 
 
 def test_the_report_lists_what_is_missing():

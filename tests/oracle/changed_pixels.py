@@ -15,8 +15,9 @@ ABOVE_LOWEST, NEAR = 1.6, 12.0  # metres
 def find_changed(
     sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: Sequence[Sequence[float]]
 ) -> np.ndarray:
-    """(2, P) bool: pixels of which a slice is missing in another sweep and not hidden there, and those of which one is
-    missing in another sweep that saw its place; none in windows of two sweeps.
+    """(3, P) bool: pixels of which a slice is missing in another sweep and not hidden there; those of which one is
+    missing in another sweep that saw its place; the first ones, and those of which every other sweep lacks a slice.
+    None in windows of two sweeps.
 
     Args:
         in_sight: (N, 3) of each sweep: its points, those that are not drawn included.
@@ -24,7 +25,8 @@ def find_changed(
 
     Convention: the middle of a slice is that of the first one at or above the lowest point of its pixel.
     """
-    is_missing, has_changed = change = np.zeros((2, len(sweeps.pixels)), dtype=bool)
+    is_missing, has_changed, may_be_fast = change = np.zeros((3, len(sweeps.pixels)), dtype=bool)
+    num_lacking = np.zeros(len(sweeps.pixels), dtype=int)
     lowest = np.full(len(sweeps.pixels), np.inf)
     np.minimum.at(lowest, sweeps.pixel_of_point, sweeps.points[:, 2])
     _, row, col = sweeps.pixels.T
@@ -33,6 +35,7 @@ def find_changed(
         farthest = np.full((ELEVATIONS, AZIMUTHS), -np.inf)
         np.maximum.at(farthest, *directions(in_sight[other], sensor))
         missing = sweeps.slices & ~sweeps.around[other, row, col]
+        num_lacking += missing > 0
         pixel, number = np.nonzero(missing[:, None] >> np.arange(NUM_SLICES) & 1)
         first = np.floor(lowest[pixel] / SLICE_HEIGHT)
         height = (first + (number - first) % NUM_SLICES + 0.5) * SLICE_HEIGHT
@@ -40,6 +43,7 @@ def find_changed(
         is_seen, is_unknown = farthest[direction] >= distance, farthest[direction] == -np.inf
         is_missing[pixel[is_seen | is_unknown]] = True
         has_changed[pixel[is_seen]] = True
+    may_be_fast |= is_missing | ((num_lacking == len(in_sight) - 1) & sweeps.has_history)
     return change
 
 

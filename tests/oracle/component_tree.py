@@ -57,7 +57,7 @@ def grow(sweeps: SlicedSweeps, change: np.ndarray, config: VerifiedConfig) -> Tr
         box at t+1. Components of changed pixels are at most 3 m long.
     """
     longest, every = config.max_object_length, np.ones(len(sweeps.pixels), dtype=bool)
-    is_missing, has_changed = change
+    is_missing, has_changed, _ = change
     scales = [(round(size / sweeps.size), True) for size in config.pixel_sizes]
     tree = Tree([components(sweeps, every, *scale) for scale in (*scales, (1, False))], [])
     node_of, plain = np.full(len(every), -1), len(scales)

@@ -57,6 +57,30 @@ def motion_of_pixels(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMoti
     return np.where(rotates, own, flow / sweeps.size)[:, ::-1]
 
 
+def biases(sweeps: SlicedSweeps) -> np.ndarray:
+    """(P,) float32: how much the surroundings of each pixel seem to shift from t to t+1; meant for pixels of t.
+
+    A slice of t that t+1 has only one pixel to the right, and not to the left, is a vector to the right, and so on.
+    The bias is the length of the sum of these vectors, divided by the root of the sum of the squares of the vectors of
+    pixels. Both sums go three times over 3 x 3 pixels, through pixels with one of t around.
+    """
+    step, row, col = sweeps.pixels.T
+    of_t, newest = sweeps.image[1], np.pad(sweeps.image[0], 1)
+    middle = slice(1, -1)
+    vectors = []
+    for behind, ahead in (
+        ((slice(-2), middle), (slice(2, None), middle)),
+        ((middle, slice(-2)), (middle, slice(2, None))),
+    ):
+        only_ahead, only_behind = (of_t & newest[a] & ~newest[b] for a, b in ((ahead, behind), (behind, ahead)))
+        vectors.append(COUNT[only_ahead] - COUNT[only_behind])
+    sums = np.stack((*vectors, vectors[0] ** 2 + vectors[1] ** 2))
+    for _ in range(3):
+        sums = over_squares(sums, 1, np.add) * (sweeps.around[1] > 0)
+    down, across, square = sums[:, row, col].astype(np.float32)
+    return np.sqrt((down * down + across * across) / np.maximum(square, 1))
+
+
 def probabilities(
     sweeps: SlicedSweeps,
     object_of: np.ndarray,
@@ -69,13 +93,13 @@ def probabilities(
     Given are the object of each pixel, the motion of each object and its margin, the missing pixels, and the dilated
     component of each pixel at the second finest scale, then at the finest.
 
-    The bins of the table: left out; static in an unmatched component, by its size; static, by the share of the
-    slices in the block around that is found; static beside something that moves; moving, by the margin. Each but the
-    first has rows, for pairs, then with history: one if unmatched, two if static, not missing and missing, and four if
-    it moves, near slow, near fast, far slow, far fast. A block is 1.6 m wide, and its slices are found if t+1 has them
-    where they move to. A pixel is unmatched if t+1 lacks a slice around it. In pairs it is then missing. A component is
-    unmatched if less than an eighth of its size is matched, the sum of the reach of its pixels of t. A missing pixel in
-    one has a bin of the first kind.
+    The bins of the table: left out; static in a pair and biased; static in an unmatched component, by its size; static,
+    by the share of the slices in the block around that is found; static beside something that moves; moving, by the
+    margin. Each but the first two has rows, for pairs, then with history: one if unmatched, two if static, not missing
+    and missing, and four if it moves, near slow, near fast, far slow, far fast. A block is 1.6 m wide, and its slices
+    are found if t+1 has them where they move to. A pixel is unmatched if t+1 lacks a slice around it. In pairs it is
+    then missing. A component is unmatched if less than an eighth of its size is matched, the sum of the reach of its
+    pixels of t. A missing pixel in one has a bin of that kind.
     """
     motion = np.array([*(each.flow[::-1] for each in rigid), (0.0, 0.0)])[object_of] / sweeps.size
     step, row, col = sweeps.pixels.T
@@ -87,7 +111,9 @@ def probabilities(
         np.add.at(of_block, (row // side, col // side), np.where(step == 1, of_pixel, 0))
     total, found = counts[:, row // side, col // side]
     sizes, share, bounds = (np.array(TABLE[name]) for name in ("size", "share", "margin"))
-    static = 1 + 2 * (1 + len(sizes))
+    biased = 1
+    unmatched = biased + len(TABLE["bias"])
+    static = unmatched + 2 * (1 + len(sizes))
     beside = static + 4 * (1 + len(share))
 
     is_moving = np.zeros(sweeps.image.shape, dtype=bool)
@@ -98,6 +124,9 @@ def probabilities(
         is_missing = is_unmatched
     kind = 2 * sweeps.has_history + is_missing
     bins = static + kind * (1 + len(share)) + (10 * found[:, None] >= share * total[:, None]).sum(1)
+    if not sweeps.has_history:
+        level = (biases(sweeps)[:, None] >= TABLE["bias"]).sum(1)
+        bins = np.where(level > 0, biased - 1 + level, bins)
     bins[is_beside] = (beside + kind)[is_beside]
     for component in scales[::-1]:  # the coarse ones come last
         for name in np.unique(component[step == 1]):
@@ -105,7 +134,7 @@ def probabilities(
             reach = sweeps.reach[row, col][members]
             if 8 * reach[~is_unmatched[members]].sum() < reach.sum():
                 lost = members[is_missing[members]]
-                bins[lost] = 1 + sweeps.has_history * (1 + len(sizes)) + (reach.sum() >= sizes).sum()
+                bins[lost] = unmatched + sweeps.has_history * (1 + len(sizes)) + (reach.sum() >= sizes).sum()
 
     is_far = (sweeps.middle(sweeps.pixels) ** 2).sum(1) >= TABLE["far"] ** 2
     is_fast = np.array([*(each.flow[0] ** 2 + each.flow[1] ** 2 >= TABLE["fast"] ** 2 for each in rigid), False])

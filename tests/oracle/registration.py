@@ -7,6 +7,7 @@ the angle.
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from typing import NamedTuple, Sequence
 
@@ -20,6 +21,7 @@ FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces
 NOISE = 0.05  # metres, standard deviation of a centroid across its surface
 MOST_TIME = 2.5  # sweep intervals: older sweeps are ignored
 NUM_STEPS, STEP_LENGTH = 4, 1.4  # steps, as long as so many of Gauss and Newton
+SAMPLE = 256  # voxels of an object, about, in the first half of the steps
 HELD = (2.0, 2.0, 5.0)  # pairs that the given translation is worth, and, at 1 m, no rotation
 
 
@@ -63,7 +65,13 @@ class Voxels:
         self.position = self.position / count[:, None]
         pixel, self.layer = keys // NUM_LAYERS, keys % NUM_LAYERS
         self.step, self.object_id = sweeps.pixels[pixel, 0], object_of[pixel]
+        self.plane = sweeps.pixels[pixel, 1:].sum(1) + self.layer
         self.number = {key: number for number, key in enumerate(keys.tolist())}
+
+    def of(self, object_id: int, most: float) -> np.ndarray:
+        """The voxels of an object before t+1; if they are more than `most`, those in every n-th diagonal plane."""
+        own = np.flatnonzero((self.object_id == object_id) & (self.step > 0))
+        return own[self.plane[own] % max(1, math.ceil(len(own) / most)) == 0]
 
     def around(self, layer: int, position: np.ndarray) -> list[int]:
         """Voxels of t+1 in the 3 x 3 pixels around a position, in its layer and those next to it, the last of which is
@@ -87,15 +95,22 @@ def register(sweeps: SlicedSweeps, object_of: np.ndarray, flow: Sequence[Vector]
             continue
         centre, given = at_t.sum(0) / len(at_t), np.array([*start, 0.0])
         motion = given
-        for _ in range(NUM_STEPS):
-            motion = motion + STEP_LENGTH * gauss_newton(voxels, spread, object_id, centre, given, motion)
+        for step in range(NUM_STEPS):
+            chosen = voxels.of(object_id, SAMPLE if step < NUM_STEPS // 2 else math.inf)
+            motion = motion + STEP_LENGTH * gauss_newton(voxels, spread, object_id, chosen, centre, given, motion)
         x, y, rotation = motion.tolist()
         result.append(RigidMotion((x, y), rotation, tuple(centre + sweeps.lower)))
     return result
 
 
 def gauss_newton(
-    voxels: Voxels, spread: np.ndarray, object_id: int, centre: np.ndarray, given: np.ndarray, motion: np.ndarray
+    voxels: Voxels,
+    spread: np.ndarray,
+    object_id: int,
+    chosen: np.ndarray,
+    centre: np.ndarray,
+    given: np.ndarray,
+    motion: np.ndarray,
 ) -> np.ndarray:
     """Least squares: change of the translation (metres) and of the tangent, per interval.
 
@@ -106,7 +121,7 @@ def gauss_newton(
     halves = np.array([1, 1, 2])  # the angle is twice the tangent
     matrix, force = np.diag(HELD), HELD * (given - motion) * halves
     velocity, elapsed = motion[:2], voxels.sweeps.elapsed
-    for v in np.flatnonzero((voxels.object_id == object_id) & (voxels.step > 0)).tolist():
+    for v in chosen.tolist():
         # The centre is that of t; it moves on, and the voxel rotates about it.
         position, layer, k = voxels.position[v], voxels.layer[v], elapsed[voxels.step[v]]
         arm = rotate(motion[2] * k, position[:2] - centre - velocity * (elapsed[1] - k))

@@ -20,12 +20,12 @@ NARROWEST = 0.4  # metres
 LEAST_SIZE, LIKE = 16, 2  # in a pair: pixels times their reach of an unmatched component; ratio of numbers of pixels
 
 
-def parts_of(sweeps: SlicedSweeps, is_missing: np.ndarray) -> list[np.ndarray]:
-    """Missing pixels of a sweep that touch in pixels of 0.4 m: at least two, at most 8 m long."""
+def parts_of(sweeps: SlicedSweeps, may_be_fast: np.ndarray) -> list[np.ndarray]:
+    """Pixels of a sweep that may be fast and touch in pixels of 0.4 m: at least two, at most 8 m long."""
     block = max(1, round(GAP / sweeps.size))
     parts = []
     for step in range(len(sweeps.elapsed)):
-        own = np.flatnonzero(is_missing & (sweeps.pixels[:, 0] == step))
+        own = np.flatnonzero(may_be_fast & (sweeps.pixels[:, 0] == step))
         row, col = sweeps.pixels[own, 1:].T // block
         image = np.zeros((row.max(initial=0) + 1, col.max(initial=0) + 1), dtype=bool)
         image[row, col] = True
@@ -59,10 +59,10 @@ def parts_of_pair(sweeps: SlicedSweeps, component: np.ndarray) -> list[np.ndarra
     return parts
 
 
-def link_unlinked(sweeps: SlicedSweeps, is_missing: np.ndarray, tree: Tree) -> list[Node]:
+def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> list[Node]:
     """The nodes of fast objects, of level L + 1."""
     is_pair = not sweeps.has_history
-    parts = parts_of_pair(sweeps, tree.levels[:-1][-2:][0]) if is_pair else parts_of(sweeps, is_missing)
+    parts = parts_of_pair(sweeps, tree.levels[:-1][-2:][0]) if is_pair else parts_of(sweeps, may_be_fast)
     step_of = [int(sweeps.pixels[part[0], 0]) for part in parts]
     centres = [sweeps.pixels[part, 1:].sum(0) / len(part) for part in parts]
     cell = max(1, round(CELL / sweeps.size))

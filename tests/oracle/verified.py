@@ -54,7 +54,7 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     )
     change = find_changed(sweeps, seen, [cloud.origin for cloud in every])
     tree = grow(sweeps, change, config)
-    tree.nodes.extend(link_unlinked(sweeps, change[0], tree))
+    tree.nodes.extend(link_unlinked(sweeps, change[2], tree))
     candidates, scores = propose(sweeps, tree.nodes)
     proven = [verify(sweeps, *given, len(tree.levels)) for given in zip(tree.nodes, candidates)]
     nodes = add_unchanged(sweeps, tree.nodes, [motion for motion, _ in proven], len(tree.levels))

@@ -18,7 +18,6 @@ from cflow_torch import CorrelationFlow, Sweep, VerifiedFlow, Window, make_confi
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.simulator import make_drive
-from cflow_torch.verified.component_tree import movable_nodes
 
 S = 0.25  # pixel of the small scenes
 # (row, col, height, width) and the shift per sweep (rows, cols); objects do not touch within three sweeps.
@@ -225,9 +224,8 @@ def test_a_step_of_a_model_can_be_replaced() -> None:
     assert not model([window])[0].residual_flow.any()
 
 
-def _nothing_may_move(*given: Any) -> Any:
-    tree = movable_nodes(*given)
-    return tree.only(torch.zeros(tree.count, dtype=torch.bool))
+def _nothing_may_move(sweeps: Any, components: Any, longest: Any) -> Any:
+    return components.nodes(torch.zeros(components.count, dtype=torch.bool))
 
 
 def test_beams_are_counted_by_turns_and_by_elevation(script: Any) -> None:

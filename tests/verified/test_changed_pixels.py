@@ -60,8 +60,8 @@ def block(x: float, y: float) -> np.ndarray:
     return places.reshape(-1, 3)
 
 
-def shares(sweeps: Sequence[np.ndarray], rows: tuple[float, float]) -> tuple[float, float]:
-    """Share of the pixels at t with x in a range that are missing, and that have changed, in t+1, t, t-1."""
+def shares(sweeps: Sequence[np.ndarray], rows: tuple[float, float]) -> tuple[float, float, float]:
+    """Share of the pixels at t with x in a range that are missing, have changed, and may be fast, in t+1, t, t-1."""
     pc1, pc0, older = (Sweep(np.concatenate((cloud, floor()))) for cloud in sweeps)
     images = sweeps_of([Window(pc0, pc1, (older,))], SETTINGS)
     found, x = find_changed(images), (images.pixels.row_col[1].double() + 0.5) * 0.25 - 20
@@ -72,8 +72,8 @@ def shares(sweeps: Sequence[np.ndarray], rows: tuple[float, float]) -> tuple[flo
 
 def test_a_pedestrian_before_a_wall_has_changed_and_the_wall_has_not():
     walk = [np.concatenate((block(6.0, y), screen(8.0, 6.0, 0.5))) for y in (1.0, 0.0, -1.0)]
-    assert shares(walk, (5.9, 6.6)) == (1.0, 1.0)
-    assert shares(walk, (7.9, 8.3)) == (0.0, 0.0)
+    assert shares(walk, (5.9, 6.6)) == (1.0, 1.0, 1.0)
+    assert shares(walk, (7.9, 8.3)) == (0.0, 0.0, 0.0)
 
 
 def test_a_pedestrian_behind_a_car_has_changed_only_if_seen_through_its_windows():
@@ -82,14 +82,16 @@ def test_a_pedestrian_behind_a_car_has_changed_only_if_seen_through_its_windows(
     hidden = [np.concatenate((car, wall)), np.concatenate((block(6.0, 0.0), wall)), np.concatenate((car, wall))]
     visible = wall[np.abs(wall[:, 1]) > 5.6]  # what the car does not hide
     hidden[0] = hidden[2] = np.concatenate((car, visible))
-    assert shares(hidden, (5.9, 6.6)) == (0.0, 0.0)
+    assert shares(hidden, (5.9, 6.6)) == (0.0, 0.0, 1.0)
+    hidden_once = [hidden[0], hidden[1], hidden[1] + (0, 0, 1e-4)]
+    assert shares(hidden_once, (5.9, 6.6)) == (0.0, 0.0, 0.0)
     through = [np.concatenate((car, wall)), hidden[1], np.concatenate((car, wall))]
     assert min(shares(through, (5.9, 6.6))) > 0.5
 
 
 def test_without_returns_pixels_are_missing_but_have_not_changed():
     alone = [screen(5.0, 0.5), np.concatenate((block(6.0, 4.0), screen(5.0, 0.5))), screen(5.0, 0.5)]
-    assert shares(alone, (5.9, 6.6)) == (1.0, 0.0)
+    assert shares(alone, (5.9, 6.6)) == (1.0, 0.0, 1.0)
 
 
 def test_nothing_has_changed_in_a_pair_or_in_an_empty_window():
@@ -122,7 +124,7 @@ def beside_a_wall(speed: float, density: float) -> tuple[Window, np.ndarray]:
 def nothing(sweeps) -> ChangedPixels:
     """All may move, and nothing has changed."""
     every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
-    return ChangedPixels(every, ~every)
+    return ChangedPixels(every, ~every, every)
 
 
 def test_a_pedestrian_next_to_a_wall_moves_and_the_wall_is_static(monkeypatch):

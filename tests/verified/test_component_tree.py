@@ -70,7 +70,8 @@ def grown(seed: int, longest: float | None = 3.0, blocks=(4, 2, 1), shape=(3, 3,
     # Few pixels are missing in some stripes, so that the static test decides, and most of them in others.
     odds = np.choose(sweeps.pixels.row_col[1].numpy() // 6 % 4, (0.0, 0.15, 0.1, 0.95))
     is_missing = torch.from_numpy(rng.random(sweeps.num_pixels) < odds) & sweeps.has_history[sweeps.pixels.window]
-    change = ChangedPixels(is_missing, is_missing & torch.from_numpy(rng.random(sweeps.num_pixels) < 0.8))
+    has_changed = is_missing & torch.from_numpy(rng.random(sweeps.num_pixels) < 0.8)
+    change = ChangedPixels(is_missing, has_changed, is_missing)
     config = VerifiedConfig(pixel_sizes=tuple(SIZE * block for block in blocks), max_object_length=longest)
     windows, trees = [for_oracle(sweeps, window) for window in range(shape[0])], []
     for window, drawn in enumerate(windows):
@@ -95,8 +96,8 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
         given = list(zip(names, parents))
         for window, tree in enumerate(found.trees):
             mine = found.sweeps.pixels.window == window
-            for level, roots in enumerate(found.components.levels):
-                assert same_groups(roots.of_item[mine].numpy(), tree.levels[level])
+            for level, roots in enumerate(tree.levels):
+                assert same_groups(found.components.of_level(level).of_item[mine].numpy(), roots)
             own = found.names(window)
             expected = {(name, None if node.parent < 0 else own[node.parent]) for name, node in zip(own, tree.nodes)}
             of_window = (found.nodes.window == window).tolist()
@@ -112,9 +113,11 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
 
 def test_scales_are_nested():
     found = grown(0, density=0.04)
-    for coarse, fine in zip(found.components.levels, found.components.levels[1:]):
-        assert torch.equal(found.components.tree.children.of_item[fine.of_item], coarse.of_item)
-    assert found.components.size.sum() == len(found.components.tree.pixel)
+    components = found.components
+    levels = [components.of_level(level) for level in range(components.num_levels)]
+    for coarse, fine in zip(levels, levels[1:]):
+        assert torch.equal(components.children.of_item[fine.of_item], coarse.of_item)
+    assert components.size.sum() == sum(len(level.of_item) for level in levels) + len(components.changed)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -151,7 +154,7 @@ def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_
     images = np.zeros((1, 2, 9, 12), dtype=np.uint8)
     images[0, :, 2:6, 2], images[0, :, 2:6, 6] = 1, 1
     sweeps = from_images(images, SIZE)
-    change = ChangedPixels(*torch.zeros((2, sweeps.num_pixels), dtype=torch.bool))
+    change = ChangedPixels(*torch.zeros((3, sweeps.num_pixels), dtype=torch.bool))
     components = find_components(sweeps, change, (2, 1))
     nodes = movable_nodes(sweeps, components, None)
     assert nodes.kind.tolist() == [0, 1, 1] and nodes.children.of_item.tolist() == [3, 0, 0]
@@ -164,7 +167,7 @@ def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_o
     images[0, :2, 4, 2:5] = images[0, :2, 4, 9:12] = 1  # two components of changed pixels
     sweeps = from_images(images, SIZE)
     every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
-    components = find_components(sweeps, ChangedPixels(every, every), (1,))
+    components = find_components(sweeps, ChangedPixels(every, every, every), (1,))
     nodes = movable_nodes(sweeps, components, None)
     first, second = (nodes.kind == NodeKind.CHANGED).nonzero()[:, 0].tolist()
     joined = nodes.pixel[nodes.members.of_item == second][:1]
@@ -182,7 +185,7 @@ def test_a_component_may_move_only_if_more_than_5_per_cent_are_missing(num_missi
     images[0, :2, 2:4, 1:6] = 1  # 20 pixels: one of them is 5 per cent
     sweeps = from_images(images, SIZE)
     is_missing = torch.arange(sweeps.num_pixels) < num_missing
-    components = find_components(sweeps, ChangedPixels(is_missing, torch.zeros_like(is_missing)), (1,))
+    components = find_components(sweeps, ChangedPixels(is_missing, torch.zeros_like(is_missing), is_missing), (1,))
     assert movable_nodes(sweeps, components, None).count == may_move
 
 
@@ -192,6 +195,6 @@ def test_a_component_of_changed_pixels_is_a_node_only_up_to_3_m(num_pixels, is_n
     images[0, :2, 4, 2 : 2 + num_pixels] = 1
     sweeps = from_images(images, SIZE)
     every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
-    components = find_components(sweeps, ChangedPixels(every, every), (1,))
+    components = find_components(sweeps, ChangedPixels(every, every, every), (1,))
     levels = movable_nodes(sweeps, components, None).kind
     assert bool((levels == NodeKind.CHANGED).any()) == is_node and 0 in levels

@@ -15,6 +15,7 @@ from cflow_torch.data.log import window as window_of
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
 from cflow_torch.verified import confidence
+from cflow_torch.verified.refinement import refine
 
 
 def test_the_tables_are_monotone_and_the_oracle_reads_them():
@@ -22,7 +23,10 @@ def test_the_tables_are_monotone_and_the_oracle_reads_them():
     table = confidence.TABLE
     sizes, shares, margins = (len(table[name]) + 1 for name in ("size", "share", "margin"))
     for name, falls in (("probabilities", False), ("moving", True)):
-        rows, start = [], 1
+        start = 1 + len(table["bias"])
+        biased = table[name][1:start]
+        assert biased == sorted(biased, reverse=not falls)
+        rows = []
         for length in (*2 * (sizes,), *4 * (shares,), *4 * (1,), *8 * (margins,)):
             rows.append(table[name][start : start + length])
             start += length
@@ -51,7 +55,25 @@ def test_a_point_that_is_missing_in_another_sweep_has_bins_of_its_own(numbered):
         )
         assert is_static[:900].float().mean() > 0.9
         sizes = len(confidence.TABLE["size"]) + 1
-        assert (bins[900:] == len(older) * sizes + sizes - 1).all()  # 40 pixels, the last bin but one
+        assert (
+            bins[900:] == confidence._Bins.unmatched + len(older) * sizes + sizes - 2
+        ).all()  # 40 pixels, the last bin but one
+
+
+@pytest.mark.parametrize("num_more", [0, 1])
+def test_in_a_pair_a_missed_person_is_biased_and_a_wall_is_not(numbered, num_more):
+    # The person moves by half a pixel, which `refine` would find. Here nothing moves.
+    rng = np.random.default_rng(0)
+    walls = [np.stack((rng.uniform(-3, 3, 900), rng.normal(4.05, 0.03, 900), rng.uniform(-1, 1, 900)), 1) for _ in "ab"]
+    person = rng.uniform((0, 0, -1), (0.3, 0.8, 0.8), (300, 3))
+    model = VerifiedFlow(MODEL.replace(num_history=1))
+    model.refine = lambda *args: refine(*args, add_slow=lambda sweeps, objects, flow, may_be_slow: 0 * flow)
+    older, newer = (np.concatenate((person + (shift, 0, 0), wall)) for shift, wall in zip((0, 0.05), walls))
+    window = Window(Sweep(older), Sweep(newer), num_more * (Sweep(older - (0.05, 0, 0)),))
+    bins = (model([window])[0].confidence * 128).round()
+    is_biased = (bins >= confidence._Bins.biased) & (bins < confidence._Bins.unmatched)
+    assert is_biased[300:].float().mean() < 0.05
+    assert is_biased[:300].float().mean() > 0.5 if num_more == 0 else not is_biased.any()
 
 
 def test_a_wall_next_to_a_pedestrian_has_less_confidence(numbered):

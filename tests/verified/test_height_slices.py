@@ -73,10 +73,9 @@ def test_copies_are_columns_of_their_own():
     before, rows = drawn(sweeps), torch.arange(0, 400, 7)
     rows = rows[sweeps.points[rows].is_member]
     own = sweeps.pixels[sweeps.points[rows].of_item]
-    num_points = len(sweeps.points.of_item)
     copies = sweeps.with_copies(rows)
     assert np.array_equal(drawn(copies), before)
-    of_copy = copies.pixels[copies.points.of_item[num_points:]]
+    of_copy = copies.pixels[copies.copies.of_item]
     assert torch.equal(of_copy.window, own.window + 2)
     assert all(torch.equal(getattr(of_copy, name), getattr(own, name)) for name in ("step", "row_col"))
     slices = copies.columns.look_up(of_copy, of_copy.step) & OWN

@@ -44,7 +44,7 @@ def overhung(boxes: Sequence[Box]) -> tuple[int, torch.Tensor]:
     pc1, pc0 = (Sweep(np.concatenate([filled(box, seed) for box in boxes])) for seed in (0, 1))
     sweeps = sweeps_of([Window(pc0, pc1)], SETTINGS)
     nothing = torch.zeros(sweeps.num_pixels, dtype=torch.bool)
-    components = find_components(sweeps, ChangedPixels(nothing, nothing), (1,))
+    components = find_components(sweeps, ChangedPixels(nothing, nothing, nothing), (1,))
     tree_nodes = movable_nodes(sweeps, components, 3.0)
     drawn, nodes = add_overhung(sweeps, components, tree_nodes)
     added = slice(tree_nodes.count, None)

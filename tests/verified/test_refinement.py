@@ -117,8 +117,8 @@ def test_long_static_objects_stay_static(longest, moves):
     rng = np.random.default_rng(0)
     scene = one_object([person((0.1, 0.0), rng), person((0.0, 0.0), rng)], (0.0, 0.0))
     nothing = torch.zeros(scene.sweeps.num_pixels, dtype=torch.bool)
-    components = find_components(scene.sweeps, ChangedPixels(nothing, nothing), (1,))
-    objects = number_objects(components.levels[0])
+    components = find_components(scene.sweeps, ChangedPixels(nothing, nothing, nothing), (1,))
+    objects = number_objects(components.of_level(0))
     rigid, _ = refine(scene.sweeps, objects, torch.zeros_like(scene.flow), longest)
     assert bool(rigid.flow.any()) == moves
 

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from cflow_torch.transforms import transform_points
-from cflow_torch.types import Sweep
 from cflow_torch.windows.stillness import REACH, Structure, static_rows, thinned_rows
 
 
@@ -47,4 +46,4 @@ def test_static_rows_leave_out_ground_the_vehicle_and_what_is_far_or_missing(has
     others = np.array([[10.0, 3, 0], [0.5, 0, 0], [60, 0, 0], [np.nan, 0, 0]])
     points = np.vstack([ground, others]).astype(np.float32)
     mask = np.arange(len(points)) < len(ground) if has_mask else None
-    assert static_rows(Sweep(points, mask)).tolist() == [len(ground)]
+    assert static_rows(points, mask).tolist() == [len(ground)]

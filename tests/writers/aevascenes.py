@@ -13,7 +13,8 @@ from cflow_torch.data.aevascenes import CATEGORY_NAME, GROUND
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.paths import safe_name
-from cflow_torch.simulator.recording import AnnotationBoxes, Recording, UnitReturns
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.recording import AnnotationBoxes, UnitReturns
 from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import CFlowError
 
@@ -37,7 +38,7 @@ _PATH_KEY = {"v2": "point_cloud_compensated_path", "v0.1": "point_cloud_path"}
 _XYZ = ("x", "y", "z")
 
 
-def write_aevascenes_sequence(log: Recording, root: str | Path, layout: str = "v2") -> Path:
+def write_aevascenes_sequence(log: Drive, root: str | Path, layout: str = "v2") -> Path:
     """Write `log` to `root/<log_id>`.
 
     Args:
@@ -68,7 +69,7 @@ def write_aevascenes_sequence(log: Recording, root: str | Path, layout: str = "v
     return Path(root) / log.log_id
 
 
-def _write_sequence(log: Recording, folder: Path, path_key: str) -> None:
+def _write_sequence(log: Drive, folder: Path, path_key: str) -> None:
     poses = np.asarray(log.poses, np.float64)
     from_first = np.linalg.inv(poses[0]) @ poses
     from_first[0] = np.eye(4)  # without rounding errors
@@ -128,7 +129,7 @@ def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str)
     )
 
 
-def _classes(log: Recording, index: int, boxes: AnnotationBoxes) -> np.ndarray:
+def _classes(log: Drive, index: int, boxes: AnnotationBoxes) -> np.ndarray:
     """(N,) int64, class of every point of a sweep, as an index of `_CLASSES`."""
     sweep = log.sweep(index)
     points = np.asarray(sweep.points)[:, :3]

@@ -14,7 +14,8 @@ import numpy as np
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.nuscenes.reader import NUSCENES_CATEGORIES
 from cflow_torch.data.paths import safe_name
-from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.recording import UnitReturns
 from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import CFlowError
 
@@ -36,7 +37,7 @@ NUSCENES_NAMES: dict[str, str] = {
 """Argoverse 2 category -> the nearest category of nuScenes in the same meta class."""
 
 
-def write_nuscenes(recording: Recording, root: str | Path, key_frame_interval: float = 0.5) -> Path:
+def write_nuscenes(recording: Drive, root: str | Path, key_frame_interval: float = 0.5) -> Path:
     """Write `recording` to `root/<log_id>`, a data root of nuScenes with one scene of that name.
 
     Args:
@@ -91,7 +92,7 @@ class SceneWriter:
         names: Argoverse 2 category -> category of the format.
     """
 
-    def __init__(self, recording: Recording, folder: Path, reference: str, names: Mapping[str, str]) -> None:
+    def __init__(self, recording: Drive, folder: Path, reference: str, names: Mapping[str, str]) -> None:
         self.recording = recording
         self.folder = folder
         self._names = names

@@ -8,7 +8,8 @@ import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.atomic import new_folder
-from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.recording import UnitReturns
 from writers.nuscenes import NUSCENES_NAMES, SceneWriter, write_tables
 
 _VERSION, _KEY_FRAME_INTERVAL = "v1.2-mini", 0.5  # seconds
@@ -22,7 +23,7 @@ TRUCKSCENES_NAMES: dict[str, str] = {
 """Argoverse 2 category -> the nearest category of TruckScenes."""
 
 
-def write_truckscenes(recording: Recording, root: str | Path) -> Path:
+def write_truckscenes(recording: Drive, root: str | Path) -> Path:
     """Write `recording` to `root/<log_id>`, a data root of TruckScenes with one scene of that name.
 
     Args:

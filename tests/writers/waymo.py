@@ -26,7 +26,8 @@ from cflow_torch.data.waymo.reader import (
     TRACK,
     VEHICLE_POSE,
 )
-from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.recording import UnitReturns
 from cflow_torch.types import CFlowError
 from writers.waymo_encoding import encode_images, poses_of_shots, true_poses_of_shots
 
@@ -79,7 +80,7 @@ SCHEMAS: dict[str, pa.Schema] = {
 }
 
 
-def write_waymo_segment(log: Recording, root: str | Path) -> Path:
+def write_waymo_segment(log: Drive, root: str | Path) -> Path:
     """Write `log` to `root/<component>/<log_id>.parquet`, one row group per frame.
 
     Args:
@@ -122,7 +123,7 @@ def write_waymo_segment(log: Recording, root: str | Path) -> Path:
     return files["lidar"]
 
 
-def _write_components(log: Recording, folder: Path) -> None:
+def _write_components(log: Drive, folder: Path) -> None:
     times = [(stamp + 500) // 1000 for stamp in log.timestamps]
     if len(set(times)) < len(times):
         raise CFlowError(f"log {log.log_id} has sweeps less than a microsecond apart, which Waymo's files cannot store")
@@ -154,7 +155,7 @@ def _write_components(log: Recording, folder: Path) -> None:
 
 
 def _image_cells(
-    log: Recording, index: int, unit: UnitReturns, calibration: LaserCalibration, is_top: bool
+    log: Drive, index: int, unit: UnitReturns, calibration: LaserCalibration, is_top: bool
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Return the cells of both range images of a unit, and of its pixel poses; None = not TOP."""
     where = f"sweep {index} of log {log.log_id}, unit {unit.name}"
@@ -198,7 +199,7 @@ def _calibration_row(log_id: str, number: int, calibration: LaserCalibration) ->
     return dict(zip(SCHEMAS["lidar_calibration"].names, (log_id, number, *values)))
 
 
-def _box_rows(log: Recording, index: int, key: dict[str, Any]) -> list[dict[str, Any]]:
+def _box_rows(log: Drive, index: int, key: dict[str, Any]) -> list[dict[str, Any]]:
     """Boxes of one frame."""
     boxes = log.boxes(index)
     rows = []

@@ -14,7 +14,8 @@ from cflow_torch.data.waymo.range_image import (
     directions,
     rotations_from_angles,
 )
-from cflow_torch.simulator.recording import Recording, UnitReturns
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.recording import UnitReturns
 from cflow_torch.types import CFlowError
 
 _NODES = 4  # sweeps whose poses we interpolate by a cubic, which is exact for constant jerk
@@ -55,7 +56,7 @@ class ShotPoses:
         return points @ T[:3, :3].T + T[:3, 3]
 
 
-def poses_of_shots(log: Recording, index: int, offset_ns: np.ndarray) -> ShotPoses:
+def poses_of_shots(log: Drive, index: int, offset_ns: np.ndarray) -> ShotPoses:
     """Interpolate poses at the times of shots by a cubic through angles and positions of the four nearest sweeps."""
     first = min(max(index - 1, 0), max(len(log.timestamps) - _NODES, 0))
     nodes = range(first, min(first + _NODES, len(log.timestamps)))

@@ -13,6 +13,7 @@ _COLUMNS = (4, 3, 5, 6, 7, 8)
 _SMALLEST, _LARGEST = 1e-6, 1e7  # sizes that coordinates, intensities, rings and times have, besides 0
 _SHARE = 0.95  # of the numbers have such a size; of numbers read in a wrong type, less than 0.8
 _EXPLAINED, _AS_GOOD = 0.05, 0.9  # least share of the variance, and the share of the best that a smaller number needs
+_FEWEST = 1000  # points of a file that tell its layout
 _MOST, _BLOCK = 1 << 17, 840  # numbers that we test; a multiple of all numbers of columns
 
 
@@ -26,6 +27,13 @@ class BinLayout(NamedTuple):
     def step(self) -> int:
         """Bytes per point."""
         return self.columns * np.dtype(self.kind).itemsize
+
+    def fits(self, content: bytes) -> bool:
+        """Test whether a file has this layout, by its first points. Files that are too short to tell have it."""
+        if len(content) % self.step:
+            return False
+        start = content[: _BLOCK * 10 * np.dtype(self.kind).itemsize]
+        return len(content) < _FEWEST * self.step or _explained(_numbers(start, self.kind), self.columns) >= _EXPLAINED
 
     def __str__(self) -> str:
         return f"{self.columns} float{8 * np.dtype(self.kind).itemsize} per point"
@@ -56,7 +64,7 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
     good = [layout for layout, share in zip(fitting, explained) if share >= max(_AS_GOOD * best, _EXPLAINED)]
     if good:
         return min(good, key=lambda layout: layout.columns)
-    if fitting and len(content) < 1000 * BinLayout().step and fitting[0] == BinLayout():
+    if fitting and len(content) < _FEWEST * BinLayout().step and fitting[0] == BinLayout():
         return BinLayout()
     counts = ", ".join(map(str, sorted(_COLUMNS)))
     raise CFlowError(

@@ -34,7 +34,8 @@ def read_cloud(path: PathLike, bin_columns: int | BinLayout | None = None) -> np
 
     Args:
         path: file; its suffix tells the format (see Convention).
-        bin_columns: numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes; None = see `find_bin_layout`.
+        bin_columns: numbers per point of a `.bin` file: 4 in KITTI, 5 in nuScenes; None = see `find_bin_layout`. A
+            layout is used if the file fits it.
 
     Returns:
         (N, 3) in the precision of the file: float32 or float64; float16 becomes float32.
@@ -170,7 +171,7 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
             arrays: Any = _plain_arrays(content).items()
             np.savez(file, **{k: v[is_kept] if v.shape[:1] == is_kept.shape else v for k, v in arrays})
         elif suffix == ".bin":
-            step = (layout or find_bin_layout(content)).step
+            step = _layout_of(content, layout).step
             file.write(np.frombuffer(content, np.uint8).reshape(-1, step)[is_kept].tobytes())
         elif suffix == ".ply":
             file.write(ply_bytes({name: values[is_kept] for name, values in ply_fields(content).items()}))
@@ -230,13 +231,19 @@ def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.nd
         return _archive_columns(content)
     if suffix == ".npy":
         return _array_columns(np.load(io.BytesIO(content), allow_pickle=False))
-    layout = bin_columns if isinstance(bin_columns, BinLayout) else find_bin_layout(content, bin_columns)
+    layout = _layout_of(content, bin_columns)
     if len(content) % layout.step:
         raise CFlowError(
             f"it has {len(content)} bytes, not a multiple of {layout.step} ({layout}): it is truncated, or has another "
             "number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
         )
     return _array_columns(np.frombuffer(content, layout.kind).reshape(-1, layout.columns))
+
+
+def _layout_of(content: bytes, expected: int | BinLayout | None) -> BinLayout:
+    if isinstance(expected, BinLayout):
+        return expected if expected.fits(content) else find_bin_layout(content)
+    return find_bin_layout(content, expected)
 
 
 def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.column_names import distinct_names
+from cflow_torch.data.column_names import distinct_names
 from cflow_torch.errors import import_optional
 
 LONGEST_HEADER = 65536  # bytes

@@ -12,7 +12,7 @@ from typing import Mapping, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.column_names import distinct_names
+from cflow_torch.data.column_names import distinct_names
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _NAMES = dict(zip(_CODES, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")))

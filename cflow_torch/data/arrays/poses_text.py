@@ -4,37 +4,43 @@ from __future__ import annotations
 
 import re
 from decimal import Decimal
-from typing import NamedTuple, Sequence
+from pathlib import Path
+from typing import Any, Callable, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
+from cflow_torch.data.arrays.stamps import nanoseconds_of_dates, nanoseconds_of_numbers
+from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import natural_key
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.transforms import interpolate_poses, poses_from_quaternions, rigid_transform
+from cflow_torch.data.paths import PathLike, as_path, read_bytes, read_start
+from cflow_torch.transforms import (
+    as_matrix,
+    interpolate_poses,
+    poses_from_quaternions,
+    rigid_transform,
+    rotations_about,
+)
 from cflow_torch.types import CFlowError
 
 CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets
-# Names of columns without punctuation, as odometry programs and exports of ROS messages write them.
-_ROTATION = "(q|.*quat|.*quaternion|.*orientation|.*rot|.*rotation|qrs)"
-_POSITION = "(t|p|pos|prsr|.*position|.*translation)?"
-_NAMES = {
-    "time": "t|.*time|.*stamp|(time|timestamp|stamp|t)(s|sec|secs|ns|us|ms|unix)",
-    "sec": "(.*stamp)?secs?",
-    "nsec": "(.*stamp)?(nsecs?|nanosec)",
-    **{axis: _POSITION + axis for axis in "xyz"},
-    **{f"q{axis}": _ROTATION + axis for axis in "wxyz"},
-}
-_OTHERS = "twist|linear|angular|veloc|accel|covariance"
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_ANGLES = ("roll", "pitch", "yaw")
+_TIMES = {"time", "sec", "nsec"}
 _LONGEST_GAP_NS = 500_000_000  # longest time between two poses over which we interpolate
-_UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))  # sizes of unix times, and the ns of their unit; else seconds
+_FEWEST_COVERED = 0.5  # share of sweeps at a pose, if poses are farther apart than that
 _TOLERANCE_NS = 1_000_000  # by which programs round times
+_FEWEST_NUMBERS = 7  # of a pose
+_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test for poses and times
+_TESTED = 8192  # bytes of a file that tell what it holds
 
 
 class Trajectory(NamedTuple):
     """K poses, and their `source` for messages."""
 
-    poses: np.ndarray  # (K, 4, 4) float64 `T_world_frame`; the file does not say which frame
+    # (K, 4, 4) float64 `T_world_frame`; the file does not say which frame. Without times, NaN where the file has NaN.
+    poses: np.ndarray
     times_ns: np.ndarray | None  # (K,) int64 nanoseconds, ascending; None if the format has no times
     layout: str  # "kitti", "tum" or "matrix"
     source: str
@@ -45,57 +51,127 @@ def read_poses(path: PathLike) -> Trajectory:
 
     Args:
         path: text with 12 numbers per line (KITTI: upper three rows of the matrix), 8 (TUM: time in seconds, tx ty tz,
-            qx qy qz qw, the scalar LAST), or 16 (the matrix by rows); or `.npy` with (K, 4, 4) or (K, 3, 4). If a line
-            before the numbers names the columns (timestamp, x, qw, ...), they may have any order. Other columns, empty
-            lines and lines that begin with `#` are ignored. Unix times may be in s, ms, us or ns.
+            qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows), or 13 or 17 (a time before
+            the matrix), or four lines of 4 numbers per pose; or `.npy` with (K, 4, 4) or (K, 3, 4); or a folder with a
+            file per pose. If a line before the numbers names the columns (timestamp, x, qw, ...), they may have any
+            order, and roll, pitch and yaw may replace the quaternion. Other columns, empty lines and lines that begin
+            with `#` are ignored. Unix times may be in s, ms, us or ns.
+
+    Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
+        angles are degrees if their name says so, or one is larger than 2 pi, else radians.
     """
-    path, times_ns, layout = as_path(path), None, "matrix"
+    path = as_path(path)
+    if path.is_dir():
+        files = _files_of_poses(path)
+        poses = [read_poses(file).poses for file in files]
+        if not files or any(len(each) != 1 for each in poses):
+            raise CFlowError(f"{path} is a folder: its .txt files must have one pose each")
+        return Trajectory(np.concatenate(poses), None, "matrix", str(path))
     if path.suffix == ".npy":
         matrices = read_npy(path, "pass a .npy file of (K, 4, 4) numbers")
-        return Trajectory(checked_poses(matrices, str(path)), None, layout, str(path))
-    names, words = _read_table(path)
+        return Trajectory(checked_poses(matrices, str(path)), None, "matrix", str(path))
+    with file_errors(path):
+        content = read_bytes(path)
+    return _poses_of(content, path)
+
+
+def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Find what holds poses in a folder, files or folders with a file per pose, and files of times, by their contents.
+
+    Files of times also say so in their name, because a column of numbers may be anything. We read the start of each.
+    """
+    tables = sorted(path for path in folder.iterdir() if path.suffix.lower() in _TABLES and path.name[0] != ".")
+    folders = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
+    poses = [path for path in tables if _start_of(path, _poses_of) is not None]
+    times = [path for path in tables if re.search("time|stamp", path.stem.lower())]
+    times = [path for path in times if _start_of(path, _times_of) is not None]
+    for path in folders:
+        files = _files_of_poses(path)
+        first = _start_of(files[0], _poses_of) if len(files) > 1 else None
+        poses += [path] if first is not None and len(first.poses) == 1 else []
+    return poses, times
+
+
+def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
+    """Parse the first lines of a file; None = this is not possible."""
+    try:
+        start = read_start(path, _TESTED)
+        return parse(start[: start.rfind(b"\n") + 1] if len(start) == _TESTED else start, path)
+    except (CFlowError, OSError):
+        return None
+
+
+def _files_of_poses(folder: Path) -> list[Path]:
+    return sorted((path for path in folder.iterdir() if path.suffix == ".txt"), key=lambda path: natural_key(path.stem))
+
+
+def _poses_of(content: bytes, path: Path) -> Trajectory:
+    """Return the poses in the content of a text file."""
+    names, words = _table_of(content, path)
     roles = _roles(names)
-    if (roles is not None and len(roles) > 7) or words.shape[1] == 8:  # with times; others repeat if the vehicle stands
-        words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]  # programs write a line twice
-    if roles is not None:
-        time, columns = roles[:-7], roles[-7:]
-    elif words.shape[1] == 8:
-        time, columns = [0], [1, 2, 3, 7, 4, 5, 6]
-    elif words.shape[1] in (12, 16):
-        matrices = words.astype(np.float64).reshape(len(words), -1, 4)
-        layout = "kitti" if words.shape[1] == 12 else "matrix"
-        return Trajectory(checked_poses(matrices, str(path)), None, layout, str(path))
+    columns = words.shape[1]
+    if not names and columns == 4 and len(words) % 4 == 0:  # a matrix in four lines
+        words = words.reshape(-1, 16)
+        columns = 16
+    has_time = not _TIMES.isdisjoint(roles) if roles else columns in (8, 13, 17)
+    if not roles and columns in (7, 8) and len(names) in (0, 8):
+        roles = dict(zip(("time", "x", "y", "z", "qx", "qy", "qz", "qw")[8 - columns :], range(columns)))
+    is_known = np.isfinite(words.astype(np.float64)).all(axis=1)
+    if not is_known.any():
+        raise CFlowError(f"{path} has no line of finite numbers")
+    if has_time:  # programs write a line twice; without times, lines repeat if the vehicle stands
+        words = words[is_known & np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]
+        is_known = np.ones(len(words), bool)
+    poses = np.full((len(words), 4, 4), np.nan)
+    if roles:
+        poses[is_known] = _poses_of_columns(names, roles, words[is_known], path)
+    elif columns in (12, 13, 16, 17):
+        matrices = words[is_known, columns % 4 :].astype(np.float64).reshape(-1, columns // 4, 4)
+        poses[is_known] = checked_poses(matrices, str(path))
+        roles = {"time": 0} if has_time else {}
     else:
         raise CFlowError(
-            f"{path} has {words.shape[1]} numbers per line; poses have 12 (KITTI), 8 (TUM) or 16, or a first line with "
-            "the names timestamp, x, y, z, qx, qy, qz, qw in any order"
+            f"{path} has {columns} numbers per line; poses have 12 (KITTI), 8 (TUM) or 16, or a first line with the "
+            "names timestamp, x, y, z, qx, qy, qz, qw, or roll, pitch, yaw, in any order"
         )
-    numbers = words[:, columns].astype(np.float64)
-    poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda row: f"{path}: pose {row}")
-    if len(time) == 2:  # seconds and nanoseconds
-        stamps = [str(int(second) * 10**9 + int(rest)) for second, rest in words[:, time].tolist()]
-        times_ns = _nanoseconds(path, np.array(stamps))
-    elif time:
-        times_ns = _nanoseconds(path, words[:, time[0]])
-    return Trajectory(poses, times_ns, "tum" if time else "matrix", str(path))
+    layout = "kitti" if columns in (12, 13) and not set(roles) - _TIMES else "tum" if has_time else "matrix"
+    return Trajectory(poses, _times_of_columns(roles, words, path), layout, str(path))
 
 
-def _roles(names: list[str]) -> list[int] | None:
-    """Return the columns of the time (none, one, or seconds and nanoseconds), of x, y, z, and of qw, qx, qy, qz.
-
-    None = the names do not tell them.
-    """
-    plain = [re.sub(r"\[.*?\]|\(.*?\)|[^a-z0-9]", "", name.lower()) for name in names]
+def _roles(names: Sequence[str]) -> dict[str, int]:
+    """Return the columns of the position, rotation and time that names tell; {} = they do not tell a pose."""
     first: dict[str, int] = {}
-    for column, name in enumerate(plain):
-        for role, pattern in _NAMES.items():
-            if re.fullmatch(pattern, name) and not re.search(_OTHERS, name):
-                first.setdefault(role, column)
-    pose = ["x", "y", "z", "qw", "qx", "qy", "qz"]
-    if not set(pose) <= set(first):
-        return None
-    time = ["sec", "nsec"] if {"sec", "nsec"} <= set(first) else ["time"] if "time" in first else []
-    return [first[role] for role in (*time, *pose)]
+    for column, name in enumerate(names):
+        role = role_of_name(name)
+        if role is not None:
+            first.setdefault(role, column)
+    if "sec" in first and "nsec" not in first:
+        first.setdefault("time", first.pop("sec"))
+    is_pose = {"x", "y"} <= set(first) and ({"z", *_QUATERNION} <= set(first) or "yaw" in first)
+    return first if is_pose else {}
+
+
+def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.ndarray, path: Path) -> np.ndarray:
+    """Return the poses, (K, 4, 4), of columns of positions and of quaternions or angles."""
+    zeros = np.zeros(len(words))
+    values = {role: words[:, column].astype(np.float64) for role, column in roles.items() if role not in _TIMES}
+    positions = np.stack([values.get(axis, zeros) for axis in "xyz"], axis=1)
+    if set(_QUATERNION) <= set(roles):
+        quaternions = np.stack([values[name] for name in _QUATERNION], axis=1)
+        return poses_from_quaternions(positions, quaternions, lambda row: f"{path}: pose {row}")
+    angles = np.stack([values.get(name, zeros) for name in _ANGLES])
+    if "deg" in names[roles["yaw"]].lower() or np.abs(angles).max() > 2 * np.pi:
+        angles = np.radians(angles)
+    roll, pitch, yaw = (rotations_about(axis, angle) for axis, angle in enumerate(angles))
+    return as_matrix(yaw @ pitch @ roll, positions)
+
+
+def _times_of_columns(roles: Mapping[str, int], words: np.ndarray, path: Path) -> np.ndarray | None:
+    """Return the nanoseconds of poses, ascending; None = there are no times."""
+    if {"sec", "nsec"} <= set(roles):
+        pairs = words[:, [roles["sec"], roles["nsec"]]].tolist()
+        return _ascending(path, [str(int(second) * 10**9 + int(rest)) for second, rest in pairs])
+    return _ascending(path, words[:, roles["time"]].tolist()) if "time" in roles else None
 
 
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
@@ -122,11 +198,26 @@ def read_calibration(path: PathLike) -> np.ndarray:
 
 
 def read_times(path: PathLike) -> np.ndarray:
-    """Read a file with one ascending time in seconds per line (KITTI's `times.txt`) as (K,) int64 nanoseconds."""
-    _, words = _read_table(path)
+    """Read a file with one ascending time per line (KITTI's `times.txt`) as (K,) int64 nanoseconds.
+
+    Times are seconds, unix times in s, ms, us or ns, or dates (2011-09-26 13:02:25.594360375).
+    """
+    path = as_path(path)
+    with file_errors(path):
+        content = read_bytes(path)
+    return _times_of(content, path)
+
+
+def _times_of(content: bytes, path: Path) -> np.ndarray:
+    with file_errors(path):
+        lines = [line for line in content.decode("utf-8-sig").splitlines() if line.strip() and line.strip()[0] != "#"]
+    dates = nanoseconds_of_dates(lines)
+    if dates:
+        return _ascending(path, [str(date) for date in dates])
+    _, words = _table_of(content, path)
     if words.shape[1] != 1:
         raise CFlowError(f"{path} must have one time in seconds per line")
-    return _nanoseconds(path, words[:, 0])
+    return _ascending(path, words[:, 0].tolist())
 
 
 def write_kitti_poses(path: PathLike, poses: np.ndarray) -> None:
@@ -147,7 +238,8 @@ def are_covered(trajectory: Trajectory, times_ns: Sequence[int]) -> np.ndarray:
     """
     known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
     covered = _neighbours(known, wanted)[2]
-    if not covered.any():
+    is_rare = bool(np.median(np.diff(known)) > _LONGEST_GAP_NS) and covered.mean() < _FEWEST_COVERED
+    if is_rare or not covered.any():
         name, where = trajectory.source, f"the sweeps are at {wanted[0]} ... {wanted[-1]} ns"
         if (wanted < known[0]).all() or (wanted > known[-1]).all():
             lag = wanted[len(wanted) // 2] - known[len(known) // 2]
@@ -200,47 +292,49 @@ def _neighbours(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.n
     return before, after, ~is_far | is_rounded
 
 
-def _read_table(path: PathLike) -> tuple[list[str], np.ndarray]:
+def _table_of(content: bytes, path: Path) -> tuple[list[str], np.ndarray]:
     """Read a table in a text file: the names of its columns, and its (K, C) words, which are finite numbers.
 
     Names are those of the last line before the numbers, also if it begins with "#". They are empty if this line does
-    not have one name for each column. K and C are at least 1.
+    not have one name for each column. Columns of texts, such as the names of frames, are left out. K and C are at
+    least 1.
     """
     with file_errors(path, "every line must have the same number of numbers"):
-        lines = [line.strip() for line in read_bytes(as_path(path)).decode("utf-8-sig").splitlines() if line.strip()]
-        start = next((k for k, line in enumerate(lines) if _are_numbers(_split(line))), len(lines))
+        lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
+        start = next((k for k, line in enumerate(lines) if _is_row(_split(line))), len(lines))
         names = re.split("[,;]", lines[start - 1].lstrip("#")) if start else []
         names = names if len(names) > 1 or not start else lines[start - 1].lstrip("#").split()
         words = np.array([_split(line) for line in lines[start:] if line[0] != "#"], str)
         if any(line[0] != "#" for line in lines[: max(start - 1, 0)]) or words.ndim != 2 or not start < len(lines):
             raise ValueError("it is empty, or has text before its numbers" if start else "its lines differ in length")
-        values = words.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise CFlowError(f"{path} has numbers that are not finite")
-    return names if len(names) == words.shape[1] else [], words
+        columns = [column for column, word in enumerate(words[0]) if _is_number(word)]
+        names = [names[column] for column in columns] if len(names) == words.shape[1] else []
+        words = words[:, columns]
+        words.astype(np.float64)  # raises the error
+    return names, words
 
 
 def _split(line: str) -> list[str]:
     return re.split(r"[\s,;]+", line.rstrip(",; "))
 
 
-def _are_numbers(words: list[str]) -> bool:
+def _is_row(words: list[str]) -> bool:
+    """Test whether words are a row of numbers, or a pose with a few texts."""
+    num_numbers = sum(map(_is_number, words))
+    return num_numbers == len(words) or num_numbers >= _FEWEST_NUMBERS
+
+
+def _is_number(word: str) -> bool:
     try:
-        return bool([float(word) for word in words])
+        float(word)
     except ValueError:
         return False
+    return True
 
 
-def _nanoseconds(path: PathLike, words: np.ndarray) -> np.ndarray:
-    """Convert (K,) texts of ascending times to int64 nanoseconds exactly: unix times need 19 digits, a float has 16.
-
-    Unix times may be in s, ms, us or ns, which their size tells. Smaller times are seconds. A line that has the time of
-    the one before it is an error.
-    """
-    numbers = [Decimal(word) for word in words.tolist()]
-    largest = max(map(abs, numbers))
-    unit = next((unit for first, unit in _UNITS if largest >= first), 10**9)
-    result = np.array([int((number * unit).to_integral_value()) for number in numbers], dtype=np.int64)
+def _ascending(path: Path, words: Sequence[str]) -> np.ndarray:
+    """Convert texts of times to (K,) int64 nanoseconds, see `nanoseconds_of_numbers`; they must ascend."""
+    result = np.array(nanoseconds_of_numbers(words), dtype=np.int64)
     falls = np.diff(result) <= 0
     if falls.any():
         raise CFlowError(f"{path}: times must ascend, line {int(falls.argmax()) + 2} does not")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Mapping, Sequence
+from typing import Any, Sequence
 
 import numpy as np
 
@@ -12,13 +12,15 @@ from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_columns, read_table
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
-from cflow_torch.data.arrays.poses_text import Trajectory
+from cflow_torch.data.arrays.poses_text import Trajectory, find_tables
+from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.folders import find_folders, natural_key
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, is_remote, read_bytes, read_start
-from cflow_torch.data.point_times import TIME_FIELDS, PointTimes, seconds_after
+from cflow_torch.data.point_times import find_times
+from cflow_torch.tensors import resolution
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
@@ -27,12 +29,9 @@ POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the cl
 POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
 GROUND_FOLDER = "ground"
 _VIEWPOINT = "VIEWPOINT"
+_COARSEST = 1e-3  # metres
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-# File names that are times: 16, 17 digits = us, 18, 19 = ns; and seconds with decimals or nanoseconds.
-_STAMP = re.compile("[0-9]{16,18}|[0-8][0-9]{18}")
-_SECONDS = re.compile(r"\D*([0-9]+)\.([0-9]+)|\D*([0-9]{9,10})_([0-9]+)")
-_FIRST_NANOSECOND = 10**17
 
 
 def find_array_logs(root: PathLike) -> list[Path]:
@@ -53,12 +52,12 @@ class ArraysLog(Log):
             velodyne, clouds or pcd that does, or one of any name if it holds poses or times.txt. Clouds are sorted
             naturally: 2 before 10.
         poses: "auto" = poses.txt, odometry.csv or the like (`POSE_FILES`) in the folder, or KITTI's
-            ../../poses/<name>.txt, if there is one, or VIEWPOINT of `.pcd` files if it is set; None = no poses; or a
-            file (see `read_poses`); or a (K, 4, 4) array.
+            ../../poses/<name>.txt, if there is one, or the only file or folder there whose contents are poses, or
+            VIEWPOINT of `.pcd` files if it is set; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
-        times: "auto" = times.txt in the folder; None = none; or a file with one time in seconds per sweep.
+        times: "auto" = times.txt in the folder, or see `timestamps`; None = none; or a file with one time per sweep.
         ground: "auto" = the subfolder `ground`, if there is one; None = no masks; or a folder. It has one .npy file per
             cloud, of the same name, with (N,) bool or 0 and 1.
         ego_T_lidar: (4, 4), maps the frame of the stored points to the ego frame; None = they are the same.
@@ -68,9 +67,11 @@ class ArraysLog(Log):
     Attributes:
         files: the clouds, in order.
         timestamps: nanoseconds from `times`, else from file names (see `times_of_names`), else from TUM poses, if each
-            cloud has one. Otherwise 0, 1, 2, ..., and sweeps have no `timestamp_ns`.
+            cloud has one, else from the only file named so with one time per cloud. Otherwise 0, 1, 2, ..., and sweeps
+            have no `timestamp_ns`.
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown. Sweeps before the first pose, after the
-            last one, or in a gap of the poses of more than half a second are left out.
+            last one, or in a gap of the poses of more than half a second are left out. If a table has more poses than
+            there are clouds, each takes that of its number.
         gaps: indices of sweeps after which sweeps were left out.
         bin_layout: numbers of a point of `.bin` files, None for files of another suffix.
         has_viewpoints: whether the poses come from VIEWPOINT. Such clouds are often in the world's frame (`read_as`).
@@ -104,6 +105,14 @@ class ArraysLog(Log):
         self.log_id = self.folder.resolve().name
         self.files = _one_suffix(self.folder, suffix)
         self.bin_layout = self._find_bin_layout(bin_columns)
+        self._bin_columns: Any = self.bin_layout if bin_columns == "auto" else bin_columns
+        others = (
+            []
+            if self.files[0].parent in _usual_places(self.folder)
+            else [path.name for path in _below(self.folder)][1:]
+        )
+        if others:
+            self._note(f"we read the clouds in {self.files[0].parent.name}; there are others in {', '.join(others)}")
         self._ground = _resolve(self.folder, ground, (GROUND_FOLDER,), "ground")
         self.ego_T_lidar = np.eye(4) if ego_T_lidar is None else rigid_transform(ego_T_lidar, "ego_T_lidar")
         self.lidar_position = self.ego_T_lidar[:3, 3]
@@ -122,9 +131,10 @@ class ArraysLog(Log):
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and times where they are known."""
         self._timestamp(index)
-        points, columns = read_table(self.files[index], self.bin_layout)
+        points, columns = read_table(self.files[index], self._bin_columns)
         time = self.timestamps[index] if self._has_times else None
-        times = self._point_times(columns, time, points)
+        period = float(np.median(np.diff(self.timestamps))) * 1e-9 if self._has_times else None
+        times = find_times(columns, time, period, points, self._note)
         is_missing = missing_returns(points)
         if times is not None:
             is_missing |= times.is_stray
@@ -135,28 +145,12 @@ class ArraysLog(Log):
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
         seconds = None if times is None else times.seconds
-        return Sweep(points.astype(np.float32, copy=False), is_ground, pose, time, seconds)
-
-    def _point_times(
-        self, columns: Mapping[str, np.ndarray], time: int | None, points: np.ndarray
-    ) -> PointTimes | None:
-        """Return the times of the points of a sweep; None = unknown. We say what we assume or leave out."""
-        period = float(np.median(np.diff(self.timestamps))) * 1e-9 if self._has_times else None
-        names = [name for name in TIME_FIELDS if name in columns]
-        found = [seconds_after(columns[name], time or 0, period, points) for name in names]
-        usable = [times for times in found if times.seconds is not None]
-        for times in usable[:1] or found:
-            self._note(times.note, "times of points")
-        for times in usable[:1]:
-            if times.is_stray.any():
-                text = f"{times.is_stray.sum()} of {len(points)} points of a sweep have stray times and become NaN"
-                self._note(text + ", also in other sweeps", "stray times")
-        return usable[0] if usable else None
+        return Sweep(_in_single(points), is_ground, pose, time, seconds)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
         self._timestamp(index)
-        return read_columns(self.files[index], self.bin_layout)
+        return read_columns(self.files[index], self._bin_columns)
 
     def _find_bin_layout(self, columns: Any) -> BinLayout | None:
         """Return the layout of `.bin` files; None = the files have another suffix. We say if it is not KITTI's."""
@@ -175,6 +169,9 @@ class ArraysLog(Log):
             return Trajectory(poses_text.checked_poses(np.asarray(poses), "poses"), None, "matrix", "poses"), False
         kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
         file = _resolve(self.folder, poses, POSE_FILES, "poses", kitti)
+        if file is None and poses == "auto":
+            file = _only(find_tables(self.folder)[0], self.folder, "poses")
+            self._note(f"its poses are those of {file.name}" if file else "")
         if file is None:
             return self._viewpoints() if poses == "auto" else None, False
         trajectory = poses_text.read_poses(file)
@@ -203,73 +200,93 @@ class ArraysLog(Log):
         count = len(self.files)
         file = _resolve(self.folder, times, ("times.txt",), "times")
         if file is not None:
-            stamps = poses_text.read_times(file).tolist()
-            if len(stamps) != count:
+            stamps = poses_text.read_times(file)
+            rows = self._rows(len(stamps), f"times in {file}")
+            if rows is None:
                 raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
-            return stamps
-        stamps = times_of_names([path.stem for path in self.files])
-        if stamps is not None:
-            return stamps
+            return stamps[rows].tolist()  # type: ignore[no-any-return]
+        named = times_of_names([path.stem for path in self.files])
+        if named is not None:
+            return named
         if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
             return trajectory.times_ns.tolist()
-        return None
+        tables = find_tables(self.folder)[1] if times == "auto" else []
+        file = _only([table for table in tables if len(poses_text.read_times(table)) == count], self.folder, "times")
+        self._note(f"the times of its sweeps are those of {file.name}" if file else "")
+        return None if file is None else poses_text.read_times(file).tolist()
+
+    def _rows(self, count: int, what: str) -> np.ndarray | None:
+        """Return the row of each file in a table of `count` rows, one per sweep; None = the table does not fit.
+
+        If files are missing, their numbers tell the rows, from 0 or 1 on, and we say so.
+        """
+        if count == len(self.files):
+            return np.arange(count)
+        digits = [re.findall(r"\d+", path.stem) for path in self.files]
+        numbers = np.array([int(runs[-1][-9:]) if runs else -1 for runs in digits])
+        fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
+        if len(fitting) != 1 or len(set(numbers)) < len(numbers):
+            return None
+        self._note(f"it has {count} {what} for {len(self.files)} sweeps, so each takes that of its number")
+        return fitting[0]
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
+        source = trajectory.source
+        rows = np.arange(len(self.files))
         if trajectory.times_ns is not None and stamps is not None:
-            covered = poses_text.are_covered(trajectory, stamps)
-            self._note(poses_text.describe_uncovered(trajectory, stamps, covered))
-            kept = np.flatnonzero(covered)
-            self.files, self.timestamps = [self.files[k] for k in kept], [stamps[k] for k in kept]
-            self.gaps = frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
-            self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
-            return poses_text.covered_poses(trajectory, self.timestamps)
-        if len(trajectory.poses) != len(self.files):
-            raise CFlowError(
-                f"{trajectory.source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, "
-                "or poses with times (TUM) and the times of the sweeps in times.txt"
-            )
-        return trajectory.poses
-
-
-def natural_key(name: str) -> tuple[Any, ...]:
-    """Return a key for sorting that compares digits in names as numbers: 2 before 10."""
-    return tuple((0, int(run), run) if run.isdecimal() else (1, 0, run) for run in re.findall(r"\d+|\D+", name))
-
-
-def times_of_names(names: Sequence[str]) -> list[int] | None:
-    """Return the nanoseconds that names of files state; None if they are not times.
-
-    Names are digits (16, 17 = microseconds, 18, 19 = nanoseconds), or seconds and a fraction, "1700000000.05" or
-    "1700000000_050000000", also after a text without digits. Fractions are decimals, unless their numbers of digits
-    differ and the longest has nine: then they are nanoseconds without leading zeros.
-    """
-    if all(_STAMP.fullmatch(name) for name in names):
-        return [int(name) * (1 if int(name) >= _FIRST_NANOSECOND else 1000) for name in names]
-    matches = [_SECONDS.fullmatch(name) for name in names]
-    pairs = [[word for word in match.groups() if word is not None] for match in matches if match is not None]
-    if len(pairs) < len(names) or any(len(second) > 10 for second, _ in pairs):
-        return None
-    digits = {len(fraction) for _, fraction in pairs}
-    are_decimals = max(digits) != 9 or len(digits) == 1
-    fractions = [int(fraction[:9].ljust(9, "0") if are_decimals else fraction) for _, fraction in pairs]
-    return [int(second) * 10**9 + fraction for (second, _), fraction in zip(pairs, fractions)]
+            is_known = poses_text.are_covered(trajectory, stamps)
+            self._note(poses_text.describe_uncovered(trajectory, stamps, is_known))
+            poses = poses_text.covered_poses(trajectory, np.array(stamps)[is_known])
+        else:
+            given = self._rows(len(trajectory.poses), f"poses in {source}")
+            if given is None:
+                raise CFlowError(
+                    f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
+                    "with times (TUM) and the times of the sweeps in times.txt"
+                )
+            rows = given
+            is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2))
+            if not is_known.all():
+                self._note(f"{(~is_known).sum()} of {len(rows)} sweeps have a pose of NaN in {source} and are left out")
+            poses = trajectory.poses[rows][is_known]
+        kept = np.flatnonzero(is_known)
+        self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
+        self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
+        is_gap = (np.diff(kept) > 1) | (np.diff(rows[kept]) > np.median(np.diff(rows)))
+        self.gaps = frozenset(np.flatnonzero(is_gap).tolist())
+        return poses
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
     """Return the folder that holds a log's clouds, and the clouds of each suffix that has two or more."""
-    places = [folder, *(folder / name for name in POINT_FOLDERS)]
-    if folder.is_dir() and any((folder / name).exists() for name in (*POSE_FILES, "times.txt")):  # of clouds below
-        places += sorted(path for path in folder.iterdir() if path.name not in (*POINT_FOLDERS, GROUND_FOLDER))
-    for parent in places:
-        kinds: dict[str, list[Path]] = {}
-        if parent.is_dir():
-            for path in parent.iterdir():
-                if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS and path.name[0] != ".":
-                    kinds.setdefault(path.suffix.lower(), []).append(path)
-        kinds = {suffix: files for suffix, files in kinds.items() if len(files) > 1}
+    for parent in _usual_places(folder):
+        kinds = _kinds(parent)
         if kinds:
             return parent, kinds
+    below = _below(folder)
+    has_tables = any((folder / name).exists() for name in (*POSE_FILES, "times.txt"))
+    if has_tables or (len(below) == 1 and any(find_tables(folder))):
+        return next(iter(below.items()), (folder, {}))
     return folder, {}
+
+
+def _usual_places(folder: Path) -> list[Path]:
+    return [folder, *(folder / name for name in POINT_FOLDERS)]
+
+
+def _below(folder: Path) -> dict[Path, dict[str, list[Path]]]:
+    """Return the folders below a log's that hold clouds, and these of each suffix."""
+    kinds = {path: _kinds(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+    return {path: kinds for path, kinds in kinds.items() if kinds and path.name != GROUND_FOLDER}
+
+
+def _kinds(folder: Path) -> dict[str, list[Path]]:
+    """Return the clouds in a folder, of each suffix that has two or more."""
+    kinds: dict[str, list[Path]] = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS and path.name[0] != ".":
+            kinds.setdefault(path.suffix.lower(), []).append(path)
+    return {suffix: files for suffix, files in kinds.items() if len(files) > 1}
 
 
 def _one_suffix(folder: Path, suffix: str | None) -> list[Path]:
@@ -294,15 +311,27 @@ def _resolve(folder: Path, setting: PathLike | None, names: Sequence[str], what:
         return None
     if setting == "auto":
         found = [parent for parent in (*(folder / name for name in names), *elsewhere) if parent.exists()]
-        if len(found) > 1:
-            several = ", ".join(path.name for path in found)
-            raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with {what}=...")
-        return found[0] if found else None
+        return _only(found, folder, what)
     path = as_path(setting)
     path = path if is_remote(path) or path.is_absolute() or path.exists() else folder / path
     if not path.exists():
         raise CFlowError(f"{what}={str(setting)!r} does not exist, neither here nor in {folder}")
     return path
+
+
+def _only(found: Sequence[Path], folder: Path, what: str) -> Path | None:
+    if len(found) > 1:
+        several = ", ".join(path.name for path in found)
+        raise CFlowError(f"{folder} has several files for {what}: {several}; choose one with {what}=...")
+    return found[0] if found else None
+
+
+def _in_single(points: np.ndarray) -> np.ndarray:
+    """Return points as float32, unless this type holds them by millimetres only, as in a map's frame."""
+    if points.dtype == np.float32:
+        return points
+    farthest = float(np.nanmax(np.abs(points), initial=0))
+    return points if resolution(np.dtype(np.float32), farthest) > _COARSEST else points.astype(np.float32)
 
 
 def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import find_folders
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
-from cflow_torch.data.point_times import TIME_FIELDS, seconds_after
+from cflow_torch.data.point_times import find_times
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep
@@ -159,18 +159,11 @@ class BagLog(Log):
     def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
         columns = self._cloud(time)
-        points, names = _points(columns), [name for name in TIME_FIELDS if name in columns]
-        found = [seconds_after(columns[name], time, self._period, points) for name in names]
-        usable = [times for times in found if times.seconds is not None]
-        for times in usable[:1] or found:
-            self._note(times.note, "times of points")
-        if not usable or usable[0].seconds is None:
+        times = find_times(columns, time, self._period, _points(columns), self._note)
+        if times is None or times.seconds is None:
             return columns, None
-        kept = ~usable[0].is_stray
-        if not kept.all():
-            text = f"{(~kept).sum()} of {len(kept)} points of the sweep at {time} ns have stray times and are left out"
-            self._note(text + ", also in other sweeps", "stray times")
-        return {name: values[kept] for name, values in columns.items()}, usable[0].seconds[kept]
+        kept = ~times.is_stray
+        return {name: values[kept] for name, values in columns.items()}, times.seconds[kept]
 
     def _reader(self) -> Any:
         """Return the open bag. Each process opens it itself, also after a fork or unpickling."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.reader import times_of_names
+from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timezone
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import Trajectory
+from cflow_torch.data.arrays.poses_text import Trajectory, read_times
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.camera import Camera
@@ -27,7 +26,6 @@ from cflow_torch.types import Sweep
 _UNKNOWN_VIEW = np.radians(40.0)  # of the left colour camera, to each side, where its calibration is missing
 _ANNOTATED_CAMERA = "02"
 _COLOUR_CAMERAS = (_ANNOTATED_CAMERA, "03")
-_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
 class KITTILog(ArraysLog):
@@ -155,10 +153,7 @@ class KITTILog(ArraysLog):
             if not file.exists():
                 return
         with file_errors(file):
-            lines = read_bytes(file).decode("utf-8").splitlines()
-            self.timestamps = [_nanoseconds(lines[frame]) for frame in self._frames]
-        if any(later <= earlier for earlier, later in zip(self.timestamps, self.timestamps[1:])):
-            raise CFlowError(f"{file}: times must ascend; copy it again")
+            self.timestamps = read_times(file)[self._frames].tolist()
         self._has_times = True
 
     def _poses_from_oxts(self) -> np.ndarray | None:
@@ -298,10 +293,3 @@ def _numbers(file: Path) -> np.ndarray:
     with file_errors(file):
         lines: Sequence[str] = read_bytes(file).decode("utf-8").splitlines()
         return np.array([line.split() for line in lines if line.strip()], np.float64)
-
-
-def _nanoseconds(line: str) -> int:
-    """Convert a time like 2011-09-26 13:02:25.594360375 to nanoseconds since 1970."""
-    whole, _, decimals = line.strip().partition(".")
-    time = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
-    return int((time - _EPOCH).total_seconds()) * 10**9 + int(decimals[:9].ljust(9, "0"))

@@ -1,1 +1,1 @@
-"""Write, write_zip and check archives for the public leaderboards, versions 1 and 3."""
+"""Write, zip and check archives for the public leaderboards, versions 1 and 3."""

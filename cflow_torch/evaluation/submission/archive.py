@@ -1,4 +1,4 @@
-"""Submission formats, versions 1 and 3: encode a flow as a file, and write, write_zip and check files.
+"""Submission formats, versions 1 and 3: encode a flow as a file, and write, zip and check files.
 
 Files are written whole or not at all. The same files give the same bytes (with the same zlib).
 """
@@ -116,7 +116,7 @@ def check_submission(path: str | Path, version: SubmissionVersion, expected: Map
 
     Args:
         path: a zip, or the folder that it is made from. Hidden files of a folder are skipped, because an interrupted
-            writer leaves some and `write_zip` does not write_zip them.
+            writer leaves some and `write_zip` leaves them out.
         version: the format.
         expected: name -> number of rows of each file. The archive must contain exactly these files.
 

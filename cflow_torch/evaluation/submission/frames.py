@@ -47,18 +47,13 @@ class MaskArchive:
         return file.vector(file.names[0], bool)
 
 
-def log_mask(log: Log, index: int) -> np.ndarray | None:
-    """Read the (N,) bool evaluation mask that a log stores; None if it has none."""
-    return log.eval_mask(index)
-
-
 def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = None) -> np.ndarray:
     """Return the (N,) bool mask of the points of sweep `index` that are evaluated.
 
-    It is the official mask, else the log's own (`log_mask`), else the official rule: not ground, |x| and |y| <= 50 m.
+    It is the official mask, else that of the log (`Log.eval_mask`), else the rule: no ground; |x|, |y| <= 50 m.
     """
     points = as_numpy(sweep.points)
-    mask = log_mask(log, index) if masks is None else masks.mask(log.log_id, log.timestamps[index])
+    mask = log.eval_mask(index) if masks is None else masks.mask(log.log_id, log.timestamps[index])
     if mask is None:
         if sweep.is_ground is None:
             raise CFlowError(f"log {log.log_id} has neither masks nor ground: give the official masks, or its map")
@@ -98,7 +93,7 @@ def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> lis
     stamps = list(log.timestamps)[:-1]
     if listed is None:
         pairs = range(len(stamps))
-        masked = [i for i in pairs if log_mask(log, i) is not None]
+        masked = [i for i in pairs if log.eval_mask(i) is not None]
         return [SubmittedFrame(log, i) for i in masked or pairs[::STRIDE]]
     wanted = sorted(set(listed.get(log.log_id, ())))
     for stamp in set(wanted) - set(stamps):

@@ -12,7 +12,8 @@ from pyarrow import feather
 
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid, Recording
+from cflow_torch.simulator.drive import Drive
+from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid
 from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import Sweep
 
@@ -20,7 +21,7 @@ CITY = "SYN"  # code of the city in file names; real logs have PIT, MIA, ...
 _DYNAMIC = 0.05  # Argoverse 2 calls a point dynamic if its residual flow is at least this, metres per sweep
 
 
-def write_av2_log(log: Recording, root: str | Path) -> Path:
+def write_av2_log(log: Drive, root: str | Path) -> Path:
     """Write `log` to `root/<log_id>` in Argoverse 2's layout.
 
     Args:
@@ -45,7 +46,7 @@ def write_av2_log(log: Recording, root: str | Path) -> Path:
     return Path(root) / log.log_id
 
 
-def _write_log(log: Recording, folder: Path) -> None:
+def _write_log(log: Drive, folder: Path) -> None:
     poses = np.asarray(log.poses, np.float64)
     annotations = []
     for index, stamp in enumerate(log.timestamps):

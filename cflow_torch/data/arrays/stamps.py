@@ -1,0 +1,71 @@
+"""Times as files and names of files state them: numbers of any usual unit, or dates."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime, timezone
+from decimal import Decimal
+from typing import Sequence
+
+_UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))  # sizes of unix times, and the ns of their unit; else seconds
+_DATE = re.compile(r"(?<!\d)(\d{4})\D?(\d\d)\D?(\d\d)\D(\d\d)\D?(\d\d)\D?(\d\d)(?:\D(\d+))?")
+_STAMP = re.compile(r"(?<!\d)(\d{13}|\d{16,18}|[0-8]\d{18})(?!\d)")
+# Seconds and a fraction: unix seconds anywhere in a name, or the only number of a name.
+_SECONDS = (re.compile(r"(?<!\d)(\d{9,10})[._](\d+)(?!\d)"), re.compile(r"^\D*(\d{1,10})\.(\d+)$"))
+_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+
+
+def nanoseconds_of_numbers(words: Sequence[str]) -> list[int]:
+    """Convert texts of times to nanoseconds exactly: unix times need 19 digits, a float has 16.
+
+    Unix times may be in s, ms, us or ns, which the largest tells. Smaller times are seconds.
+    """
+    numbers = [Decimal(word) for word in words]
+    largest = max(map(abs, numbers))
+    unit = next((unit for first, unit in _UNITS if largest >= first), 10**9)
+    return [int((number * unit).to_integral_value()) for number in numbers]
+
+
+def nanoseconds_of_dates(texts: Sequence[str]) -> list[int] | None:
+    """Convert texts that contain a date such as 2011-09-26 13:02:25.594360375 to nanoseconds since 1970 (UTC).
+
+    Year to second have all digits, with one separator or none. None = a text contains no date.
+    """
+    matches = [_DATE.search(text) for text in texts]
+    times = []
+    for match in matches:
+        if match is None:
+            return None
+        try:
+            date = datetime(*map(int, match.groups()[:6]), tzinfo=timezone.utc)  # type: ignore[arg-type,misc]
+        except ValueError:
+            return None
+        times.append(int((date - _EPOCH).total_seconds()) * 10**9 + int((match[7] or "0")[:9].ljust(9, "0")))
+    return times
+
+
+def times_of_names(names: Sequence[str]) -> list[int] | None:
+    """Return the nanoseconds that names of files state; None if they do not state times, or repeat one.
+
+    Names contain a unix time in milliseconds (13 digits), microseconds (16, 17) or nanoseconds (18, 19), unix seconds
+    and a fraction ("1700000000.05", "1700000000_050000000"), or a date; or their only number is seconds ("0.05").
+    Fractions are decimals, unless their numbers of digits differ and the longest has nine: then they are nanoseconds
+    without leading zeros.
+    """
+    times = None
+    stamps = [_STAMP.search(name) for name in names]
+    seconds = [[pattern.search(name) for name in names] for pattern in _SECONDS]
+    if all(stamps):
+        times = nanoseconds_of_numbers([stamp[1] for stamp in stamps if stamp])
+    for matches in seconds:
+        if times is None and all(matches):
+            times = _with_fractions([(match[1], match[2]) for match in matches if match])
+    times = times or nanoseconds_of_dates(names)
+    return times if times is not None and len(set(times)) == len(times) else None
+
+
+def _with_fractions(pairs: Sequence[tuple[str, str]]) -> list[int]:
+    digits = {len(fraction) for _, fraction in pairs}
+    are_decimals = max(digits) != 9 or len(digits) == 1
+    fractions = [int(fraction[:9].ljust(9, "0") if are_decimals else fraction) for _, fraction in pairs]
+    return [int(second) * 10**9 + fraction for (second, _), fraction in zip(pairs, fractions)]

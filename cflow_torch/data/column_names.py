@@ -1,0 +1,44 @@
+"""Names of columns, of clouds and of tables of poses."""
+
+from __future__ import annotations
+
+import re
+from typing import Iterable, Sequence
+
+# Names without punctuation and units, as drivers, odometry programs and exports of ROS messages write them.
+_ROTATION = "(q|.*quat|.*quaternion|.*orientation|.*rot|.*rotation|qrs)"
+_POSITION = "(t|p|pos|prsr|.*position|.*translation)?"
+_ROLES = {
+    "sec": "(.*stamp)?secs?",
+    "nsec": "(.*stamp)?(nsecs?|nanosec)",
+    "time": "t|.*time|.*stamp|(time|timestamp|stamp|t)(s|sec|secs|ns|us|ms|unix)",
+    **{axis: f"{_POSITION}{axis}m?" for axis in "xyz"},
+    **{f"q{axis}": _ROTATION + axis for axis in "wxyz"},
+    "roll": ".*roll(deg|degrees|rad|radians)?",
+    "pitch": ".*pitch(deg|degrees|rad|radians)?",
+    "yaw": ".*(yaw|heading)(deg|degrees|rad|radians)?",
+}
+_OTHERS = "twist|linear|angular|veloc|accel|covariance|rate"
+
+
+def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
+    """Number the repetitions of a name: intensity, intensity_2. The name of `padding` stays."""
+    counts = [list(names[:k]).count(name) for k, name in enumerate(names, 1)]
+    return [name if count == 1 or name == padding else f"{name}_{count}" for name, count in zip(names, counts)]
+
+
+def role_of_name(name: str) -> str | None:
+    """Return what a column holds: time, sec, nsec, x, y, z, qw, qx, qy, qz, roll, pitch or yaw; None = else."""
+    plain = _plain(name)
+    if re.search(_OTHERS, plain):
+        return None
+    return next((role for role, pattern in _ROLES.items() if re.fullmatch(pattern, plain)), None)
+
+
+def time_columns(names: Iterable[str]) -> list[str]:
+    """Return those of the names that columns with times of points have."""
+    return [name for name in names if role_of_name(name) == "time" or _plain(name) in ("dt", "offset", "timeoffset")]
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\[.*?\]|\(.*?\)|[^a-z0-9]", "", name.lower())
