@@ -59,6 +59,7 @@ def test_truth_is_residual_and_only_where_it_is_known(cflow, drive, monkeypatch,
 
     def spy(*arguments: object, **settings: object) -> None:
         seen.append(settings["truth"])
+        assert str(settings["title"]).endswith("preset paper"), "the picture names its method"
         raise CFlowError("seen")
 
     monkeypatch.setattr(plot_command, "plot_flow", spy)
