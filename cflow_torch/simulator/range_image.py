@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.raycast import Solids, cast_solids, nearest_hits, ray_directions, take
+from cflow_torch.simulator.raycast import RayBlocks, Solids, UnitRays, nearest_hits, ray_directions, take
 from cflow_torch.simulator.rolling import MovingSolids, RollingRays, Shots, covered_blocks
 from cflow_torch.simulator.sensors import SpinningLidar
 
@@ -63,6 +63,53 @@ def cast_unit(
     )
 
 
+def cast_solids(
+    kind: Tensor,
+    T_solid_sensor: Tensor,
+    half_size: Tensor,
+    azimuth: Tensor,
+    elevation: Tensor,
+    max_range: float,
+) -> tuple[Tensor, Tensor]:
+    """Find the nearest solid along every ray of an instantaneous range image.
+
+    Args:
+        kind: (P,) int64, BOX, CYLINDER or ELLIPSOID.
+        T_solid_sensor: (P, 4, 4) float64, rigid, from the sensor frame to the frame of each solid.
+        half_size: (P, 3) float64, metres.
+        azimuth: (C,) float64 radians, evenly spaced over one full revolution, ascending.
+        elevation: (B,) float64 radians, ascending.
+        max_range: metres; we may skip solids that are entirely beyond it.
+
+    Returns:
+        (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 solid, -1 = no hit. Ray index column * B + beam.
+
+    Convention: a solid that contains the sensor is not hit. Of solids at equal range, the first is hit.
+    """
+    shots = Shots.at_once(azimuth, elevation)
+    blocks = covered_blocks(MovingSolids.standing(kind, T_solid_sensor[:, :3], half_size), shots, max_range)
+    blocks = blocks.at(blocks.solid.argsort(stable=True))
+    # From the sensor frame to the unit coordinates of each solid.
+    to_unit = T_solid_sensor[:, :3] / half_size[:, :, None]
+    origin, matrix = to_unit[..., 3].T.float(), to_unit[..., :3].permute(1, 2, 0).float()  # (3, P), (3, 3, P)
+    cos_azimuth = azimuth.cos().float()
+    sin_azimuth = azimuth.sin().float()
+
+    def rays_at(block: Tensor, column: Tensor) -> UnitRays:
+        solid = take(blocks.solid, block)
+        level = take(matrix[:, 0], solid) * take(cos_azimuth, column)
+        level += take(matrix[:, 1], solid) * take(sin_azimuth, column)
+        return UnitRays(take(origin, solid), level, take(matrix[:, 2], solid))
+
+    distance, block = nearest_hits(kind, blocks, rays_at, len(azimuth), elevation)
+    return distance, _solid_of(blocks, block)
+
+
+def _solid_of(blocks: RayBlocks, block: Tensor) -> Tensor:
+    """Return the solid of each block; -1 of block -1, which takes the last element."""
+    return torch.cat([blocks.solid, torch.tensor([-1])]).take(block)
+
+
 def cast_shots(
     shots: Shots, solids: MovingSolids, ground: Ground, max_range: float
 ) -> tuple[RangeImage, Callable[[Tensor], Tensor]]:
@@ -80,8 +127,7 @@ def cast_shots(
     directions = level * shots.elevation.cos().float() + up * shots.elevation.sin().float()  # (3, C, B)
     origin = (shots.T_world_sensor[:, :3, 3] + solids.origin).T[..., None]
     ground_distance, cosine = (values.flatten() for values in ground.cast(origin, directions))
-    solid = torch.cat([blocks.solid, torch.tensor([-1])]).take(block)  # block -1 takes the last element
-    solid = solid.masked_fill(ground_distance < distance, -1)
+    solid = _solid_of(blocks, block).masked_fill(ground_distance < distance, -1)
     distance = torch.minimum(distance, ground_distance)
 
     def cosine_at(ray: Tensor) -> Tensor:

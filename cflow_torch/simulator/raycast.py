@@ -7,7 +7,6 @@ image. We test only the rays of this block. Of the hits of a ray, the nearest co
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Callable, NamedTuple
 
@@ -54,6 +53,10 @@ class RayBlocks(NamedTuple):
     first_beam: Tensor
     end_beam: Tensor
 
+    def at(self, index: Tensor) -> RayBlocks:
+        """Select blocks by their positions in the list, (K,) int64."""
+        return RayBlocks(*(values[index] for values in self))
+
 
 class UnitRays(NamedTuple):
     """M columns of rays, each in unit coordinates of a solid. All fields are (3, M) float32.
@@ -72,46 +75,6 @@ def ray_directions(azimuth: Tensor, elevation: Tensor) -> Tensor:
     x = azimuth.cos()[:, None] * horizontal
     y = azimuth.sin()[:, None] * horizontal
     return torch.stack([x, y, vertical.expand_as(x)]).flatten(1)
-
-
-def cast_solids(
-    kind: Tensor,
-    T_solid_sensor: Tensor,
-    half_size: Tensor,
-    azimuth: Tensor,
-    elevation: Tensor,
-    max_range: float,
-) -> tuple[Tensor, Tensor]:
-    """Find the nearest solid along every ray of a range image.
-
-    Args:
-        kind: (P,) int64, BOX, CYLINDER or ELLIPSOID.
-        T_solid_sensor: (P, 4, 4) float64, rigid, from the sensor frame to the frame of each solid.
-        half_size: (P, 3) float64, metres.
-        azimuth: (C,) float64 radians, evenly spaced over one full revolution, ascending.
-        elevation: (B,) float64 radians, ascending.
-        max_range: metres; we may skip solids that are entirely beyond it.
-
-    Returns:
-        (C * B,) float32 range in metres, inf = no hit; (C * B,) int64 solid, -1 = no hit. Ray index column * B + beam.
-
-    Convention: a solid that contains the sensor is not hit. Of solids at equal range, the first is hit.
-
-    Cost: time grows with the total number of rays in the blocks of all solids, memory with the size of the image.
-    """
-    blocks = _covered_blocks(T_solid_sensor, half_size, azimuth, elevation, max_range)
-    # From the sensor frame to the unit coordinates of each solid.
-    to_unit = T_solid_sensor[:, :3] / half_size[:, :, None]
-    origin, matrix = to_unit[..., 3].T.float(), to_unit[..., :3].permute(1, 2, 0).float()  # (3, P), (3, 3, P)
-    cos_azimuth = azimuth.cos().float()
-    sin_azimuth = azimuth.sin().float()
-
-    def rays_at(solid: Tensor, column: Tensor) -> UnitRays:
-        level = take(matrix[:, 0], solid) * take(cos_azimuth, column)
-        level += take(matrix[:, 1], solid) * take(sin_azimuth, column)
-        return UnitRays(take(origin, solid), level, take(matrix[:, 2], solid))
-
-    return nearest_hits(kind, blocks, rays_at, len(azimuth), elevation)  # block = solid
 
 
 def nearest_hits(
@@ -197,50 +160,6 @@ def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
 def take(values: Tensor, index: Tensor) -> Tensor:
     """values[..., index], but several times faster on a CPU."""
     return values.index_select(-1, index)
-
-
-def _covered_blocks(
-    T_solid_sensor: Tensor, half_size: Tensor, azimuth: Tensor, elevation: Tensor, max_range: float
-) -> RayBlocks:
-    """For each solid, the block of all rays that can meet its bounding box."""
-    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64, device=azimuth.device)] * 3)
-    corners = signs * half_size[:, None] - T_solid_sensor[:, None, :3, 3]
-    x, y, z = (corners @ T_solid_sensor[:, :3, :3]).unbind(-1)  # (P, 8) each, sensor frame
-    middle_x = x.mean(1, keepdim=True)
-    middle_y = y.mean(1, keepdim=True)
-    radius = torch.hypot(x - middle_x, y - middle_y).amax(1, keepdim=True)
-    nearest = (torch.hypot(middle_x, middle_y) - radius).clamp(min=1e-6)[:, 0]
-    first_column, num_columns = _covered_columns(x, y, torch.atan2(middle_y, middle_x), azimuth)
-    first_beam, end_beam = covered_beams(
-        bottom=z.amin(1),
-        top=z.amax(1),
-        nearest=nearest,
-        farthest=torch.hypot(x, y).amax(1),
-        elevation=elevation,
-    )
-    solid = torch.arange(len(half_size), device=azimuth.device)
-    return RayBlocks(solid, first_column, num_columns.masked_fill(nearest > max_range, 0), first_beam, end_beam)
-
-
-def _covered_columns(x: Tensor, y: Tensor, middle: Tensor, azimuth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the first column and the number of columns that P solids cover, (P,) int64 each.
-
-    Args:
-        x, y: (P, 8) float64, corners of the solids, sensor frame.
-        middle: (P, 1) float64 radians, azimuth of the middle of each solid.
-        azimuth: (C,) float64 radians, of the columns.
-    """
-    cos = middle.cos()
-    sin = middle.sin()
-    side = torch.atan2(y * cos - x * sin, x * cos + y * sin)  # azimuth of each corner, from the middle
-    step = 2 * math.pi / len(azimuth)
-    low = (middle[:, 0] + side.amin(1) - azimuth[0]) / step
-    high = (middle[:, 0] + side.amax(1) - azimuth[0]) / step
-    first = (low - 1e-6).ceil().long()
-    count = (high + 1e-6).floor().long() - first + 1
-    # If the corners span half a revolution, the sensor's axis passes through the solid, and every column can meet it.
-    is_around = (high - low) * step > math.pi - 1e-6
-    return first, torch.where(is_around, len(azimuth), count).clamp(0, len(azimuth))
 
 
 def covered_beams(

@@ -49,6 +49,14 @@ class MovingSolids:
     row: Tensor
     dynamic: Tensor
 
+    @classmethod
+    def standing(cls, kind: Tensor, to_solid: Tensor, half_size: Tensor) -> MovingSolids:
+        """Make solids that do not move, from their transforms (P, 3, 4), world to solid."""
+        none = torch.zeros(len(kind))
+        origin = torch.zeros(3, dtype=torch.float64)
+        dynamic = to_solid.new_zeros((2, 0, 3, 4))
+        return cls(kind, half_size, none, none > 0, none > 0, origin, origin[:2], to_solid, none.long() - 1, dynamic)
+
     def at(self, solid: Tensor, seconds: Tensor) -> MovingTransforms:
         """Return the transforms of E solids, (E,) int64, each at its own time, (E,) float64 seconds."""
         to_solid = self.static.index_select(0, solid)
@@ -121,6 +129,12 @@ class Shots:
     T_world_sensor: Tensor
     elevation: Tensor
     speed: tuple[float, float]
+
+    @classmethod
+    def at_once(cls, azimuth: Tensor, elevation: Tensor) -> Shots:
+        """Make shots of a LiDAR at the origin of the world, all at the same time."""
+        pose = torch.eye(4, dtype=torch.float64).expand(len(azimuth), 4, 4)
+        return cls(azimuth, torch.zeros_like(azimuth), pose, elevation, (0.0, 0.0))
 
     @property
     def step(self) -> float:

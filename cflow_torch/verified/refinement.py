@@ -61,7 +61,7 @@ _PRIOR = (2.0, 2.0, 20.0)
 # seam between sweeps crosses it.
 _LEAST_STRETCH = 0.75
 _NUM_ITERATIONS = 4
-_SAMPLE = 256  # voxels of an object, about, in the first half of the iterations
+_SAMPLE = 512  # voxels of an object, about, in the first half of the iterations
 STEP_LENGTH = 1.4  # of an iteration; above 1, because the nearest voxels change with each one
 
 
@@ -239,7 +239,7 @@ class Registration:
 
         Each Gauss-Newton iteration minimises the weighted residuals of the correspondences over translation and angle,
         with a prior that keeps the translation near `start`, and the rotation near zero. The first half of the
-        iterations uses a sample of about 256 voxels of each object.
+        iterations uses a sample of about 512 voxels of each object.
 
         Args:
             start: (G, 2) float64, x and y, metres per sweep interval.

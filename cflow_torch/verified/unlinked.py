@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.ops.groups import FAR, Groups
-from cflow_torch.ops.indices import constant, draw, flat_nonzero, gather, lazy_zeros, split_index, take_columns
+from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
 from cflow_torch.ops.segments import masked_median
 from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.component_tree import Components, NodeKind, Tree
@@ -125,7 +125,7 @@ def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> t
     found = find_unmatched(sweeps, components, index, pixels, is_unmatched, 1)
     large = flat_nonzero(found.size >= _LEAST_SIZE)
     component = found.component[large]
-    return index.index_select(0, large), component.select(flat_nonzero(draw(component.of_item, component.count)))
+    return index.index_select(0, large), component.select(component.nonempty())
 
 
 class _Map:

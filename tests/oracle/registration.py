@@ -21,7 +21,7 @@ FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces
 NOISE = 0.05  # metres, standard deviation of a centroid across its surface
 MOST_TIME = 2.5  # sweep intervals: older sweeps are ignored
 NUM_STEPS, STEP_LENGTH = 4, 1.4  # steps, as long as so many of Gauss and Newton
-SAMPLE = 256  # voxels of an object, about, in the first half of the steps
+SAMPLE = 512  # voxels of an object, about, in the first half of the steps
 HELD = (2.0, 2.0, 5.0)  # pairs that the given translation is worth, and, at 1 m, no rotation
 
 

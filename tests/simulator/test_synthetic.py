@@ -14,8 +14,8 @@ from cflow_torch.simulator.drive import SCENES, Drive
 from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.lidar import scan
 from cflow_torch.simulator.profiles import PROFILES
-from cflow_torch.simulator.range_image import cast_shots
-from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID, Solids, cast_solids, ray_directions
+from cflow_torch.simulator.range_image import cast_shots, cast_solids
+from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID, Solids, ray_directions
 from cflow_torch.simulator.rolling import Shots
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.trajectories import Route, Towed
