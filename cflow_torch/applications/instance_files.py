@@ -14,19 +14,21 @@ from cflow_torch.transforms import upright_poses
 
 INSTANCES_FILE = "instances_info.json"
 FRAMES_FILE = "frame_instances.json"
-CAR = "Car"
-"""Class of KITTI and PandaSet in DriveStudio, which reconstructs it as a rigid object."""
 CLASSES_OF_READER = {
     "av2": ("REGULAR_VEHICLE", "BICYCLIST"),
+    "kitti": ("Car", "Cyclist"),
     "nuscenes": ("vehicle.car", "vehicle.bicycle"),
+    "pandaset": ("Car", "Bicycle"),
     "waymo": ("Vehicle", "Cyclist"),
 }
 """Data set -> classes of rigid and of deformable objects in DriveStudio, whose loaders know only those of their set."""
+CLASSES = CLASSES_OF_READER["kitti"]
+"""Classes for logs of other data sets."""
 _DEFORMABLE = ("pedestrian", "cyclist")  # classes of tracks
 
 
 def write_drivestudio(
-    folder: PathLike, table: Table, log: Log, class_name: str = CAR, deformable_class: str | None = None
+    folder: PathLike, table: Table, log: Log, class_name: str = CLASSES[0], deformable_class: str | None = None
 ) -> None:
     """Write `folder/instances_info.json` and `folder/frame_instances.json`.
 

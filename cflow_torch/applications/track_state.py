@@ -13,7 +13,9 @@ from cflow_torch.applications.smoothing import MotionState
 # A track must show motion to be confirmed, because most short-lived groups are noise of the static world.
 _MIN_EVIDENCE = 2.0  # sum of the log-odds of its confidence
 _NO_CONFIDENCE = 0.7  # log-odds per sweep if the method has no confidence
-_THIN = 0.12  # metres; narrower boxes add no evidence: posts, and strips of a façade at the edge of an occlusion
+# Metres; narrower and lower boxes add no evidence: posts, strips of a façade at the edge of an occlusion, and the lines
+# that single beams draw on the static world, which slide along it as the vehicle moves.
+_THIN = 0.12
 _MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # least net displacement of the box: metres, plus a share of its length
 _TRAVEL_FACTOR = 2.0  # largest ratio between the displacement of the box and the sum of its flow, either way
 # The box of an object that is ever more hidden shrinks: one end stays. With much evidence, it is enough that the centre

@@ -323,9 +323,9 @@ def track(
         `confidence`: of the flow when it last moved, NaN where the method has none;
         `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must
         have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much, if
-        the box shrinks, the centre must have moved by 0.3 m plus a twentieth of the length. Otherwise, its flow in at
-        least three sweeps must add up to the larger of 1.5 m and its length, and the box must have moved by this sum
-        ± 25 %. Tracks that are never confirmed are left out.
+        the box shrinks, the centre must have moved by 0.3 m plus a twentieth of the length. Otherwise, and if it is
+        narrower or lower than 0.12 m, its flow in at least three sweeps must add up to the larger of 1.5 m and its
+        length, and the box must have moved by this sum ± 25 %. Tracks that are never confirmed are left out.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.

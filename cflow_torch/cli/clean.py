@@ -13,7 +13,7 @@ from cflow_torch.applications.clean_files import own_suffix, stored_masks, write
 from cflow_torch.applications.cleaning import CleanLog, MaskedLog, static_map_with_intensity
 from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
-from cflow_torch.cli.flows import stored_flow
+from cflow_torch.cli.flows import method_of_flow, stored_flow
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import local_folder, settings_record, versions, write_config
 from cflow_torch.data.arrays import ArraysLog
@@ -22,11 +22,10 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
-from cflow_torch.data.paths import as_path
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.changes import check_same_run
-from cflow_torch.fleet.manifest import MANIFEST, describe_log
+from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
@@ -90,16 +89,11 @@ def _record(cfg: Clean, log: Log) -> dict[str, Any]:
     """Return what the clean points follow from: settings, versions, sweeps, and the method of stored flow."""
     settings = settings_record(cfg)
     settings["data"].pop("root", None)  # several logs, which may be elsewhere tomorrow
-    made = {"versions": versions(), "log": describe_log(log)}
+    made: dict[str, Any] = {"versions": versions(), "log": describe_log(log)}
     if cfg.flow is not None:
         settings.pop("model")  # it is not used
-        made["flow_by"] = _method_of_flow(as_path(cfg.flow) / log.log_id / MANIFEST)
+        made["flow_by"] = method_of_flow(cfg.flow, log.log_id)
     return {**settings, **made}
-
-
-def _method_of_flow(manifest: Path) -> Any:
-    """Return the settings of the method that made the flow files of a log; None = they have no manifest."""
-    return read_json(manifest).get("run", {}).get("method") if manifest.exists() else None
 
 
 def _record_file(folder: Path) -> Path:

@@ -23,7 +23,7 @@ from cflow_torch.applications.detection_files import (
     write_openpcdet,
 )
 from cflow_torch.applications.instance_files import (
-    CAR,
+    CLASSES,
     CLASSES_OF_READER,
     FRAMES_FILE,
     INSTANCES_FILE,
@@ -254,7 +254,7 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
                 continue
             results = partial(_read_all, stored, log, pairs)
             if cfg.tracks or cfg.masks:
-                classes = CLASSES_OF_READER.get(flow.sources.reader, (CAR, None))
+                classes = CLASSES_OF_READER.get(flow.sources.reader, CLASSES)
                 tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, classes))
             if cfg.masks:
                 tracks = read_tracks(output / log.log_id / TRACKS_FILE)

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from cflow_torch.cli.commands import Animation, CorrelationPicture, FlowPicture, Plot
 from cflow_torch.cli.failures import finish
 from cflow_torch.cli.logs import check_pair, chosen_pairs, find_logs, paths_of
-from cflow_torch.cli.outputs import local_folder
+from cflow_torch.cli.outputs import chosen_preset, local_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import Log, window
@@ -86,7 +86,7 @@ def _from_above(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: W
     view: dict[str, Any] = {
         "is_ground": sweeps.pc0.is_ground,
         "point_cloud_range": model.config.point_cloud_range,
-        "title": f"{log.log_id}, sweep {log.timestamps[pair]}",
+        "title": f"{log.log_id}, sweep {log.timestamps[pair]}, preset {chosen_preset()}",
     }
     if not isinstance(cfg, FlowPicture):
         return plot_clusters(points, result, **view)

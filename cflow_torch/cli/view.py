@@ -12,7 +12,7 @@ from cflow_torch.applications.track_table import TRACKS_FILE, Table, read_tracks
 from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.cli.commands import View
 from cflow_torch.cli.failures import Failures, collect_failures, finish
-from cflow_torch.cli.flows import stored_flow
+from cflow_torch.cli.flows import preset_of_flow, stored_flow
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import chosen_preset, local_folder, write_config
 from cflow_torch.data.atomic import ensure_writable
@@ -73,7 +73,7 @@ def _save_page(cfg: View, log: Log, results: Iterator[tuple[int, FlowResult]], f
         results if table is not None else tracked(),
         file,
         tracks=lambda: tracker.table() if table is None else table,
-        preset=chosen_preset() if cfg.flow is None else None,
+        preset=chosen_preset() if cfg.flow is None else preset_of_flow(cfg.flow, log.log_id),
         max_flow=cfg.max_flow,
         voxel=cfg.voxel,
     )

@@ -105,7 +105,7 @@ def plot_map(points: Array, title: str | None = None) -> Figure:
     position = position[np.isfinite(position).all(axis=1)]
     shown = position if len(position) else np.zeros((1, 3))
     view = np.percentile(shown, (_OUTLIERS, 100 - _OUTLIERS), axis=0) + np.array([[-1.0], [1.0]])
-    figure, (axes,) = new_figure(("",), view, title, f"{len(position)} points from above", has_rings=False)
+    figure, (axes,) = new_figure(("",), view, title, f"{len(position):,} points from above", has_rings=False)
     x, y, z = position[np.argsort(position[:, 2], kind="stable")].T
     lowest, highest = np.percentile(shown[:, 2], _HEIGHTS)
     dots = axes.scatter(x, y, s=dot_area(axes), c=z, cmap="viridis_r", vmin=lowest, vmax=highest, linewidths=0)

@@ -26,6 +26,7 @@ from command_line import cflow
 
 import cflow_torch
 from cflow_torch import evaluation, viz
+from cflow_torch.applications.track_table import read_tracks
 from cflow_torch.config import METHODS
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.arrays.cloud_file import read_cloud, read_columns, write_cloud
@@ -137,6 +138,10 @@ def test_three_commands_of_the_readme_make_actors_and_a_clean_map(folder: Path, 
     actors = json.loads(Path("outputs/flow/my_drive/instances_info.json").read_text())
     assert list(frames) == [str(index) for index in range(6)] and max(map(len, frames.values())) > 2
     assert f"{len(actors)} tracks in tracks.parquet, instances_info.json, frame_instances.json" in printed
+    table = read_tracks(Path("outputs/flow/my_drive/tracks.parquet"))
+    kinds = {str(number): str(kind) for number, kind in zip(table["id"], table["class"])}
+    is_soft = {actor["id"]: actor["class_name"] == "Cyclist" for actor in actors.values()}
+    assert is_soft == {number: kind in ("pedestrian", "cyclist") for number, kind in kinds.items()}
     points = read_columns("outputs/clean/my_drive.ply")["intensity"]
     kept = [read_cloud(f"outputs/clean/my_drive/points/scan_{index}.pcd") for index in range(6)]
     assert 1000 < len(points) < sum(map(len, kept)) < 0.95 * sum(map(len, clouds))

@@ -185,6 +185,13 @@ def drive_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+LIST_FITS = """(() => {
+  document.querySelector("#list td").textContent = "pedestrian #116";  // the longest kind
+  const panel = document.querySelector("#objects");
+  return panel.scrollWidth <= panel.clientWidth;
+})()"""
+
+
 # Where the ids of tracks point to, away from the edges.
 ANCHORS = """[...document.querySelectorAll("#labels span")]
   .filter(span => !span.hidden && span.textContent.includes("m/s"))
@@ -281,6 +288,8 @@ def test_an_object_that_is_clicked_is_described_and_followed(browser: Any, drive
     boxes = content_of(drive_page.read_text(encoding="utf-8"))["frames"][1]["boxes"]
     assert tab.locator("#list tbody tr").count() == len(boxes) and all(box["moving"] is not None for box in boxes)
 
+    assert tab.evaluate(LIST_FITS), "no column is cut off"
+
     tab.keyboard.press("t")
     at = tab.evaluate("boxes => boxes.map(box => viewer.onScreen(box.centre))", boxes)
     middle = [np.hypot(x - 500, y - 350) for x, y, _ in at]
@@ -322,6 +331,8 @@ def test_a_phone_shows_all_controls(browser: Any, drive_page: Path) -> None:
     head, side, time, objects = boxes
     assert head["y"] + head["height"] <= side["y"] and side["y"] + side["height"] <= time["y"], "nothing overlaps"
     assert head["y"] + head["height"] <= objects["y"] and objects["x"] + objects["width"] <= side["x"]
+    tab.locator("#objects summary").click()
+    assert tab.locator("#list tbody tr").first.is_visible() and tab.evaluate(LIST_FITS), "no column is cut off"
     labels = tab.locator("#labels span:not(.ring)").all_inner_texts()
     assert labels and all(re.fullmatch(r"#\d+", text) for text in labels), "ids only"
     context.close()
