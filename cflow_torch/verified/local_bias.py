@@ -15,6 +15,7 @@ from torch import Tensor
 from cflow_torch.ops.indices import constant, floor_divide
 from cflow_torch.verified.columns import NUM_SLICES, OWN, Columns, Pixels
 
+_COUNTS = tuple(bin(slices).count("1") for slices in range(1 << NUM_SLICES))
 _NUM_SUMS = 3  # times that we sum over 3 x 3 pixels: 7 x 7 pixels, of which those in the middle count most
 
 
@@ -27,29 +28,21 @@ def local_bias(columns: Columns, pixels: Pixels) -> Tensor:
     """
     newest = columns.slices[:, 0] & OWN  # [C + 1]
     of_t = columns.slices[:, 1] & OWN
-    left, right, above, below = columns.beside(newest)
-    down = _difference(of_t & below, of_t & above)
-    across = _difference(of_t & right, of_t & left)
-    square = down * down + across * across
-    sums = torch.stack((down, across, square, torch.zeros_like(square)), 1)  # [C + 1, 4]
+    matched = (columns.beside(newest) & of_t).view(2, 2, -1)  # to the left and right; above and below
+    vector = _count(matched[:, 1] & ~matched[:, 0]) - _count(matched[:, 0] & ~matched[:, 1])  # [2, C + 1], x and y
+    x, y = vector
+    square = x * x + y * y
+    sums = torch.stack((x, y, square, torch.zeros_like(square)), 1)  # [C + 1, 4]
     near = -(columns.slices[:, 1:2] > OWN).long()  # [C + 1, 1], all bits or none
     for _ in range(_NUM_SUMS):
         around = columns.sum_around(sums)  # at most 32 per pixel, and 9^3 pixels: 23328
         sums = (around.view(torch.int64) & near).view(torch.int16)
     column = floor_divide(pixels.first_slot, columns.num_slots)
-    down, across, square = sums.index_select(0, column).float().t()[:3]
-    return ((down * down + across * across) / square.clamp(min=1)).sqrt()
-
-
-def _difference(ahead: Tensor, behind: Tensor) -> Tensor:
-    """Count the slices that are matched only ahead, minus those only behind: (C + 1,) uint8 to int16."""
-    return _count(ahead & ~behind) - _count(behind & ~ahead)
+    x, y, square = sums.index_select(0, column).float().t()[:3]
+    return ((x * x + y * y) / square.clamp(min=1)).sqrt()
 
 
 def _count(slices: Tensor) -> Tensor:
-    """Count the slices of each pixel, (C + 1,) uint8 to int16."""
+    """Count the slices of each pixel, (2, C + 1) uint8 to int16."""
     counts = constant(_COUNTS, torch.int16, slices.device)
-    return counts.index_select(0, slices.int())
-
-
-_COUNTS = tuple(bin(slices).count("1") for slices in range(1 << NUM_SLICES))
+    return counts.index_select(0, slices.reshape(-1).int()).view(slices.shape)
