@@ -308,6 +308,21 @@ class Columns:
         dtype = index_dtype(max(len(self.image), self.rank.numel()), place.device)
         return Pixels(place.to(dtype), self.slices.view(-1).index_select(0, slot) & OWN)
 
+    def window_row_col(self) -> tuple[Tensor, Tensor]:
+        """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
+        line, col = split_index(self.position, self.stride)
+        window, row = split_index(line, self.height + 2 * REACH)
+        return window, torch.stack((row, col)) - REACH
+
+    def fill(self, is_unknown: Tensor) -> None:
+        """Set all bits where it is not known what a sweep would have, (K, S) bool, for the first K columns.
+
+        There, nothing is missing, and what is looked up is found, in place as well as at a target. The empty column
+        stays empty. The pixels that are drawn already stay as they are.
+        """
+        filled = self.slices[1 : len(is_unknown), : is_unknown.shape[1]]
+        filled |= is_unknown[1:].view(torch.uint8) * 255
+
     def _occupied(self, slices: Tensor, num_windows: int) -> _Occupied:
         """List the occupied pixels of B windows; `slices` is as for `draw`."""
         step, column = nonzero_pairs((slices != 0).t().contiguous())

@@ -16,6 +16,7 @@ from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.indices import flat_nonzero, split_index
 from cflow_torch.types import Window
 from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.coverage import Coverage
 from cflow_torch.windows.pieces import read_pieces
 from cflow_torch.windows.timeline import Timeline
 
@@ -58,6 +59,7 @@ class Batch:
     # (K, 3) float32, metres, T_ego1_ego0 p - p of the K rows of all these pc0; 0 for points that are not finite
     pose_flow: Tensor
     ground: GroundHeights | None = None  # heights of the ground points of t; None = the method does not need them
+    coverage: Coverage | None = None  # where each sweep measured; None = the method does not need it
     # (P,) float32, time of each point after the instant of its sweep, in sweep intervals, a multiple of 2^-20. 0 in a
     # window if one of its sweeps has no times of points. None = no window has them, or the method does not need them.
     point_times: Tensor | None = None
@@ -100,7 +102,8 @@ def make_batch(
         grid: grid of the images, of any scale; it contains the region.
         device: device of the batch.
         num_axes: coordinates to keep, 2 or 3.
-        needs_ground, needs_times: also keep the heights of the ground, or the times of the points.
+        needs_ground: also keep the heights of the ground, and where each sweep measured.
+        needs_times: also keep the times of the points.
 
     Raises:
         CFlowError: wrong shape or dtype, a transform that is not rigid, tensors on several devices, poses for some
@@ -111,7 +114,8 @@ def make_batch(
     timeline = Timeline.of(windows, config, grid, needs_times)
     num_windows, num_steps = timeline.table.shape[1:]
     ground = GroundHeights(num_windows, grid.lower, grid.upper, device) if needs_ground else None
-    pieces = list(read_pieces(timeline, config, grid, device, num_axes, ground))
+    coverage = Coverage(num_windows, num_steps, device) if needs_ground else None
+    pieces = list(read_pieces(timeline, config, grid, device, num_axes, ground, coverage))
     point_times = [piece.point_times for piece in pieces if piece.point_times is not None]
     num_newest = sum(piece.image.numel() for piece in pieces if piece.step == 0)
     starts = list(accumulate([num_newest, *(window.pc0.points.shape[0] for window in windows)]))
@@ -134,5 +138,6 @@ def make_batch(
         rows=tuple(slice(*ends) for ends in zip(starts, starts[1:])),
         pose_flow=pose_flow,
         ground=ground,
+        coverage=coverage,
         point_times=torch.cat(point_times) if point_times else None,
     )

@@ -18,6 +18,7 @@ from cflow_torch.ops.indices import flat_nonzero, take_columns
 from cflow_torch.tensors import read_ground, read_point_times, read_positions
 from cflow_torch.types import Sweep
 from cflow_torch.windows.bev_grid import Grid
+from cflow_torch.windows.coverage import Coverage
 from cflow_torch.windows.ego_motion import compensate
 from cflow_torch.windows.timeline import Entry, Timeline
 
@@ -42,8 +43,12 @@ def read_pieces(
     device: torch.device,
     num_axes: int,
     ground: GroundHeights | None,
+    coverage: Coverage | None,
 ) -> Iterator[Piece]:
-    """Yield the pieces in the order of the timeline, and add the ground points of t to `ground`, if it is not None.
+    """Yield the pieces in the order of the timeline.
+
+    The ground points of t are added to `ground`, and the points of sweeps with a ground mask to `coverage`. Either may
+    be None.
 
     The other arguments are as for `make_batch`. For a CPU we read each sweep alone, in pieces that fit its cache. On a
     GPU few launches matter more, so we read all sweeps t+1 at once, then all sweeps t, then all others.
@@ -56,6 +61,7 @@ def read_pieces(
         ego_box=config.ego_box,
         num_axes=num_axes,
         ground=ground,
+        coverage=coverage,
         device=device,
     )
     for _, entries in groupby(timeline.entries, lambda entry: entry[:2] if on_cpu else min(entry.step, 2)):
@@ -103,6 +109,7 @@ class _Reader:
     ego_box: tuple[float, ...] | None
     num_axes: int
     ground: GroundHeights | None
+    coverage: Coverage | None
     device: torch.device
 
     def read(self, sweeps: _Sweeps, rows: slice) -> Piece:
@@ -113,6 +120,9 @@ class _Reader:
             num_axes = 3 if sweeps.step == 1 else max(self.num_axes, self._num_checked(sweeps))
             moved = compensate(raw, sweeps.T_ego1_ego, num_axes)
         is_active = self._is_active(sweeps, rows, raw, moved)
+        if self.coverage is not None and sweeps.is_ground is not None:
+            offset = moved[:2] if sweeps.T_ego1_ego is None else moved[:2] - sweeps.T_ego1_ego[:2, 3]
+            self.coverage.add(sweeps.image, offset, sweeps.is_ground[rows])
         if sweeps.step == 1:
             return Piece(
                 step=1,
