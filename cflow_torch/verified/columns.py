@@ -315,12 +315,12 @@ class Columns:
         return window, torch.stack((row, col)) - REACH
 
     def fill(self, is_unknown: Tensor) -> None:
-        """Set all bits where it is not known what a sweep would have, (K, S) bool, for the first K columns.
+        """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
 
         There, nothing is missing, and what is looked up is found, in place as well as at a target. The empty column
         stays empty. The pixels that are drawn already stay as they are.
         """
-        filled = self.slices[1 : len(is_unknown), : is_unknown.shape[1]]
+        filled = self.slices[1:, : is_unknown.shape[1]]
         filled |= is_unknown[1:].view(torch.uint8) * 255
 
     def _occupied(self, slices: Tensor, num_windows: int) -> _Occupied:

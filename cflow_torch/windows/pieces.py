@@ -121,8 +121,7 @@ class _Reader:
             moved = compensate(raw, sweeps.T_ego1_ego, num_axes)
         is_active = self._is_active(sweeps, rows, raw, moved)
         if self.coverage is not None and sweeps.is_ground is not None:
-            offset = moved[:2] if sweeps.T_ego1_ego is None else moved[:2] - sweeps.T_ego1_ego[:2, 3]
-            self.coverage.add(sweeps.image, offset, sweeps.is_ground[rows])
+            self.coverage.add(sweeps.image, raw, sweeps.T_ego1_ego, sweeps.is_ground[rows])
         if sweeps.step == 1:
             return Piece(
                 step=1,

@@ -12,15 +12,14 @@ from cflow_torch.simulator import make_drive
 from cflow_torch.types import Sweep, Window
 from cflow_torch.windows.coverage import Coverage
 
-NUM_BINS = 180
+NUM_BINS = 182  # two of them are the y axis
 SHORTEST = 16
 
 
 def bin_of(x: float, y: float) -> int:
-    """Of the vector; the circle has length 4, and y / (|x| + |y|) measures a quarter."""
-    around = y / (abs(x) + abs(y))
-    around = around + 1 if x >= 0 else 3 - around
-    return min(int(around * NUM_BINS / 4), NUM_BINS - 1)
+    """Of the vector; half of the circle has length 2, and y / (|x| + |y|) measures a quarter of the circle."""
+    number = int((y / (abs(x) + abs(y)) + 1) * 45)
+    return number if x >= 0 else NUM_BINS - 1 - number
 
 
 def unmeasured_by_loops(points: np.ndarray) -> list[bool]:
@@ -43,17 +42,30 @@ def test_equals_plain_loops_for_sweeps_alone_and_together():
     for low, high in ((-0.6, 0.6), (-3.1, 2.9), (2.8, 3.5), (-2.0, 2.3)):
         angle = rng.uniform(low, high, 300)
         sweeps.append(rng.uniform(2, 50, (300, 1)) * np.stack((np.cos(angle), np.sin(angle)), 1))
-    offsets = [torch.from_numpy(points).float().double().t() for points in sweeps]
+    clouds = [torch.from_numpy(points).float().double().t() for points in sweeps]
     is_ground = torch.arange(300) < 5
+    angle = np.array([0.0, 0.7, -2.0, 3.0])  # from ego1 to the frame of each sweep
+    T_ego1_ego = torch.zeros((3, 4, 4), dtype=torch.float64)
+    T_ego1_ego[0, 0], T_ego1_ego[1, 0] = torch.from_numpy(np.stack((np.cos(angle), np.sin(angle))))
     alone, together = (Coverage(2, 2, torch.device("cpu")) for _ in range(2))
-    for image, offset in enumerate(offsets):
-        alone.add(image, offset, is_ground & (image != 3))  # the last sweep has no ground
+    for image, cloud in enumerate(clouds):
+        # The last sweep has no ground.
+        alone.add(image, cloud, T_ego1_ego[..., image, None], is_ground & (image != 3))
     image = torch.arange(4, dtype=torch.int32).repeat_interleave(300)
-    together.add(image, torch.cat(offsets, 1), is_ground.repeat(4) & (image != 3))
-    expected = [unmeasured_by_loops(offset.t().numpy()) for offset in offsets[:3]] + [[False] * NUM_BINS]
-    assert alone.unmeasured().view(4, -1).tolist() == expected
-    assert torch.equal(together.unmeasured(), alone.unmeasured())
-    assert [sum(flags) for flags in expected][0] > 100 and sum(expected[1]) == 0 and sum(expected[2]) > 100
+    ground = is_ground.repeat(4) & (image != 3)
+    together.add(image, torch.cat(clouds, 1), T_ego1_ego.repeat_interleave(300, 2), ground)
+
+    directions = rng.normal(size=(500, 2))
+    window = torch.arange(500) % 2
+    offset = torch.from_numpy(directions.T.copy())[..., None].expand(2, 500, 2)
+    found = alone.is_unmeasured(window, offset)
+    assert torch.equal(together.is_unmeasured(window, offset), found) and alone.has_gaps()
+    flags = [unmeasured_by_loops(cloud.t().numpy()) for cloud in clouds[:3]] + [[False] * NUM_BINS]
+    for (x, y), of_window, row in zip(directions.tolist(), window.tolist(), found.tolist()):
+        for step, is_unmeasured in enumerate(row):
+            cos, sin = np.cos(angle[2 * of_window + step]), np.sin(angle[2 * of_window + step])
+            assert is_unmeasured == flags[2 * of_window + step][bin_of(cos * x + sin * y, cos * y - sin * x)]
+    assert sum(flags[0]) > 100 and sum(flags[1]) == 0 and sum(flags[2]) > 100
 
 
 def cut(sweep: Sweep, is_front: bool, is_lost: bool) -> np.ndarray:
