@@ -238,17 +238,15 @@ class Columns:
         """
         return values.index_select(0, self._neighbours.view(-1)).view(4, -1)
 
-    def sum_around(self, values: Tensor) -> Tensor:
-        """Sum four numbers of each column over the 3 x 3 columns around it, (C + 1, 4) int16; the first row is 0.
+    def sum_along(self, values: Tensor, is_vertical: bool) -> Tensor:
+        """Sum four numbers of each column and the two beside it, (C + 1, 4) int16; the first row is 0.
 
-        The four numbers of a column are one word of eight bytes, so a lookup takes all four (float32 took three times
-        as long). Sums must fit into 16 bits.
+        The two are to the left and to the right, or above and below. The four numbers of a column are one word of eight
+        bytes, so a lookup takes all four (float32 took three times as long). Sums must fit into 16 bits.
         """
-        left, right, above, below = self._neighbours
-        for before, after in ((left, right), (above, below)):
-            words = values.view(torch.int64)[:, 0]
-            for side in (before, after):
-                values = values + words.index_select(0, side).view(torch.int16).view(-1, 4)
+        words = values.view(torch.int64)[:, 0]
+        for side in self._neighbours[2:] if is_vertical else self._neighbours[:2]:
+            values = values + words.index_select(0, side).view(torch.int16).view(-1, 4)
         return values
 
     def _or_within_reach(self, words: Tensor) -> Tensor:

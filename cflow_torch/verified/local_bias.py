@@ -22,7 +22,8 @@ _NUM_SUMS = 3  # times that we sum over 3 x 3 pixels: 7 x 7 pixels, of which tho
 def local_bias(columns: Columns, pixels: Pixels) -> Tensor:
     """Return the bias around each of K pixels of t, (K,) float32; 0 = none.
 
-    Convention: a sum goes only through pixels that have a pixel of t within the reach.
+    Convention: we sum to the left and right, then up and down, and so on. The sums go only through pixels that have a
+        pixel of t within the reach.
 
     Cost: a few lookups for each column.
     """
@@ -34,9 +35,9 @@ def local_bias(columns: Columns, pixels: Pixels) -> Tensor:
     square = x * x + y * y
     sums = torch.stack((x, y, square, torch.zeros_like(square)), 1)  # [C + 1, 4]
     near = -(columns.slices[:, 1:2] > OWN).long()  # [C + 1, 1], all bits or none
-    for _ in range(_NUM_SUMS):
-        around = columns.sum_around(sums)  # at most 32 per pixel, and 9^3 pixels: 23328
-        sums = (around.view(torch.int64) & near).view(torch.int16)
+    for is_vertical in (False, True) * _NUM_SUMS:
+        along = columns.sum_along(sums, is_vertical)  # at most 32 per pixel, and 9^3 pixels: 23328
+        sums = (along.view(torch.int64) & near).view(torch.int16)
     column = floor_divide(pixels.first_slot, columns.num_slots)
     x, y, square = sums.index_select(0, column).float().t()[:3]
     return ((x * x + y * y) / square.clamp(min=1)).sqrt()

@@ -62,7 +62,7 @@ def biases(sweeps: SlicedSweeps) -> np.ndarray:
 
     A slice of t that t+1 has only one pixel to the right, and not to the left, is a vector to the right, and so on.
     The bias is the length of the sum of these vectors, divided by the root of the sum of the squares of the vectors of
-    pixels. Both sums go three times over 3 x 3 pixels, through pixels with one of t around.
+    pixels. Both sums go three times over three pixels of a row, then of a column, through pixels with one of t around.
     """
     step, row, col = sweeps.pixels.T
     of_t, newest = sweeps.image[1], np.pad(sweeps.image[0], 1)
@@ -75,8 +75,10 @@ def biases(sweeps: SlicedSweeps) -> np.ndarray:
         only_ahead, only_behind = (of_t & newest[a] & ~newest[b] for a, b in ((ahead, behind), (behind, ahead)))
         vectors.append(COUNT[only_ahead] - COUNT[only_behind])
     sums = np.stack((*vectors, vectors[0] ** 2 + vectors[1] ** 2))
-    for _ in range(3):
-        sums = over_squares(sums, 1, np.add) * (sweeps.around[1] > 0)
+    for axis in (2, 1) * 3:
+        padded = np.pad(sums, [(0, 0)] + [(int(axis == other), int(axis == other)) for other in (1, 2)])
+        windows = np.lib.stride_tricks.sliding_window_view(padded, 3, axis)
+        sums = windows.sum(-1) * (sweeps.around[1] > 0)
     down, across, square = sums[:, row, col].astype(np.float32)
     return np.sqrt((down * down + across * across) / np.maximum(square, 1))
 
