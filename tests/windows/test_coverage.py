@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scenes import assert_same_bits
 
 from cflow_torch import VerifiedFlow
 from cflow_torch.evaluation.frame import ego_motion_flow
-from cflow_torch.simulator import make_drive
+from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.types import Sweep, Window
 from cflow_torch.windows.coverage import Coverage
 
@@ -74,19 +75,34 @@ def cut(sweep: Sweep, is_front: bool, is_lost: bool) -> np.ndarray:
     return np.abs(azimuth) < 35 if is_front else ~(is_lost & (azimuth > 0) & (azimuth < 90))
 
 
-@pytest.mark.parametrize(("is_front", "pair"), [(True, 7), (False, 11)])
-def test_static_points_stay_static_where_sweeps_are_cut(is_front, pair):
-    drive = make_drive(seed=1, num_sweeps=pair + 2, profile="demo", scene="street")
+def cut_window(drive: Drive, is_front: bool, pair: int, num_history: int = 4) -> Window:
+    """A pair of a drive with older sweeps, each of which is cut."""
     sweeps = []
-    for index in range(pair + 1, pair - 5, -1):
+    for index in range(pair + 1, pair - 1 - num_history, -1):
         sweep = drive.sweep(index)
         kept = cut(sweep, is_front, index % 3 == 0)
         sweeps.append(Sweep(sweep.points[kept], is_ground=sweep.is_ground[kept], pose=sweep.pose))
     newest, now, *history = sweeps
-    (result,) = VerifiedFlow.from_preset("default")([Window(now, newest, pch=tuple(history))])
+    return Window(now, newest, pch=tuple(history))
+
+
+@pytest.mark.parametrize(("is_front", "pair"), [(True, 7), (False, 11)])
+def test_static_points_stay_static_where_sweeps_are_cut(is_front, pair):
+    drive = make_drive(seed=1, num_sweeps=pair + 2, profile="demo", scene="street")
+    window = cut_window(drive, is_front, pair)
+    (result,) = VerifiedFlow.from_preset("default")([window])
     sweep = drive.sweep(pair)
-    truth = drive.labels(pair).flow - ego_motion_flow(sweep.points, np.linalg.inv(newest.pose) @ now.pose)
+    truth = drive.labels(pair).flow - ego_motion_flow(sweep.points, np.linalg.inv(window.pc1.pose) @ window.pc0.pose)
     speed = np.linalg.norm(truth, axis=1)[cut(sweep, is_front, pair % 3 == 0)]
     moves = result.is_moving.numpy()
     assert (moves & (speed < 0.001)).sum() < 60
     assert moves[speed > 0.3].mean() > 0.7  # of the others, t+1 has lost the points
+
+
+def test_cut_sweeps_in_a_batch_give_the_bits_of_each_window_alone():
+    drive = make_drive(seed=1, num_sweeps=6, profile="demo", scene="street")
+    whole = Window(drive.sweep(3), drive.sweep(4), pch=(drive.sweep(2),))
+    windows = [cut_window(drive, True, 3, 1), whole, cut_window(drive, False, 2, 1)]
+    model = VerifiedFlow.from_preset("default")
+    for window, result in zip(windows, model(windows)):
+        assert_same_bits(model([window])[0], result)
