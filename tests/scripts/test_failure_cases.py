@@ -13,7 +13,7 @@ FIXED = {
     "touching": (0.4, 0.03),
     "turning": (0.2, 0.13),
     "vertical": (0.17, 0.02),
-    "fast": (0.59, 0.012),
+    "fast": (0.58, 0.012),
     "ground_left_in": (1.1, 0.03),
     "wrong_frame": (0.05, 0.0005),
 }
