@@ -308,9 +308,13 @@ class Columns:
 
     def window_row_col(self) -> tuple[Tensor, Tensor]:
         """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
-        line, col = split_index(self.position, self.stride)
-        window, row = split_index(line, self.height + 2 * REACH)
+        window, row, col = self._split(self.position)
         return window, torch.stack((row, col)) - REACH
+
+    def _split(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return window, row and column of positions, (K,) int64 each, in the images with their borders."""
+        line, col = split_index(position, self.stride)
+        return (*split_index(line, self.height + 2 * REACH), col)
 
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
@@ -325,8 +329,7 @@ class Columns:
         """List the occupied pixels of B windows; `slices` is as for `draw`."""
         step, column = nonzero_pairs((slices != 0).t().contiguous())
         position = self.position.index_select(0, column)
-        line, col = split_index(position, self.stride)
-        window, row = split_index(line, self.height + 2 * REACH)
+        window, row, col = self._split(position)
         occupied = _Occupied(window, step, column, position, row, col)
         if num_windows == 1:
             return occupied

@@ -12,10 +12,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import constant, floor_divide
-from cflow_torch.verified.columns import NUM_SLICES, OWN, Columns, Pixels
+from cflow_torch.ops.indices import floor_divide
+from cflow_torch.verified.columns import OWN, Columns, Pixels, count_slices
 
-_COUNTS = tuple(bin(slices).count("1") for slices in range(1 << NUM_SLICES))
 _NUM_SUMS = 3  # times that we sum over 3 x 3 pixels: 7 x 7 pixels, of which those in the middle count most
 
 
@@ -30,8 +29,9 @@ def local_bias(columns: Columns, pixels: Pixels) -> Tensor:
     newest = columns.slices[:, 0] & OWN  # [C + 1]
     of_t = columns.slices[:, 1] & OWN
     matched = (columns.beside(newest) & of_t).view(2, 2, -1)  # to the left and right; above and below
-    vector = _count(matched[:, 1] & ~matched[:, 0]) - _count(matched[:, 0] & ~matched[:, 1])  # [2, C + 1], x and y
-    x, y = vector
+    ahead = count_slices(matched[:, 1] & ~matched[:, 0])  # [2, C + 1], to the right; below
+    behind = count_slices(matched[:, 0] & ~matched[:, 1])
+    x, y = (ahead - behind).short()
     square = x * x + y * y
     sums = torch.stack((x, y, square, torch.zeros_like(square)), 1)  # [C + 1, 4]
     near = -(columns.slices[:, 1:2] > OWN).long()  # [C + 1, 1], all bits or none
@@ -41,9 +41,3 @@ def local_bias(columns: Columns, pixels: Pixels) -> Tensor:
     column = floor_divide(pixels.first_slot, columns.num_slots)
     x, y, square = sums.index_select(0, column).float().t()[:3]
     return ((x * x + y * y) / square.clamp(min=1)).sqrt()
-
-
-def _count(slices: Tensor) -> Tensor:
-    """Count the slices of each pixel, (2, C + 1) uint8 to int16."""
-    counts = constant(_COUNTS, torch.int16, slices.device)
-    return counts.index_select(0, slices.reshape(-1).int()).view(slices.shape)

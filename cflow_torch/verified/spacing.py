@@ -14,8 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.directions import azimuth_bin, elevation_bin
 from cflow_torch.ops.indices import draw, exceeds, flat_nonzero, floor_divide, scatter_count, split_index, take_columns
+from cflow_torch.verified.directions import azimuth_bin, elevation_bin
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
