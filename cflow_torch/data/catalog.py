@@ -14,7 +14,7 @@ from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.folders import find_folders, visible
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
@@ -89,7 +89,7 @@ def recognise(root: Any) -> str:
             fitting = {name for name, one in DATA_SETS.items() for path in level if any(map(path.match, one.marks))}
             if fitting:
                 break
-            level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+            level = [path for folder in level for path in visible(folder)]
     if fitting == {"kitti"} and not _has_logs("kitti", root):
         fitting = set()
     found = [name for name in DATA_SETS if name in fitting] or ["arrays"]
@@ -118,7 +118,7 @@ def _why_nothing_fits(top: Path) -> str:
     level, suffixes = [top], Counter()  # type: ignore[var-annotated]
     for _ in range(_DEEPEST):
         suffixes.update(path.suffix.lower() for path in level if path.is_file())
-        level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+        level = [path for folder in level for path in visible(folder)]
     if not suffixes:
         return "it has no files" if top.is_dir() else ""
     suffix, count = suffixes.most_common(1)[0]

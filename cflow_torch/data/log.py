@@ -332,77 +332,33 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
 
 
 class LogWrapper(Log):
-    """Base class of logs that change the sweeps of another log. Every other attribute comes from the other log."""
+    """Base class of logs that change the sweeps of another log. Every other member comes from the other log."""
 
     def __init__(self, log: Log) -> None:
         self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
         self.gaps = log.gaps
 
-    def labels(self, index: int) -> FlowLabels | None:
-        return self.log.labels(index)
-
-    def columns(self, index: int) -> Mapping[str, np.ndarray]:
-        return self.log.columns(index)
-
-    def cameras(self, index: int) -> Sequence[Camera]:
-        return self.log.cameras(index)
-
-    @property
-    def notes(self) -> list[str]:
-        return self.log.notes
-
-    def _note(self, text: str, kind: str = "") -> None:
-        self.log._note(text, kind)
-
-    @cached_property
-    def poses(self) -> np.ndarray | None:
-        return self.log.poses
-
-    @cached_property
-    def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
-        return self.log.trajectory
-
-    @property
-    def readings(self) -> tuple[str, ...]:
-        return self.log.readings
-
-    @cached_property
-    def surrounds_poses(self) -> bool:
-        return self.log.surrounds_poses
-
-    @property
-    def judgement(self) -> Judgement | None:
-        return self.log.judgement
-
-    def findings(self) -> list[Finding]:
-        return self.log.findings()
-
-    def eval_mask(self, index: int) -> np.ndarray | None:
-        return self.log.eval_mask(index)
-
-    def stored_motion(self, index: int) -> Any:
-        return self.log.stored_motion(index)
-
-    def moving(self, index: int) -> np.ndarray | None:
-        return self.log.moving(index)
-
-    def units(self, index: int) -> Any:
-        return self.log.units(index)
-
-    def boxes(self, index: int) -> Any:
-        return self.log.boxes(index)
-
-    def close(self) -> None:
-        self.log.close()
-
-    @property
-    def unwrapped(self) -> Log:
-        return self.log.unwrapped
-
     def __getattr__(self, name: str) -> Any:
         if name == "log" or name.startswith("__"):  # Python asks for hooks while it unpickles, before `log` is set
             raise AttributeError(name)
         return getattr(self.log, name)
+
+
+class _OfLog:
+    """A member of a wrapper that is the member of the wrapped log."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, wrapper: Any, owner: Any = None) -> Any:
+        return self if wrapper is None else getattr(wrapper.log, self._name)
+
+
+for _name in (
+    *("labels", "columns", "cameras", "poses", "trajectory", "readings", "surrounds_poses", "judgement", "findings"),
+    *("eval_mask", "stored_motion", "moving", "units", "boxes", "notes", "_note", "close", "unwrapped"),
+):
+    setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has
 
 
 class CachedLog(LogWrapper):

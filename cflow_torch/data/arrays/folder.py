@@ -32,7 +32,7 @@ def find_array_logs(root: PathLike) -> list[Path]:
     """
     what = "a folder with one point cloud per file, or a folder of such"
     is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
-    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed)
+    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed=is_passed)
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:

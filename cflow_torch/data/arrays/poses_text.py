@@ -24,7 +24,6 @@ from cflow_torch.transforms import (
 )
 from cflow_torch.types import CFlowError
 
-CALIBRATION_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")  # KITTI's odometry, raw and tracking sets
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _ANGLES = ("roll", "pitch", "yaw")
 _TIMES = {"time", "sec", "nsec"}
@@ -157,16 +156,10 @@ def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
     return poses
 
 
-def read_calibration(path: PathLike) -> np.ndarray:
-    """Read the (4, 4) float64 `T_cam0_lidar` of KITTI's `calib.txt`: the line `Tr: ` and 12 numbers.
-
-    It converts the poses P of KITTI's camera to poses of the LiDAR: inv(T) P T.
-    """
-    with file_errors(path, f"pass a file with a line {' or '.join(CALIBRATION_KEYS)} and 12 numbers"):
-        lines = [line.replace(":", " ").split() for line in read_bytes(as_path(path)).decode("utf-8").splitlines()]
-        row = next((words for words in lines if words and words[0] in CALIBRATION_KEYS), ["no line Tr"])
-        matrix = np.array(row[1:], np.float64).reshape(3, 4)
-    return rigid_transform(np.concatenate([matrix, [[0, 0, 0, 1]]]), f"{row[0]} of {path}")
+def read_numbers(path: Path) -> np.ndarray:
+    """Read a table without names, (K, C) float64."""
+    with file_errors(path):
+        return _table_of(read_bytes(path), path)[1].astype(np.float64)
 
 
 def read_times(path: PathLike) -> np.ndarray:

@@ -23,6 +23,7 @@ from cflow_torch.data.arrays.folder import (
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
 from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transform
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
@@ -168,8 +169,15 @@ class ArraysLog(Log):
         chosen = resolve(self.folder, calibration, ("calib.txt",), "calibration")
         if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
             return trajectory, False
-        T_cam_lidar = poses_text.read_calibration(chosen)
-        return trajectory._replace(poses=np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar), True
+        T_cam_lidar = transform(read_calibration(chosen), chosen, *CAMERA_KEYS)
+        converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
+        if calibration == "auto" and _drives_along_x(trajectory.poses) and not _drives_along_x(converted):
+            self._note(
+                f"{file} has poses that drive along x, the LiDAR's axis ahead, not along z, the camera's. So we take "
+                f"them for poses of the LiDAR, and ignore Tr of {chosen.name}"
+            )
+            return trajectory, True
+        return trajectory._replace(poses=converted), True
 
     def _viewpoints(self) -> Trajectory | None:
         """Read the poses in VIEWPOINT of `.pcd` files; None if no file has one."""
@@ -246,6 +254,13 @@ class ArraysLog(Log):
         gaps = np.flatnonzero(is_gap).tolist()
         self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
         return poses
+
+
+def _drives_along_x(poses: np.ndarray) -> bool:
+    """Test whether poses (K, 4, 4) move along their own x axis more than along y and z."""
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    along = np.abs(steps[:, :3, 3]).sum(axis=0)
+    return bool(along[0] > along[1] + along[2])
 
 
 def _in_single(points: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from cflow_torch.data.arrays.poses_text import Trajectory, fit_to_sweeps
 from cflow_torch.data.bags.messages import Frames, cloud_columns, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.folders import search
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import find_times
@@ -55,8 +55,7 @@ def find_bags(root: PathLike) -> list[Path]:
     root = as_path(root)
     if root.is_file():
         return [root]
-    folders = find_folders(root, lambda folder: bool(_bags_in(folder)), SEARCH_DEPTH, "a bag, or a folder of bags")
-    return sorted(bag for folder in folders for bag in _bags_in(folder))
+    return sorted(search(root, _bags_in, SEARCH_DEPTH, "a bag, or a folder of bags"))
 
 
 class BagLog(Log):

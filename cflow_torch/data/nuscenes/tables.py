@@ -81,10 +81,11 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
     all versions, that is a `CFlowError`.
     """
     what = "the data root, which holds v1.0-mini or the like"
-    versions = find_folders(
-        *(as_path(root), lambda folder: (folder / "scene.json").is_file(), SEARCH_DEPTH, what),
-        lambda child: child.name not in _SENSOR_FOLDERS,
+    is_version, is_passed = (
+        (lambda folder: (folder / "scene.json").is_file()),
+        (lambda c: c.name not in _SENSOR_FOLDERS),
     )
+    versions = find_folders(as_path(root), is_version, SEARCH_DEPTH, what, is_passed=is_passed)
     alien = [v for v in versions if any((v / f"{table}.json").exists() for table in foreign)]
     if alien and len(alien) == len(versions):
         raise CFlowError(f"{alien[0]} is not {data_set}: it has one of {sorted(foreign)}; choose the other reader")
