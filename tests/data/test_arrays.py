@@ -21,6 +21,7 @@ from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.writer import write_array_log
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
+from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
 
 STAMP = 1_700_000_000_123_456_789
 
@@ -289,9 +290,9 @@ def test_poses_of_another_rate_are_interpolated(tmp_path):
     poses_text.write_times(folder / "times.txt", [time + 10**12 for time in SmallLog().timestamps])
     with pytest.raises(CFlowError, match="clocks differ by about 999.973 s"):
         ArraysLog(folder)
-    gap = poses_text.Trajectory(truth[:2], np.array([0, 10**9]), "tum", "x")
-    assert np.array_equal(poses_text.fit_to_sweeps(gap, [0, 10**9])[0], gap.poses), "a pose at its time is kept"
-    assert poses_text.fit_to_sweeps(gap, [0, 5 * 10**8, 10**9 + 10**6, 10**9 + 10**7])[1].tolist() == [1, 0, 1, 0]
+    gap = Trajectory(truth[:2], np.array([0, 10**9]), False, "x")
+    assert np.array_equal(fit_to_sweeps(gap, [0, 10**9])[0], gap.poses), "a pose at its time is kept"
+    assert fit_to_sweeps(gap, [0, 5 * 10**8, 10**9 + 10**6, 10**9 + 10**7])[1].tolist() == [1, 0, 1, 0]
 
 
 def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):

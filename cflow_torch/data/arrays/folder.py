@@ -12,7 +12,7 @@ from cflow_torch.data.arrays.cloud_file import SUFFIXES
 from cflow_torch.data.arrays.poses_text import files_of_poses, parse_poses, parse_times
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.folders import find_folders, natural_key
-from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start
+from cflow_torch.data.paths import PathLike, as_path, is_remote, read_bytes, read_start
 from cflow_torch.types import CFlowError
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
@@ -20,7 +20,7 @@ POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajecto
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test for poses and times
+_TABLES = (".txt", ".csv", ".tum", ".json")  # suffixes of files that we test for poses and times
 _TESTED = 8192  # bytes of a file that tell what it holds
 
 
@@ -135,7 +135,7 @@ def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
 def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
     """Parse the first lines of a file; None = this is not possible."""
     try:
-        start = read_start(path, _TESTED)
+        start = read_bytes(path) if path.suffix.lower() == ".json" else read_start(path, _TESTED)
         if len(start) == _TESTED:  # whole lines, and whole matrices of four
             lines = start.splitlines(keepends=True)[:-1]
             start = b"".join(lines[: len(lines) // 4 * 4])

@@ -21,14 +21,15 @@ from cflow_torch.data.arrays.folder import (
     resolve,
 )
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
-from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transform
 from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start
 from cflow_torch.data.point_times import find_times
+from cflow_torch.data.trajectory import Trajectory, checked_poses, fit_to_sweeps
 from cflow_torch.tensors import resolution
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep
@@ -157,17 +158,18 @@ class ArraysLog(Log):
     def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, bool]:
         """Return the poses, and whether a calibration converted them to the LiDAR's."""
         if poses is not None and not is_path_like(poses):
-            return Trajectory(poses_text.checked_poses(np.asarray(poses), "poses"), None, "matrix", "poses"), False
+            return Trajectory(checked_poses(np.asarray(poses), "poses"), None, False, "poses"), False
         kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
         file = resolve(self.folder, poses, POSE_FILES, "poses", kitti)
         if file is None and poses == "auto":
-            file = only_one(find_tables(self.folder)[0], self.folder, "poses")
+            found = [path for path in find_tables(self.folder)[0] if path.suffix.lower() != ".json" or self._fits(path)]
+            file = only_one(found, self.folder, "poses")
             self._note(f"its poses are those of {file.name}" if file else "")
         if file is None:
             return self._viewpoints() if poses == "auto" else None, False
         trajectory = poses_text.read_poses(file)
         chosen = resolve(self.folder, calibration, ("calib.txt",), "calibration")
-        if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
+        if chosen is None or (calibration == "auto" and not trajectory.is_kitti):
             return trajectory, False
         T_cam_lidar = transform(read_calibration(chosen), chosen, *CAMERA_KEYS)
         converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
@@ -178,6 +180,12 @@ class ArraysLog(Log):
             )
             return trajectory, True
         return trajectory._replace(poses=converted), True
+
+    def _fits(self, path: Path) -> bool:
+        """Test whether a JSON file has poses of the sweeps, because such files often hold other poses."""
+        trajectory = poses_text.read_poses(path)
+        rows = self._labelled_rows(trajectory.labels)
+        return trajectory.times_ns is not None or len(trajectory.poses) == len(self.files) or rows is not None
 
     def _viewpoints(self) -> Trajectory | None:
         """Read the poses in VIEWPOINT of `.pcd` files; None if no file has one."""
@@ -191,7 +199,7 @@ class ArraysLog(Log):
         if (numbers == np.eye(7)[3]).all():
             return None
         poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
-        return Trajectory(poses, None, "matrix", _VIEWPOINT)
+        return Trajectory(poses, None, False, _VIEWPOINT)
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
@@ -213,14 +221,24 @@ class ArraysLog(Log):
         self._note(f"the times of its sweeps are those of {file.name}" if file else "")
         return None if file is None else poses_text.read_times(file).tolist()
 
-    def _rows(self, count: int, what: str) -> np.ndarray | None:
+    def _labelled_rows(self, labels: Sequence[str]) -> np.ndarray | None:
+        """Return the row of each file in a table whose rows have labels: by its name, or in the order of numbers."""
+        row_of = {Path(label).stem: row for row, label in enumerate(labels)}
+        if row_of.keys() >= {path.stem for path in self.files}:
+            return np.array([row_of[path.stem] for path in self.files])
+        if len(row_of) != len(self.files) or len({re.sub(r"\d+", "", label) for label in labels}) > 1:
+            return None
+        return np.array(sorted(range(len(labels)), key=lambda row: natural_key(labels[row])))
+
+    def _rows(self, count: int, what: str, labels: Sequence[str] = ()) -> np.ndarray | None:
         """Return the row of each file in a table of `count` rows, one per sweep; None = the table does not fit.
 
-        If files are missing, their numbers tell the rows, from 0 or 1 on, and we say so. The last number must be near
-        the end of the table, else the table is of another rate.
+        Labels of the rows may be the names of the files. If files are missing, their numbers tell the rows, from 0 or 1
+        on, and we say so. The last number must be near the end of the table, else the table is of another rate.
         """
-        if count == len(self.files):
-            return np.arange(count)
+        labelled = self._labelled_rows(labels) if len(labels) == count else None
+        if count == len(self.files) or labelled is not None:
+            return np.arange(count) if labelled is None else labelled
         digits = [re.findall(r"\d+", path.stem) for path in self.files]
         numbers = np.array([int(runs[-1][-9:]) if runs else -1 for runs in digits])
         fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
@@ -233,10 +251,10 @@ class ArraysLog(Log):
         source = trajectory.source
         rows = np.arange(len(self.files))
         if trajectory.times_ns is not None and stamps is not None:
-            poses, is_known, note = poses_text.fit_to_sweeps(trajectory, stamps)
+            poses, is_known, note = fit_to_sweeps(trajectory, stamps)
             self._note(note)
         else:
-            given = self._rows(len(trajectory.poses), f"poses in {source}")
+            given = self._rows(len(trajectory.poses), f"poses in {source}", trajectory.labels)
             if given is None:
                 raise CFlowError(
                     f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "

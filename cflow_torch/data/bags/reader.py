@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import Trajectory, fit_to_sweeps
 from cflow_torch.data.bags.messages import Frames, cloud_columns, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import search
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import find_times
+from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep
@@ -141,7 +141,7 @@ class BagLog(Log):
         """Take the poses of "tf" or of a topic, and keep the sweeps that have one."""
         self.trajectory = times, matrices = self._find_trajectory(source, tracks)
         self._set_clock(times)
-        trajectory = Trajectory(matrices, times, "bag", f"{source} of {self.path}")
+        trajectory = Trajectory(matrices, times, False, f"{source} of {self.path}")
         self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
         self._note(note)
         self.timestamps = [time for time, has_pose in zip(self.timestamps, is_covered) if has_pose]

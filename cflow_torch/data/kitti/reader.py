@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import read_numbers, read_times
+from cflow_torch.data.arrays.poses_text import read_times
 from cflow_torch.data.arrays.reader import ArraysLog
+from cflow_torch.data.arrays.tables import read_numbers
 from cflow_torch.data.boxes import flow_from_boxes
 from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transform
 from cflow_torch.data.camera import Camera
