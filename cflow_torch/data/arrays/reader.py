@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import read_columns, read_table
+from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
     POSE_FILES,
@@ -30,13 +30,11 @@ from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start
 from cflow_torch.data.point_times import find_times
 from cflow_torch.data.trajectory import Trajectory, checked_poses, fit_to_sweeps
-from cflow_torch.tensors import resolution
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 
 _VIEWPOINT = "VIEWPOINT"
-_COARSEST = 1e-3  # metres
 _LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
@@ -44,12 +42,11 @@ class ArraysLog(Log):
     """A folder of point clouds.
 
     Args:
-        folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
-            velodyne, clouds or pcd that does, or one of any name if it holds poses or times.txt. Clouds are sorted
-            naturally: 2 before 10.
-        poses: "auto" = poses.txt, odometry.csv or the like (`POSE_FILES`) in the folder, or KITTI's
-            ../../poses/<name>.txt, if there is one, or the only file or folder there whose contents are poses, or
-            VIEWPOINT of `.pcd` files if it is set; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
+        folder: of a log, see `find_array_logs`. Clouds are sorted by the times in their names, else naturally: 2
+            before 10.
+        poses: "auto" = one of `POSE_FILES` in the folder, or KITTI's ../../poses/<name>.txt, or the only file or
+            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set; None = no poses; or a file
+            (see `read_poses`); or a (K, 4, 4) array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
@@ -65,18 +62,14 @@ class ArraysLog(Log):
         timestamps: nanoseconds from `times`, else from file names (see `times_of_names`), else from TUM poses, if each
             cloud has one, else from the only file named so with one time per cloud. Otherwise 0, 1, 2, ..., and sweeps
             have no `timestamp_ns`.
-        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown. Sweeps before the first pose, after the
-            last one, or in a gap of the poses of more than half a second are left out. If a table has more poses than
-            there are clouds, each takes that of its number.
-        gaps: indices of sweeps after which sweeps were left out.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep, see `fit_to_sweeps`; None = unknown. Without times, there
+            is one pose per sweep, or each sweep takes that of its name or number.
         bin_layout: numbers of a point of `.bin` files, None for files of another suffix.
         has_viewpoints: whether the poses come from VIEWPOINT. Such clouds are often in the world's frame (`read_as`).
 
     Convention:
-        `missing_returns` stay, as NaN, so that results have a row for every row of the file.
-        Sweeps are in the ego frame: points are transformed by `ego_T_lidar` in float64, then rounded to float32. Poses
-        with times (TUM) are interpolated at the times of the sweeps, if these are known. Otherwise there must be one
-        pose per sweep. The ego frame should have z up, because the method works in the bird's-eye view.
+        `missing_returns` stay, as NaN, so that results have a row for every row of the file. Sweeps are in the ego
+        frame, which should have z up: points are transformed by `ego_T_lidar` in float64, then rounded to float32.
     """
 
     has_raw_times: bool = True
@@ -137,7 +130,7 @@ class ArraysLog(Log):
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
         seconds = None if times is None else times.seconds
-        return Sweep(_in_single(points), is_ground, pose, time, seconds)
+        return Sweep(in_single(points), is_ground, pose, time, seconds)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
@@ -279,14 +272,6 @@ def _drives_along_x(poses: np.ndarray) -> bool:
     steps = np.linalg.inv(poses[:-1]) @ poses[1:]
     along = np.abs(steps[:, :3, 3]).sum(axis=0)
     return bool(along[0] > along[1] + along[2])
-
-
-def _in_single(points: np.ndarray) -> np.ndarray:
-    """Return points as float32, unless this type holds them by millimetres only, as in a map's frame."""
-    if points.dtype == np.float32:
-        return points
-    farthest = float(np.abs(points[np.isfinite(points)]).max(initial=0))
-    return points if resolution(np.dtype(np.float32), farthest) > _COARSEST else points.astype(np.float32)
 
 
 def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:

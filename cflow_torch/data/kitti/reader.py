@@ -19,7 +19,7 @@ from cflow_torch.data.kitti.drives import KITTIDrive, find_kitti_drives
 from cflow_torch.data.kitti.geometry import IMAGE_SIZE, in_image, png_size, poses_from_oxts
 from cflow_torch.data.kitti.labels import FrameBoxes
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import PathLike, remote_errors
+from cflow_torch.data.paths import PathLike, exist, remote_errors
 from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep
@@ -133,9 +133,8 @@ class KITTILog(ArraysLog):
     def _read_times(self) -> None:
         """Read the times of a raw drive: a line per frame, YYYY-MM-DD hh:mm:ss and 9 decimals."""
         file = self.drive.root / "velodyne_points" / "timestamps.txt"
-        with remote_errors(file):
-            if not file.exists():
-                return
+        if not exist(file):
+            return
         with file_errors(file):
             self.timestamps = read_times(file)[self._frames].tolist()
         self._has_times = True
@@ -180,16 +179,13 @@ class KITTILog(ArraysLog):
         single = (
             root / "calib.txt" if self.drive.layout == "sequence" else root / "calib" / f"{self.drive.clouds.name}.txt"
         )
-        with remote_errors(root):
-            for name in names:
-                places = [folder / f"calib_{name}.txt" for folder in (root, root.resolve().parent)]
-                file = next(
-                    (each for each in (places if self.drive.layout == "raw" else [single]) if each.exists()), None
-                )
-                if file is None:
-                    return None
-                prefix = f"{name}." if self.drive.layout == "raw" else ""
-                values.update({prefix + key: numbers for key, numbers in read_calibration(file).items()})
+        for name in names:
+            places = [folder / f"calib_{name}.txt" for folder in (root, root.resolve().parent)]
+            file = next(filter(exist, places if self.drive.layout == "raw" else [single]), None)
+            if file is None:
+                return None
+            prefix = f"{name}." if self.drive.layout == "raw" else ""
+            values.update({prefix + key: numbers for key, numbers in read_calibration(file).items()})
         return values
 
     def cameras(self, index: int) -> list[Camera]:
@@ -246,14 +242,11 @@ class KITTILog(ArraysLog):
         root = self.drive.root
         tracklets = root / "tracklet_labels.xml"
         tracks = root / "label_02" / f"{self.drive.clouds.name}.txt"
-        with remote_errors(root):
-            if self.drive.layout == "raw" and tracklets.exists():
-                return stored_labels.read_tracklets(tracklets)
-            if self.drive.layout == "tracking" and tracks.exists():
-                camera = self._camera()
-                if camera is None:
-                    raise CFlowError(
-                        f"{tracks} needs the calibration calib/{tracks.name}, which is missing; download it"
-                    )
-                return stored_labels.read_tracking_labels(tracks, np.linalg.inv(camera[0]))
+        if self.drive.layout == "raw" and exist(tracklets):
+            return stored_labels.read_tracklets(tracklets)
+        if self.drive.layout == "tracking" and exist(tracks):
+            camera = self._camera()
+            if camera is None:
+                raise CFlowError(f"{tracks} needs the calibration calib/{tracks.name}, which is missing; download it")
+            return stored_labels.read_tracking_labels(tracks, np.linalg.inv(camera[0]))
         return {}

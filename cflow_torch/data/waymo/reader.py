@@ -15,7 +15,7 @@ from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.folders import search
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import PathLike, as_path, remote_errors, source_for_mmap, source_for_random_access
+from cflow_torch.data.paths import PathLike, as_path, exist, source_for_mmap, source_for_random_access
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
 from cflow_torch.transforms import rigid_transform, upright_poses
 from cflow_torch.types import CFlowError, Sweep
@@ -169,9 +169,8 @@ class WaymoLog(BoxLog):
     def _box_rows(self) -> dict[int, list[list[Any]]]:
         """Read the rows of boxes by frame time; empty if the segment has no labels (the testing split)."""
         component, by_frame = Component(self.file, "lidar_box"), defaultdict(list)
-        with remote_errors(component.file):
-            if not component.file.exists():
-                return {}
+        if not exist(component.file):
+            return {}
         for time, *row in component.rows((TIME, TRACK, *(f"{BOX}{name}" for name in _BOX_COLUMNS))):
             by_frame[time].append(row)
         return by_frame
