@@ -118,6 +118,7 @@ class Command(Settings):
     """A command with settings."""
 
     SUMMARY: ClassVar[str]
+    CHOOSES_PAIRS: ClassVar[bool] = False  # by data.first and data.step
 
     output: str = setting("outputs", "folder of the results")
     model: Config = group("default", kind=Config)
@@ -293,6 +294,7 @@ class Eval(Command):
     """
 
     SUMMARY: ClassVar[str] = "estimate and score all labelled pairs of a data set"
+    CHOOSES_PAIRS: ClassVar[bool] = True
 
     output: str = setting("outputs/eval", "folder of the results; each job of a sweep writes to a folder below it")
     overwrite: bool = setting(False, "true = repeat a run whose results.json exists")
@@ -468,6 +470,7 @@ class View(Command):
     """
 
     SUMMARY: ClassVar[str] = "write a 3-D page for the browser, or a recording for the viewer rerun"
+    CHOOSES_PAIRS: ClassVar[bool] = True
 
     output: str = setting("outputs/view", "local folder; each log gets <log id>.html or .rrd")
     format: str = setting(

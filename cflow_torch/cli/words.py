@@ -24,6 +24,9 @@ _LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan":
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
 
 
+_OF_PAIRS = ("data.first", "data.step")
+
+
 class Call(NamedTuple):
     """The words of a call. A word without "=" is a path."""
 
@@ -79,6 +82,9 @@ def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
             of_value = [group for group in chosen if value in choices(group)]  # preset=live
             hint = f" (did you mean {of_value[0]}={value}?)" if of_value else near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
+        if key in _OF_PAIRS and not kind.CHOOSES_PAIRS:
+            able = " and ".join(f"`cflow {name}`" for name, other in WITH_SETTINGS.items() if other.CHOOSES_PAIRS)
+            raise CFlowError(f"cflow {command} does not choose pairs by {key}: leave it out; {able} do")
         owners = [choice for choice in known[key] if _is_chosen(choice, chosen)]
         if not owners:
             raise CFlowError(

@@ -54,6 +54,7 @@ class Log(ABC):
             future, and `cflow flow` leaves out the pair over it.
         is_compensated: True = the format is known to be compensated for ego motion within a sweep.
         has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
+        has_sparse_poses: True = most poses are interpolated between sweeps.
         lidar_position: (3,) metres, position of the rotating LiDAR in the frame of the points.
         has_viewpoints: True = the poses come with the clouds, which are then often in the world's frame.
         turn_seconds: duration of a turn of the LiDAR; None = the median time between two sweeps.
@@ -70,6 +71,7 @@ class Log(ABC):
     timestamps: Sequence[int]
     gaps: frozenset[int] = frozenset()
     has_viewpoints: bool = False
+    has_sparse_poses: bool = False
     # What `cflow_torch.data.deskewing` must know of a reader.
     is_compensated: bool = False
     has_raw_times: bool = False

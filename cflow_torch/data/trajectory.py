@@ -6,11 +6,12 @@ from typing import NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.transforms import interpolate_poses, rigid_transform
+from cflow_torch.transforms import interpolate_motion, rigid_transform
 from cflow_torch.types import CFlowError
 
 _LONGEST_GAP_NS = 500_000_000  # longest time between two poses over which we interpolate
 _FEWEST_COVERED = 0.5  # share of sweeps at a pose, if poses are farther apart than that
+_SPARSE = 1.5  # sweep intervals between poses
 _TOLERANCE_NS = 1_000_000  # by which programs round times
 
 
@@ -23,6 +24,11 @@ class Trajectory(NamedTuple):
     is_kitti: bool  # 12 numbers without names, as KITTI's poses of a camera
     source: str
     labels: Sequence[str] = ()  # names of the rows, such as those of the clouds; () = unknown
+
+    def is_sparse(self, times_ns: Sequence[int]) -> bool:
+        """Test whether poses are clearly rarer than sweeps at these times."""
+        known: np.ndarray = np.zeros(0) if self.times_ns is None else self.times_ns
+        return bool(np.median(np.diff(known)) > _SPARSE * np.median(np.diff(times_ns)))
 
 
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
@@ -37,7 +43,7 @@ def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
 
 
 def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Interpolate a trajectory at the times of sweeps: positions linearly, rotations at a constant rate.
+    """Interpolate a trajectory at the times of sweeps, with constant speed and rate of turn between two poses.
 
     Args:
         trajectory: poses with times.
@@ -60,7 +66,7 @@ def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.n
         raise CFlowError(_describe_misfit(trajectory.source, known, wanted))
     left, right, time = before[covered], after[covered], wanted[covered]
     share = np.where(left == right, 0.0, (time - known[left]) / np.maximum(known[right] - known[left], 1))
-    poses = interpolate_poses(trajectory.poses[left], trajectory.poses[right], share)
+    poses = interpolate_motion(trajectory.poses[left], trajectory.poses[right], share)
     return poses, covered, _describe_uncovered(trajectory.source, known, wanted, covered)
 
 

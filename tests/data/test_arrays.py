@@ -278,14 +278,17 @@ def test_names_are_sorted_naturally_and_read_as_times(tmp_path):
 
 
 def test_poses_of_another_rate_are_interpolated(tmp_path):
-    """Constant speed and yaw rate are reproduced between the poses of a 50 Hz trajectory."""
+    """An arc of constant speed and yaw rate is reproduced between the poses of a 50 Hz trajectory."""
     folder = write_array_log(SmallLog(), tmp_path)
+
+    def on_arc(s: float) -> np.ndarray:
+        return scenes.pose(20 * np.sin(0.5 * s), 20 * (1 - np.cos(0.5 * s)), 0.5 * s)
+
     seconds = np.arange(-1, 14) * 0.02
-    truth = np.stack([scenes.pose(10 * s, 0, 0.5 * s) for s in seconds])
+    truth = np.stack([on_arc(s) for s in seconds])
     write_tum(folder / "poses.txt", [STAMP + 7_000_000 + round(s * 1e9) for s in seconds], truth)
     for k, pose in enumerate(ArraysLog(folder).poses):
-        at = 0.1 * k - 0.007
-        assert np.abs(pose - scenes.pose(10 * at, 0, 0.5 * at)).max() < 1e-12
+        assert np.abs(pose - on_arc(0.1 * k - 0.007)).max() < 1e-12
     poses_text.write_times(folder / "times.txt", [time + 10**12 for time in SmallLog().timestamps])
     with pytest.raises(CFlowError, match="clocks differ by about 999.973 s"):
         ArraysLog(folder)

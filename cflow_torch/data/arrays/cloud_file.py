@@ -24,6 +24,7 @@ from cflow_torch.types import CFlowError, check_array
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
 _AXES = ("x", "y", "z")
 _COARSEST = 1e-3  # metres
+_MOST_COLUMNS = 64  # of a cloud with fewer points than columns; more are those of a cloud that is transposed
 _TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
     ".feather": (feather.read_table, feather.write_feather),
     ".parquet": (parquet.read_table, parquet.write_table),
@@ -175,7 +176,7 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
             read, write = _TABLES[suffix]
             write(read(pa.BufferReader(content), use_threads=False).filter(pa.array(is_kept)), file)
         elif suffix == ".npy":
-            np.save(file, np.load(io.BytesIO(content), allow_pickle=False)[is_kept])
+            np.save(file, _by_rows(np.load(io.BytesIO(content), allow_pickle=False))[is_kept])
         elif suffix == ".npz":
             arrays: Any = _plain_arrays(content).items()
             np.savez(file, **{k: v[is_kept] if v.shape[:1] == is_kept.shape else v for k, v in arrays})
@@ -256,11 +257,18 @@ def _layout_of(content: bytes, expected: int | BinLayout | None) -> BinLayout:
 
 
 def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
+    array = _by_rows(array)
     if array.dtype.names is not None:
         return {name: array[name] for name in array.dtype.names}
-    if array.ndim != 2 or array.shape[1] < 3:
+    if array.ndim != 2 or array.shape[1] < 3 or array.shape[1] > max(_MOST_COLUMNS, len(array)):
         raise CFlowError(f"it has an array of shape {array.shape}; it must be (N, 3+), columns x, y, z first")
     return dict(zip((*_AXES, *(f"column_{k}" for k in range(3, array.shape[1]))), array.T))
+
+
+def _by_rows(array: np.ndarray) -> np.ndarray:
+    """Return an organised cloud, (H, W) or (H, W, C), with a row per point."""
+    num_axes = 1 if array.dtype.names is not None else 2
+    return array.reshape(-1, *array.shape[-1:][: num_axes - 1]) if array.ndim == num_axes + 1 else array
 
 
 def _plain_arrays(content: bytes) -> dict[str, np.ndarray]:

@@ -32,12 +32,13 @@ def read_poses(path: PathLike) -> Trajectory:
     """Read poses, whose rotations must be orthogonal up to rounding.
 
     Args:
-        path: a file of text, of JSON, or `.npy` with (K, 4, 4) or (K, 3, 4); or a folder with a file per pose. A line
-            of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM: time in seconds, tx ty tz, qx qy qz
-            qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows), or 13 or 17 (a time before the matrix),
-            or four lines have a matrix. If a line before the numbers names the columns (timestamp, x, qw, ...), they
-            may have any order, and roll, pitch and yaw may replace the quaternion. Other columns, empty lines and lines
-            that begin with `#` are ignored. Unix times may be in s, ms, us or ns. JSON: see `tables_of_json`.
+        path: a file of text, of JSON, or `.npy` with (K, 4, 4), (K, 3, 4) or the numbers of K lines; or a folder with a
+            file per pose. A line of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM: time in
+            seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows), or 13 or 17
+            (a time before the matrix), or four lines have a matrix. If a line before the numbers names the columns
+            (timestamp, x, qw, ...), they may have any order, and roll, pitch and yaw may replace the quaternion. Other
+            columns, empty lines and lines that begin with `#` are ignored. Times: `nanoseconds_of_numbers`. JSON:
+            `tables_of_json`.
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
         angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3 has w
@@ -51,8 +52,10 @@ def read_poses(path: PathLike) -> Trajectory:
             raise CFlowError(f"{path} is a folder: its .txt files must have one pose each")
         return Trajectory(np.concatenate(poses), None, False, str(path), [file.stem for file in files])
     if path.suffix == ".npy":
-        matrices = read_npy(path, "pass a .npy file of (K, 4, 4) numbers")
-        return Trajectory(checked_poses(matrices, str(path)), None, False, str(path))
+        numbers = read_npy(path, "pass a .npy file of (K, 4, 4) numbers")
+        if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
+            return _poses_of_table(Table([], numbers.astype(str), []), path)
+        return Trajectory(checked_poses(numbers, str(path)), None, False, str(path))
     with file_errors(path):
         content = read_bytes(path)
     return parse_poses(content, path)

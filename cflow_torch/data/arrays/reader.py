@@ -54,7 +54,7 @@ class ArraysLog(Log):
         ground: "auto" = the subfolder `ground`, if there is one; None = no masks; or a folder. It has one .npy file per
             cloud, of the same name, with (N,) bool or 0 and 1.
         ego_T_lidar: (4, 4), maps the frame of the stored points to the ego frame; None = they are the same.
-        suffix: suffix of the clouds to read, if a folder has several kinds.
+        suffix: suffix, or pattern of the names ("front_*.pcd"), of the clouds to read, if a folder has several kinds.
         bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes; "auto" = `find_bin_layout`.
 
     Attributes:
@@ -246,6 +246,7 @@ class ArraysLog(Log):
         if trajectory.times_ns is not None and stamps is not None:
             poses, is_known, note = fit_to_sweeps(trajectory, stamps)
             self._note(note)
+            self.has_sparse_poses = trajectory.is_sparse(stamps)
         else:
             given = self._rows(len(trajectory.poses), f"poses in {source}", trajectory.labels)
             if given is None:
