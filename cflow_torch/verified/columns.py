@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -19,8 +18,11 @@ from cflow_torch.ops.indices import (
     constant,
     flat_nonzero,
     floor_divide,
+    gather,
     index_dtype,
+    lazy_empty,
     lazy_zeros,
+    mark,
     nonzero_pairs,
     split_index,
 )
@@ -110,8 +112,10 @@ class Columns:
     width: int  # W
     image: Tensor  # (B * area,) int32, column at each position; 0 = none
     position: Tensor  # (C + 1,) int64, flat index into `image` of each column; column 0 is the empty one
+    place: Tensor  # (C + 1, 6) int32 or int64, as in `Pixels`, of sweep t+1
     slices: Tensor  # (C + 1, T) uint8
-    # (C + 1, T) int32, position of each occupied pixel in the list of pixels; `_EMPTY` = the pixel is empty
+    # (T, C + 1) int32, position of each occupied pixel in the list of pixels; `_EMPTY` = the pixel is empty. Rows of
+    # sweeps that are not drawn yet are undefined.
     rank: Tensor
     reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
     most_reach: int
@@ -119,16 +123,21 @@ class Columns:
 
     @classmethod
     def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int, spacing: Spacing) -> Columns:
-        """Make empty columns at and around the occupied positions, (B * area,) bool. The border must be False."""
+        """Make empty columns at and around the occupied positions, (B * area,) bool, which this overwrites.
+
+        The border must be False.
+        """
         stride = grid.width + 2 * REACH
         device = is_occupied.device
-        is_column = _dilate(is_occupied, stride)
-        reach_at = torch.ones(len(is_column) if spacing.most > 1 else 0, dtype=torch.uint8, device=device)
+        square = _square(1, stride, device)
+        is_column = mark(is_occupied, (flat_nonzero(is_occupied) + square).view(-1))
         for reach in range(2, spacing.most + 1):
-            is_wide = spacing.are_wide(grid, REACH, reach).view(-1)
-            is_column |= _dilate(is_column, stride) & is_wide
-            reach_at += is_wide
-        is_tall = spacing.are_tall(grid, REACH, SLICE_HEIGHT).view(-1) if spacing.has_tall else None
+            position = flat_nonzero(is_column)
+            # A neighbour of a pixel may be wide although the pixel itself is nearer.
+            near = flat_nonzero(spacing.are_wide(grid, *_split(grid, position), reach, margin=2.0))
+            around = (position.index_select(0, near) + square).view(-1)
+            wide = flat_nonzero(spacing.are_wide(grid, *_split(grid, around), reach))
+            mark(is_column, around.index_select(0, wide))
         images = is_column.view(-1, grid.height + 2 * REACH, stride)
         images[:, :REACH] = images[:, -REACH:] = False
         images[:, :, :REACH] = images[:, :, -REACH:] = False
@@ -137,12 +146,24 @@ class Columns:
         image.index_copy_(0, position, torch.arange(1, len(position) + 1, dtype=torch.int32, device=device))
         # Column 0 is said to be at a position of the border that has only border around it.
         position = torch.cat((constant((stride + 1,), torch.int64, device), position))
-        shape = (len(position), 2 * _WORD * -(-num_steps // _WORD))
-        slices = torch.zeros(shape, dtype=torch.uint8, device=device)
-        rank = torch.full(shape, _EMPTY, dtype=torch.int32, device=device)
-        reach_of = reach_at.index_select(0, position) if spacing.most > 1 else None
-        tall = None if is_tall is None else flat_nonzero(is_tall.index_select(0, position))
-        return cls(grid.height, grid.width, image, position, slices, rank, reach_of, spacing.most, tall)
+        window, row_col = _split(grid, position)
+        num_slots = 2 * _WORD * -(-num_steps // _WORD)
+        rank = lazy_empty(num_slots * len(position), torch.int32, device).view(num_slots, -1)
+        slot = torch.arange(len(position), device=device) * num_slots
+        start = window * (grid.height + 2 * REACH) * stride + REACH * (stride + 1)
+        place = torch.stack((slot, start, window, torch.zeros_like(slot), *row_col), 1)
+        return cls(
+            height=grid.height,
+            width=grid.width,
+            image=image,
+            position=position,
+            place=place.to(index_dtype(max(len(image), rank.numel()), device)),
+            slices=torch.zeros((len(position), num_slots), dtype=torch.uint8, device=device),
+            rank=rank,
+            reach=spacing.reach(grid, window, row_col) if spacing.most > 1 else None,
+            most_reach=spacing.most,
+            tall=flat_nonzero(spacing.are_tall(grid, window, row_col, SLICE_HEIGHT)) if spacing.has_tall else None,
+        )
 
     @property
     def stride(self) -> int:
@@ -208,17 +229,15 @@ class Columns:
         The result has an item for each pixel of the square in raster order, and for each of the K pixels:
         (2 reach + 1)^2 K items, grouped by the pixel of the list.
         """
-        line = range(-reach, reach + 1)
-        offsets = tuple((down * self.stride + right,) for down in line for right in line)
         column = floor_divide(pixels.first_slot, self.num_slots)
         slot = pixels.first_slot - column * self.num_slots + pixels.step
-        position = self.position.index_select(0, column) + constant(offsets, torch.int64, column.device)
+        position = self.position.index_select(0, column) + _square(reach, self.stride, column.device)
         around = self.image.index_select(0, position.view(-1)).view_as(position)  # [(2 reach + 1)^2, K]
-        return self.pixel_at((around * self.num_slots + slot).view(-1), count)
+        return self.pixel_at((around + slot * len(self.position)).view(-1), count)
 
-    def pixel_at(self, slot: Tensor, count: int) -> Groups:
-        """Group K slots, counted through all columns, (K,), by their pixel, one of `count` in the list."""
-        rank = self.rank.view(-1).index_select(0, slot).long()
+    def pixel_at(self, entry: Tensor, count: int) -> Groups:
+        """Group K entries of `rank`, slot * (C + 1) + column, (K,), by their pixel, one of `count` in the list."""
+        rank = self.rank.view(-1).index_select(0, entry).long()
         return Groups(rank.clamp_(max=count), count)
 
     def as_words(self, values: Tensor) -> Tensor:
@@ -265,9 +284,7 @@ class Columns:
             return around
         wide = flat_nonzero(self.reach > 1)
         reach = self.reach.index_select(0, wide)[:, None]
-        line = range(-1, 2)
-        offsets = tuple((down * self.stride + right,) for down in line for right in line)
-        beside = self.position.index_select(0, wide) + constant(offsets, torch.int64, wide.device)
+        beside = self.position.index_select(0, wide) + _square(1, self.stride, wide.device)
         beside = self.image.index_select(0, beside.view(-1))  # [9 wide]
         for step in range(2, self.most_reach + 1):
             # The columns beside one of this reach have at least the reach before.
@@ -295,26 +312,21 @@ class Columns:
         words = self.as_words(slices)
         half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
         self.slices.view(torch.int64)[:, half] = words | self._or_within_reach(words) << NUM_SLICES
-        occupied = self._occupied(slices, num_windows)
-        step = occupied.step
-        slot = occupied.column * self.num_slots + (step + first)  # counted through all columns
-        rank = torch.arange(pixels_before, pixels_before + len(slot), dtype=torch.int32, device=slot.device)
-        self.rank.view(-1).index_copy_(0, slot, rank)
-        start = occupied.position - occupied.row * self.stride - occupied.col + REACH * (self.stride + 1)
-        window = occupied.window + num_windows if first > 0 else occupied.window
-        place = torch.stack((slot - step, start, window, step, occupied.row - REACH, occupied.col - REACH), 1)
-        dtype = index_dtype(max(len(self.image), self.rank.numel()), place.device)
-        return Pixels(place.to(dtype), self.slices.view(-1).index_select(0, slot) & OWN)
-
-    def window_row_col(self) -> tuple[Tensor, Tensor]:
-        """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
-        window, row, col = self._split(self.position)
-        return window, torch.stack((row, col)) - REACH
-
-    def _split(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return window, row and column of positions, (K,) int64 each, in the images with their borders."""
-        line, col = split_index(position, self.stride)
-        return (*split_index(line, self.height + 2 * REACH), col)
+        drawn = slices.t().contiguous()  # [S, C + 1]
+        step, column = nonzero_pairs(drawn.bool())
+        if num_windows > 1:
+            window = self.place[:, 2].index_select(0, column)
+            step, column = gather(window.sort(stable=True).indices, step, column)
+        rank = self.rank[first : first + len(drawn)].fill_(_EMPTY).view(-1)
+        number = torch.arange(pixels_before, pixels_before + len(step), dtype=torch.int32, device=step.device)
+        pixel = step * len(self.position) + column
+        rank.index_copy_(0, pixel, number)
+        place = self.place.index_select(0, column)
+        place[:, 3] = step
+        if first > 0:
+            place[:, 0] += first
+            place[:, 2] += num_windows
+        return Pixels(place, drawn.view(-1).index_select(0, pixel))
 
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
@@ -324,27 +336,6 @@ class Columns:
         """
         filled = self.slices[1:, : is_unknown.shape[1]]
         filled |= is_unknown[1:].view(torch.uint8) * 255
-
-    def _occupied(self, slices: Tensor, num_windows: int) -> _Occupied:
-        """List the occupied pixels of B windows; `slices` is as for `draw`."""
-        step, column = nonzero_pairs((slices != 0).t().contiguous())
-        position = self.position.index_select(0, column)
-        window, row, col = self._split(position)
-        occupied = _Occupied(window, step, column, position, row, col)
-        if num_windows == 1:
-            return occupied
-        return _Occupied(*torch.stack(occupied).index_select(1, window.sort(stable=True).indices))
-
-
-class _Occupied(NamedTuple):
-    """K occupied pixels in order of window, step and position, (K,) int64 each."""
-
-    window: Tensor
-    step: Tensor
-    column: Tensor
-    position: Tensor  # flat index into the images
-    row: Tensor  # of the image with its border
-    col: Tensor
 
 
 def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:
@@ -358,15 +349,17 @@ def num_positions(grid: Grid, num_windows: int) -> int:
     return num_windows * (grid.height + 2 * REACH) * (grid.width + 2 * REACH)
 
 
-def _dilate(image: Tensor, stride: int) -> Tensor:
-    """Dilate images by 3 x 3, (N,) bool, row after row of `stride` values; their borders are empty."""
-    across = image.clone()
-    across[1:] |= image[:-1]
-    across[:-1] |= image[1:]
-    result = across.clone()
-    result[stride:] |= across[:-stride]
-    result[:-stride] |= across[stride:]
-    return result
+def _square(reach: int, stride: int, device: torch.device) -> Tensor:
+    """Return what to add to positions for those around, up to `reach` each way, ((2 reach + 1)^2, 1) int64."""
+    line = range(-reach, reach + 1)
+    return constant(tuple((down * stride + right,) for down in line for right in line), torch.int64, device)
+
+
+def _split(grid: Grid, position: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the window of K positions, (K,) int64, and row and column in its image, (2, K) int64."""
+    line, col = split_index(position, grid.width + 2 * REACH)
+    window, row = split_index(line, grid.height + 2 * REACH)
+    return window, torch.stack((row, col)) - REACH
 
 
 def count_slices(slices: Tensor) -> Tensor:
