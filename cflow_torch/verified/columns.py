@@ -6,7 +6,7 @@ window tells which column is at a position, and small tables have a row for each
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import torch
@@ -16,11 +16,11 @@ from torch import Tensor
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import (
     constant,
+    draw,
     flat_nonzero,
     floor_divide,
     gather,
     index_dtype,
-    lazy_empty,
     lazy_zeros,
     mark,
     nonzero_pairs,
@@ -85,7 +85,9 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of B windows. Only this class and `position_of` know how positions and slots are numbered.
+    """The columns of B windows, and of B windows of copies.
+
+    Only this class and `position_of` know how positions and slots are numbered.
 
     The image of a window has an empty border of `REACH` positions (b), so that only distant positions need a test:
 
@@ -96,11 +98,8 @@ class Columns:
         b b b b b b b b
         b b b b b b b b
 
-    The tables have a row for each column, and a slot for each sweep. S slots are rounded up to whole words. As many
-    slots follow for the copies of points that lie under an overhang (`HeightSlicedSweeps.with_copies`):
-
-        slot         0    1    2    3   .   .   .   .  |  8    9   ...
-        sweep of    t+1   t   t-1  t-2                 | t+1   t   ...      of the copies
+    The tables have a row for each column, and a slot for each sweep: slot 0 for t+1, 1 for t, 2 for t-1, ... The number
+    of slots is a multiple of 8, so a row is read as whole words.
 
     A byte of `slices` holds two sets of height slices:
 
@@ -110,13 +109,11 @@ class Columns:
 
     height: int  # H, rows of an image without its border
     width: int  # W
-    image: Tensor  # (B * area,) int32, column at each position; 0 = none
+    image: Tensor  # (2 B * area,) int32, column at each position; 0 = none
     position: Tensor  # (C + 1,) int64, flat index into `image` of each column; column 0 is the empty one
     place: Tensor  # (C + 1, 6) int32 or int64, as in `Pixels`, of sweep t+1
     slices: Tensor  # (C + 1, T) uint8
-    # (T, C + 1) int32, position of each occupied pixel in the list of pixels; `_EMPTY` = the pixel is empty. Rows of
-    # sweeps that are not drawn yet are undefined.
-    rank: Tensor
+    rank: Tensor  # (S, C + 1) int32, position of each pixel in the list of pixels; `_EMPTY` = the pixel is empty
     reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
     most_reach: int
     tall: Tensor | None  # (K,) int64, the tall columns; None = there are none
@@ -142,27 +139,79 @@ class Columns:
         images[:, :REACH] = images[:, -REACH:] = False
         images[:, :, :REACH] = images[:, :, -REACH:] = False
         position = flat_nonzero(is_column)  # [C]
-        image = lazy_zeros(len(is_column), torch.int32, device)
-        image.index_copy_(0, position, torch.arange(1, len(position) + 1, dtype=torch.int32, device=device))
+        image = lazy_zeros(2 * len(is_column), torch.int32, device)
         # Column 0 is said to be at a position of the border that has only border around it.
         position = torch.cat((constant((stride + 1,), torch.int64, device), position))
         window, row_col = _split(grid, position)
-        num_slots = 2 * _WORD * -(-num_steps // _WORD)
-        rank = lazy_empty(num_slots * len(position), torch.int32, device).view(num_slots, -1)
+        num_slots = _WORD * -(-num_steps // _WORD)
         slot = torch.arange(len(position), device=device) * num_slots
         start = window * (grid.height + 2 * REACH) * stride + REACH * (stride + 1)
         place = torch.stack((slot, start, window, torch.zeros_like(slot), *row_col), 1)
-        return cls(
+        # With copies, there are at most twice as many columns.
+        dtype = index_dtype(2 * max(len(is_column), len(position) * num_slots), device)
+        columns = cls(
             height=grid.height,
             width=grid.width,
             image=image,
             position=position,
-            place=place.to(index_dtype(max(len(image), rank.numel()), device)),
+            place=place.to(dtype),
             slices=torch.zeros((len(position), num_slots), dtype=torch.uint8, device=device),
-            rank=rank,
+            rank=torch.full((num_steps, len(position)), _EMPTY, dtype=torch.int32, device=device),
             reach=spacing.reach(grid, window, row_col) if spacing.most > 1 else None,
             most_reach=spacing.most,
             tall=flat_nonzero(spacing.are_tall(grid, window, row_col, SLICE_HEIGHT)) if spacing.has_tall else None,
+        )
+        columns._number(1)
+        return columns
+
+    def _number(self, first: int) -> None:
+        """Write the numbers of the columns into the image, beginning with that of column 1."""
+        number = torch.arange(first, first + len(self.position) - 1, dtype=torch.int32, device=self.image.device)
+        self.image.index_copy_(0, self.position[1:], number)
+
+    def for_copies(self, column: Tensor) -> tuple[Columns, Tensor]:
+        """Make empty columns for copies of pixels in some columns, (K,) int64, and around these columns.
+
+        They are at the same places in windows B ... 2 B - 1. `followed_by` appends them to these columns. The second
+        result is the column of each copy, (K,) int64.
+        """
+        is_near = draw(column, len(self.position))
+        for _ in range(self.most_reach):
+            near = self.position.index_select(0, flat_nonzero(is_near)) + _square(1, self.stride, column.device)
+            mark(is_near, self.image.index_select(0, near.view(-1)).long())
+        is_near[0] = True  # the empty column stays the first one
+        own = flat_nonzero(is_near)
+        half = len(self.image) // 2
+        place = self.place.index_select(0, own)
+        place[:, 0] = (torch.arange(len(own), device=own.device) + (len(self.position) - 1)) * self.num_slots
+        place[:, 1] += half
+        place[:, 2] += half // ((self.height + 2 * REACH) * self.stride)
+        copies = replace(
+            self,
+            position=self.position.index_select(0, own) + half,
+            place=place,
+            slices=torch.zeros_like(self.slices[: len(own)]),
+            rank=torch.full_like(self.rank[:, : len(own)], _EMPTY),
+            reach=None if self.reach is None else self.reach.index_select(0, own),
+            tall=None if self.tall is None else flat_nonzero(draw(self.tall, len(self.position)).index_select(0, own)),
+        )
+        copies._number(1)
+        return copies, self.image.index_select(0, self.position.index_select(0, column) + half).long()
+
+    def followed_by(self, copies: Columns) -> Columns:
+        """Append the columns of copies, which are then numbered after these columns."""
+        copies._number(len(self.position))
+        tall = self.tall
+        if tall is not None and copies.tall is not None:
+            tall = torch.cat((tall, copies.tall + (len(self.position) - 1)))
+        return replace(
+            self,
+            position=torch.cat((self.position, copies.position[1:])),
+            place=torch.cat((self.place, copies.place[1:])),
+            slices=torch.cat((self.slices, copies.slices[1:])),
+            rank=torch.cat((self.rank, copies.rank[:, 1:]), 1),
+            reach=None if self.reach is None or copies.reach is None else torch.cat((self.reach, copies.reach[1:])),
+            tall=tall,
         )
 
     @property
@@ -174,11 +223,6 @@ class Columns:
     def num_slots(self) -> int:
         """T."""
         return self.slices.shape[1]
-
-    @property
-    def first_of_copies(self) -> int:
-        """First slot of the copies."""
-        return self.num_slots // 2
 
     def look_up(self, pixels: Pixels, step: Tensor | int, shift: Tensor | None = None) -> Tensor:
         """Return the bytes of the pixels that are `shift` away in another sweep of the same window.
@@ -193,8 +237,8 @@ class Columns:
         """
         if shift is None:
             return self.slices.view(-1).index_select(0, pixels.first_slot + step)
-        slot = pixels.first_slot % self.num_slots + step  # in its column
-        index = self._column_at(pixels, shift) * self.num_slots + slot[:, None]  # [K, C]
+        slot = step[:, None] if isinstance(step, Tensor) else step
+        index = self._column_at(pixels, shift) * self.num_slots + slot  # [K, C]
         return self.slices.view(-1).index_select(0, index.view(-1)).view_as(index)
 
     def _column_at(self, pixels: Pixels, shift: Tensor) -> Tensor:
@@ -216,12 +260,15 @@ class Columns:
         """Return the reach of K pixels (`Spacing`), (K,) uint8."""
         if self.reach is None:
             return torch.ones_like(pixels.slices)
-        return self.reach.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
+        return self.reach.index_select(0, self.column_of(pixels))
+
+    def column_of(self, pixels: Pixels) -> Tensor:
+        """Return the column of K pixels, (K,) int64."""
+        return floor_divide(pixels.first_slot, self.num_slots)
 
     def words(self, pixels: Pixels) -> Tensor:
         """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""
-        words = self.slices.view(torch.int64)[:, : self.first_of_copies // _WORD]  # not of copies
-        return words.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
+        return self.slices.view(torch.int64).index_select(0, self.column_of(pixels))
 
     def around(self, pixels: Pixels, reach: int, count: int) -> Groups:
         """Return which of the `count` pixels of the list are around K pixels, up to `reach` pixels each way.
@@ -229,20 +276,19 @@ class Columns:
         The result has an item for each pixel of the square in raster order, and for each of the K pixels:
         (2 reach + 1)^2 K items, grouped by the pixel of the list.
         """
-        column = floor_divide(pixels.first_slot, self.num_slots)
-        slot = pixels.first_slot - column * self.num_slots + pixels.step
+        column = self.column_of(pixels)
         position = self.position.index_select(0, column) + _square(reach, self.stride, column.device)
         around = self.image.index_select(0, position.view(-1)).view_as(position)  # [(2 reach + 1)^2, K]
-        return self.pixel_at((around + slot * len(self.position)).view(-1), count)
+        return self.pixel_at((around + pixels.step * len(self.position)).view(-1), count)
 
     def pixel_at(self, entry: Tensor, count: int) -> Groups:
-        """Group K entries of `rank`, slot * (C + 1) + column, (K,), by their pixel, one of `count` in the list."""
+        """Group K entries of `rank`, step * (C + 1) + column, (K,), by their pixel, one of `count` in the list."""
         rank = self.rank.view(-1).index_select(0, entry).long()
         return Groups(rank.clamp_(max=count), count)
 
     def as_words(self, values: Tensor) -> Tensor:
-        """Return (C + 1, S) bytes as words, with a byte for each slot: (C + 1, T / 16) int64."""
-        return F.pad(values, (0, self.first_of_copies - values.shape[1])).view(torch.int64)
+        """Return (C + 1, S) bytes as words, with a byte for each slot: (C + 1, T / 8) int64."""
+        return F.pad(values, (0, self.num_slots - values.shape[1])).view(torch.int64)
 
     def or_around(self, words: Tensor) -> Tensor:
         """Return the bitwise OR over the 3 x 3 columns around each column, (C + 1, ...) int64."""
@@ -300,33 +346,26 @@ class Columns:
         beside = self.position + steps
         return self.image.index_select(0, beside.view(-1)).view_as(beside)
 
-    def draw(self, slices: Tensor, first: int, pixels_before: int, num_windows: int) -> Pixels:
+    def draw(self, slices: Tensor, pixels_before: int = 0) -> Pixels:
         """Draw the height slices of sweeps, and list their pixels, in order of window, step and position.
 
         Args:
             slices: (C + 1, S) uint8, slices of the pixels themselves; row 0 is 0.
-            first: the first slot to draw, 0 or `first_of_copies`.
             pixels_before: number of pixels that are in the list already.
-            num_windows: B. Pixels of copies are in window B + w.
         """
         words = self.as_words(slices)
-        half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
-        self.slices.view(torch.int64)[:, half] = words | self._or_within_reach(words) << NUM_SLICES
+        self.slices.view(torch.int64).copy_(words | self._or_within_reach(words) << NUM_SLICES)
         drawn = slices.t().contiguous()  # [S, C + 1]
         step, column = nonzero_pairs(drawn.bool())
-        if num_windows > 1:
+        if len(self.image) > 2 * (self.height + 2 * REACH) * self.stride:
             window = self.place[:, 2].index_select(0, column)
             step, column = gather(window.sort(stable=True).indices, step, column)
-        rank = self.rank[first : first + len(drawn)].fill_(_EMPTY).view(-1)
-        number = torch.arange(pixels_before, pixels_before + len(step), dtype=torch.int32, device=step.device)
-        pixel = step * len(self.position) + column
-        rank.index_copy_(0, pixel, number)
+        entry = step * len(self.position) + column
+        number = torch.arange(pixels_before, pixels_before + len(entry), dtype=torch.int32, device=entry.device)
+        self.rank.view(-1).index_copy_(0, entry, number)
         place = self.place.index_select(0, column)
         place[:, 3] = step
-        if first > 0:
-            place[:, 0] += first
-            place[:, 2] += num_windows
-        return Pixels(place, drawn.view(-1).index_select(0, pixel))
+        return Pixels(place, drawn.view(-1).index_select(0, entry))
 
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
