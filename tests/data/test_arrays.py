@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.arrays import poses_text
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, read_cloud, read_columns, write_cloud
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows, read_cloud, read_columns, write_cloud
 from cflow_torch.data.arrays.folder import find_array_logs
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.arrays.reader import ArraysLog
@@ -177,6 +177,38 @@ def test_columns_are_found_by_name_or_position(tmp_path):
     (tmp_path / "nuscenes.bin").write_bytes(np.concatenate([points, points[:, :2]], 1).tobytes())
     for file in sorted(tmp_path.iterdir()):
         assert np.array_equal(read_cloud(file, 5), points), file.name
+
+
+@pytest.mark.parametrize("kind", ["i2", "i4", "i8"])
+def test_integers_are_millimetres_or_centimetres_and_keep_their_digits(tmp_path, kind):
+    points = np.array([[12345, -20000, 300], [1, 2, 3], [32767, 0, -32768]], kind)
+    np.save(tmp_path / "a.npy", points)
+    read = read_cloud(tmp_path / "a.npy")
+    assert read.dtype == (np.float32 if kind == "i2" else np.float64) and np.array_equal(read, points)
+
+
+def test_organised_arrays_have_a_row_per_point(tmp_path):
+    points = np.arange(96, dtype=np.float32).reshape(4, 8, 3) + 1
+    np.save(tmp_path / "a.npy", points)
+    fields = np.zeros((4, 8), [(name, "f4") for name in "xyz"])
+    for axis, name in enumerate("xyz"):
+        fields[name] = points[..., axis]
+    np.save(tmp_path / "b.npy", fields)
+    for name in ("a.npy", "b.npy"):
+        assert np.array_equal(read_cloud(tmp_path / name), points.reshape(-1, 3))
+        copy_rows(tmp_path / name, tmp_path / "few.npy", np.arange(32) < 5)
+        assert np.array_equal(read_cloud(tmp_path / "few.npy"), points.reshape(-1, 3)[:5])
+    np.save(tmp_path / "turned.npy", points.reshape(-1, 3).T.repeat(9, axis=1))
+    with pytest.raises(CFlowError, match=r"shape \(3, 288\); it must be \(N, 3\+\)"):
+        read_cloud(tmp_path / "turned.npy")
+
+
+def test_clouds_of_two_sensors_in_one_folder_need_a_choice(tmp_path):
+    for k, name in enumerate(("front_0", "front_1", "rear_0", "rear_1")):
+        np.save(tmp_path / f"{name}.npy", np.full((3, 3), k + 1.0))
+    with pytest.raises(CFlowError, match=r"front_\*\.npy, rear_\*\.npy: choose one by suffix"):
+        ArraysLog(tmp_path)
+    assert [sweep.points[0, 0] for sweep in ArraysLog(tmp_path, suffix="rear_*.npy")] == [3, 4]
 
 
 def test_files_with_other_contents_are_refused(tmp_path):

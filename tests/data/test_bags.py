@@ -66,6 +66,29 @@ def test_poses_come_from_a_topic(form: str, poses: str, frame: str, recording: T
     assert np.allclose(world_of(sweep) @ to_map[:3, :3].T + to_map[:3, 3], recording.world(3)[:40], atol=5e-3)
 
 
+@pytest.mark.parametrize("kind", ["Path", "TransformStamped"])
+def test_poses_come_from_a_path_or_from_transforms_outside_of_tf(
+    kind: str, recording: TinyRecording, tmp_path: Path
+) -> None:
+    writer = BagWriter(tmp_path, "ros1")
+    driven: list[Any] = []
+    for index, stamp in enumerate(recording.timestamps):
+        T, header = recording.poses[index], writer.header(stamp, "map")
+        driven.append(writer.make("geometry_msgs/msg/PoseStamped", header, writer.pose(T)))
+        planned = [writer.make("geometry_msgs/msg/PoseStamped", writer.header(0, "map"), writer.pose(T))] * 2
+        writer.write("/plan", stamp, "nav_msgs/msg/Path", header, planned)
+        if kind == "Path":
+            writer.write("/path", stamp, "nav_msgs/msg/Path", header, list(driven))
+        else:
+            names = ("Vector3", "Quaternion", "Transform")
+            writer.write("/vicon", stamp, "geometry_msgs/msg/TransformStamped", header, "roof", writer.pose(T, names))
+        cloud = writer.cloud(stamp, recording.units(index)[0].points, None)
+        writer.write("/points", stamp, "sensor_msgs/msg/PointCloud2", *cloud)
+    writer.bag.close()
+    log: Any = BagLog(tmp_path / "drive.bag", poses="/path" if kind == "Path" else "/vicon")
+    assert np.allclose(log.poses, recording.poses, atol=1e-9)
+
+
 def test_a_bag_without_poses_is_read(recording: TinyRecording, tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", recording, "none")
     sweep = BagLog(next(path.glob("*.mcap")), ego_T_lidar=MOUNT).sweep(0)

@@ -18,6 +18,7 @@ import cflow_torch
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import GroundSegmentedLog, Logs, find_sources, open_log, recognise
 from cflow_torch.data.log import Log, window
+from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.simulator import Drive
 from cflow_torch.simulator.benchmark import benchmark_logs
 from cflow_torch.types import CFlowError, CFlowWarning
@@ -153,6 +154,19 @@ def test_a_path_is_opened_with_one_call(drive: Drive, arrays: Path, tmp_path: Pa
         cflow_torch.open(arrays, sweeps=3)
     with pytest.raises(CFlowError, match="data set 'ply'"):
         cflow_torch.open(arrays, data="ply")
+
+
+def test_several_paths_and_patterns_are_opened_with_one_call(drive: Drive, tmp_path: Path) -> None:
+    for name in ("drive_1", "drive_2", "other"):
+        write_array_log(drive, tmp_path / name)
+    logs: Any = cflow_torch.open(tmp_path / "drive_*", check=False)
+    assert len(logs) == 2 and len(logs[0]) == len(drive)
+    assert len(cflow_torch.open([tmp_path / "drive_1", str(tmp_path / "*")], check=False)) == 3, "paths may overlap"
+    with pytest.raises(CFlowError, match="no file or folder matches this pattern"):
+        cflow_torch.open(tmp_path / "drives_*")
+    write_av2_log(drive, tmp_path / "av2")
+    with pytest.raises(CFlowError, match="several formats, arrays and av2"):
+        cflow_torch.open(str(tmp_path / "*"))
 
 
 def test_the_name_open_does_not_hide_that_of_python() -> None:

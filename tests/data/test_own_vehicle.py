@@ -93,6 +93,21 @@ def test_a_wall_along_the_road_a_standing_vehicle_and_unknown_poses_stay(hood):
         assert next(one for one in examine(OwnVehicleLog(log)) if one.topic == "own vehicle").status == RIGHT
 
 
+def test_points_upside_down_are_not_taken_for_the_vehicle():
+    """Then the ground is not found, so its nearest rings seem to ride along."""
+    drive = drive_of(16)
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+
+    class Down(Log):
+        log_id, timestamps, poses = "down", drive.timestamps, np.asarray(drive.poses) @ down
+
+        def sweep(self, index):
+            sweep = drive.sweep(index)
+            return Sweep(sweep.points @ down[:3, :3].astype(np.float32), None, self.poses[index], sweep.timestamp_ns)
+
+    assert len(OwnVehicleLog(Down()).own_cells) == 0
+
+
 def test_the_setting_keeps_them(hood, tmp_path):
     write_array_log(Added(hood), tmp_path)
     with pytest.warns(CFlowWarning, match="ride along"):

@@ -126,6 +126,10 @@ def reordered(order):
     return lambda pose: as_matrix(to_rotations(to_quaternions(pose[None, :3, :3])[:, order])[0], pose[:3, 3])
 
 
+def mirrored(axes):
+    return lambda pose: as_matrix(axes) @ pose @ as_matrix(axes)
+
+
 POSES = {
     "inverted": np.linalg.inv,
     CAMERA: lambda pose: pose @ as_matrix(AXES[CAMERA]),
@@ -135,6 +139,12 @@ POSES = {
     "w_last": reordered((1, 2, 3, 0)),
     "down": lambda pose: pose @ as_matrix(AXES["down"]),
     "right": lambda pose: pose @ as_matrix(AXES["right"]),
+    "opengl": lambda pose: pose @ as_matrix(AXES["opengl"]),
+    "mirrored": mirrored(np.diag([1, -1, 1])),
+    "mirrored_back": mirrored(np.diag([-1, 1, 1])),
+    "swapped": mirrored(np.eye(3)[[1, 0, 2]]),
+    "transposed": lambda pose: as_matrix(pose[:3, :3].T, pose[:3, 3]),
+    "compass": lambda pose: as_matrix(pose[:3, :3].T @ AXES["left"], pose[:3, 3]),
 }
 WRONG_POSES = {
     **{name: each(change) for name, change in POSES.items()},
@@ -169,6 +179,21 @@ def test_wrong_poses_are_named_and_the_reading_undoes_them(reading, source, requ
     true, read = (np.linalg.inv(log.poses[2:-1]) @ log.poses[1:-2] for log in (Wrong(good), again))
     is_half = "half" in reading  # a pose midway between two others is interpolated
     assert np.allclose(true, read, atol=0.01 if is_half else 1e-6), "the motion between the sweeps is the true one"
+
+
+@pytest.mark.parametrize("name", ["mirrored", "swapped"])
+def test_mirrored_clouds_are_named_and_no_pose_is_blamed(drive, name):
+    axes = {"mirrored": np.diag([1, -1, 1]), "swapped": np.eye(3)[[1, 0, 2]]}[name]
+    (problem,) = find_problems(Wrong(drive, points=lambda points, _: points @ axes))
+    assert "(left-handed)" in problem and f"data.read_as={name}" in problem
+
+
+def test_poses_that_are_only_steps_are_told_by_the_motion_of_the_sensor(drive):
+    steps = each(lambda pose: pose)
+    relative = Wrong(
+        drive, poses=lambda poses: np.concatenate([np.eye(4)[None], np.linalg.inv(steps(poses)[:-1]) @ poses[1:]])
+    )
+    assert any("the poses hardly move, but the sensor moves" in text for text in find_problems(relative))
 
 
 @pytest.mark.parametrize("source", ["drive", "real"])

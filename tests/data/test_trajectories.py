@@ -16,6 +16,8 @@ from cflow_torch.data.arrays.folder import find_array_logs
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.log import Log, window
+from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
+from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import as_matrix, rotations_about, to_quaternions
 from cflow_torch.types import CFlowWarning, Sweep
 
@@ -264,6 +266,32 @@ def test_poses_in_json_are_found_and_read_in_the_order_of_the_clouds(tmp_path, l
     with pytest.warns(CFlowWarning, match="its poses are those of transforms.json"):
         log: Any = ArraysLog(tmp_path)
     assert np.allclose(log.poses, POSES, atol=1e-9)
+
+
+def test_rows_of_poses_may_be_an_array(tmp_path) -> None:
+    clouds(tmp_path, range(12))
+    for table in (
+        POSES[:, :3].reshape(12, 12),
+        np.column_stack([POSES[:, :3, 3], QUATERNIONS])[:, [0, 1, 2, 4, 5, 6, 3]],
+    ):
+        np.save(tmp_path / "poses.npy", table)
+        assert np.allclose(ArraysLog(tmp_path).poses, POSES, atol=1e-12)
+
+
+def test_times_from_another_start_have_the_unit_of_their_steps(tmp_path) -> None:
+    clouds(tmp_path, range(12))
+    for unit, step in ((1, 0.1), (10**3, 100), (10**6, 100_000), (10**9, 100_000_000)):
+        np.savetxt(tmp_path / "times.txt", 0.1 * unit * np.arange(12), "%.7g" if unit == 1 else "%d")
+        assert ArraysLog(tmp_path).timestamps == [k * 100_000_000 for k in range(12)], step
+
+
+def test_rare_poses_are_joined_by_arcs_and_not_called_late() -> None:
+    drive = make_drive(seed=1, num_sweeps=21, profile="demo")  # turns by 18 degrees a second
+    kept = np.arange(2, 21, 3)
+    trajectory = Trajectory(drive.poses[kept], np.array(drive.timestamps)[kept], False, "x")
+    poses, is_covered, _ = fit_to_sweeps(trajectory, drive.timestamps)
+    assert np.abs(poses - drive.poses[is_covered]).max() < 1e-3, "chords are off by 2 cm"
+    assert trajectory.is_sparse(drive.timestamps) and not trajectory.is_sparse(drive.timestamps[::3])
 
 
 def test_json_without_poses_is_an_error_that_says_what_poses_are(tmp_path) -> None:

@@ -25,11 +25,10 @@ def nanoseconds_of_numbers(words: Sequence[str]) -> list[int]:
     numbers = [Decimal(word) for word in words]
     largest = max(map(abs, numbers))
     unit = next((unit for first, unit in _UNITS if largest >= first), None)
-    if unit is None and largest >= _FIRST_UNIX:
-        unit = 10**9
-    if unit is None:  # times from another start than 1970
+    if unit is None:  # times from another start than 1970, or unix seconds
         steps = sorted(after - before for before, after in zip(numbers, numbers[1:])) or [Decimal(0)]
         unit = next((unit for first, unit in _STEPS if steps[len(steps) // 2] >= first), 10**9)
+        unit = 10**9 if largest >= _FIRST_UNIX and unit == 10**6 else unit  # poses may be seconds apart
     return [int((number * unit).to_integral_value()) for number in numbers]
 
 
