@@ -29,6 +29,7 @@ from cflow_torch.windows.readings import (
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
+_DOUBTFUL = 0.2  # share in place, below which poses that hardly move are compared with the motion of the sensor
 _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle stands
 # A step between two poses is suspect if it differs from its neighbours' by this, as a length or as a part of theirs.
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
@@ -119,7 +120,8 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
         if WORLD in judgement.best:
             return judgement
     judgement = judge(pairs(scans, False))
-    if poses is not None and not judgement.best and _usual_speed(poses) < _LEAST_TIMED:
+    is_in_doubt = not judgement.best and judgement.given < _DOUBTFUL
+    if poses is not None and is_in_doubt and _usual_speed(poses) < _LEAST_TIMED:
         spread = choose_pairs(len(log.timestamps), None)
         clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
         unposed = judge(make_pair(pc0, pc1) for pc0, pc1 in clouds)
