@@ -104,7 +104,8 @@ def poses_from_quaternions(translation: Any, quaternion: Any, what: Callable[[in
     for row in np.flatnonzero(~(np.isfinite(shift).all(axis=1) & is_unit)):
         raise CFlowError(
             f"{what(int(row))} is not a rigid motion: quaternion (w, x, y, z) and translation must be finite, the "
-            f"quaternion of length 1, got {rotation[row].tolist()}, {shift[row].tolist()}; copy the file again"
+            f"quaternion of length 1, got {rotation[row].tolist()}, {shift[row].tolist()}; write more digits, or copy "
+            "the file again"
         )
     return as_matrix(to_rotations(rotation), shift)
 

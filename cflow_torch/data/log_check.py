@@ -14,7 +14,7 @@ from cflow_torch.errors import CFlowError, warn
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import MOUNTS, NO_READING, STILL, TURNED, UNKNOWN, WORLD, Judgement
+from cflow_torch.windows.readings import MOUNTS, NO_READING, SCALED, STILL, TURNED, UNKNOWN, WORLD, Judgement
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
@@ -122,6 +122,8 @@ def _fix(log: Log, judgement: Judgement, name: str) -> str:
     if name == TURNED:
         turn = np.degrees(judgement.turn)
         return f"data.ego_T_lidar with a rotation of about {turn:.0f} degrees about z (data=arrays, hdf5 or bags)"
+    if name == SCALED:
+        return f"positions multiplied by {judgement.scale:.3g}, unless the points have another unit (feet)"
     if name not in MOUNTS:
         return _setting(log, name)
     x, y = MOUNTS[name]

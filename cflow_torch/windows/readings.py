@@ -24,7 +24,7 @@ STILL, WORLD, INVERTED, LATE, EARLY, CAMERA = "still", "world", "inverted", "lat
 HALF_LATE, HALF_EARLY = "half_late", "half_early"
 SHIFTS = {LATE: 1, EARLY: -1, HALF_LATE: 1, HALF_EARLY: -1}
 """Readings of poses of another time, and the neighbour whose pose is right, or that from which the other half comes."""
-MOUNT, UNKNOWN, TURNED, NO_READING = "mount", "unknown", "turned", "none"
+MOUNT, UNKNOWN, TURNED, SCALED, NO_READING = "mount", "unknown", "turned", "scaled", "none"
 _FRAME = "the poses are of a frame whose"
 # What each reading says. The settings are values of `read_as` in `cflow_torch.data.catalog.open_log`.
 CAUSES = {
@@ -84,6 +84,7 @@ _SHIFT, _PEAK = 0.15, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 _EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 _OBLIQUE = np.radians(10)  # least angle between axes that are turned and those with a name
+_RESCALED = 1.1  # least factor between motions of another scale
 _HOPELESS = 0.04  # nothing fits if the share as given is below this
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
 # The search for an unknown motion correlates occupied cells of a square.
@@ -196,6 +197,7 @@ class Judgement:
     best: tuple[str, ...] = ()  # readings of the poses that fit clearly better than as given; equal ones together
     motion: np.ndarray | None = None  # of `UNKNOWN`: T_target_source of the first pair
     turn: float = 0.0  # of `TURNED`: azimuth of the points' x axis in the frame of the poses, radians
+    scale: float = 1.0  # of `SCALED`: length of the motion of the points over that of the poses
     scan: str = ""  # the scan under which this holds; "" = not compared
     shares_of_scans: Mapping[str, float] = field(default_factory=dict)
 
@@ -222,6 +224,8 @@ class Judgement:
             return (
                 f"the points' x axis points about {abs(np.degrees(self.turn)):.0f} degrees to the {side} of the poses'"
             )
+        if name == SCALED:
+            return f"the positions of the poses are {1 / self.scale:.3g} times as long as the motion of the points"
         if name not in MOUNTS:
             return CAUSES[name]
         x, y = MOUNTS[name]
@@ -304,12 +308,12 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     fast = [pair for pair in moving if len(pair.scans) > 1]
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
-    turn = 0.0
+    turn, scale = 0.0, 1.0
     if np.mean([each[GIVEN] for each in of_pairs]) < LEAST_SHARE and not any(WORLD in each for each in of_pairs):
-        turn, of_turns = _find_turn(moving)
-        of_pairs = [{**each, TURNED: share} for each, share in zip(of_pairs, of_turns)]
+        turn, scale, of_similar = _find_similarity(moving)
+        of_pairs = [{**each, **similar} for each, similar in zip(of_pairs, of_similar)]
     shares, clear = _compare(of_pairs)
-    judgement = Judgement(shares, turn=turn, scan=scan, shares_of_scans=shares_of_scans)
+    judgement = Judgement(shares, turn=turn, scale=scale, scan=scan, shares_of_scans=shares_of_scans)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return replace(judgement, best=(WORLD,))
     if clear or shares[GIVEN] >= _HOPELESS:
@@ -330,23 +334,33 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
     return tuple(name for name in best if name not in other_mountings)
 
 
-def _find_turn(pairs: Sequence[Pair]) -> tuple[float, list[float]]:
-    """Return the azimuth of the points' x axis in the frame of the poses, radians, and the share of each pair under it.
+def _find_similarity(pairs: Sequence[Pair]) -> tuple[float, float, list[dict[str, float]]]:
+    """Return how the motion under which the points fit best is turned, and its length, against that of the poses.
 
-    It is the angle between the motion of the poses and that under which the points fit best. The shares are 0 if it is
-    nearly a multiple of 90 degrees, because such readings have names.
+    Returns:
+        The azimuth of the points' x axis in the frame of the poses, radians; the length over that of the poses; and for
+        each pair the share under `TURNED`, unless it is nearly a multiple of 90 degrees, because such readings have
+        names, and under `SCALED`, unless it is near 1.
     """
-    turned = 0j
+    product, square = 0j, 0.0
     for pair in pairs:
         given = pair.transforms[GIVEN]
         source = pair.source.points(OFF)[:_MOST_POINTS] @ given[:3, :3].T  # a turn of the axes keeps rotations about z
         motion = find_motion(source, pair.target.points(OFF), turns=(0.0,))
-        turned += complex(*given[:2, 3]) * complex(*motion[:2, 3]).conjugate()
-    turn = float(np.angle(turned))
+        product += complex(*given[:2, 3]) * complex(*motion[:2, 3]).conjugate()
+        square += abs(complex(*given[:2, 3])) ** 2
+    turn, scale = float(np.angle(product)), float(abs(product) / max(square, 1e-9))
     Y = as_matrix(rotations_about(2, turn))
-    read = [replace(pair, transforms={GIVEN: Y.T @ pair.transforms[GIVEN] @ Y}) for pair in pairs]
-    is_oblique = abs((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4) > _OBLIQUE
-    return turn, [pair.share(OFF) if is_oblique else 0.0 for pair in read]
+    found = {}
+    if abs((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4) > _OBLIQUE:
+        found[TURNED] = lambda T: Y.T @ T @ Y
+    if scale > _RESCALED or 1e-9 < scale < 1 / _RESCALED:
+        found[SCALED] = _scaled(scale)
+    read = [
+        {name: replace(p, transforms={GIVEN: f(p.transforms[GIVEN])}).share(OFF) for name, f in found.items()}
+        for p in pairs
+    ]
+    return turn, scale, read
 
 
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:

@@ -18,9 +18,9 @@ import cflow_torch
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.catalog import GroundSegmentedLog, Logs, find_sources, open_log, recognise
 from cflow_torch.data.log import Log, window
-from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.simulator import Drive
 from cflow_torch.simulator.benchmark import benchmark_logs
+from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.types import CFlowError, CFlowWarning
 
 

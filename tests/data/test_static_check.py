@@ -188,6 +188,13 @@ def test_mirrored_clouds_are_named_and_no_pose_is_blamed(drive, name):
     assert "(left-handed)" in problem and f"data.read_as={name}" in problem
 
 
+@pytest.mark.parametrize("factor", [0.5, 3.28])
+def test_positions_of_another_scale_are_named_with_the_factor(drive, factor):
+    (problem,) = find_problems(Wrong(drive, poses=scaled(factor)))
+    found = re.search(r"positions multiplied by ([0-9.]+)", problem)
+    assert found and abs(float(found[1]) * factor - 1) < 0.04
+
+
 def test_poses_that_are_only_steps_are_told_by_the_motion_of_the_sensor(drive):
     steps = each(lambda pose: pose)
     relative = Wrong(

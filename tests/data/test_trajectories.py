@@ -268,6 +268,30 @@ def test_poses_in_json_are_found_and_read_in_the_order_of_the_clouds(tmp_path, l
     assert np.allclose(log.poses, POSES, atol=1e-9)
 
 
+@pytest.mark.parametrize("suffix", [".txt", ".json", ".npy"])
+def test_a_folder_may_have_a_file_per_pose(tmp_path, suffix) -> None:
+    clouds(tmp_path / "points", range(12))
+    (tmp_path / "pose").mkdir()
+    for k, pose in enumerate(POSES):
+        file = tmp_path / "pose" / f"{k}{suffix}"
+        if suffix == ".npy":
+            np.save(file, pose)
+        else:
+            text = json.dumps({"transform": pose.tolist()}) if suffix == ".json" else rows([pose.reshape(-1)])[0]
+            file.write_text(text)
+    assert np.allclose(ArraysLog(tmp_path).poses, POSES, atol=1e-12)
+
+
+def test_a_line_of_json_per_pose_and_decimal_commas(tmp_path) -> None:
+    clouds(tmp_path, range(12))
+    (tmp_path / "odometry.jsonl").write_text("\n".join(json.dumps({"pose": pose.tolist()}) for pose in POSES))
+    assert np.allclose(ArraysLog(tmp_path).poses, POSES, atol=1e-12)
+    numbers = rows([(*POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ";")
+    lines = ["x;y;z;roll;pitch;yaw", *(row.replace(".", ",") for row in numbers)]
+    (tmp_path / "poses.csv").write_text("\n".join(lines))
+    assert np.allclose(ArraysLog(tmp_path).poses, POSES, atol=1e-12)
+
+
 def test_rows_of_poses_may_be_an_array(tmp_path) -> None:
     clouds(tmp_path, range(12))
     for table in (

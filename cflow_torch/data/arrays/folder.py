@@ -9,7 +9,7 @@ from typing import Any, Callable, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import SUFFIXES
-from cflow_torch.data.arrays.poses_text import files_of_poses, parse_poses, parse_times
+from cflow_torch.data.arrays.poses_text import files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.folders import find_folders, natural_key, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_bytes, read_start
@@ -20,7 +20,7 @@ POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajecto
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_TABLES = (".txt", ".csv", ".tum", ".json")  # suffixes of files that we test for poses and times
+_TABLES = (".txt", ".csv", ".tum", ".json", ".jsonl")  # suffixes of files that we test for poses and times
 _TESTED = 8192  # bytes of a file that tell what it holds
 
 
@@ -139,16 +139,23 @@ def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
     times = [path for path in times if _start_of(path, parse_times) is not None]
     for path in folders:
         files = files_of_poses(path)
-        first = _start_of(files[0], parse_poses) if len(files) > 1 else None
-        poses += [path] if first is not None and len(first.poses) == 1 else []
+        poses += [path] if len(files) > 1 and _has_one_pose(files[0]) else []
     return poses, times
+
+
+def _has_one_pose(path: Path) -> bool:
+    try:
+        return len(read_start(path, _TESTED)) < _TESTED and len(read_poses(path).poses) == 1
+    except (CFlowError, OSError):
+        return False
 
 
 def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
     """Parse the first lines of a file; None = this is not possible."""
     try:
-        start = read_bytes(path) if path.suffix.lower() == ".json" else read_start(path, _TESTED)
-        if len(start) == _TESTED:  # whole lines, and whole matrices of four
+        is_json = path.suffix.lower() in (".json", ".jsonl")
+        start = read_bytes(path) if is_json else read_start(path, _TESTED)
+        if not is_json and len(start) == _TESTED:  # whole lines, and whole matrices of four
             lines = start.splitlines(keepends=True)[:-1]
             start = b"".join(lines[: len(lines) // 4 * 4])
         return parse(start, path)

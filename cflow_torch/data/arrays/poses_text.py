@@ -49,10 +49,12 @@ def read_poses(path: PathLike) -> Trajectory:
         files = files_of_poses(path)
         poses = [read_poses(file).poses for file in files]
         if not files or any(len(each) != 1 for each in poses):
-            raise CFlowError(f"{path} is a folder: its .txt files must have one pose each")
+            raise CFlowError(f"{path} is a folder: its files must have one pose each")
         return Trajectory(np.concatenate(poses), None, False, str(path), [file.stem for file in files])
     if path.suffix == ".npy":
         numbers = read_npy(path, "pass a .npy file of (K, 4, 4) numbers")
+        if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
+            numbers = numbers[None]
         if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
             return _poses_of_table(Table([], numbers.astype(str), []), path)
         return Trajectory(checked_poses(numbers, str(path)), None, False, str(path))
@@ -62,12 +64,14 @@ def read_poses(path: PathLike) -> Trajectory:
 
 
 def files_of_poses(folder: Path) -> list[Path]:
-    return sorted((path for path in folder.iterdir() if path.suffix == ".txt"), key=lambda path: natural_key(path.stem))
+    """Return the files of a folder that may have a pose each, in order."""
+    files = [path for path in folder.iterdir() if path.suffix.lower() in (".txt", ".json", ".npy")]
+    return sorted(files, key=lambda path: natural_key(path.stem))
 
 
 def parse_poses(content: bytes, path: Path) -> Trajectory:
     """Return the poses in the content of a text or JSON file."""
-    if path.suffix.lower() != ".json":
+    if path.suffix.lower() not in (".json", ".jsonl"):
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")
     for table in tables_of_json(content, path):

@@ -155,7 +155,9 @@ class ArraysLog(Log):
         kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
         file = resolve(self.folder, poses, POSE_FILES, "poses", kitti)
         if file is None and poses == "auto":
-            found = [path for path in find_tables(self.folder)[0] if path.suffix.lower() != ".json" or self._fits(path)]
+            found = [
+                path for path in find_tables(self.folder)[0] if ".json" not in path.suffix.lower() or self._fits(path)
+            ]
             file = only_one(found, self.folder, "poses")
             self._note(f"its poses are those of {file.name}" if file else "")
         if file is None:

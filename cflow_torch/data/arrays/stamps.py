@@ -59,6 +59,8 @@ def times_of_names(names: Sequence[str]) -> list[int] | None:
     without leading zeros.
     """
     times = None
+    if not names:
+        return None
     stamps = [_STAMP.search(name) for name in names]
     seconds = [[pattern.search(name) for name in names] for pattern in _SECONDS]
     if all(stamps):

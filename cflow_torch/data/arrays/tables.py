@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any, Iterator, NamedTuple, Sequence
 
@@ -68,12 +69,14 @@ def tables_of_json(content: bytes, path: Path) -> Iterator[Table]:
     Numbers of a row are named by their keys, joined by dots. A list, nested or not, of 12 or 16 numbers is a matrix, by
     rows, or by columns if these end in 0, 0, 0, 1. A list of three or four is a vector if the name of the list says so.
     """
+    parse = partial(json.loads, parse_float=Decimal, parse_int=Decimal)
     with file_errors(f"{path} as JSON"):
-        value = json.loads(content.decode("utf-8-sig"), parse_float=Decimal, parse_int=Decimal)
-    for labels, members in _series(value):
+        text = content.decode("utf-8-sig")
+        value = list(map(parse, text.splitlines())) if path.suffix.lower() == ".jsonl" else parse(text)
+    for labels, members in (*_series(value), ([], [value])):
         rows = [dict(_numbers_of(member, "")) for member in members]
         names = max(rows, key=len, default={}).keys()
-        if len(rows) > 1 and names and sum(row.keys() == names for row in rows) > len(rows) / 2:
+        if names and sum(row.keys() == names for row in rows) > len(rows) / 2:
             texts = labels or [_text_of(member) for member in members]
             words = [[row.get(name, "nan") for name in names] for row in rows]
             yield Table(list(names), np.array(words, str), texts if len({*texts, ""}) > len(texts) else [])
@@ -139,7 +142,8 @@ def _text_of(value: Any) -> str:
 
 
 def _split(line: str) -> list[str]:
-    return re.split(r"[\s,;]+", line.rstrip(",; "))
+    decimal = line.replace(",", ".") if ";" in line else line  # as some languages write numbers
+    return re.split(r"[\s,;]+", decimal.rstrip(",; "))
 
 
 def _is_row(words: Sequence[str]) -> bool:
