@@ -23,12 +23,10 @@ _ABANDONED = 3600.0  # seconds without a change after which we assume that no pr
 
 @contextmanager
 def atomic_file(path: PathLike) -> Iterator[Any]:
-    """Open a binary file for writing. It takes its name only when everything is written.
+    """Open a binary file for writing. It takes its name only when everything is written; an older one stays until then.
 
-    If the block raises, we remove the new file and keep an older one. Missing folders are created. Local files get a
-    temporary name in the same folder, `.NAME.<random>.tmp`, and are renamed at the end. Only a killed process leaves
-    the temporary file behind (`remove_stale` removes it). Remote files stay in memory until the end. An object store
-    receives them under their final name. On other file systems we write them under a temporary name and move them.
+    Missing folders are created. Local files have a temporary name in the same folder, `.NAME.<random>.tmp`, which a
+    killed process leaves behind. Remote files stay in memory until the end.
     """
     path = as_path(path)
     if is_remote(path):
@@ -104,8 +102,7 @@ def new_folder(root: PathLike, name: str) -> Iterator[Path]:
 def remove_stale(folder: PathLike) -> None:
     """Remove the temporary files and folders that killed processes have left in a folder, which may be remote.
 
-    We remove those that have not changed for an hour. A process may still be writing to newer ones. Subfolders are not
-    searched.
+    They have not changed for an hour, because a process may still be writing to newer ones.
     """
     folder = as_path(folder)
     forget_listings(folder)
@@ -126,10 +123,7 @@ def _is_abandoned(path: Path) -> bool:
 
 
 def ensure_writable(folder: PathLike) -> Path:
-    """Create a folder and write a trial file, so that long work does not fail at its end. Return the folder.
-
-    We also remove the temporary files of killed processes. A folder that cannot be written to is a `CFlowError`.
-    """
+    """Create a folder, see `remove_stale`, and write a trial file, so that long work does not fail at its end."""
     folder = as_path(folder)
     try:
         remove_stale(folder)

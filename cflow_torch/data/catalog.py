@@ -250,16 +250,18 @@ def open_log(
         CFlowError: the log cannot be read; its `log_id` cannot be the name of a folder; the reader does not know a
             setting (the message lists the known ones), or cannot use its value.
     """
-    if find_ground not in CHOICES:
-        raise CFlowError(f"find_ground={find_ground!r}: choose null or one of {', '.join(filter(None, CHOICES))}")
     if isinstance(deskew, bool):
         deskew = "auto" if deskew else "off"
     if read_as in ("times", *SCANS) and deskew == "auto":  # how sweeps are scanned is a reading of the log, too
         deskew, read_as = read_as, "auto"
-    if deskew not in DESKEW_CHOICES:
-        raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
-    if own_vehicle not in ("auto", None):
-        raise CFlowError(f"own_vehicle={own_vehicle!r}: give auto, or null to keep returns of the own vehicle")
+    given = {
+        "find_ground": (find_ground, CHOICES),
+        "deskew": (deskew, DESKEW_CHOICES),
+        "own_vehicle": (own_vehicle, ("auto", None)),
+    }
+    for setting, (value, choices) in given.items():
+        if value not in choices:
+            raise CFlowError(f"{setting}={value!r}: choose one of {', '.join(str(each or 'null') for each in choices)}")
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
     if isinstance(source, UserSource):
@@ -339,10 +341,7 @@ def open(path: Any, data: str = AUTO, **settings: Any) -> Log | Logs:
 
     Returns:
         The log if there is one, else a sequence of logs, each of which is opened when you ask for it. Both have
-        `windows(num_history=..., num_future=...)`.
-
-    Raises:
-        CFlowError: no format fits, or several do; there is no log; an error of `open_log`.
+        `windows(num_history=..., num_future=...)`. Errors as in `recognise` and `open_log`.
 
     Examples:
         >>> for window in cflow_torch.open("/data/my_drive").windows(num_history=4):

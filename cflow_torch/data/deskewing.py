@@ -107,10 +107,7 @@ class DeskewedLog(LogWrapper):
         return f"{moved}{measured}. {same}, data.deskew=off leaves the points as they are"
 
     def sweep(self, index: int) -> Sweep:
-        return self.read(index, self.scan)
-
-    def read(self, index: int, reading: str) -> Sweep:
-        """Read a sweep under any reading, one of `CHOICES` but "auto"."""
+        reading = self.scan
         sweep = self._recent.sweep(index)
         if reading == "off" or sweep.pose is None:
             return sweep

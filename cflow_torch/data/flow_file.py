@@ -31,8 +31,8 @@ def write_flow(
     Args:
         path: file name, by convention `<log id>/<time stamp of sweep t>.feather`.
         result: flow of one window.
-        contents: names in `CONTENTS` and `ON_REQUEST`, and `POINTS`. A file without pose flow and total flow is about
-            17 times smaller. You can compute both from the residual flow and the poses.
+        contents: names in `CONTENTS` and `ON_REQUEST`, and `POINTS`. Without pose flow and total flow, which follow
+            from the residual flow and the poses, a file is about 17 times smaller.
         points: (N, 3+) of sweep t, metres, needed only for the content "points".
 
     Convention:

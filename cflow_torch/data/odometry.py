@@ -30,8 +30,8 @@ def poses_from_odometry(log: Log) -> np.ndarray:
     Poses of the sweeps are ignored. Ground points are used, because they constrain height and tilt.
 
     Convention: KISS-ICP runs with its default settings, but without de-skewing, and on one thread, so that the poses do
-        not depend on the number of threads. KISS-ICP needs a few sweeps to adapt to the speed. So we take the first
-        five steps from a second run, which goes backwards from the eleventh sweep.
+        not depend on their number. The first five steps are those of a second run, backwards from the eleventh sweep,
+        because KISS-ICP needs a few sweeps to adapt to the speed.
 
     Cost: one registration per sweep and eleven more, 0.13 s each for 120,000 points; reads as many sweeps.
 

@@ -134,8 +134,7 @@ def source_for_random_access(path: Path) -> Any:
 def source_for_mmap(path: Path) -> Any:
     """Return a large file for pyarrow to read repeatedly: its name, or a local copy if it is remote.
 
-    We keep the last four copies as unnamed files in the folder for temporary files (TMPDIR). They vanish with the
-    process, even if it is killed.
+    The last four copies are unnamed files in TMPDIR, which vanish with the process, even if it is killed.
     """
     return pa.BufferReader(_copy(path)) if is_remote(path) else check_file(path)
 

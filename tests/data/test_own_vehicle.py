@@ -114,5 +114,5 @@ def test_the_setting_keeps_them(hood, tmp_path):
         log = open_log("arrays", tmp_path / "ride")
     assert num_left_out(log)[4] == 40
     assert sum(num_left_out(open_log("arrays", tmp_path / "ride", own_vehicle=None))) == 0
-    with pytest.raises(CFlowError, match="own_vehicle='keep': give auto, or null"):
+    with pytest.raises(CFlowError, match="own_vehicle='keep': choose one of auto, null"):
         open_log("arrays", tmp_path / "ride", own_vehicle="keep")

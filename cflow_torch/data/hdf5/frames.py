@@ -37,11 +37,9 @@ def recognized_extrinsics(timestamp: int, points: np.ndarray, is_ground: np.ndar
     """Recognise ego_T_lidar, (4, 4) float64, which maps the points of a scene to the frame of its stored poses.
 
     The arguments describe one sweep: its time stamp, its points as stored, (N, 3+) float in metres, and its ground
-    mask, (N,) bool, None = unknown. We recognise sweeps of Argoverse 2 by the time stamp. If their ground is more than
-    1.2 m below the origin, their points are in the frame of up_lidar, and their poses are of the ego frame. We then
-    return the extrinsics of one log of Argoverse 2, because the scene lacks its own, which are in the log's
-    `calibration/egovehicle_SE3_sensor.feather`. For all other sweeps we return the identity (nuScenes and ZOD have
-    poses of the sensor, Waymo and TruckScenes have points in the ego frame).
+    mask, (N,) bool, None = unknown. If ground of Argoverse 2 is more than 1.2 m below the origin, points are in the
+    frame of up_lidar, and poses of the ego frame: we return the extrinsics of one log, because the scene lacks its own.
+    All other sweeps have the identity (nuScenes and ZOD: poses of the sensor; Waymo, TruckScenes: points of the ego).
     """
     if not is_argoverse2(timestamp) or is_ground is None:
         return np.eye(4)

@@ -117,13 +117,8 @@ def write_hdf5_results(file: str | Path, name: str, results: Iterable[tuple[int,
 
     Convention:
         The flow is float32, compressed as the points of the sweep are. NaN rows are kept (viewers show them white).
-        All results go into a copy next to the scene, and the copy replaces the scene at the end. A reader that has the
-        old scene open continues with it. Only one process may write into a scene at a time.
-
-    Raises:
-        CFlowError: the name, the scene or a result cannot be used. The scene is then unchanged.
-
-    Cost: one copy of the scene, in time and, until the end, in space.
+        All results go into a copy next to the scene, which replaces it at the end, unless there is an error. Only one
+        process may write into a scene at a time.
     """
     check_result_name(name)
     return _write(file, ((timestamp, {name: as_numpy(flow)}) for timestamp, flow in results), _store_flow)

@@ -121,9 +121,9 @@ class KITTILog(ArraysLog):
         return FlowLabels(labels.flow, labels.category, labels.is_valid & self._is_annotated(points, pair[0]))
 
     def _is_annotated(self, points: np.ndarray, boxes: FrameBoxes) -> np.ndarray:
-        projection = self._projection()
-        if projection is not None:
-            return in_image(points, projection, boxes.ignored)
+        camera = self._camera()
+        if camera is not None:
+            return in_image(points, camera[1] @ camera[0], boxes.ignored)
         return np.abs(np.arctan2(points[:, 1], points[:, 0])) < _UNKNOWN_VIEW  # type: ignore[no-any-return]
 
     def _classes(self, index: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -231,10 +231,6 @@ class KITTILog(ArraysLog):
             )
         T_camera_lidar = transform(values, root, "velo_to_cam.R velo_to_cam.T", *CAMERA_KEYS)
         return rotation @ T_camera_lidar, projection.reshape(3, 4)
-
-    def _projection(self) -> np.ndarray | None:
-        camera = self._camera()
-        return None if camera is None else camera[1] @ camera[0]
 
     @cached_property
     def _boxes(self) -> dict[int, FrameBoxes]:

@@ -13,7 +13,7 @@ from cflow_torch.data.camera import Camera, at_image
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.nuscenes.tables import Chain, SceneSource, Tables, Tracks, find_scenes
-from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes, remote_errors
+from cflow_torch.data.paths import PathLike, as_path, exist, path_inside, read_bytes
 from cflow_torch.transforms import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
@@ -148,8 +148,7 @@ class NuScenesLog(Log):
         for is_key_frame in (True, False):
             rows = kept[chain.is_key_frame[kept] == is_key_frame]
             chosen = rows[[0, len(rows) // 2, -1]] if len(rows) else rows
-            with remote_errors(self._root):
-                kinds.append(any(self._has_file(chain.files[row]) for row in chosen))
+            kinds.append(any(self._has_file(chain.files[row]) for row in chosen))
         if kinds == [True, False] and not chain.is_key_frame[kept].all():
             raise CFlowError(
                 f"scene {self.log_id}: only its key frames are in {self._root}. Pass sweep_step={step} (in commands "
@@ -163,7 +162,7 @@ class NuScenesLog(Log):
     def _has_file(self, name: str) -> bool:
         """Test whether a file exists. For a name that may not be read, `sweep` raises the error."""
         try:
-            return path_inside(self._root, name, self.log_id).exists()
+            return exist(path_inside(self._root, name, self.log_id))
         except CFlowError:
             return True
 

@@ -95,7 +95,10 @@ class WaymoLog(BoxLog):
         self._check_count(self.file)
         self._lasers = self._choose(lasers)
         self._calibration = self._read_calibration()
-        self._poses = self._read_poses(times)
+        component = Component(self.file, "vehicle_pose")
+        poses = component.rows_by(TIME, times, (VEHICLE_POSE,))
+        where = f"{component.file}: the pose of frame"
+        self._poses = np.stack([matrix_of(values, f"{where} {time}") for time, (values,) in poses.items()])
         self._frame = lru_cache(_KEPT_FRAMES)(self._read_frame)
 
     def _choose(self, lasers: Sequence[str]) -> list[int]:
@@ -108,13 +111,6 @@ class WaymoLog(BoxLog):
         if TOP in chosen and not self._pixel_poses.row_of:
             raise CFlowError(f"{self._pixel_poses.file} is empty; copy it again")
         return chosen
-
-    def _read_poses(self, times: Sequence[int]) -> np.ndarray:
-        """Read the poses of frames, (K, 4, 4) float64."""
-        component = Component(self.file, "vehicle_pose")
-        rows = component.rows_by(TIME, times, (VEHICLE_POSE,))
-        poses = [matrix_of(values, f"{component.file}: the pose of frame {time}") for time, (values,) in rows.items()]
-        return np.stack(poses)
 
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
