@@ -105,7 +105,7 @@ def recognise(root: Any) -> str:
 
 def matching_paths(path: Any) -> list[Any]:
     """Return the paths that are given, one or several, with patterns replaced by what they match."""
-    paths = [path] if is_path_like(path) else list(path)
+    paths = list(path) if isinstance(path, (list, tuple)) else [path]
     found = [
         sorted(glob(str(each))) if set(str(each)) & set("*?[") and not exist(as_path(each)) else [each]
         for each in paths
