@@ -16,7 +16,7 @@ import pyarrow
 import torch
 
 from cflow_torch.data.atomic import remove_stale
-from cflow_torch.data.catalog import open_log
+from cflow_torch.data.catalog import open_log, source_name
 from cflow_torch.data.flow_file import POINTS, write_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
@@ -237,8 +237,3 @@ def _stage(frame: _Frame, name: str) -> Iterator[None]:
 def open_quickly(job: Job, source: Any) -> Log:
     """Open a log for its name and times, without what takes long."""
     return open_log(job.reader, source, **{**job.settings, "check": False, "odometry": False, "read_as": None})
-
-
-def source_name(source: Any) -> str:
-    """Return the name of a log that is not open."""
-    return str(getattr(source, "scene", None) or getattr(source, "stem", None) or source)
