@@ -66,26 +66,26 @@ class Worker:
         """Begin a part, if one is given, and return the next event of the part; None after the last one."""
         self._is_stopped = is_stopped
         if part is not None:
-            self._events = self.run(part, lambda: self._is_stopped)
+            self._events = self.run(part)
         return next(self._events, None)
 
-    def run(self, part: Part, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
+    def run(self, part: Part) -> Iterator[Event]:
         """Do the frames of a part that are not complete. `BrokenExecutor` if the GPU can no longer be used.
 
-        We call `stop` before each frame and batch. Once it returns True, we write computed frames and begin no others.
+        After a stop, we write computed frames and begin no others.
 
         Yields:
             `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something other than a
             frame fails, `Failed` has no time stamp.
         """
         try:
-            yield from self._run(part, stop)
+            yield from self._run(part)
         except BrokenExecutor:
             raise
         except Exception as error:
             yield Failed(part.number, source_name(part.source), describe_error(error))
 
-    def _run(self, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
+    def _run(self, part: Part) -> Iterator[Event]:
         log = self._open(part.source)
         folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
         stamps = {i: int(log.timestamps[i]) for i in part.frames(len(log.timestamps) - 1) if i not in log.gaps}
@@ -102,7 +102,7 @@ class Worker:
                 for text in find_problems(log):
                     yield Noted(part.number, log.log_id, text)
         claim = lru_cache(partial(claim_log, folder, manifest))  # once, before the first frame
-        for frame in self._pass(log, partial(self._write, folder, claim), todo, stop):
+        for frame in self._pass(log, partial(self._write, folder, claim), todo):
             name = f"{log.log_id}/{frame.timestamp}"
             if checks and frame.is_repetition:
                 yield Noted(part.number, name, "the next sweep has the same points")
@@ -127,14 +127,12 @@ class Worker:
             self._source, self._log = source, CachedLog(log, self._job.config.num_sweeps)
         return self._log  # type: ignore[no-any-return]
 
-    def _pass(
-        self, log: Log, write: Callable[[_Frame], _Frame], todo: Iterable[int], stop: Callable[[], bool]
-    ) -> Iterator[_Frame]:
+    def _pass(self, log: Log, write: Callable[[_Frame], _Frame], todo: Iterable[int]) -> Iterator[_Frame]:
         """Pass frames through the reading thread, this thread and the writing thread."""
         size, ahead = self._job.batch, self._ahead * self._job.batch
-        begun = takewhile(lambda _: not stop(), todo)
+        begun = takewhile(lambda _: not self._is_stopped, todo)
         frames = (future.result() for future in run_ahead(self._reader, partial(self._read, log), begun, ahead))
-        batches = takewhile(lambda _: not stop(), iter(lambda: list(islice(frames, size)), []))
+        batches = takewhile(lambda _: not self._is_stopped, iter(lambda: list(islice(frames, size)), []))
         computed = (frame for batch in batches for frame in self._compute(batch))
         for future in run_ahead(self._writer, write, computed, ahead):
             yield future.result()
