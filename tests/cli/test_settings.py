@@ -157,7 +157,7 @@ def test_the_page_lists_every_setting(cflow, capsys):
     for file in FOLDER.glob("data/[a-z]*.yaml"):
         section = sections[f"data={file.stem}"].splitlines()
         assert set(file.read_text().splitlines()) - {"defaults:", "  - _log", ""} <= set(section)
-        assert "data=_log" not in sections and section.count("step: 1  # cflow eval: score every n-th pair") < 2
+        assert "data=_log" not in sections and section.count("step: 1  # cflow eval and view: every n-th pair") < 2
     assert "\nfind_ground: auto  # ground" in sections["data=av2"]
 
 
