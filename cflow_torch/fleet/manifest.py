@@ -67,7 +67,7 @@ def check_logs(
 
     `resume` continues an earlier run of the same identity. `overwrite` replaces the results of other runs. It is
     allowed only if you are `alone`, that is, if no other shard works on these logs. A worker checks a log again when it
-    has opened it (`check_log`); in an object store, which takes a while for each log, we leave it to the workers.
+    has opened it (`checked_manifest`). An object store takes a while for each log, so there we leave it to the workers.
     """
     forget_listings(output)
     if (overwrite and alone) or (resume and is_remote(output)):
@@ -82,7 +82,7 @@ def check_logs(
             raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
 
 
-def check_log(folder: Path, log: Log, identity: Mapping[str, Any]) -> dict[str, Any]:
+def checked_manifest(folder: Path, log: Log, identity: Mapping[str, Any]) -> dict[str, Any]:
     """Make sure that the frames in a log's folder were computed from this log, and return its manifest.
 
     A log that has changed since, or another log of its name, is a `CFlowError`. Cost: reads three sweeps.
@@ -95,7 +95,7 @@ def check_log(folder: Path, log: Log, identity: Mapping[str, Any]) -> dict[str, 
 
 
 def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest of `check_log`, unless there is one. Call this before the first frame is written."""
+    """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written."""
     before = _read(folder / MANIFEST)
     if before is None or (before.get("run") != manifest["run"] and not complete_frames(folder)):
         write_json(folder / MANIFEST, manifest)

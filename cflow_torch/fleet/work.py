@@ -24,7 +24,7 @@ from cflow_torch.data.paths import as_path, safe_name
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.executors import describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
-from cflow_torch.fleet.manifest import check_log, claim_log, complete_frames, frame_file
+from cflow_torch.fleet.manifest import checked_manifest, claim_log, complete_frames, frame_file
 from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -93,7 +93,7 @@ class Worker:
             stamps = {i: stamp for i, stamp in stamps.items() if stamp == part.only}
         complete = set() if self._job.redo else complete_frames(folder)
         todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
-        manifest: Any = check_log(folder, log, self._job.identity) if todo or complete else None
+        manifest: Any = checked_manifest(folder, log, self._job.identity) if todo or complete else None
         remove_stale(folder)
         yield Opened(part.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
         checks = bool(self._job.settings.get("check", True))
