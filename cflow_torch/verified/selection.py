@@ -1,0 +1,168 @@
+"""Select objects among the nodes of the component tree: which motion does each pixel take?
+
+A component wins if its motion has more evidence than its children together. But it may hold two objects, and the motion
+of the larger one wins. Where the smaller one is, hardly anything is found, neither in place nor at the targets of that
+motion, so the evidence does not fall. Therefore a node inside a winner *dissents* if its own motion, or "static", beats
+the motion of the winner in its own pixels:
+
+    winner     [   A     A  c  p ]     a car A, a cyclist c behind it and a parked car p: all move as A
+    dissent              [c][p]        c moves by itself, p is static
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.verified.component_tree import PER_SLICE, Components, NodeKind, Objects, Tree
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.paired_test import NEAR_Z, Counts, Verdict, count_wins
+
+# The price of an object on each level. Children move separately only if that gains more evidence.
+PRICE = 4 * PER_SLICE
+_DISSENT_Z = 2.0  # factor of z for nodes that dissent
+_LEAST_DIFFERENCE = 1.0  # finest pixels per sweep interval, between the motions of a winner and of a node that dissents
+
+
+def select_objects(
+    sweeps: HeightSlicedSweeps,
+    components: Components,
+    tree: Tree,
+    verdict: Verdict,
+    significance: float,
+    price: int = PRICE,
+) -> Objects:
+    """Select objects from the leaves up, then let nodes inside the winners dissent.
+
+    Args:
+        components, tree: `tree` includes nodes under overhangs, `components` does not.
+        verdict: the best motion of each node, and its evidence; 0 = none is significant.
+        significance: z of the paired test. For a node against the winner around it, z is twice as large.
+        price: of an object, in units of `PER_SLICE`.
+
+    Returns:
+        The objects. A pixel belongs to the node whose motion the finest of its nodes takes, but to its node of a fast
+        object if that has more evidence. If there is none, it belongs to its node of changed pixels if that node has
+        evidence. Otherwise it is static and belongs to its finest component, or to no object if that component is not
+        linked. The pixel of a copy belongs to its node if that node has evidence, else to no object.
+
+    Convention:
+        The value of a child is its own evidence or the sum of its children's values, whichever is more, minus `price`,
+        but at least 0. So objects pay the price once for each level above them. The coarsest node with more evidence
+        than its children wins. Ties: the children win.
+        A node inside a winner dissents if its motion differs from that of the winner, and from the one it would take
+        from its parent, by a pixel per sweep interval in y or in x, and gains more than `price`.
+
+    Cost: a few passes over the nodes for each level, and over the members; the paired test of nodes that may dissent.
+    """
+    none = tree.count
+    node = torch.arange(none, device=verdict.evidence.device)
+    winner = _winners(tree, node, verdict.evidence, price)
+    winner = _with_dissent(sweeps, tree, verdict, winner, significance, price)  # [N]
+    pixels = Groups(tree.pixel, sweeps.num_pixels)  # the members, grouped by pixel
+    # Nodes are listed by level, so the finest one of a pixel has the largest number.
+    of_level = torch.where(tree.kind < tree.num_levels, node, -1)
+    finest = pixels.max(tree.members.spread(of_level, none=-1), empty=-1)  # [P]
+    moving = Groups(finest.where(finest >= 0, none), none).spread(winner, none=none)
+    is_fast = tree.kind == NodeKind.UNLINKED
+    is_other = (tree.kind >= tree.num_levels) & ~is_fast
+    by_kind = torch.where(torch.stack((is_fast, is_other)), winner, none)  # [2, N]
+    fast, other = (pixels.min(tree.members.spread(of_node, none=none), empty=none) for of_node in by_kind)  # [P] each
+    moving = torch.where(moving < none, moving, other)
+    evidence_of = F.pad(verdict.evidence, (0, 1))  # of none, 0
+    is_faster = evidence_of.index_select(0, fast) > evidence_of.index_select(0, moving)
+    moving = torch.where(is_faster, fast, moving)
+
+    # A static pixel belongs to its plain component. If that is a node, its key is the number of the node, else N plus
+    # the number of the component.
+    plain_node = torch.where(tree.kind == tree.num_levels - 1, node, none)
+    static = pixels.min(tree.members.spread(plain_node, none=none), empty=none)  # [P]
+    plain = components.of_level(-1)
+    linked = plain.where(plain.spread(components.is_linked))
+    num_keys = none + plain.count
+    num_copies = len(static) - len(plain.of_item)
+    component = F.pad(none + linked.of_item, (0, num_copies), value=num_keys)  # [P]; copies have none
+    key = torch.where(moving < none, moving, torch.where(static < none, static, component))
+    return number_objects(Groups(key, num_keys), tree.count)
+
+
+def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
+    """Return the coarsest winner among each node and those that contain it, (N,) int64; N = none of them won.
+
+    `node` is the number of each node, 0 ... N - 1.
+    """
+    # From the leaves up: the value of the children of each node.
+    of_children = torch.zeros_like(evidence)
+    for level in range(tree.num_levels - 1, 0, -1):
+        value = (torch.maximum(evidence, of_children) - price).clamp(min=0)
+        of_children += tree.children.sum(torch.where(tree.kind == level, value, 0))
+
+    # From the roots down: a node follows the coarsest winner that contains it, which has the smallest number.
+    winner = torch.where(evidence > of_children, node, tree.count)
+    for _ in range(tree.num_levels - 1):
+        winner = torch.minimum(winner, tree.children.spread(winner, none=tree.count))
+    return winner
+
+
+def _with_dissent(
+    sweeps: HeightSlicedSweeps, tree: Tree, verdict: Verdict, winner: Tensor, significance: float, price: int
+) -> Tensor:
+    """Return the node whose motion each node takes, (N,) int64; N = it is static.
+
+    `winner` is (N,), the result of `_winners`.
+    """
+    none = tree.count
+    node = torch.arange(none, device=winner.device)
+    motion = verdict.motion
+    of_winner = Groups(winner, none)
+    motion_around = of_winner.spread(motion)  # [N, 2]
+    is_inside = (tree.kind < tree.num_levels) & of_winner.is_member & (winner != node)
+    inside = flat_nonzero(is_inside & _differ(motion, motion_around))
+    if len(inside) == 0:
+        return winner
+    dissents = torch.zeros_like(is_inside)
+    dissents[inside] = _gain(sweeps, tree, inside, motion, motion_around, significance) > price
+    own = torch.where(motion.any(1), node, none)
+    for level in range(1, tree.num_levels):
+        of_parent = tree.children.spread(winner, none=none)
+        takes_own = dissents & _differ(motion, Groups(of_parent, none).spread(motion))
+        taken = torch.where(takes_own, own, of_parent)
+        winner = torch.where(is_inside & (tree.kind == level), taken, winner)
+    return winner
+
+
+def _differ(motion: Tensor, other: Tensor) -> Tensor:
+    """Tell which motions differ by a pixel in y or in x, (N,) bool, from (N, 2) each, pixels per sweep interval."""
+    return ((motion - other).abs() >= _LEAST_DIFFERENCE).any(1)
+
+
+def _gain(
+    sweeps: HeightSlicedSweeps, tree: Tree, node: Tensor, motion: Tensor, other: Tensor, significance: float
+) -> Tensor:
+    """Return the evidence of motions against others in the pixels of K nodes, (K,) int64, units of `PER_SLICE`.
+
+    The motions are (N, 2) each, of all nodes. What one motion wins against "static", the other one loses against it.
+    """
+    groups = tree.members.select(node)
+    member = flat_nonzero(groups.is_member)
+    pixels = sweeps.pixels[tree.pixel.index_select(0, member)]
+    motions = torch.stack((motion.index_select(0, node), other.index_select(0, node)), 1)  # [K, 2, 2]
+    wins = count_wins(sweeps, pixels, groups[member], motions)
+    exact, near = (Counts(n.won[:, 0] + n.lost[:, 1], n.lost[:, 0] + n.won[:, 1]) for n in (wins.exact, wins.near))
+    z = _DISSENT_Z * significance
+    return exact.evidence(z) + near.evidence(NEAR_Z * z)
+
+
+def number_objects(by_key: Groups, num_nodes: int = 0) -> Objects:
+    """Number the objects in order of their first pixel.
+
+    `by_key` groups the P pixels. The first `num_nodes` groups are objects that are nodes, the others are components.
+    """
+    first = by_key.first()
+    used = flat_nonzero(first < len(by_key.of_item))
+    first, order = first[used].sort()
+    used = used[order]
+    return Objects(by_key.select(used), Groups(used.clamp(max=num_nodes), num_nodes), first)
