@@ -107,11 +107,9 @@ class Columns:
         slices of    the 3 x 3 pixels around | the pixel itself
     """
 
-    height: int  # H, rows of an image without its border
-    width: int  # W
+    grid: Grid  # H rows and W columns, without the border
     image: Tensor  # (2 B * area,) int32, column at each position; 0 = none
     position: Tensor  # (C + 1,) int64, flat index into `image` of each column; column 0 is the empty one
-    place: Tensor  # (C + 1, 6) int32 or int64, as in `Pixels`, of sweep t+1
     slices: Tensor  # (C + 1, T) uint8
     rank: Tensor  # (S, C + 1) int32, position of each pixel in the list of pixels; `_EMPTY` = the pixel is empty
     reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
@@ -128,38 +126,26 @@ class Columns:
         device = is_occupied.device
         square = _square(1, stride, device)
         is_column = mark(is_occupied, (flat_nonzero(is_occupied) + square).view(-1))
-        images = is_column.view(-1, grid.height + 2 * REACH, stride)
-        _clear_border(images)
+        position = _inside(is_column, grid)  # [C]
         for reach in range(2, spacing.most + 1):
-            position = flat_nonzero(is_column)
             # A neighbour of a pixel may be wide although the pixel itself is nearer.
             near = flat_nonzero(spacing.are_wide(grid, *_split(grid, position), reach, margin=2.0))
             around = (position.index_select(0, near) + square).view(-1)
             wide = flat_nonzero(spacing.are_wide(grid, *_split(grid, around), reach))
-            mark(is_column, around.index_select(0, wide))
-            _clear_border(images)
-        position = flat_nonzero(is_column)  # [C]
-        image = lazy_zeros(2 * len(is_column), torch.int32, device)
+            position = _inside(mark(is_column, around.index_select(0, wide)), grid)
         # Column 0 is said to be at a position of the border that has only border around it.
         position = torch.cat((constant((stride + 1,), torch.int64, device), position))
-        window, row_col = _split(grid, position)
+        reach_of, tall = _reach_and_tall(grid, position, spacing)
         num_slots = _WORD * -(-num_steps // _WORD)
-        slot = torch.arange(len(position), device=device) * num_slots
-        start = window * (grid.height + 2 * REACH) * stride + REACH * (stride + 1)
-        place = torch.stack((slot, start, window, torch.zeros_like(slot), *row_col), 1)
-        # With copies, there are at most twice as many columns.
-        dtype = index_dtype(2 * max(len(is_column), len(position) * num_slots), device)
         columns = cls(
-            height=grid.height,
-            width=grid.width,
-            image=image,
+            grid=grid,
+            image=lazy_zeros(2 * len(is_column), torch.int32, device),
             position=position,
-            place=place.to(dtype),
             slices=torch.zeros((len(position), num_slots), dtype=torch.uint8, device=device),
             rank=torch.full((num_steps, len(position)), _EMPTY, dtype=torch.int32, device=device),
-            reach=spacing.reach(grid, window, row_col) if spacing.most > 1 else None,
+            reach=reach_of,
             most_reach=spacing.most,
-            tall=flat_nonzero(spacing.are_tall(grid, window, row_col, SLICE_HEIGHT)) if spacing.has_tall else None,
+            tall=tall,
         )
         columns._number(1)
         return columns
@@ -182,14 +168,9 @@ class Columns:
         is_near[0] = True  # the empty column stays the first one
         own = flat_nonzero(is_near)
         half = len(self.image) // 2
-        place = self.place.index_select(0, own)
-        place[:, 0] = (torch.arange(len(own), device=own.device) + (len(self.position) - 1)) * self.num_slots
-        place[:, 1] += half
-        place[:, 2] += half // ((self.height + 2 * REACH) * self.stride)
         copies = replace(
             self,
             position=self.position.index_select(0, own) + half,
-            place=place,
             slices=torch.zeros_like(self.slices[: len(own)]),
             rank=torch.full_like(self.rank[:, : len(own)], _EMPTY),
             reach=None if self.reach is None else self.reach.index_select(0, own),
@@ -207,7 +188,6 @@ class Columns:
         return replace(
             self,
             position=torch.cat((self.position, copies.position[1:])),
-            place=torch.cat((self.place, copies.place[1:])),
             slices=torch.cat((self.slices, copies.slices[1:])),
             rank=torch.cat((self.rank, copies.rank[:, 1:]), 1),
             reach=None if self.reach is None or copies.reach is None else torch.cat((self.reach, copies.reach[1:])),
@@ -217,7 +197,7 @@ class Columns:
     @property
     def stride(self) -> int:
         """Positions from a row of an image to the next one."""
-        return self.width + 2 * REACH
+        return self.grid.width + 2 * REACH
 
     @property
     def num_slots(self) -> int:
@@ -245,8 +225,8 @@ class Columns:
         """Return the column at the positions that are `shift` away, (K, C) int32."""
         # These lines take 3 % of a window, so they are in place, and in 32 bits unless there are too many positions.
         _, start, _, _, row, col = pixels.place[..., None].unbind(1)  # [K, 1] each
-        index = (row + shift[..., 0]).clamp_(-1, self.height).mul_(self.stride)  # [K, C]
-        index += (col + shift[..., 1]).clamp_(-1, self.width)
+        index = (row + shift[..., 0]).clamp_(-1, self.grid.height).mul_(self.stride)  # [K, C]
+        index += (col + shift[..., 1]).clamp_(-1, self.grid.width)
         index += start
         return self.image.index_select(0, index.view(-1)).view_as(index)
 
@@ -346,26 +326,40 @@ class Columns:
         beside = self.position + steps
         return self.image.index_select(0, beside.view(-1)).view_as(beside)
 
-    def draw(self, slices: Tensor, pixels_before: int = 0) -> Pixels:
+    def draw(self, slices: Tensor, columns_before: int = 0, pixels_before: int = 0) -> Pixels:
         """Draw the height slices of sweeps, and list their pixels, in order of window, step and position.
 
         Args:
             slices: (C + 1, S) uint8, slices of the pixels themselves; row 0 is 0.
+            columns_before: number of columns that these will follow.
             pixels_before: number of pixels that are in the list already.
         """
         words = self.as_words(slices)
         self.slices.view(torch.int64).copy_(words | self._or_within_reach(words) << NUM_SLICES)
         drawn = slices.t().contiguous()  # [S, C + 1]
         step, column = nonzero_pairs(drawn.bool())
-        if len(self.image) > 2 * (self.height + 2 * REACH) * self.stride:
-            window = self.place[:, 2].index_select(0, column)
+        if len(self.image) > 2 * self._area:
+            window = floor_divide(self.position.index_select(0, column), self._area)
             step, column = gather(window.sort(stable=True).indices, step, column)
         entry = step * len(self.position) + column
         number = torch.arange(pixels_before, pixels_before + len(entry), dtype=torch.int32, device=entry.device)
         self.rank.view(-1).index_copy_(0, entry, number)
-        place = self.place.index_select(0, column)
-        place[:, 3] = step
-        return Pixels(place, drawn.view(-1).index_select(0, entry))
+        first_slot = (column + columns_before) * self.num_slots
+        window, row_col = _split(self.grid, self.position.index_select(0, column))
+        start = window * self._area + REACH * (self.stride + 1)
+        place = torch.stack((first_slot, start, window, step, *row_col), 1)
+        # With copies, there are at most twice as many columns.
+        dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
+        return Pixels(place.to(dtype), drawn.view(-1).index_select(0, entry))
+
+    def window_row_col(self) -> tuple[Tensor, Tensor]:
+        """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
+        return _split(self.grid, self.position)
+
+    @property
+    def _area(self) -> int:
+        """Number of positions of a window."""
+        return (self.grid.height + 2 * REACH) * self.stride
 
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
@@ -375,12 +369,6 @@ class Columns:
         """
         filled = self.slices[1:, : is_unknown.shape[1]]
         filled |= is_unknown[1:].view(torch.uint8) * 255
-
-
-def _clear_border(images: Tensor) -> None:
-    """Empty the borders of images, (B, height, width) with their borders."""
-    images[:, :REACH] = images[:, -REACH:] = False
-    images[:, :, :REACH] = images[:, :, -REACH:] = False
 
 
 def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:
@@ -400,11 +388,29 @@ def _square(reach: int, stride: int, device: torch.device) -> Tensor:
     return constant(tuple((down * stride + right,) for down in line for right in line), torch.int64, device)
 
 
+def _inside(is_column: Tensor, grid: Grid) -> Tensor:
+    """Clear the borders of images, (B * area,) bool, and list the positions that remain, (C,) int64."""
+    images = is_column.view(-1, grid.height + 2 * REACH, grid.width + 2 * REACH)
+    images[:, :REACH] = images[:, -REACH:] = False
+    images[:, :, :REACH] = images[:, :, -REACH:] = False
+    return flat_nonzero(is_column)
+
+
 def _split(grid: Grid, position: Tensor) -> tuple[Tensor, Tensor]:
     """Return the window of K positions, (K,) int64, and row and column in its image, (2, K) int64."""
     line, col = split_index(position, grid.width + 2 * REACH)
     window, row = split_index(line, grid.height + 2 * REACH)
     return window, torch.stack((row, col)) - REACH
+
+
+def _reach_and_tall(grid: Grid, position: Tensor, spacing: Spacing) -> tuple[Tensor | None, Tensor | None]:
+    """Return `Columns.reach` and `Columns.tall` of columns at positions, (C + 1,) int64."""
+    if spacing.most == 1 and not spacing.has_tall:
+        return None, None
+    window, row_col = _split(grid, position)
+    reach = spacing.reach(grid, window, row_col) if spacing.most > 1 else None
+    tall = flat_nonzero(spacing.are_tall(grid, window, row_col, SLICE_HEIGHT)) if spacing.has_tall else None
+    return reach, tall
 
 
 def count_slices(slices: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ LOW, HIGH = np.array(RANGE[:3]), np.array(RANGE[3:])
 def drawn(sweeps: HeightSlicedSweeps) -> np.ndarray:
     """Bytes of all positions of B windows, then of B windows of copies, and S sweeps, (2 B, S, H, W)."""
     columns = sweeps.columns
-    images = columns.image.view(-1, columns.height + 2 * REACH, columns.stride)
+    images = columns.image.view(-1, columns.grid.height + 2 * REACH, columns.stride)
     column = images[:, REACH:-REACH, REACH:-REACH].long()
     return columns.slices[:, : sweeps.num_steps][column].permute(0, 3, 1, 2).numpy()
 
