@@ -6,9 +6,8 @@ window tells which column is at a position, and small tables have a row for each
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -17,10 +16,13 @@ from torch import Tensor
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import (
     constant,
+    draw,
     flat_nonzero,
     floor_divide,
+    gather,
     index_dtype,
     lazy_zeros,
+    mark,
     nonzero_pairs,
     split_index,
 )
@@ -83,7 +85,9 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of B windows. Only this class and `position_of` know how positions and slots are numbered.
+    """The columns of B windows, and of B windows of copies.
+
+    Only this class and `position_of` know how positions and slots are numbered.
 
     The image of a window has an empty border of `REACH` positions (b), so that only distant positions need a test:
 
@@ -94,11 +98,8 @@ class Columns:
         b b b b b b b b
         b b b b b b b b
 
-    The tables have a row for each column, and a slot for each sweep. S slots are rounded up to whole words. As many
-    slots follow for the copies of points that lie under an overhang (`HeightSlicedSweeps.with_copies`):
-
-        slot         0    1    2    3   .   .   .   .  |  8    9   ...
-        sweep of    t+1   t   t-1  t-2                 | t+1   t   ...      of the copies
+    The tables have a row for each column, and a slot for each sweep: slot 0 for t+1, 1 for t, 2 for t-1, ... The number
+    of slots is a multiple of 8, so a row is read as whole words.
 
     A byte of `slices` holds two sets of height slices:
 
@@ -106,58 +107,102 @@ class Columns:
         slices of    the 3 x 3 pixels around | the pixel itself
     """
 
-    height: int  # H, rows of an image without its border
-    width: int  # W
-    image: Tensor  # (B * area,) int32, column at each position; 0 = none
+    grid: Grid  # H rows and W columns, without the border
+    image: Tensor  # (2 B * area,) int32, column at each position; 0 = none
     position: Tensor  # (C + 1,) int64, flat index into `image` of each column; column 0 is the empty one
     slices: Tensor  # (C + 1, T) uint8
-    # (C + 1, T) int32, position of each occupied pixel in the list of pixels; `_EMPTY` = the pixel is empty
-    rank: Tensor
+    rank: Tensor  # (S, C + 1) int32, position of each pixel in the list of pixels; `_EMPTY` = the pixel is empty
     reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
     most_reach: int
     tall: Tensor | None  # (K,) int64, the tall columns; None = there are none
 
     @classmethod
     def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int, spacing: Spacing) -> Columns:
-        """Make empty columns at and around the occupied positions, (B * area,) bool. The border must be False."""
+        """Make empty columns at and around the occupied positions, (B * area,) bool, which this overwrites.
+
+        The border must be False.
+        """
         stride = grid.width + 2 * REACH
         device = is_occupied.device
-        is_column = _dilate(is_occupied, stride)
-        reach_at = torch.ones(len(is_column) if spacing.most > 1 else 0, dtype=torch.uint8, device=device)
+        square = _square(1, stride, device)
+        is_column = mark(is_occupied, (flat_nonzero(is_occupied) + square).view(-1))
+        position = _inside(is_column, grid)  # [C]
         for reach in range(2, spacing.most + 1):
-            is_wide = spacing.are_wide(grid, REACH, reach).view(-1)
-            is_column |= _dilate(is_column, stride) & is_wide
-            reach_at += is_wide
-        is_tall = spacing.are_tall(grid, REACH, SLICE_HEIGHT).view(-1) if spacing.has_tall else None
-        images = is_column.view(-1, grid.height + 2 * REACH, stride)
-        images[:, :REACH] = images[:, -REACH:] = False
-        images[:, :, :REACH] = images[:, :, -REACH:] = False
-        position = flat_nonzero(is_column)  # [C]
-        image = lazy_zeros(len(is_column), torch.int32, device)
-        image.index_copy_(0, position, torch.arange(1, len(position) + 1, dtype=torch.int32, device=device))
+            # A neighbour of a pixel may be wide although the pixel itself is nearer.
+            near = flat_nonzero(spacing.are_wide(grid, *_split(grid, position), reach, margin=2.0))
+            around = (position.index_select(0, near) + square).view(-1)
+            wide = flat_nonzero(spacing.are_wide(grid, *_split(grid, around), reach))
+            position = _inside(mark(is_column, around.index_select(0, wide)), grid)
         # Column 0 is said to be at a position of the border that has only border around it.
         position = torch.cat((constant((stride + 1,), torch.int64, device), position))
-        shape = (len(position), 2 * _WORD * -(-num_steps // _WORD))
-        slices = torch.zeros(shape, dtype=torch.uint8, device=device)
-        rank = torch.full(shape, _EMPTY, dtype=torch.int32, device=device)
-        reach_of = reach_at.index_select(0, position) if spacing.most > 1 else None
-        tall = None if is_tall is None else flat_nonzero(is_tall.index_select(0, position))
-        return cls(grid.height, grid.width, image, position, slices, rank, reach_of, spacing.most, tall)
+        reach_of, tall = _reach_and_tall(grid, position, spacing)
+        num_slots = _WORD * -(-num_steps // _WORD)
+        columns = cls(
+            grid=grid,
+            image=lazy_zeros(2 * len(is_column), torch.int32, device),
+            position=position,
+            slices=torch.zeros((len(position), num_slots), dtype=torch.uint8, device=device),
+            rank=torch.full((num_steps, len(position)), _EMPTY, dtype=torch.int32, device=device),
+            reach=reach_of,
+            most_reach=spacing.most,
+            tall=tall,
+        )
+        columns._number(1)
+        return columns
+
+    def _number(self, first: int) -> None:
+        """Write the numbers of the columns into the image, beginning with that of column 1."""
+        number = torch.arange(first, first + len(self.position) - 1, dtype=torch.int32, device=self.image.device)
+        self.image.index_copy_(0, self.position[1:], number)
+
+    def for_copies(self, column: Tensor) -> tuple[Columns, Tensor]:
+        """Make empty columns for copies of pixels in some columns, (K,) int64, and around these columns.
+
+        They are at the same places in windows B ... 2 B - 1. `followed_by` appends them to these columns. The second
+        result is the column of each copy, (K,) int64.
+        """
+        is_near = draw(column, len(self.position))
+        for _ in range(self.most_reach):
+            near = self.position.index_select(0, flat_nonzero(is_near)) + _square(1, self.stride, column.device)
+            mark(is_near, self.image.index_select(0, near.view(-1)).long())
+        is_near[0] = True  # the empty column stays the first one
+        own = flat_nonzero(is_near)
+        half = len(self.image) // 2
+        copies = replace(
+            self,
+            position=self.position.index_select(0, own) + half,
+            slices=torch.zeros_like(self.slices[: len(own)]),
+            rank=torch.full_like(self.rank[:, : len(own)], _EMPTY),
+            reach=None if self.reach is None else self.reach.index_select(0, own),
+            tall=None if self.tall is None else flat_nonzero(draw(self.tall, len(self.position)).index_select(0, own)),
+        )
+        copies._number(1)
+        return copies, self.image.index_select(0, self.position.index_select(0, column) + half).long()
+
+    def followed_by(self, copies: Columns) -> Columns:
+        """Append the columns of copies, which are then numbered after these columns."""
+        copies._number(len(self.position))
+        tall = self.tall
+        if tall is not None and copies.tall is not None:
+            tall = torch.cat((tall, copies.tall + (len(self.position) - 1)))
+        return replace(
+            self,
+            position=torch.cat((self.position, copies.position[1:])),
+            slices=torch.cat((self.slices, copies.slices[1:])),
+            rank=torch.cat((self.rank, copies.rank[:, 1:]), 1),
+            reach=None if self.reach is None or copies.reach is None else torch.cat((self.reach, copies.reach[1:])),
+            tall=tall,
+        )
 
     @property
     def stride(self) -> int:
         """Positions from a row of an image to the next one."""
-        return self.width + 2 * REACH
+        return self.grid.width + 2 * REACH
 
     @property
     def num_slots(self) -> int:
         """T."""
         return self.slices.shape[1]
-
-    @property
-    def first_of_copies(self) -> int:
-        """First slot of the copies."""
-        return self.num_slots // 2
 
     def look_up(self, pixels: Pixels, step: Tensor | int, shift: Tensor | None = None) -> Tensor:
         """Return the bytes of the pixels that are `shift` away in another sweep of the same window.
@@ -172,16 +217,16 @@ class Columns:
         """
         if shift is None:
             return self.slices.view(-1).index_select(0, pixels.first_slot + step)
-        slot = pixels.first_slot % self.num_slots + step  # in its column
-        index = self._column_at(pixels, shift) * self.num_slots + slot[:, None]  # [K, C]
+        slot = step[:, None] if isinstance(step, Tensor) else step
+        index = self._column_at(pixels, shift) * self.num_slots + slot  # [K, C]
         return self.slices.view(-1).index_select(0, index.view(-1)).view_as(index)
 
     def _column_at(self, pixels: Pixels, shift: Tensor) -> Tensor:
         """Return the column at the positions that are `shift` away, (K, C) int32."""
         # These lines take 3 % of a window, so they are in place, and in 32 bits unless there are too many positions.
         _, start, _, _, row, col = pixels.place[..., None].unbind(1)  # [K, 1] each
-        index = (row + shift[..., 0]).clamp_(-1, self.height).mul_(self.stride)  # [K, C]
-        index += (col + shift[..., 1]).clamp_(-1, self.width)
+        index = (row + shift[..., 0]).clamp_(-1, self.grid.height).mul_(self.stride)  # [K, C]
+        index += (col + shift[..., 1]).clamp_(-1, self.grid.width)
         index += start
         return self.image.index_select(0, index.view(-1)).view_as(index)
 
@@ -195,12 +240,15 @@ class Columns:
         """Return the reach of K pixels (`Spacing`), (K,) uint8."""
         if self.reach is None:
             return torch.ones_like(pixels.slices)
-        return self.reach.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
+        return self.reach.index_select(0, self.column_of(pixels))
+
+    def column_of(self, pixels: Pixels) -> Tensor:
+        """Return the column of K pixels, (K,) int64."""
+        return floor_divide(pixels.first_slot, self.num_slots)
 
     def words(self, pixels: Pixels) -> Tensor:
         """Return the bytes of all sweeps at the same position as each pixel, a byte for each slot: (K, words) int64."""
-        words = self.slices.view(torch.int64)[:, : self.first_of_copies // _WORD]  # not of copies
-        return words.index_select(0, floor_divide(pixels.first_slot, self.num_slots))
+        return self.slices.view(torch.int64).index_select(0, self.column_of(pixels))
 
     def around(self, pixels: Pixels, reach: int, count: int) -> Groups:
         """Return which of the `count` pixels of the list are around K pixels, up to `reach` pixels each way.
@@ -208,22 +256,19 @@ class Columns:
         The result has an item for each pixel of the square in raster order, and for each of the K pixels:
         (2 reach + 1)^2 K items, grouped by the pixel of the list.
         """
-        line = range(-reach, reach + 1)
-        offsets = tuple((down * self.stride + right,) for down in line for right in line)
-        column = floor_divide(pixels.first_slot, self.num_slots)
-        slot = pixels.first_slot - column * self.num_slots + pixels.step
-        position = self.position.index_select(0, column) + constant(offsets, torch.int64, column.device)
+        column = self.column_of(pixels)
+        position = self.position.index_select(0, column) + _square(reach, self.stride, column.device)
         around = self.image.index_select(0, position.view(-1)).view_as(position)  # [(2 reach + 1)^2, K]
-        return self.pixel_at((around * self.num_slots + slot).view(-1), count)
+        return self.pixel_at((around + pixels.step * len(self.position)).view(-1), count)
 
-    def pixel_at(self, slot: Tensor, count: int) -> Groups:
-        """Group K slots, counted through all columns, (K,), by their pixel, one of `count` in the list."""
-        rank = self.rank.view(-1).index_select(0, slot).long()
+    def pixel_at(self, entry: Tensor, count: int) -> Groups:
+        """Group K entries of `rank`, step * (C + 1) + column, (K,), by their pixel, one of `count` in the list."""
+        rank = self.rank.view(-1).index_select(0, entry).long()
         return Groups(rank.clamp_(max=count), count)
 
     def as_words(self, values: Tensor) -> Tensor:
-        """Return (C + 1, S) bytes as words, with a byte for each slot: (C + 1, T / 16) int64."""
-        return F.pad(values, (0, self.first_of_copies - values.shape[1])).view(torch.int64)
+        """Return (C + 1, S) bytes as words, with a byte for each slot: (C + 1, T / 8) int64."""
+        return F.pad(values, (0, self.num_slots - values.shape[1])).view(torch.int64)
 
     def or_around(self, words: Tensor) -> Tensor:
         """Return the bitwise OR over the 3 x 3 columns around each column, (C + 1, ...) int64."""
@@ -265,9 +310,7 @@ class Columns:
             return around
         wide = flat_nonzero(self.reach > 1)
         reach = self.reach.index_select(0, wide)[:, None]
-        line = range(-1, 2)
-        offsets = tuple((down * self.stride + right,) for down in line for right in line)
-        beside = self.position.index_select(0, wide) + constant(offsets, torch.int64, wide.device)
+        beside = self.position.index_select(0, wide) + _square(1, self.stride, wide.device)
         beside = self.image.index_select(0, beside.view(-1))  # [9 wide]
         for step in range(2, self.most_reach + 1):
             # The columns beside one of this reach have at least the reach before.
@@ -283,38 +326,40 @@ class Columns:
         beside = self.position + steps
         return self.image.index_select(0, beside.view(-1)).view_as(beside)
 
-    def draw(self, slices: Tensor, first: int, pixels_before: int, num_windows: int) -> Pixels:
+    def draw(self, slices: Tensor, columns_before: int = 0, pixels_before: int = 0) -> Pixels:
         """Draw the height slices of sweeps, and list their pixels, in order of window, step and position.
 
         Args:
             slices: (C + 1, S) uint8, slices of the pixels themselves; row 0 is 0.
-            first: the first slot to draw, 0 or `first_of_copies`.
+            columns_before: number of columns that these will follow.
             pixels_before: number of pixels that are in the list already.
-            num_windows: B. Pixels of copies are in window B + w.
         """
         words = self.as_words(slices)
-        half = slice(first // _WORD, (first + self.first_of_copies) // _WORD)
-        self.slices.view(torch.int64)[:, half] = words | self._or_within_reach(words) << NUM_SLICES
-        occupied = self._occupied(slices, num_windows)
-        step = occupied.step
-        slot = occupied.column * self.num_slots + (step + first)  # counted through all columns
-        rank = torch.arange(pixels_before, pixels_before + len(slot), dtype=torch.int32, device=slot.device)
-        self.rank.view(-1).index_copy_(0, slot, rank)
-        start = occupied.position - occupied.row * self.stride - occupied.col + REACH * (self.stride + 1)
-        window = occupied.window + num_windows if first > 0 else occupied.window
-        place = torch.stack((slot - step, start, window, step, occupied.row - REACH, occupied.col - REACH), 1)
-        dtype = index_dtype(max(len(self.image), self.rank.numel()), place.device)
-        return Pixels(place.to(dtype), self.slices.view(-1).index_select(0, slot) & OWN)
+        self.slices.view(torch.int64).copy_(words | self._or_within_reach(words) << NUM_SLICES)
+        drawn = slices.t().contiguous()  # [S, C + 1]
+        step, column = nonzero_pairs(drawn.bool())
+        if len(self.image) > 2 * self._area:
+            window = floor_divide(self.position.index_select(0, column), self._area)
+            step, column = gather(window.sort(stable=True).indices, step, column)
+        entry = step * len(self.position) + column
+        number = torch.arange(pixels_before, pixels_before + len(entry), dtype=torch.int32, device=entry.device)
+        self.rank.view(-1).index_copy_(0, entry, number)
+        first_slot = (column + columns_before) * self.num_slots
+        window, row_col = _split(self.grid, self.position.index_select(0, column))
+        start = window * self._area + REACH * (self.stride + 1)
+        place = torch.stack((first_slot, start, window, step, *row_col), 1)
+        # With copies, there are at most twice as many columns.
+        dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
+        return Pixels(place.to(dtype), drawn.view(-1).index_select(0, entry))
 
     def window_row_col(self) -> tuple[Tensor, Tensor]:
         """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
-        window, row, col = self._split(self.position)
-        return window, torch.stack((row, col)) - REACH
+        return _split(self.grid, self.position)
 
-    def _split(self, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return window, row and column of positions, (K,) int64 each, in the images with their borders."""
-        line, col = split_index(position, self.stride)
-        return (*split_index(line, self.height + 2 * REACH), col)
+    @property
+    def _area(self) -> int:
+        """Number of positions of a window."""
+        return (self.grid.height + 2 * REACH) * self.stride
 
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
@@ -324,27 +369,6 @@ class Columns:
         """
         filled = self.slices[1:, : is_unknown.shape[1]]
         filled |= is_unknown[1:].view(torch.uint8) * 255
-
-    def _occupied(self, slices: Tensor, num_windows: int) -> _Occupied:
-        """List the occupied pixels of B windows; `slices` is as for `draw`."""
-        step, column = nonzero_pairs((slices != 0).t().contiguous())
-        position = self.position.index_select(0, column)
-        window, row, col = self._split(position)
-        occupied = _Occupied(window, step, column, position, row, col)
-        if num_windows == 1:
-            return occupied
-        return _Occupied(*torch.stack(occupied).index_select(1, window.sort(stable=True).indices))
-
-
-class _Occupied(NamedTuple):
-    """K occupied pixels in order of window, step and position, (K,) int64 each."""
-
-    window: Tensor
-    step: Tensor
-    column: Tensor
-    position: Tensor  # flat index into the images
-    row: Tensor  # of the image with its border
-    col: Tensor
 
 
 def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:
@@ -358,15 +382,35 @@ def num_positions(grid: Grid, num_windows: int) -> int:
     return num_windows * (grid.height + 2 * REACH) * (grid.width + 2 * REACH)
 
 
-def _dilate(image: Tensor, stride: int) -> Tensor:
-    """Dilate images by 3 x 3, (N,) bool, row after row of `stride` values; their borders are empty."""
-    across = image.clone()
-    across[1:] |= image[:-1]
-    across[:-1] |= image[1:]
-    result = across.clone()
-    result[stride:] |= across[:-stride]
-    result[:-stride] |= across[stride:]
-    return result
+def _square(reach: int, stride: int, device: torch.device) -> Tensor:
+    """Return what to add to positions for those around, up to `reach` each way, ((2 reach + 1)^2, 1) int64."""
+    line = range(-reach, reach + 1)
+    return constant(tuple((down * stride + right,) for down in line for right in line), torch.int64, device)
+
+
+def _inside(is_column: Tensor, grid: Grid) -> Tensor:
+    """Clear the borders of images, (B * area,) bool, and list the positions that remain, (C,) int64."""
+    images = is_column.view(-1, grid.height + 2 * REACH, grid.width + 2 * REACH)
+    images[:, :REACH] = images[:, -REACH:] = False
+    images[:, :, :REACH] = images[:, :, -REACH:] = False
+    return flat_nonzero(is_column)
+
+
+def _split(grid: Grid, position: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the window of K positions, (K,) int64, and row and column in its image, (2, K) int64."""
+    line, col = split_index(position, grid.width + 2 * REACH)
+    window, row = split_index(line, grid.height + 2 * REACH)
+    return window, torch.stack((row, col)) - REACH
+
+
+def _reach_and_tall(grid: Grid, position: Tensor, spacing: Spacing) -> tuple[Tensor | None, Tensor | None]:
+    """Return `Columns.reach` and `Columns.tall` of columns at positions, (C + 1,) int64."""
+    if spacing.most == 1 and not spacing.has_tall:
+        return None, None
+    window, row_col = _split(grid, position)
+    reach = spacing.reach(grid, window, row_col) if spacing.most > 1 else None
+    tall = flat_nonzero(spacing.are_tall(grid, window, row_col, SLICE_HEIGHT)) if spacing.has_tall else None
+    return reach, tall
 
 
 def count_slices(slices: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import floor_divide
 from cflow_torch.verified.columns import OWN, Columns, Pixels, count_slices
 
 _NUM_SUMS = 3  # times that we sum over 3 x 3 pixels: 7 x 7 pixels, of which those in the middle count most
@@ -38,6 +37,5 @@ def local_bias(columns: Columns, pixels: Pixels) -> Tensor:
     for is_vertical in (False, True) * _NUM_SUMS:
         along = columns.sum_along(sums, is_vertical)  # at most 32 per pixel, and 9^3 pixels: 23328
         sums = (along.view(torch.int64) & near).view(torch.int16)
-    column = floor_divide(pixels.first_slot, columns.num_slots)
-    x, y, square = sums.index_select(0, column).float().t()[:3]
+    x, y, square = sums.index_select(0, columns.column_of(pixels)).float().t()[:3]
     return ((x * x + y * y) / square.clamp(min=1)).sqrt()

@@ -50,15 +50,15 @@ from cflow_torch.verified.voxel_centroids import (
 LAYER_HEIGHT = 0.1  # metres, of the voxels, which are as wide as the finest pixels
 NUM_LAYERS = 32  # number of layers of voxels before they repeat
 MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
-_NOISE = 0.05  # metres, standard deviation of a centroid, besides the covariance of its surface
+_NOISE = 0.05  # metres, standard deviation between two centroids, besides the covariances of their surfaces
 _FARTHEST = 0.2  # metres, between the two voxels of a correspondence
 _KERNEL = 3.0  # scale of the Geman-McClure kernel, in variances of both surfaces
 # The prior holds x and y near the start as firmly as two correspondences do, and the tangent of half the angle near
 # zero as firmly as five correspondences at 1 m from the centre.
 _PRIOR = (2.0, 2.0, 20.0)
-# The least ratio of `Registration.stretch`. At 0.75, the beam hits the object a quarter turn earlier than in the sweep
-# before. To move that far around the sensor, it would have to be nearer than its own length. So at smaller ratios, the
-# seam between sweeps crosses it.
+# The least ratio of `Registration.stretch`. At 0.75, the beam hits the object a quarter turn earlier than one sweep
+# before. An object that moves so far around the sensor in a sweep is nearer to it than its own length. So a smaller
+# ratio means that the seam between two sweeps crosses the object.
 _LEAST_STRETCH = 0.75
 _NUM_ITERATIONS = 4
 _SAMPLE = 512  # voxels of an object, about, in the first half of the iterations
@@ -113,10 +113,10 @@ def register_deskewed(
         return apparent, apparent
     stretch = registration.stretch(apparent)[:, None]
     divided = replace(apparent, flow=apparent.flow / stretch)
-    points = points.at(flat_nonzero(sweeps.has_history.index_select(0, points.window)))
-    deskewed = Registration(deskew(points, sweeps, divided), sweeps, len(start))
+    with_history = points.at(flat_nonzero(sweeps.has_history.index_select(0, points.window)))
+    deskewed = Registration(deskew(with_history, sweeps, divided), sweeps, len(start))
     again = deskewed.align(start / stretch, num_iterations)
-    is_again = Groups(points.object_id, len(start)).size() > 0
+    is_again = Groups(with_history.object_id, len(start)).size() > 0
     return again.where(is_again, divided), apparent
 
 
@@ -152,6 +152,7 @@ class Source:
         window = voxels.window.index_select(0, voxel)
         num_steps = elapsed.shape[1]
         up = constant(((-1,), (0,), (1,)), torch.int64, voxel.device)
+        # The noise of a pair is added here, to its source.
         noise = constant((_NOISE**2, 0.0, 0.0, _NOISE**2, 0.0, _NOISE**2), torch.float64, voxel.device)[:, None]
         position = take_columns(voxels.position, voxel)  # [3, K]
         centre = take_columns(centre, by_object.of_item)  # [2, K]
@@ -262,7 +263,8 @@ class Registration:
                 equations = pairs.by_object.sum(_normal_equations(pairs))  # [9, G]
                 hessian = hessian + equations[:6]
                 right_side = right_side + equations[6:]
-            motion = torch.add(motion, matvec(full(inverse(hessian)), right_side), alpha=STEP_LENGTH)
+            change = matvec(full(inverse(hessian)), right_side)
+            motion = torch.add(motion, change, alpha=STEP_LENGTH)
         return RigidMotion(motion[:2].t(), motion[2], self._centre.nan_to_num(0.0).t())
 
     def _correspond(self, source: Source, motion: Tensor) -> Correspondences:
@@ -270,19 +272,22 @@ class Registration:
         motion_of_voxel = take_columns(motion, source.by_object.of_item)  # [3, K]
         velocity = motion_of_voxel[:2]
         rotation = motion_of_voxel[2]
-        # The object rotates about its centre, which moves on.
+        # The object rotates about its centre, which moves on from t to t+1. From the moved centre, `arm` leads to the
+        # moved voxel.
         arm = rotate(rotation * source.elapsed, source.offset + velocity * source.before_t)
         moved = source.centre + velocity * source.elapsed_of_t + arm
         moved = torch.cat((moved, source.height))  # [3, K]
 
-        target = self._target.nearest(source.target_start, source.target_layers, moved)  # [K], 0 = none, far away
+        # 0 = none: this voxel is far away, and belongs to no object.
+        target = self._target.nearest(source.target_start, source.target_layers, moved)  # [K]
         residual = take_columns(self._voxels.position, target) - moved
         is_near = residual.square().sum(0) <= _FARTHEST**2
         is_same = self._voxels.object_id.index_select(0, target) == source.by_object.of_item
         covariance = source.covariance + take_columns(self._covariance, target)
         information = full(inverse(covariance))
         pull = matvec(information, residual)  # [3, K]
-        square = (residual * pull).sum(0)  # Mahalanobis distance
+        square = (residual * pull).sum(0)  # squared Mahalanobis distance
+        # In units of 1 / noise^2: two centroids without surfaces, at distance 0, have the identity as information.
         weight = (1 + square / _KERNEL).pow(-2) * _NOISE**2 * (is_near & is_same)
         return Correspondences(
             source=source.voxel,
@@ -337,6 +342,7 @@ def _normal_equations(pairs: Correspondences) -> Tensor:
     )  # as in ops/linear.py
     force = pairs.pull[:2]
     torque = (lever * force).sum(0, keepdim=True)
+    # The hessian is quadratic in the elapsed time, the right side is linear.
     return torch.cat((hessian * pairs.elapsed, force, torque)) * pairs.elapsed
 
 

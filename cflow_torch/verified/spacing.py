@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.indices import draw, exceeds, flat_nonzero, floor_divide, scatter_count, split_index, take_columns
+from cflow_torch.ops.indices import constant, draw, flat_nonzero, floor_divide, scatter_count, split_index, take_columns
 from cflow_torch.verified.directions import azimuth_bin, elevation_bin
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
@@ -56,30 +56,41 @@ class Spacing(NamedTuple):
         most = int(_SHARE * corner / grid.pixel_size * largest_angle + 0.5)
         return cls(angle, rise, min(max(most, 1), _FARTHEST), corner * largest_rise >= slice_height)
 
-    def are_wide(self, grid: Grid, border: int, reach: int) -> Tensor:
-        """Tell at which pixels the reach is at least `reach` pixels, (B, height, width) bool, with a border.
+    def reach(self, grid: Grid, window: Tensor, row_col: Tensor) -> Tensor:
+        """Return the reach at K pixels, (K,) uint8.
+
+        Args:
+            window: (K,) int64.
+            row_col: (2, K) int64, inside of the images or in a border.
 
         Convention: the reach is 1.5 times the spacing, rounded, from 1 to 6 pixels. The spacing is the distance of the
             middle of the pixel from the origin, times the angle.
         """
-        return _are_beyond((reach - 0.5) / (_SHARE * self.angle), grid, border)
+        reach = torch.ones_like(window, dtype=torch.uint8)
+        for least in range(2, self.most + 1):
+            reach += self.are_wide(grid, window, row_col, least)
+        return reach
 
-    def are_tall(self, grid: Grid, border: int, slice_height: float) -> Tensor:
-        """Tell at which pixels rings are farther apart than a slice is high, (B, height, width) bool, with a border."""
-        return _are_beyond(slice_height / grid.pixel_size / self.rise, grid, border)
+    def are_wide(self, grid: Grid, window: Tensor, row_col: Tensor, reach: int, margin: float = 0.0) -> Tensor:
+        """Tell at which of K pixels the reach is at least `reach` pixels, or would be if they were `margin` farther."""
+        return _are_beyond((reach - 0.5) / (_SHARE * self.angle) - margin, grid, window, row_col)
+
+    def are_tall(self, grid: Grid, window: Tensor, row_col: Tensor, slice_height: float) -> Tensor:
+        """Tell at which of K pixels rings are farther apart than a slice is high, (K,) bool."""
+        return _are_beyond(slice_height / grid.pixel_size / self.rise, grid, window, row_col)
 
 
-def _are_beyond(distance: Tensor, grid: Grid, border: int) -> Tensor:
-    """Tell which pixels are farther from the origin than a distance, (B, height, width) bool, with a border.
+def _are_beyond(distance: Tensor, grid: Grid, window: Tensor, row_col: Tensor) -> Tensor:
+    """Tell which of K pixels are farther from the origin than a distance, (K,) bool.
 
     `distance` is (B,) float64, pixels, to the middle of a pixel; it may be infinite.
     """
-    device = distance.device
-    row = torch.arange(-border, grid.height + border, device=device) + (grid.lower[1] / grid.pixel_size + 0.5)
-    col = torch.arange(-border, grid.width + border, device=device) + (grid.lower[0] / grid.pixel_size + 0.5)
-    # From row to row, a pixel is beyond if its column is farther than this from the middle.
-    beyond = (distance.square()[:, None] - row.double().square()).clamp_(min=0).sqrt_()
-    return exceeds(col.abs(), beyond.float()[..., None])
+    middle = constant(tuple(lower / grid.pixel_size + 0.5 for lower in grid.lower[1::-1]), torch.float32, window.device)
+    y, x = row_col.float() + middle[:, None]
+    square = distance.clamp(min=0).square().index_select(0, window)
+    # In its row, a pixel is beyond if its column is farther than this from the middle.
+    beyond = (square - y.double().square()).clamp_(min=0).sqrt_()
+    return x.abs() > beyond.float()
 
 
 def _median_gaps(batch: Batch) -> tuple[Tensor, Tensor]:

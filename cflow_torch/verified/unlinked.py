@@ -79,7 +79,7 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         members=objects[member],
         window=objects.max(pixels.window, empty=0),
         kind=NodeKind.UNLINKED,
-        velocity=tracks.velocity.index_select(0, kept),
+        motion=tracks.velocity.index_select(0, kept),
     )
 
 

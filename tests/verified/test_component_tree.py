@@ -92,7 +92,7 @@ def test_components_and_nodes_equal_the_oracle(blocks, longest):
     for seed in range(6):
         found = grown(seed, longest, blocks)
         names, none = found.fast_names(), found.nodes.count
-        parents = [None if parent == none else names[parent] for parent in found.nodes.children.of_item.tolist()]
+        parents = [None if parent == none else names[parent] for parent in found.nodes.by_parent.of_item.tolist()]
         given = list(zip(names, parents))
         for window, tree in enumerate(found.trees):
             mine = found.sweeps.pixels.window == window
@@ -116,7 +116,7 @@ def test_scales_are_nested():
     components = found.components
     levels = [components.of_level(level) for level in range(components.num_levels)]
     for coarse, fine in zip(levels, levels[1:]):
-        assert torch.equal(components.children.of_item[fine.of_item], coarse.of_item)
+        assert torch.equal(components.by_parent.of_item[fine.of_item], coarse.of_item)
     assert components.size.sum() == sum(len(level.of_item) for level in levels) + len(components.changed)
 
 
@@ -157,7 +157,7 @@ def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_
     change = ChangedPixels(*torch.zeros((3, sweeps.num_pixels), dtype=torch.bool))
     components = find_components(sweeps, change, (2, 1))
     nodes = movable_nodes(sweeps, components, None)
-    assert nodes.kind.tolist() == [0, 1, 1] and nodes.children.of_item.tolist() == [3, 0, 0]
+    assert nodes.kind.tolist() == [0, 1, 1] and nodes.by_parent.of_item.tolist() == [3, 0, 0]
     objects = select_objects(sweeps, components, nodes, torch.tensor([whole, 100, 100]))
     assert objects.by_node.of_item.tolist() == ([0] if wins else [1, 2])
 

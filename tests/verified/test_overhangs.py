@@ -49,7 +49,7 @@ def overhung(boxes: Sequence[Box]) -> tuple[int, torch.Tensor]:
     drawn, nodes = add_overhung(sweeps, components, tree_nodes)
     added = slice(tree_nodes.count, None)
     assert torch.equal(nodes.pixel[: len(tree_nodes.pixel)], tree_nodes.pixel)
-    assert (nodes.kind[added] == NodeKind.OVERHUNG).all() and (nodes.children.of_item[added] == nodes.count).all()
+    assert (nodes.kind[added] == NodeKind.OVERHUNG).all() and (nodes.by_parent.of_item[added] == nodes.count).all()
     assert (nodes.window[added] == 1).all() and (drawn.pixels.window[nodes.pixel[len(tree_nodes.pixel) :]] == 1).all()
     return nodes.count - tree_nodes.count, sweeps.batch.positions[2, drawn.copied]
 

@@ -56,9 +56,11 @@ def test_the_angle_is_that_between_beams_and_as_the_oracle_measures_it():
     degrees = np.degrees(found.angle.numpy())
     assert degrees[:2] == pytest.approx([1.2, 0.3], abs=0.1) and degrees[2] == degrees[3] == 0
     for window, angle in enumerate(found.angle.tolist()):
-        wide = [found.are_wide(grid, 0, reach)[window].numpy() for reach in range(2, 7)]
-        assert np.array_equal(1 + np.sum(wide, 0), oracle.reach_of_pixels(angle, SETTINGS))
-        tall = found.are_tall(grid, 0, SLICE_HEIGHT)[window].numpy()
+        rows, cols = torch.meshgrid(torch.arange(grid.height), torch.arange(grid.width), indexing="ij")
+        every = (torch.full((rows.numel(),), window), torch.stack((rows.flatten(), cols.flatten())))
+        reach = found.reach(grid, *every).view_as(rows).numpy()
+        assert np.array_equal(reach, oracle.reach_of_pixels(angle, SETTINGS))
+        tall = found.are_tall(grid, *every, SLICE_HEIGHT).view_as(rows).numpy()
         assert np.array_equal(tall, oracle.are_tall(expected[window][1], SETTINGS))
     assert found.most == 6 and found.has_tall
 
