@@ -13,6 +13,7 @@ from cflow_torch.config import Config
 from cflow_torch.setting import AUTO, Settings, bounds, checked, setting
 
 NOT_GIVEN = "???"  # a setting without a value
+PAIR_SETTINGS = ("data.first", "data.step")
 
 # Settings of data sets that we check before a reader gets them. configs/data/ has the defaults of all of them.
 DATA_SETTINGS: dict[str, dict[str, Any]] = {
@@ -118,7 +119,7 @@ class Command(Settings):
     """A command with settings."""
 
     SUMMARY: ClassVar[str]
-    CHOOSES_PAIRS: ClassVar[bool] = False  # by data.first and data.step
+    CHOOSES_PAIRS: ClassVar[bool] = False  # the command uses `PAIR_SETTINGS`
 
     output: str = setting("outputs", "folder of the results")
     model: Config = group("default", kind=Config)

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from cflow_torch.cli.choices import choices, known_settings
-from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
+from cflow_torch.cli.commands import PAIR_SETTINGS, PICTURES, WITH_SETTINGS, Command
 from cflow_torch.errors import CFlowError, near
 from cflow_torch.setting import checked
 
@@ -22,9 +22,6 @@ _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
 _LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan": math.nan}
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
-
-
-_OF_PAIRS = ("data.first", "data.step")
 
 
 class Call(NamedTuple):
@@ -82,14 +79,14 @@ def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
             of_value = [group for group in chosen if value in choices(group)]  # preset=live
             hint = f" (did you mean {of_value[0]}={value}?)" if of_value else near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
-        if key in _OF_PAIRS and not kind.CHOOSES_PAIRS:
-            able = " and ".join(f"`cflow {name}`" for name, other in WITH_SETTINGS.items() if other.CHOOSES_PAIRS)
-            raise CFlowError(f"cflow {command} does not choose pairs by {key}: leave it out; {able} do")
         owners = [choice for choice in known[key] if _is_chosen(choice, chosen)]
         if not owners:
             raise CFlowError(
                 f"setting {key!r} belongs to {' or '.join(known[key])}: give that as well, or leave it out"
             )
+        if key in PAIR_SETTINGS and not kind.CHOOSES_PAIRS:
+            choosing = [name for name, other in WITH_SETTINGS.items() if other.CHOOSES_PAIRS]
+            raise CFlowError(f"{key} is for cflow {' and cflow '.join(choosing)}: cflow {command} takes every pair")
         limits = known[key][owners[0]]
         if len(owners) == 1 and limits is not None:
             for plain in plain_values(value, limits["kind"] is str):

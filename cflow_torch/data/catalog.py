@@ -202,6 +202,12 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
     return made if hasattr(made, "__getitem__") else list(made)
 
 
+def source_name(source: Any) -> str:
+    """Return the name of a log that is not open."""
+    names = (getattr(source, key, None) for key in ("scene", "stem", "name"))
+    return str(next(filter(None, names), source))
+
+
 def find_sources(name: str, root: Any) -> Sequence[Any]:
     """Return one source for `open_log` per log under a path. If there is no log, that is a `CFlowError`."""
     top, (module, _), form = as_path(root), _reader(name), DATA_SETS[name]
@@ -304,13 +310,17 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
 
 
 class Logs(Sequence[Log]):
-    """The logs of a folder. Each is opened when you ask for it, as `open_log` does with the same arguments."""
+    """The logs of a data set. Each is opened when you ask for it, as `open_log` does with the same arguments."""
 
     def __init__(self, name: str, sources: Sequence[Any], settings: Mapping[str, Any]) -> None:
-        self._name, self._sources, self._settings = name, sources, settings
+        self.name, self.sources, self.settings = name, sources, settings
+
+    def open(self, source: Any) -> Log:
+        """Open one of the `sources`."""
+        return open_log(self.name, source, **self.settings)
 
     def __len__(self) -> int:
-        return len(self._sources)
+        return len(self.sources)
 
     @overload
     def __getitem__(self, index: int) -> Log: ...
@@ -318,11 +328,11 @@ class Logs(Sequence[Log]):
     def __getitem__(self, index: slice) -> Logs: ...
     def __getitem__(self, index: int | slice) -> Log | Logs:
         if isinstance(index, slice):
-            return Logs(self._name, self._sources[index], self._settings)
-        return open_log(self._name, self._sources[index], **self._settings)
+            return Logs(self.name, self.sources[index], self.settings)
+        return self.open(self.sources[index])
 
     def __repr__(self) -> str:
-        return f"Logs(data={self._name}, {len(self)} logs)"
+        return f"Logs(data={self.name}, {len(self)} logs)"
 
     def windows(self, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
         """Iterate over the windows of each log in turn, see `Log.windows`."""
