@@ -8,7 +8,7 @@ from typing import Any, TextIO
 from cflow_torch.cli.choices import FOLDER, read_settings
 from cflow_torch.cli.commands import NOT_GIVEN
 from cflow_torch.cli.failures import Failures, collect_failures
-from cflow_torch.data.catalog import Logs, find_sources, find_user_sources, recognise, source_name
+from cflow_torch.data.catalog import Logs, find_all_sources, find_user_sources, source_name, the_format
 from cflow_torch.data.log import Log
 from cflow_torch.setting import AUTO
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
@@ -19,13 +19,10 @@ def complete_data(data: dict[str, Any], out: TextIO | None = None) -> dict[str, 
     """Replace data=auto by the settings of the recognised format, and print it to `out`; None = standard output."""
     if data.get("name") != AUTO:
         return data
-    formats = {path: recognise(path) for path in paths_of(data)}
-    for path, name in formats.items():
+    paths = paths_of(data)
+    name = the_format(paths) if paths else "synthetic"
+    for path in paths:
         print(f"{path}: data={name}", file=out)
-    if len(set(formats.values())) > 1:
-        several = " and ".join(sorted(set(formats.values())))
-        raise CFlowError(f"the paths have several formats, {several}: give one command each")
-    name = next(iter(formats.values()), "synthetic")
     settings = dict(read_settings(FOLDER / "data" / f"{name}.yaml"))
     if "cache" in settings:
         settings["cache"] = os.environ.get("CFLOW_CACHE", "outputs/cache")
@@ -74,10 +71,7 @@ def find_logs(data: dict[str, Any]) -> Logs:
         return Logs(chosen.data_set, drives, {"check": False, **chosen.settings})
     name = settings.pop("name")
     del settings["root"]
-    sources: list[Any] = []
-    for path in paths_of(data):
-        sources += [source for source in find_sources(name, path) if source not in sources]  # paths may overlap
-    return Logs(name, sources, settings)
+    return Logs(name, find_all_sources(name, paths_of(data)), settings)
 
 
 def open_first_log(data: dict[str, Any]) -> Log:

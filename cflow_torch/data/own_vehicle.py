@@ -13,6 +13,7 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.windows.point_frame import frame_problem
 from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite, cell_keys
 
 _NEAR, _CELL = 2.7, 0.25  # metres from the origin along x and y, and side of a cell
@@ -97,6 +98,8 @@ class OwnVehicleLog(LogWrapper):
         of_all = _cells_of(np.concatenate(near))
         if rides.sum() < _FEWEST_POINTS * len(clouds) or explained[rides].mean() > _IN_PLACE:
             return nothing
+        if frame_problem(self.log.sweep(chosen[0]).points)[1]:
+            return nothing  # then other points than those of the ground were taken for ground
         return np.unique(of_all[rides & ~explained], axis=0)
 
 
