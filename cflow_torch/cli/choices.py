@@ -7,7 +7,16 @@ from pathlib import Path
 from typing import Any, Dict, Iterable, Iterator, Mapping, Optional, Tuple
 
 import cflow_torch.configs
-from cflow_torch.cli.commands import COMMANDS, DATA_SETTINGS, ENGINES, PICTURES, Command, own_fields, setting_lines
+from cflow_torch.cli.commands import (
+    COMMANDS,
+    DATA_SETTINGS,
+    ENGINES,
+    PICTURES,
+    Command,
+    Plot,
+    own_fields,
+    setting_lines,
+)
 from cflow_torch.config import PRESETS
 from cflow_torch.setting import Settings
 
@@ -26,7 +35,12 @@ def help_of(name: str) -> str:
     if not issubclass(kind, Command):
         return text
     of_groups = [f"{group}={'|'.join(choices(group))}" for group in kind.groups()]
-    lines = [*setting_lines(kind), *of_groups, "data.NAME, model.NAME, ...: `cflow settings` lists them"]
+    lines = [*setting_lines(kind), *of_groups]
+    for picture, own in PICTURES.items() if kind is Plot else ():
+        preset = f" (model={own.PRESET})" if own.PRESET else ""
+        lines.append(f"picture={picture}:  # {str(own.__doc__).partition(chr(10))[0]}{preset}")
+        lines += [f"  {line}" for line in setting_lines(own, Plot)]
+    lines.append("data.NAME, model.NAME, ...: `cflow settings` lists them")
     return "\n  ".join([f"{text}\nsettings:", *lines]) + "\n"
 
 

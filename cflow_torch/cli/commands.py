@@ -344,13 +344,6 @@ class Plot(Command):
 
     log=ID and pair=N choose the pair. Without log=, the first log is drawn.
 
-    picture=flow         the flow from above; truth=true|false|auto adds the ground truth and the error
-    picture=clusters     the points by cluster
-    picture=keypoints    the key points of both sweeps and their matches (model=keypoints)
-    picture=correlation  one cluster and the correlation of all its shifts (model=paper); cluster=ID chooses it
-    picture=scales       one cluster and the flow, coarse to fine: a column per pixel size, one more (model=paper)
-    picture=animation    the flow of many pairs: first= step= count= format=gif|mp4 frames_per_second= width=
-
     examples:
       cflow plot                                             the simulated street, outputs/plot/flow.png
       cflow plot picture=correlation pair=2
@@ -422,7 +415,7 @@ class CorrelationPicture(Plot):
 
 @dataclass(frozen=True)
 class ScalesPicture(CorrelationPicture):
-    """Coarse to fine, one column per pixel size and one more."""
+    """One cluster and the flow, coarse to fine: one column per pixel size and one more."""
 
     PIXEL_SIZES: ClassVar[tuple[float, ...]] = (0.4, 0.2, 0.1)
 

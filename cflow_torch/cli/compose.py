@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cflow_torch.cli.choices import known_settings
 from cflow_torch.cli.commands import ENGINES, NOT_GIVEN, PICTURES, WITH_SETTINGS, Check, Command, Plot, own_fields
-from cflow_torch.cli.exits import UnfinishedJob, exit_if_refused, exit_wrong
+from cflow_torch.cli.failures import UnfinishedJob, exit_if_refused, exit_wrong
 from cflow_torch.cli.words import Call, check_exists
 from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError

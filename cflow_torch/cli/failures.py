@@ -1,22 +1,26 @@
-"""What fails in a run: it is reported, the rest goes on, and the exit status tells."""
+"""What fails in a run, and how a command ends: the rest of a run goes on, and the exit status tells."""
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import contextmanager
 from typing import Iterator, List, Tuple
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-
-from cflow_torch.cli.exits import UnfinishedJob
 from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.progress import log_line
 
 Failures = List[Tuple[str, str]]  # name of a frame or log, and message
 
 
+class UnfinishedJob(RuntimeError):
+    """Something is missing, and a message says what. The other jobs of a sweep still run."""
+
+
 def is_sweep() -> bool:
+    from hydra.core.hydra_config import HydraConfig  # takes half a second, so not before a call is read
+    from hydra.types import RunMode
+
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
@@ -42,3 +46,18 @@ def finish(failures: Failures) -> None:
         if is_sweep():
             raise UnfinishedJob(f"{len(failures)} failed in a job, listed above")
         raise SystemExit(1)
+
+
+def exit_wrong(message: object) -> None:
+    """Exit after a call that was wrong."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2) from None
+
+
+def exit_if_refused(error: Exception) -> None:
+    """Exit after an error that is not a bug: a file that the system refused, or a pipe whose reader has ended."""
+    if isinstance(error, BrokenPipeError):  # as in `cflow info | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(128 + 13) from None  # as if SIGPIPE had ended it
+    if isinstance(error, OSError) and error.filename is not None:
+        exit_wrong(f"{error.filename}: {error.strerror or error}; check data.root= (read) and output= (written)")

@@ -34,8 +34,7 @@ from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
 from cflow_torch.cli.commands import Flow, FlowFiles
-from cflow_torch.cli.exits import UnfinishedJob
-from cflow_torch.cli.failures import Failures, collect_failures, is_sweep
+from cflow_torch.cli.failures import Failures, UnfinishedJob, collect_failures, is_sweep
 from cflow_torch.cli.flows import stored_flow
 from cflow_torch.cli.logs import chosen_pairs, find_logs
 from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config

@@ -7,6 +7,7 @@ from typing import Any, Mapping, NamedTuple, Sequence, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
+from cflow_torch.data.log import Log
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError
 
@@ -43,6 +44,10 @@ class Part:
     def frames(self, num_pairs: int) -> range:
         """Indices of the sweeps t, in a log of `num_pairs` pairs."""
         return range(self.begin * num_pairs // self.of, self.end * num_pairs // self.of)
+
+    def stamps(self, log: Log) -> dict[int, int]:
+        """Return the time stamp of each sweep t by its index; the pair over a gap of the log is not a frame."""
+        return {i: int(log.timestamps[i]) for i in self.frames(len(log.timestamps) - 1) if i not in log.gaps}
 
 
 class Opened(NamedTuple):

@@ -102,7 +102,7 @@ def count_frames(job: Job, parts: Iterable[Part]) -> Iterator[tuple[str, int, in
     for part in parts:
         try:
             with open_quickly(job, part.source) as log:
-                stamps = {int(log.timestamps[i]) for i in part.frames(len(log.timestamps) - 1) if i not in log.gaps}
+                stamps = set(part.stamps(log).values())
                 complete = set() if job.redo else complete_frames(as_path(job.output) / log.log_id)
                 yield log.log_id, len(stamps), len(stamps - complete)
         except Exception as error:

@@ -88,7 +88,7 @@ class Worker:
     def _run(self, part: Part) -> Iterator[Event]:
         log = self._open(part.source)
         folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
-        stamps = {i: int(log.timestamps[i]) for i in part.frames(len(log.timestamps) - 1) if i not in log.gaps}
+        stamps = part.stamps(log)
         if part.only is not None:
             stamps = {i: stamp for i, stamp in stamps.items() if stamp == part.only}
         complete = set() if self._job.redo else complete_frames(folder)

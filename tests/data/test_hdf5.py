@@ -105,8 +105,9 @@ def test_every_key_is_read_in_its_own_type(tmp_path):
         "cluster": np.arange(50, dtype=np.int16)[:, None],
         "my_result": np.ones((50, 3), np.float32),
     }
-    file = write_scene(tmp_path / "scene.h5", **extra)
-    assert find_hdf5_scenes(tmp_path) == find_hdf5_scenes(file) == [file]
+    (tmp_path / "val").mkdir()
+    file = write_scene(tmp_path / "val" / "scene.h5", **extra)
+    assert find_hdf5_scenes(tmp_path) == find_hdf5_scenes(file.parent) == find_hdf5_scenes(file) == [file]
     with HDF5Log(file) as log:
         assert list(log.timestamps) == list(STAMPS) and len(window(log, 1, 4).pch) == 1
         assert log.sweep(1).timestamp_ns == STAMPS[1] * 1000, "microseconds become nanoseconds"

@@ -26,13 +26,16 @@ EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` stores
 
 
 def find_hdf5_scenes(root: PathLike) -> list[Path]:
-    """Return the scene files of a folder, sorted, or the given file; a missing path is a `CFlowError`."""
+    """Return the scene files of a folder or, if it has none, of its subfolders (train, val), sorted; or the given file.
+
+    A missing path is a `CFlowError`.
+    """
     root = as_path(root)
     if root.is_file():
         return [root]
     if not root.is_dir():
         raise CFlowError(f"{root} is neither a file nor a folder; pass a scene (.h5) or a folder of scenes")
-    return sorted(root.glob("*.h5"))
+    return sorted(root.glob("*.h5")) or sorted(root.glob("*/*.h5"))
 
 
 class HDF5Log(Log):

@@ -77,7 +77,7 @@ def write_index_files(folder: str | Path) -> None:
     """
     folder = Path(folder)
     sweeps = []
-    for file in find_hdf5_scenes(folder):
+    for file in (file for file in find_hdf5_scenes(folder) if file.parent == folder):
         with HDF5Log(file, ego_T_lidar=None) as log:
             sweeps += [([log.log_id, str(stamp)], log.keys(k)) for k, stamp in enumerate(log.timestamps)]
     for name, needed in (("total", "lidar"), ("flow", "flow"), ("eval", "eval_mask")):
