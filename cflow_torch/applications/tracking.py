@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, regroup
-from cflow_torch.applications.completion import SeenPoints, TrackedPoints, complete
+from cflow_torch.applications.completion import TrackedPoints, complete
 from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
 from cflow_torch.applications.people import divide_people
@@ -369,10 +369,9 @@ class LogTracker:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
-        points = TrackedPoints.of(index, track_id)
-        seen = SeenPoints.of(sweeps, result, points, self._tracker.times)
+        points = TrackedPoints.of(index, sweeps, result, track_id, self._tracker.times)
         free = FreePoints.of(sweeps, result, points)
-        now = SweepTracks(table, points, seen, int(self._log.timestamps[index]), free)
+        now = SweepTracks(table, points, int(self._log.timestamps[index]), free)
         self._find_before(now)
         self._sweeps.append(now)
         if len(self._sweeps) > _MAX_MISSED:
@@ -401,4 +400,4 @@ class LogTracker:
 
     def _whole(self) -> dict[str, np.ndarray]:
         table = confirmed(join_tables([each.table for each in self._sweeps]))
-        return complete(table, [each.seen for each in self._sweeps])
+        return complete(table, self.points)
