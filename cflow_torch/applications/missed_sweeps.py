@@ -16,6 +16,7 @@ from cflow_torch.transforms import transform_points
 from cflow_torch.types import FlowResult, Window, as_numpy
 
 _MARGIN = 0.2  # metres, added to length, width and height of a box
+_APART = 0.1  # metres between a box and the place that it has left
 
 
 class FreePoints(NamedTuple):
@@ -73,10 +74,8 @@ class SweepTracks:
         if self.free is None:
             return False
         number = int(later.table["id"][row])
-        position, velocity = later.points.of_track(number)
-        heading = torch.from_numpy(later.table["heading"][row : row + 1])
-        points = torch.from_numpy(position)
-        centre, size = enclosing_boxes(points, torch.zeros(len(points), dtype=torch.int64), heading)
+        _, velocity = later.points.of_track(number)
+        centre, size, heading = later.box(row)
         size = size + _MARGIN
         step = torch.from_numpy((self.points.seconds - later.points.seconds) * velocity)
         index = self.free.inside(centre + step, size, heading)
@@ -90,6 +89,13 @@ class SweepTracks:
         self.points = self.points.followed_by(number, self.free.row[index], self.free.position[index], velocity)
         self.free = self.free.without(index)
         return True
+
+    def box(self, row: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the box around the points of the track in a row: centre and size, (1, 3) metres, and heading, (1,)."""
+        position, _ = self.points.of_track(int(self.table["id"][row]))
+        heading = torch.from_numpy(self.table["heading"][row : row + 1])
+        points = torch.from_numpy(position)
+        return (*enclosing_boxes(points, torch.zeros(len(points), dtype=torch.int64), heading), heading)
 
     def divide(self, number: int, ids: np.ndarray) -> None:
         """Give the points of the track `number` new ids, (P,) int64; -1 = no track.
@@ -110,3 +116,30 @@ class SweepTracks:
         id_of_point = self.points.id.copy()
         id_of_point[self.points.id == number] = np.where(np.isin(ids, parts), ids, -1)
         self.points = self.points.renumber(id_of_point)
+
+
+class LeftPlaces:
+    """The places that tracks have left. Objects leave free places, pieces of a wall that seem to move do not."""
+
+    def __init__(self) -> None:
+        self._boxes: dict[int, list[tuple[Tensor, Tensor, Tensor, int]]] = {}  # of each track, and its points inside
+        self._shares: dict[int, list[float]] = {}  # points that remain, as a share of those of the track
+
+    def add(self, now: SweepTracks) -> None:
+        """Count the points at the last place of each moving track that its box does not touch any more."""
+        for row in np.flatnonzero(now.table["is_moving"]).tolist():
+            number = int(now.table["id"][row])
+            centre, size, heading = now.box(row)
+            boxes = self._boxes.setdefault(number, [])
+            for before, size_before, heading_before, count in reversed(boxes):
+                sides = size[0, :2].max() + size_before[0, :2].max()
+                if now.free is not None and (centre - before)[0, :2].norm() > sides / 2 + _APART:
+                    remaining = len(now.free.inside(before, size_before, heading_before))
+                    self._shares.setdefault(number, []).append(remaining / count)
+                    break
+            boxes.append((centre, size, heading, int(now.table["num_points"][row])))
+
+    def occupied(self) -> list[int]:
+        """Return the tracks whose places are not free, in the median of at least two sweeps."""
+        shares = {number: each for number, each in self._shares.items() if len(each) > 1}
+        return [number for number, each in shares.items() if np.median(each) >= MIN_STOPPED_SHARE]
