@@ -83,7 +83,7 @@ def fit(sums: np.ndarray) -> dict[str, list[float]]:
     sizes, shares, margins = (1 + len(table[name]) for name in ("size", "share", "margin"))
     # Lengths of rows, and whether the confidence falls along them: the more is unmatched or biased, the worse.
     rows = [
-        (1, False),
+        *2 * [(1, False)],
         (biases, True),
         *2 * [(sizes, True)],
         *4 * [(shares, False)],

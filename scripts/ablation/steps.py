@@ -19,7 +19,7 @@ from sets import ScoredSet, make_sets
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.verified import changed_pixels, component_tree, confidence, paired_test, refinement
+from cflow_torch.verified import changed_pixels, component_tree, confidence, paired_test, refinement, selection
 
 
 def _without_changed(sweeps: Any) -> changed_pixels.ChangedPixels:
@@ -58,7 +58,7 @@ STEPS: dict[str, dict[str, Any]] = {
     "no objects under overhangs": {"add_overhung": lambda sweeps, components, tree: (sweeps, tree)},
     "no aperture test": {"verify": partial(paired_test.verify, slides=_nothing_slides)},
     "no least gain": {"verify": partial(paired_test.verify, least_gain=0)},
-    "no price of an object": {"select_objects": partial(component_tree.select_objects, price=0)},
+    "no price of an object": {"select_objects": partial(selection.select_objects, price=0)},
     "no margin": {"motion_margin": _without_margin},
     "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
     "no slow objects of pairs": {"refine": partial(refinement.refine, add_slow=_nothing_is_slow)},

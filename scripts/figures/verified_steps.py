@@ -20,10 +20,11 @@ from cflow_torch.types import MOVING
 from cflow_torch.verified.candidates import propose
 from cflow_torch.verified.changed_pixels import find_changed
 from cflow_torch.verified.columns import count_slices
-from cflow_torch.verified.component_tree import NodeKind, find_components, movable_nodes, select_objects
+from cflow_torch.verified.component_tree import NodeKind, find_components, movable_nodes
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.overhangs import add_overhung
 from cflow_torch.verified.paired_test import add_unchanged, verify
+from cflow_torch.verified.selection import select_objects
 from cflow_torch.viz import save_picture, style
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, group_medians
@@ -62,10 +63,10 @@ def take_steps(drive: Any) -> tuple[Any, ...]:
     components = find_components(sweeps, change, blocks)
     sweeps, tree = add_overhung(sweeps, components, movable_nodes(sweeps, components, config.max_object_length))
     candidates = propose(tree, blocks, sweeps, config)
-    motion, evidence = verify(sweeps, tree, candidates.motion, config.significance)
-    tree = add_unchanged(sweeps, tree, motion)
-    objects = select_objects(sweeps, components, tree, evidence)
-    return sweeps, change, components, tree, objects, objects.by_node.spread(motion).any(1), model(given)[0]
+    verdict = verify(sweeps, tree, candidates.motion, config.significance)
+    tree = add_unchanged(sweeps, tree, verdict.motion)
+    objects = select_objects(sweeps, components, tree, verdict, config.significance)
+    return sweeps, change, components, tree, objects, objects.by_node.spread(verdict.motion).any(1), model(given)[0]
 
 
 def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: float) -> None:

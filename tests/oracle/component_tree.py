@@ -10,7 +10,8 @@ from scipy import ndimage
 from cflow_torch.config import VerifiedConfig
 from oracle.aperture import both_ends_move
 from oracle.clustering import SQUARE
-from oracle.height_slices import SlicedSweeps
+from oracle.height_slices import SlicedSweeps, Vector
+from oracle.paired_test import count_wins, evidence_of
 
 PRICE = 16 * 4  # what every child costs, sixteenths of a slice
 LOCAL = 3.0  # metres, longest component of changed pixels
@@ -101,20 +102,56 @@ def cut(nodes: Sequence[Node], evidence: Sequence[int]) -> list[int]:
     return winner
 
 
-def select_objects(sweeps: SlicedSweeps, tree: Tree, evidence: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def dissent(sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], winner: Sequence[int], z: float) -> list[int]:
+    """The node whose motion each node takes, -1 = none, from the winners of the cut.
+
+    A node inside a winner takes its own motion, or is static, if that differs from the motion of the winner, and from
+    what its parent takes, by a pixel in y or in x, and gains more than `PRICE` against the winner in its own pixels.
+    """
+    taken = list(winner)
+    for i, node in enumerate(tree.nodes):
+        if node.level >= len(tree.levels) or winner[i] in (-1, i):
+            continue
+        taken[i] = taken[node.parent]
+        around = motions[taken[i]] if taken[i] >= 0 else (0.0, 0.0)
+        differs = differ(motions[i], motions[winner[i]]) and differ(motions[i], around)
+        if differs and gain(sweeps, node.members, motions[i], motions[winner[i]], z) > PRICE:
+            taken[i] = i if any(motions[i]) else -1
+    return taken
+
+
+def differ(motion: Vector, other: Vector) -> bool:
+    return max(abs(a - b) for a, b in zip(motion, other)) >= 1
+
+
+def gain(sweeps: SlicedSweeps, members: np.ndarray, motion: Vector, other: Vector, z: float) -> int:
+    """Evidence of one motion against another: what one wins against static, the other loses. z counts twice."""
+    total = 0
+    for is_near in (False, True):
+        (won, lost), (other_won, other_lost) = (
+            count_wins(sweeps, members, each, is_near).sum(1).tolist() for each in (motion, other)
+        )
+        total += evidence_of(won + other_lost, lost + other_won, (4 if is_near else 2) * z)
+    return total
+
+
+def select_objects(
+    sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], evidence: Sequence[int], z: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Objects, which move or are static as a whole: (P,) object of each pixel, numbered by their first pixels, and node
     of each object; -1 = none.
 
-    A pixel moves with the winner of its finest node in the tree; else with its node of changed pixels, if that has any
-    evidence; but with its node of a fast object, if that has more evidence. Else it is static with its plain component,
-    if that is linked.
+    A pixel moves with the node whose motion its finest node in the tree takes; else with its node of changed pixels, if
+    that has any evidence; but with its node of a fast object, if that has more evidence. Else it is static with its
+    plain component, if that is linked.
     """
     nodes, num_levels, plain = tree.nodes, len(tree.levels), tree.levels[-1]
     name, moving, changed = np.full((3, len(plain)), -1)
     for label in np.unique(plain):
         if is_linked(sweeps, np.flatnonzero(plain == label)):
             name[plain == label] = len(nodes) + label
-    for i, (node, winner) in enumerate(zip(nodes, cut(nodes, evidence))):
+    taken = dissent(sweeps, tree, motions, cut(nodes, evidence), z)
+    for i, (node, winner) in enumerate(zip(nodes, taken)):
         if node.level < num_levels:
             moving[node.members] = winner
         if node.level == num_levels - 1:

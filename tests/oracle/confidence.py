@@ -113,7 +113,7 @@ def probabilities(
         np.add.at(of_block, (row // side, col // side), np.where(step == 1, of_pixel, 0))
     total, found = counts[:, row // side, col // side]
     sizes, share, bounds = (np.array(TABLE[name]) for name in ("size", "share", "margin"))
-    biased = 1
+    biased = 2
     unmatched = biased + len(TABLE["bias"])
     static = unmatched + 2 * (1 + len(sizes))
     beside = static + 4 * (1 + len(share))

@@ -58,7 +58,9 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     candidates, scores = propose(sweeps, tree.nodes)
     proven = [verify(sweeps, *given, len(tree.levels)) for given in zip(tree.nodes, candidates)]
     nodes = add_unchanged(sweeps, tree.nodes, [motion for motion, _ in proven], len(tree.levels))
-    object_of, chosen = select_objects(sweeps, tree._replace(nodes=nodes), [evidence for _, evidence in proven])
+    motions = [motion for motion, _ in proven]
+    evidence = [value for _, value in proven]
+    object_of, chosen = select_objects(sweeps, tree._replace(nodes=nodes), motions, evidence, config.significance)
 
     motions = [proven[i][0] if i >= 0 else (0.0, 0.0) for i in chosen.tolist()]
     size, members = sweeps.size, [np.flatnonzero(object_of == i) for i in range(len(chosen))]

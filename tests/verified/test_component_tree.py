@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from moving_scenes import for_oracle, from_images
 from oracle import component_tree as oracle
-from oracle.height_slices import SlicedSweeps
+from oracle.height_slices import SlicedSweeps, Vector
 
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.ops.groups import Groups
@@ -24,9 +24,10 @@ from cflow_torch.verified.component_tree import (
     Tree,
     find_components,
     movable_nodes,
-    select_objects,
 )
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.paired_test import Verdict
+from cflow_torch.verified.selection import select_objects
 
 SIZE = 0.25
 Name = Tuple[FrozenSet[int], int]  # pixels of a window and level of a node
@@ -124,20 +125,23 @@ def test_scales_are_nested():
 @given(st.integers(0, 5), st.integers(0, 1000))
 def test_the_cut_equals_the_oracle(seed, of_evidence):
     found, rng = grown(seed), np.random.default_rng(of_evidence)
-    evidence_of: dict[tuple[int, Name], int] = {}
+    verdict_of: dict[tuple[int, Name], tuple[Vector, int]] = {}
     evidence = torch.from_numpy(rng.choice([0, 0, 5, 63, 64, 65, 70, 130, 300], found.nodes.count))
+    motion = torch.from_numpy(rng.uniform(-4, 4, (found.nodes.count, 2)).round(1)) * (evidence > 0)[:, None]
     names = found.fast_names()
-    for window, name, value in zip(found.nodes.window.tolist(), names, evidence.tolist()):
-        evidence_of[window, name] = value
-    objects = select_objects(found.sweeps, found.components, found.nodes, evidence)
+    for window, name, y_x, value in zip(found.nodes.window.tolist(), names, motion.tolist(), evidence.tolist()):
+        verdict_of[window, name] = tuple(y_x), value
+    verdict = Verdict(motion, evidence)
+    # Random pixels hardly gain anything, so at z = 0 some nodes dissent.
+    objects = select_objects(found.sweeps, found.components, found.nodes, verdict, 0.0)
     node = objects.by_node.of_item
     assert torch.equal(objects.pixels.of_item[objects.first], torch.arange(objects.count))
     assert torch.equal(objects.first, objects.first.sort().values)
     start = 0
     for window, tree in enumerate(found.trees):
         own = found.names(window)
-        values = [evidence_of[window, name] for name in own]
-        expected, chosen = oracle.select_objects(found.windows[window], tree, values)
+        verdicts = zip(*[verdict_of[window, name] for name in own])
+        expected, chosen = oracle.select_objects(found.windows[window], tree, *verdicts, 0.0)
         mine = objects.pixels.of_item[found.sweeps.pixels.window == window]
         numbers = torch.where(mine < objects.count, mine - start, -1).tolist()
         assert numbers == expected.tolist()
@@ -158,8 +162,31 @@ def test_a_component_wins_only_with_more_evidence_than_its_children_minus_their_
     components = find_components(sweeps, change, (2, 1))
     nodes = movable_nodes(sweeps, components, None)
     assert nodes.kind.tolist() == [0, 1, 1] and nodes.by_parent.of_item.tolist() == [3, 0, 0]
-    objects = select_objects(sweeps, components, nodes, torch.tensor([whole, 100, 100]))
+    alike = Verdict(torch.ones((3, 2), dtype=torch.float64), torch.tensor([whole, 100, 100]))
+    objects = select_objects(sweeps, components, nodes, alike, 1.5)
     assert objects.by_node.of_item.tolist() == ([0] if wins else [1, 2])
+
+
+@pytest.mark.parametrize("z, dissents", [(1.5, True), (100.0, False)])
+def test_inside_a_car_a_cyclist_moves_by_himself_and_a_parked_car_is_static(z, dissents):
+    # In rows of their own, with one row between, so that they are one component where it is dilated. The car moves by 4
+    # pixels a sweep, the cyclist by 2.
+    images = np.zeros((1, 4, 20, 40), dtype=np.uint8)
+    for step in range(4):
+        for row, first, length in ((3, 20 - 4 * step, 12), (6, 24 - 2 * step, 8), (9, 20, 12)):
+            images[0, step, row : row + 2, first : first + length] = 15
+    sweeps = from_images(images, SIZE)
+    every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
+    components = find_components(sweeps, ChangedPixels(every, ~every, ~every), (2, 1))
+    nodes = movable_nodes(sweeps, components, None)
+    assert nodes.kind.tolist() == [0, 1, 2, 2, 2]
+    speed = torch.tensor([4.0, 4.0, 4.0, 2.0, 0.0], dtype=torch.float64)
+    motion = torch.stack((0 * speed, speed), 1)
+    objects = select_objects(sweeps, components, nodes, Verdict(motion, torch.tensor([9000, 9000, 4000, 4000, 0])), z)
+    row = sweeps.pixels.row_col[0]
+    flow = objects.pixels.spread(objects.by_node.spread(motion))
+    for first, own in ((3, 4.0), (6, 2.0), (9, 0.0)):
+        assert (flow[(row == first) | (row == first + 1), 1] == (own if dissents else 4.0)).all()
 
 
 def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_of_it_has_no_evidence():
@@ -175,7 +202,8 @@ def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_o
     nodes = replace(nodes, pixel=torch.cat((nodes.pixel, joined)), members=members)
     evidence = torch.zeros(nodes.count, dtype=torch.int64)
     evidence[first] = 100
-    objects = select_objects(sweeps, components, nodes, evidence)
+    verdict = Verdict((evidence > 0)[:, None].double().expand(-1, 2), evidence)
+    objects = select_objects(sweeps, components, nodes, verdict, 1.5)
     assert objects.by_node.of_item[objects.pixels.of_item[joined]].tolist() == [first]
 
 

@@ -23,8 +23,9 @@ def test_the_tables_are_monotone_and_the_oracle_reads_them():
     table = confidence.TABLE
     sizes, shares, margins = (len(table[name]) + 1 for name in ("size", "share", "margin"))
     for name, falls in (("probabilities", False), ("moving", True)):
-        start = 1 + len(table["bias"])
-        biased = table[name][1:start]
+        assert table[name][confidence._Bins.unmeasured] == 0.5
+        start = 2 + len(table["bias"])
+        biased = table[name][2:start]
         assert biased == sorted(biased, reverse=not falls)
         rows = []
         for length in (*2 * (sizes,), *4 * (shares,), *4 * (1,), *8 * (margins,)):

@@ -15,8 +15,8 @@ from turning_car import MODEL, upright_box
 
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, estimate_flow, make_config, make_model
 from cflow_torch.ops.groups import Groups
-from cflow_torch.verified.component_tree import number_objects
 from cflow_torch.verified.offline import best_nearby
+from cflow_torch.verified.selection import number_objects
 
 OFFLINE = MODEL.replace(num_history=4, num_future=4)
 SPEED = 0.9  # metres per sweep, along -x

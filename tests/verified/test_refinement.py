@@ -13,9 +13,10 @@ from oracle import registration as oracle
 from cflow_torch.ops.groups import Groups
 from cflow_torch.verified import subpixel_motion as fast
 from cflow_torch.verified.changed_pixels import ChangedPixels
-from cflow_torch.verified.component_tree import find_components, number_objects
+from cflow_torch.verified.component_tree import find_components
 from cflow_torch.verified.refinement import Registration, refine
 from cflow_torch.verified.rigid_motion import RigidMotion
+from cflow_torch.verified.selection import number_objects
 from cflow_torch.verified.voxel_centroids import Voxels, points_of_objects
 
 

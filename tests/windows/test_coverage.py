@@ -92,11 +92,20 @@ def test_static_points_stay_static_where_sweeps_are_cut(is_front, pair):
     window = cut_window(drive, is_front, pair)
     (result,) = VerifiedFlow.from_preset("default")([window])
     sweep = drive.sweep(pair)
-    truth = drive.labels(pair).flow - ego_motion_flow(sweep.points, np.linalg.inv(window.pc1.pose) @ window.pc0.pose)
+    T_ego1_ego0 = np.linalg.inv(window.pc1.pose) @ window.pc0.pose
+    truth = drive.labels(pair).flow - ego_motion_flow(sweep.points, T_ego1_ego0)
     speed = np.linalg.norm(truth, axis=1)[cut(sweep, is_front, pair % 3 == 0)]
     moves = result.is_moving.numpy()
     assert (moves & (speed < 0.001)).sum() < 60
     assert moves[speed > 0.3].mean() > 0.7  # of the others, t+1 has lost the points
+    # Whether points move that t+1 did not measure, nobody knows. A few cells at the borders of the azimuths differ.
+    at_newest = window.pc0.points.astype(np.float64) @ T_ego1_ego0[:2, :3].T + T_ego1_ego0[:2, 3]
+    azimuth = np.degrees(np.arctan2(at_newest[:, 1], at_newest[:, 0]))
+    is_unknown = np.abs(azimuth) > 37 if is_front else (azimuth > 2) & (azimuth < 88)
+    is_static = (result.is_valid & (result.residual_flow == 0).all(1)).numpy()
+    is_half = (result.confidence == 0.5).numpy()
+    assert is_front or ((is_unknown & is_static).sum() > 100 and is_half[is_unknown & is_static].mean() > 0.95)
+    assert not is_half[np.abs(azimuth) < 33 if is_front else azimuth < -2].any()
 
 
 def test_cut_sweeps_in_a_batch_give_the_bits_of_each_window_alone():

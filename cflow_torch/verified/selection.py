@@ -1,0 +1,182 @@
+"""Select objects among the nodes of the component tree: which motion does each pixel take?
+
+A component wins if its motion has more evidence than its children together. But it may hold two objects, and the motion
+of the larger one wins. Where the smaller one is, hardly anything is found, neither in place nor at the targets of that
+motion, so the evidence does not fall. Therefore a node inside a winner *dissents* if its own motion, or "static", beats
+the motion of the winner in its own pixels:
+
+    winner     [   A     A  c  p ]     a car A, a cyclist c behind it and a parked car p: all move as A
+    dissent              [c][p]        c moves by itself, p is static
+
+The pixels of copies follow the drawn ones, and P' counts both.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import flat_nonzero
+from cflow_torch.verified.component_tree import PER_SLICE, Components, NodeKind, Objects, Tree
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.paired_test import NEAR_Z, Counts, Verdict, count_wins
+
+# The price of an object on each level. Children move separately only if that gains more evidence.
+PRICE = 4 * PER_SLICE
+_DISSENT_Z = 2.0  # factor of z for nodes that dissent
+_LEAST_DIFFERENCE = 1.0  # finest pixels per sweep interval, between the motions of a winner and of a node that dissents
+
+
+def select_objects(
+    sweeps: HeightSlicedSweeps,
+    components: Components,
+    tree: Tree,
+    verdict: Verdict,
+    significance: float,
+    price: int = PRICE,
+) -> Objects:
+    """Select objects from the leaves up, then let nodes inside the winners dissent.
+
+    Args:
+        components, tree: `tree` includes nodes under overhangs, `components` does not.
+        verdict: the best motion of each node, and its evidence; 0 = none is significant.
+        significance: z of the paired test. For a node against the winner around it, z is twice as large.
+        price: of an object, in units of `PER_SLICE`.
+
+    Returns:
+        The objects. A pixel belongs to the first of these that exists:
+        1. its node of a fast object, if that has evidence, and more than 2 has;
+        2. the node whose motion the finest of its nodes of the levels takes, else its node of changed pixels or of
+           copies with evidence;
+        3. its plain component, if that is linked. Then it is static.
+        Otherwise it is static and belongs to no object.
+
+    Convention:
+        The value of a child is its own evidence or the sum of its children's values, whichever is more, minus `price`,
+        but at least 0. The coarsest node with more evidence than its children wins. Ties: the children win.
+        A node inside a winner dissents if its motion differs from that of the winner, and from the one it would take
+        from its parent, by a pixel per sweep interval in y or in x, and gains more than `price`.
+
+    Cost: a few passes over the nodes for each level, and over the members; the paired test of nodes that may dissent.
+    """
+    none = tree.count
+    node = torch.arange(none, device=verdict.evidence.device)
+    winner = _winners(tree, node, verdict.evidence, price)
+    taken = _with_dissent(sweeps, tree, verdict, winner, significance, price)
+    by_pixel = Groups(tree.pixel, sweeps.num_pixels)  # the members
+    moving = _moving_nodes(tree, by_pixel, taken, verdict.evidence)
+
+    # The key of an object is the number of its node, else N plus the number of its component.
+    plain_node = torch.where(tree.kind == tree.num_levels - 1, node, none)
+    static = by_pixel.min(tree.members.spread(plain_node, none=none), empty=none)  # [P']
+    key = _keys_of_components(components, none, sweeps.num_pixels)
+    key = torch.where(static < none, static, key)
+    key = torch.where(moving < none, moving, key)
+    return number_objects(Groups(key, none + components.count), tree.count)
+
+
+def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
+    """Return the coarsest winner among each node and those that contain it, (N,) int64; N = none of them won.
+
+    `node` is the number of each node, 0 ... N - 1.
+    """
+    # From the leaves up: the value of the children of each node.
+    of_children = torch.zeros_like(evidence)
+    for level in range(tree.num_levels - 1, 0, -1):
+        value = (torch.maximum(evidence, of_children) - price).clamp(min=0)
+        of_children += tree.by_parent.sum(torch.where(tree.kind == level, value, 0))
+
+    # From the roots down: a node follows the coarsest winner that contains it, which has the smallest number.
+    winner = torch.where(evidence > of_children, node, tree.count)
+    for _ in range(tree.num_levels - 1):
+        winner = torch.minimum(winner, tree.by_parent.spread(winner, none=tree.count))
+    return winner
+
+
+def _with_dissent(
+    sweeps: HeightSlicedSweeps, tree: Tree, verdict: Verdict, winner: Tensor, significance: float, price: int
+) -> Tensor:
+    """Return the node whose motion each node takes, (N,) int64; N = it is static.
+
+    `winner` is (N,), the result of `_winners`.
+    """
+    none = tree.count
+    node = torch.arange(none, device=winner.device)
+    motion = verdict.motion
+    motion_around = Groups(winner, none).spread(motion)  # [N, 2]
+    is_inside = (tree.kind < tree.num_levels) & (winner < none) & (winner != node)
+    inside = flat_nonzero(is_inside & _differ(motion, motion_around))
+    if len(inside) == 0:
+        return winner
+    dissents = torch.zeros_like(is_inside)
+    dissents[inside] = _gain(sweeps, tree, inside, motion, motion_around, _DISSENT_Z * significance) > price
+    own = torch.where(motion.any(1), node, none)
+    taken = winner
+    for level in range(1, tree.num_levels):
+        of_parent = tree.by_parent.spread(taken, none=none)
+        takes_own = dissents & _differ(motion, Groups(of_parent, none).spread(motion))
+        of_level = torch.where(takes_own, own, of_parent)
+        taken = torch.where(is_inside & (tree.kind == level), of_level, taken)
+    return taken
+
+
+def _differ(motion: Tensor, other: Tensor) -> Tensor:
+    """Tell which motions differ by a pixel in y or in x, (N,) bool, from (N, 2) each, pixels per sweep interval."""
+    return ((motion - other).abs() >= _LEAST_DIFFERENCE).any(1)
+
+
+def _gain(sweeps: HeightSlicedSweeps, tree: Tree, node: Tensor, motion: Tensor, other: Tensor, z: float) -> Tensor:
+    """Return the evidence of motions against others in the pixels of K nodes, (K,) int64, units of `PER_SLICE`.
+
+    The motions are (N, 2) each, of all nodes. What one motion wins against "static", the other one loses against it.
+    """
+    pixel, members = tree.pixels_of(node)
+    motions = torch.stack((motion.index_select(0, node), other.index_select(0, node)), 1)  # [K, 2, 2]
+    wins = count_wins(sweeps, sweeps.pixels[pixel], members, motions)
+    exact, near = (Counts(n.won[:, 0] + n.lost[:, 1], n.lost[:, 0] + n.won[:, 1]) for n in (wins.exact, wins.near))
+    return exact.evidence(z) + near.evidence(NEAR_Z * z)
+
+
+def _moving_nodes(tree: Tree, by_pixel: Groups, taken: Tensor, evidence: Tensor) -> Tensor:
+    """Return the moving node of each pixel, (P',) int64, N = none; see `select_objects`.
+
+    `by_pixel` groups the members by pixel, `taken` is the result of `_with_dissent`.
+    """
+    none = tree.count
+    node = torch.arange(none, device=taken.device)
+    is_of_level = tree.kind < tree.num_levels
+    is_fast = tree.kind == NodeKind.UNLINKED
+    # Nodes are listed level by level, so the finest node of a pixel has the largest number.
+    finest = by_pixel.max(tree.members.spread(torch.where(is_of_level, node, -1), none=-1), empty=-1)  # [P']
+    slow = torch.where(finest >= 0, F.pad(taken, (0, 1), value=none).index_select(0, finest.clamp(min=0)), none)
+    fast = by_pixel.min(tree.members.spread(taken.masked_fill(~is_fast, none), none=none), empty=none)  # [P']
+    other = by_pixel.min(tree.members.spread(taken.masked_fill(is_of_level | is_fast, none), none=none), empty=none)
+    slow = torch.where(slow < none, slow, other)
+    evidence_of = F.pad(evidence, (0, 1))  # of none, 0
+    is_faster = evidence_of.index_select(0, fast) > evidence_of.index_select(0, slow)
+    return torch.where(is_faster, fast, slow)
+
+
+def _keys_of_components(components: Components, first: int, num_pixels: int) -> Tensor:
+    """Return `first` plus the plain component of each pixel, (P',) int64, if that is linked.
+
+    Otherwise, and for the pixels of copies, the result is the number after the last component.
+    """
+    plain = components.of_level(-1)
+    linked = plain.where(plain.spread(components.is_linked))
+    num_copies = num_pixels - len(linked.of_item)
+    return F.pad(first + linked.of_item, (0, num_copies), value=first + components.count)
+
+
+def number_objects(by_key: Groups, num_nodes: int = 0) -> Objects:
+    """Number the objects in order of their first pixel.
+
+    `by_key` groups the P' pixels. The first `num_nodes` groups are objects that are nodes, the others are components.
+    """
+    first = by_key.first()
+    used = flat_nonzero(first < len(by_key.of_item))
+    first, order = first[used].sort()
+    used = used[order]
+    return Objects(by_key.select(used), Groups(used.clamp(max=num_nodes), num_nodes), first)
