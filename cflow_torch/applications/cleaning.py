@@ -96,10 +96,7 @@ class CleanLog(MaskedLog):
         model: SceneFlowModel | None = None,
         flow: Callable[[int], FlowResult] | None = None,
         remove_stopped: bool = False,
-        standing: None = None,
     ) -> None:
-        if standing is not None:
-            raise CFlowError("standing= is now remove_stopped=")
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
         if flow is None and model is None:

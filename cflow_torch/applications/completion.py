@@ -1,4 +1,4 @@
-"""Replace the visible boxes in the table of tracks of a complete log by whole ones."""
+"""Replace the visible boxes in the table of tracks of a complete log by whole ones, found from their points."""
 
 from __future__ import annotations
 
@@ -16,34 +16,51 @@ from cflow_torch.types import FlowResult, Window, as_numpy
 
 
 class TrackedPoints(NamedTuple):
-    """The points of a sweep that belong to tracks.
+    """The M points of a sweep that belong to tracks."""
 
-    Args:
-        sweep: index of the sweep in its log.
-        num_points: N, all points of the sweep.
-        row: (M,) int64 rows of the points that have a track.
-        id: (M,) int64 ids of their tracks.
-    """
-
-    sweep: int
-    num_points: int
-    row: np.ndarray
-    id: np.ndarray
+    sweep: int  # index of the sweep in its log
+    num_points: int  # N, all points of the sweep
+    seconds: float  # time
+    sensor: np.ndarray  # (3,) float64 metres, position of the vehicle in the world
+    row: np.ndarray  # (M,) int64 rows of the points
+    id: np.ndarray  # (M,) int64 ids of their tracks
+    offset: np.ndarray  # (M, 3) float32 metres, from the vehicle to each point, axes of the world
+    velocity: np.ndarray  # (M, 3) float32 m/s, flow in the world
 
     @classmethod
-    def of(cls, sweep: int, track_id: np.ndarray) -> TrackedPoints:
-        """Keep the points with an id, of (N,) ids where -1 = no track."""
+    def of(cls, index: int, sweeps: Window, result: FlowResult, track_id: np.ndarray, times: Times) -> TrackedPoints:
+        """Keep the points of sweep `index` that have an id, of (N,) ids where -1 = no track."""
+        T_world_ego0 = pose_of(sweeps.pc0)
+        T_world_ego1 = pose_of(sweeps.pc1)
+        sensor = T_world_ego0[:3, 3]
         row = np.flatnonzero(track_id >= 0)
-        return cls(sweep, len(track_id), row, track_id[row])
+        position = transform_points(as_numpy(sweeps.pc0.points)[row, :3], T_world_ego0)
+        step = as_numpy(result.residual_flow)[row].astype(np.float64) @ T_world_ego1[:3, :3].T
+        offset = (position - sensor).astype(np.float32)
+        velocity = (step / times.interval).astype(np.float32)
+        return cls(index, len(track_id), times.now, sensor, row, track_id[row], offset, velocity)
 
-    def followed_by(self, row: np.ndarray, number: int) -> TrackedPoints:
-        """Append rows of the points of another track, with its id."""
-        ids = np.append(self.id, np.full(len(row), number))
-        return self._replace(row=np.append(self.row, row), id=ids)
+    def of_track(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions of the points of a track, (P, 3) float64 metres in the world, and its mean velocity."""
+        is_on_track = self.id == number
+        return self.sensor + self.offset[is_on_track], self.velocity[is_on_track].mean(0, dtype=np.float64)
+
+    def followed_by(self, number: int, row: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> TrackedPoints:
+        """Append the points of another track: rows, positions (P, 3), and their velocity (3,)."""
+        offset = (position - self.sensor).astype(np.float32)
+        velocities = np.broadcast_to(velocity.astype(np.float32), offset.shape)
+        return self._replace(
+            row=np.append(self.row, row),
+            id=np.append(self.id, np.full(len(row), number)),
+            offset=np.concatenate([self.offset, offset]),
+            velocity=np.concatenate([self.velocity, velocities]),
+        )
 
     def renumber(self, ids: np.ndarray) -> TrackedPoints:
         """Give the points other ids, (M,) int64, and drop those with -1."""
-        return self._replace(row=self.row[ids >= 0], id=ids[ids >= 0])
+        is_kept = ids >= 0
+        columns = {name: getattr(self, name)[is_kept] for name in ("row", "offset", "velocity")}
+        return self._replace(id=ids[is_kept], **columns)
 
     def track_id(self, kept: np.ndarray) -> np.ndarray:
         """Return the id of every point, (N,) int64; -1 = no track, or one that is not among the ids `kept`."""
@@ -52,54 +69,7 @@ class TrackedPoints(NamedTuple):
         return ids
 
 
-class SeenPoints(NamedTuple):
-    """The points of tracks in one sweep, float32 relative to the vehicle to save memory."""
-
-    sweep: int  # index in the log
-    seconds: float  # time
-    id: np.ndarray  # (T,) int64 tracks, ascending
-    velocity: np.ndarray  # (T, 3) float64 m/s, mean flow of each track, in the world
-    sensor: np.ndarray  # (3,) float64 metres, position of the vehicle in the world
-    offset: np.ndarray  # (M, 3) float32 metres, from the vehicle to each point, axes of the world
-    track: np.ndarray  # (M,) int32 index in `id` of each point's track
-
-    @classmethod
-    def of(cls, sweeps: Window, result: FlowResult, points: TrackedPoints, times: Times) -> SeenPoints:
-        """Read the positions and the flow of the points of tracks."""
-        T_world_ego0 = pose_of(sweeps.pc0)
-        T_world_ego1 = pose_of(sweeps.pc1)
-        sensor = T_world_ego0[:3, 3]
-        position = transform_points(as_numpy(sweeps.pc0.points)[points.row, :3], T_world_ego0)
-        step = as_numpy(result.residual_flow)[points.row].astype(np.float64) @ T_world_ego1[:3, :3].T
-        ids, number, count = np.unique(points.id, return_inverse=True, return_counts=True)
-        total = [np.bincount(number, step[:, axis], len(ids)) for axis in range(3)]
-        velocity = np.stack(total, 1) / count[:, None] / times.interval
-        offset = (position - sensor).astype(np.float32)
-        return cls(points.sweep, times.now, ids, velocity, sensor, offset, number.astype(np.int32))
-
-    def positions(self, index: int) -> np.ndarray:
-        """(P, 3) float64 metres in the world, points of the track `id[index]`."""
-        return self.sensor + self.offset[self.track == index]
-
-    def insert(self, index: int, number: int, velocity: np.ndarray, position: np.ndarray) -> SeenPoints:
-        """Insert a track with the id `number` before `id[index]`: its velocity, (3,), and its points, (P, 3)."""
-        shifted = self.track + (self.track >= index)
-        return self._replace(
-            id=np.insert(self.id, index, number),
-            velocity=np.insert(self.velocity, index, velocity, axis=0),
-            offset=np.concatenate([self.offset, (position - self.sensor).astype(np.float32)]),
-            track=np.append(shifted, np.full(len(position), index)).astype(np.int32),
-        )
-
-    def renumber(self, ids: np.ndarray) -> SeenPoints:
-        """Give the points other ids, (M,) int64, and drop those with -1. New tracks keep the velocity."""
-        is_kept = ids >= 0
-        new, first, track = np.unique(ids[is_kept], return_index=True, return_inverse=True)
-        velocity = self.velocity[self.track[is_kept][first]]
-        return self._replace(id=new, velocity=velocity, offset=self.offset[is_kept], track=track.astype(np.int32))
-
-
-def complete(table: Table, seen: Sequence[SeenPoints]) -> Table:
+def complete(table: Table, seen: Sequence[TrackedPoints]) -> Table:
     """Give every row of a table its whole box, the smoothed position and velocity of its centre, its class and its age.
 
     Args:
@@ -130,7 +100,7 @@ def complete(table: Table, seen: Sequence[SeenPoints]) -> Table:
     }
 
 
-def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence[SeenPoints]) -> Sightings:
+def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence[TrackedPoints]) -> Sightings:
     """Collect what is seen of the rows of a table, in the given order. `rank` is the position of each row in it."""
     sweeps = [each.sweep for each in seen]
     seconds = np.zeros(len(order))
@@ -143,14 +113,15 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
     for number, each in enumerate(seen):
         now = slice(first[number], last[number])
         is_in_table = np.isin(each.id, table["id"][now])
-        row_of_id = np.full(len(each.id), -1)
-        row_of_id[is_in_table] = rank[now]  # both are sorted by id
-        row = row_of_id[each.track]
-        points.append(each.sensor + each.offset[row >= 0])
-        rows.append(row[row >= 0])
-        velocity[rank[now]] = each.velocity[is_in_table] * table["is_moving"][now, None]
+        row = rank[now][np.searchsorted(table["id"][now], each.id[is_in_table])]  # ids of a sweep ascend
+        points.append(each.sensor + each.offset[is_in_table])
+        rows.append(row)
+        np.add.at(velocity, row, each.velocity[is_in_table])
         seconds[rank[now]] = each.seconds
         sensor[rank[now]] = each.sensor
+    row_of_point = np.concatenate(rows)
+    count = np.bincount(row_of_point, minlength=len(order)).clip(1)
+    velocity *= (table["is_moving"][order] / count)[:, None]
     columns = (
         np.unique(table["id"][order], return_inverse=True)[1],
         seconds,
@@ -158,6 +129,6 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
         velocity,
         table["heading"][order],
         np.concatenate(points),
-        np.concatenate(rows),
+        row_of_point,
     )
     return Sightings(*map(torch.from_numpy, columns))

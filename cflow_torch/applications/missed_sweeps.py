@@ -5,37 +5,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from cflow_torch.applications.association import MIN_STOPPED_SHARE
-from cflow_torch.applications.completion import SeenPoints, TrackedPoints
+from cflow_torch.applications.association import MIN_STOPPED_SHARE, box_of_point, enclosing_boxes
+from cflow_torch.applications.completion import TrackedPoints
 from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of
 from cflow_torch.applications.track_table import Table
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import FlowResult, Window, as_numpy
 
 _MARGIN = 0.2  # metres, added to length, width and height of a box
-
-
-class Box(NamedTuple):
-    """An upright box in the world around some points."""
-
-    centre: np.ndarray  # (3,) metres
-    size: np.ndarray  # (3,) metres: along the heading, across, up
-    axes: np.ndarray  # (3, 3) rows: ahead, left, up
-
-    @classmethod
-    def around(cls, points: np.ndarray, heading: float) -> Box:
-        """Enclose (M, 3) points."""
-        cos, sin = np.cos(heading), np.sin(heading)
-        axes = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-        local = points @ axes.T
-        low = local.min(0)
-        high = local.max(0)
-        return cls((low + high) / 2 @ axes, high - low, axes)
-
-    def moved(self, step: np.ndarray) -> Box:
-        """Shift the box by (3,) metres."""
-        return self._replace(centre=self.centre + step)
+_APART = 0.1  # metres between a box and the place that it has left
 
 
 class FreePoints(NamedTuple):
@@ -55,12 +36,13 @@ class FreePoints(NamedTuple):
         order = np.argsort(position[:, 0])
         return cls(row[order], position[order])
 
-    def inside(self, box: Box) -> np.ndarray:
-        """(M,) int64 indices of the points in a box, `_MARGIN` larger."""
-        reach = np.hypot(*box.size[:2]) / 2 + _MARGIN
-        first, last = np.searchsorted(self.position[:, 0], box.centre[0] + [-reach, reach])
-        local = (self.position[first:last] - box.centre) @ box.axes.T
-        return first + np.flatnonzero((np.abs(local) <= (box.size + _MARGIN) / 2).all(axis=1))
+    def inside(self, centre: Tensor, size: Tensor, heading: Tensor) -> np.ndarray:
+        """(M,) int64 indices of the points in a box, see `box_of_point`."""
+        reach = float(size[0, :2].norm()) / 2
+        x = float(centre[0, 0])
+        first, last = np.searchsorted(self.position[:, 0], [x - reach, x + reach])
+        box = box_of_point(torch.from_numpy(self.position[first:last]), centre, size, heading)
+        return first + np.flatnonzero(box.numpy() == 0)
 
     def without(self, index: np.ndarray) -> FreePoints:
         """Remove points by their indices."""
@@ -72,17 +54,13 @@ class SweepTracks:
 
     Args:
         table: rows of this sweep, sorted by id.
-        points: rows of the points of the tracks.
-        seen: positions and flow of these points.
+        points: the points of the tracks.
         timestamp_ns: time stamp of the sweep in its log.
         free: the other points; None = no track is looked for.
     """
 
-    def __init__(
-        self, table: Table, points: TrackedPoints, seen: SeenPoints, timestamp_ns: int, free: FreePoints | None
-    ) -> None:
+    def __init__(self, table: Table, points: TrackedPoints, timestamp_ns: int, free: FreePoints | None) -> None:
         self.points = points
-        self.seen = seen
         self.free = free
         self._where = {"sweep": points.sweep, "timestamp_ns": timestamp_ns}
         self.table = {**table, **{name: np.full(len(table["id"]), value) for name, value in self._where.items()}}
@@ -95,21 +73,29 @@ class SweepTracks:
         """
         if self.free is None:
             return False
-        velocity = later.seen.velocity[row]
-        box = Box.around(later.seen.positions(row), later.table["heading"][row])
-        index = self.free.inside(box.moved((self.seen.seconds - later.seen.seconds) * velocity))
-        least = max(MIN_POINTS, MIN_STOPPED_SHARE * later.table["num_points"][row], len(self.free.inside(box)))
-        if len(index) < least:
-            return False
         number = int(later.table["id"][row])
+        _, velocity = later.points.of_track(number)
+        centre, size, heading = later.box(row)
+        size = size + _MARGIN
+        step = torch.from_numpy((self.points.seconds - later.points.seconds) * velocity)
+        index = self.free.inside(centre + step, size, heading)
+        num_there = len(self.free.inside(centre, size, heading))
+        if len(index) < max(MIN_POINTS, MIN_STOPPED_SHARE * later.table["num_points"][row], num_there):
+            return False
         at = int(np.searchsorted(self.table["id"], number))
         values = {name: column[row] for name, column in later.table.items()}
         values.update(self._where, num_points=len(index), cluster_id=-1, is_confirmed=False)
         self.table = {name: np.insert(column, at, values[name]) for name, column in self.table.items()}
-        self.points = self.points.followed_by(self.free.row[index], number)
-        self.seen = self.seen.insert(at, number, velocity, self.free.position[index])
+        self.points = self.points.followed_by(number, self.free.row[index], self.free.position[index], velocity)
         self.free = self.free.without(index)
         return True
+
+    def box(self, row: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the box around the points of the track in a row: centre and size, (1, 3) metres, and heading, (1,)."""
+        position, _ = self.points.of_track(int(self.table["id"][row]))
+        heading = torch.from_numpy(self.table["heading"][row : row + 1])
+        points = torch.from_numpy(position)
+        return (*enclosing_boxes(points, torch.zeros(len(points), dtype=torch.int64), heading), heading)
 
     def divide(self, number: int, ids: np.ndarray) -> None:
         """Give the points of the track `number` new ids, (P,) int64; -1 = no track.
@@ -129,5 +115,31 @@ class SweepTracks:
         self.table = {name: column[order] for name, column in columns.items()}
         id_of_point = self.points.id.copy()
         id_of_point[self.points.id == number] = np.where(np.isin(ids, parts), ids, -1)
-        self.seen = self.seen.renumber(id_of_point)
         self.points = self.points.renumber(id_of_point)
+
+
+class LeftPlaces:
+    """The places that tracks have left. Objects leave free places, pieces of a wall that seem to move do not."""
+
+    def __init__(self) -> None:
+        self._boxes: dict[int, list[tuple[Tensor, Tensor, Tensor, int]]] = {}  # of each track, and its points inside
+        self._shares: dict[int, list[float]] = {}  # points that remain, as a share of those of the track
+
+    def add(self, now: SweepTracks) -> None:
+        """Count the points at the last place of each moving track that its box does not touch any more."""
+        for row in np.flatnonzero(now.table["is_moving"]).tolist():
+            number = int(now.table["id"][row])
+            centre, size, heading = now.box(row)
+            boxes = self._boxes.setdefault(number, [])
+            for before, size_before, heading_before, count in reversed(boxes):
+                sides = size[0, :2].max() + size_before[0, :2].max()
+                if now.free is not None and (centre - before)[0, :2].norm() > sides / 2 + _APART:
+                    remaining = len(now.free.inside(before, size_before, heading_before))
+                    self._shares.setdefault(number, []).append(remaining / count)
+                    break
+            boxes.append((centre, size, heading, int(now.table["num_points"][row])))
+
+    def occupied(self) -> list[int]:
+        """Return the tracks whose places are not free, in the median of at least two sweeps."""
+        shares = {number: each for number, each in self._shares.items() if len(each) > 1}
+        return [number for number, each in shares.items() if np.median(each) >= MIN_STOPPED_SHARE]

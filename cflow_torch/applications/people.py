@@ -28,13 +28,13 @@ _LEAST_SWEEPS = 0.5  # share of the sweeps of the group in which a person is see
 def divide_people(sweeps: Sequence[SweepTracks], table: Table) -> bool:
     """Give each person of a group a track. `table` has the boxes of the groups. Returns whether a group was divided."""
     row_of = {(sweep, number): row for row, (sweep, number) in enumerate(zip(table["sweep"], table["id"]))}
-    next_id = 1 + max((int(each.seen.id.max(initial=-1)) for each in sweeps), default=-1)
+    next_id = 1 + max((int(each.points.id.max(initial=-1)) for each in sweeps), default=-1)
     is_divided = False
     for number in np.unique(table["id"]).tolist():
         rows = np.flatnonzero(table["id"] == number)
         if np.median(np.hypot(table["vx"][rows], table["vy"][rows])) >= RUNNING:
             continue
-        seen = [each for each in sweeps if (each.points.sweep, number) in row_of and number in each.seen.id]
+        seen = [each for each in sweeps if (each.points.sweep, number) in row_of and number in each.points.id]
         points = [_in_box(each, table, row_of[each.points.sweep, number]) for each in seen]
         sweep = torch.arange(len(seen)).repeat_interleave(torch.tensor([len(each) for each in points]))
         person = people(torch.cat(points), sweep)
@@ -51,8 +51,8 @@ def divide_people(sweeps: Sequence[SweepTracks], table: Table) -> bool:
 
 def _in_box(sweep: SweepTracks, table: Table, row: int) -> Tensor:
     """Return the points of a track along the axes of its box, (P, 3) metres from its centre."""
-    index = int(np.searchsorted(sweep.seen.id, table["id"][row]))
-    offset = sweep.seen.positions(index) - [table[axis][row] for axis in "xyz"]
+    position, _ = sweep.points.of_track(int(table["id"][row]))
+    offset = position - [table[axis][row] for axis in "xyz"]
     return turned(torch.from_numpy(offset), torch.full((len(offset),), -table["heading"][row], dtype=torch.float64))
 
 

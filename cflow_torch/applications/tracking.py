@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, regroup
-from cflow_torch.applications.completion import SeenPoints, TrackedPoints, complete
-from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
+from cflow_torch.applications.completion import TrackedPoints, complete
+from cflow_torch.applications.missed_sweeps import FreePoints, LeftPlaces, SweepTracks
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
 from cflow_torch.applications.people import divide_people
 from cflow_torch.applications.track_state import Times, TrackStates
@@ -326,7 +326,8 @@ def track(
         have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much, if
         the box shrinks, the centre must have moved by 0.3 m plus a twentieth of the length. Otherwise, and if it is
         narrower or lower than 0.12 m, its flow in at least three sweeps must add up to the larger of 1.5 m and its
-        length, and the box must have moved by this sum ± 25 %. Tracks that are never confirmed are left out.
+        length, and the box must have moved by this sum ± 25 %. Tracks that are never confirmed are left out, and those
+        that leave no free place: where they were, 0.3 times as many static points or more remain.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
@@ -363,17 +364,18 @@ class LogTracker:
         self._log = log
         self._tracker = Tracker(sweep_interval)
         self._sweeps: list[SweepTracks] = []
+        self._left = LeftPlaces()
         self._last: dict[int, int] = {}  # id -> number of the last sweep in which the track is seen
 
     def push(self, index: int, result: FlowResult) -> None:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
-        points = TrackedPoints.of(index, track_id)
-        seen = SeenPoints.of(sweeps, result, points, self._tracker.times)
+        points = TrackedPoints.of(index, sweeps, result, track_id, self._tracker.times)
         free = FreePoints.of(sweeps, result, points)
-        now = SweepTracks(table, points, seen, int(self._log.timestamps[index]), free)
+        now = SweepTracks(table, points, int(self._log.timestamps[index]), free)
         self._find_before(now)
+        self._left.add(now)
         self._sweeps.append(now)
         if len(self._sweeps) > _MAX_MISSED:
             self._sweeps[-_MAX_MISSED - 1].free = None  # to save memory
@@ -401,4 +403,5 @@ class LogTracker:
 
     def _whole(self) -> dict[str, np.ndarray]:
         table = confirmed(join_tables([each.table for each in self._sweeps]))
-        return complete(table, [each.seen for each in self._sweeps])
+        has_left = ~np.isin(table["id"], self._left.occupied())
+        return complete({name: values[has_left] for name, values in table.items()}, self.points)

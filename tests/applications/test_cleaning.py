@@ -139,8 +139,6 @@ def test_wrong_inputs_are_one_clear_error() -> None:
         static_map(log, 0.0)
     with pytest.raises(CFlowError, match="rows"):
         CleanLog(log, flow=lambda index: Staged(log.paths * np.nan).result(index)).moving(0)
-    with pytest.raises(CFlowError, match="is now remove_stopped="):
-        CleanLog(log, standing=True)
     log.poses = np.tile(np.eye(4), (12, 1, 1))
     with pytest.raises(CFlowError, match="larger voxels"):
         static_map(log, 1e-5)

@@ -156,6 +156,27 @@ def test_a_strip_that_one_beam_draws_is_not_a_track_unless_it_goes_far() -> None
     assert len(set(table["id"])) == 1 and np.all(table["y"] > 4), "the one that moves by more than its length"
 
 
+@pytest.mark.parametrize("is_free", [True, False])
+def test_what_leaves_no_free_place_is_not_a_track(is_free: bool) -> None:
+    """A piece of a fence seems to move along it: the fence is there again where the piece was."""
+
+    class Fence(Staged):
+        def world(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            points, flow, car = super().world(index)
+            x, y = self.paths[0, index]
+            fence = np.stack(np.meshgrid(np.arange(-5, 25, 0.05), [y + 0.5], np.arange(0, 1.2, 0.2)), -1).reshape(-1, 3)
+            fence = fence[(fence[:, 0] < x) | (fence[:, 0] > x + SIZE[0])]
+            count = 0 if is_free else len(fence)
+            return (
+                np.concatenate([points, fence[:count]]),
+                np.concatenate([flow, np.zeros((count, 3))]),
+                np.concatenate([car, np.full(count, -1)]),
+            )
+
+    log = Fence([straight((0, 0), (0.9, 0.0), 16)])
+    assert len(set(track(log, log.results())["id"])) == is_free
+
+
 def test_two_cars_in_one_cluster_keep_their_ids() -> None:
     log = Staged([straight((0, 0), (0.8, 0.0)), straight((0, 2.2), (0.8, 0.0))])
     results = log.results()
