@@ -53,10 +53,10 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
 
     Convention:
         Parts have the pixels of a sweep that most other sweeps lack (`ChangedPixels.may_be_fast`). A part of t takes
-        its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least half of
-        the older sweeps. Of the velocities of a part of t, or of t+1, the one with the most sweeps wins, then the one
-        with the smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part
-        belongs to its first node. The velocity of a node must win more slices near its targets than it loses.
+        its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least
+        half of the older sweeps. Of the velocities of a part of t, or of t+1, the one with the most sweeps wins, then
+        the one with the smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A
+        part belongs to its first node. The velocity of a node must win more slices near its targets than it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """

@@ -5,8 +5,8 @@
   python scripts/ablation/calibrate_confidence.py evaluate    Argoverse 2 pair, KITTI 0000, PandaSet, simulated drives
 
 The windows come from sets.py. We fit on pairs (h = 0) and history (h = 4) of five sensors, region +-70 m, without
-ground: four kinds of scenes, seeds 100-103, and motorways, seeds 822-825. We evaluate on motorways, seeds 826-827, and
-on drives with seeds 500-501. docs/verified.md explains the columns.
+ground: four kinds of scenes, seeds 100-103, and motorways, seeds 822-825 and 840-847. We evaluate on motorways, seeds
+826-827, and on drives with seeds 500-501. docs/verified.md explains the columns.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.types import FlowResult
 from cflow_torch.verified import confidence
 
-SEEDS, MOTORWAYS = range(100, 104), range(822, 826)
+SEEDS, MOTORWAYS = range(100, 104), (*range(822, 826), *range(840, 848))
 OTHER_SEEDS, OTHER_MOTORWAYS = range(500, 502), range(826, 828)
 TABLES = ("probabilities", "moving")  # of the confidence, of P(moving)
 RIGHT = 0.1  # metres
