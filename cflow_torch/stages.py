@@ -6,12 +6,11 @@ import statistics
 import threading
 import time
 from contextlib import contextmanager
-from typing import Any, Iterator, Protocol, Sequence
+from typing import Any, Iterator, Sequence
 
 import torch
 from torch.profiler import record_function
 
-from cflow_torch.config import Config
 from cflow_torch.types import FlowResult, Window
 
 _watched = threading.local()
@@ -39,15 +38,6 @@ def stage_seconds() -> Iterator[dict[str, float]]:
         _watched.seconds = before
 
 
-class FlowModel(Protocol):
-    """A method, or a wrapper of one."""
-
-    config: Config
-
-    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
-        """One result per window."""
-
-
 class TimedModel:
     """Wrap a method and time every call.
 
@@ -55,7 +45,7 @@ class TimedModel:
     a warm-up and does not count, unless it is the only one.
     """
 
-    def __init__(self, model: FlowModel) -> None:
+    def __init__(self, model: Any) -> None:
         self.model = model
         self.config = model.config
         self.pairs: list[tuple[float, dict[str, float]]] = []  # seconds of each call, and of its stages

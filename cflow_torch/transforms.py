@@ -13,6 +13,7 @@ from cflow_torch.types import CFlowError, as_numpy, last_row
 QUATERNION_TOLERANCE = 1e-3  # only quaternions of length 1 are rotations; lengths in data sets are within 1e-6 of 1
 # A pose moves all points, so its type must resolve this distance, metres.
 _COARSEST_POSE = 0.01
+_FLATTEST = 1e-4  # metres from the middle of an arc to its chord; flatter ones are taken as straight
 # Largest allowed |R R^T - I|. Poses stored in float32 are within 1e-6.
 _ORTHOGONALITY = 1e-3
 
@@ -142,6 +143,33 @@ def interpolate_poses(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarr
     rotated = axis_angle_to_quaternion(axis_angle * torch.from_numpy(np.asarray(fraction, np.float64))[:, None])
     rotation = np.asarray(first, np.float64) @ to_rotations(rotated.numpy())
     return as_matrix(rotation, poses0[:, :3, 3] + fraction[:, None] * (poses1[:, :3, 3] - poses0[:, :3, 3]))
+
+
+def interpolate_motion(poses0: np.ndarray, poses1: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Interpolate between pairs of (K, 4, 4) float64 poses as a vehicle drives: on an arc, with constant body rates.
+
+    `fraction` is (K,) float64, 0 = the first pose, 1 = the second. The result is (K, 4, 4) float64. Where the arc
+    leaves the straight line by less than 0.1 mm, it is that of `interpolate_poses`.
+
+    Source: the exponential map of rigid motions.
+    """
+    result = interpolate_poses(poses0, poses1, fraction)
+    steps = np.linalg.inv(poses0) @ poses1
+    angle = np.array([turn_of(step) for step in steps])
+    is_arc = np.linalg.norm(steps[:, :3, 3], axis=1) * angle / 8 > _FLATTEST
+    steps, angle, share = steps[is_arc], angle[is_arc], fraction[is_arc]
+    cross = (steps[:, :3, :3] - steps[:, :3, :3].transpose(0, 2, 1)) / (2 * np.sin(angle)[:, None, None])
+    velocity = np.linalg.solve(_arc(cross, angle), steps[:, :3, 3:])
+    shift = share[:, None] * (_arc(cross, share * angle) @ velocity)[..., 0]
+    result[is_arc, :3, 3] = (poses0[is_arc, :3, :3] @ shift[..., None])[..., 0] + poses0[is_arc, :3, 3]
+    return result
+
+
+def _arc(cross: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return the (K, 3, 3) matrices that map a constant velocity to the shift over turns by (K,) angles, radians."""
+    half = np.where(angle == 0, 0, (1 - np.cos(angle)) / np.where(angle == 0, 1, angle))
+    rest = np.where(angle == 0, 0, 1 - np.sin(angle) / np.where(angle == 0, 1, angle))
+    return np.asarray(np.eye(3) + half[:, None, None] * cross + rest[:, None, None] * (cross @ cross))
 
 
 def halfway(poses0: np.ndarray, poses1: np.ndarray) -> np.ndarray:

@@ -26,11 +26,11 @@ _MOST_COLUMNS = 64
 _OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8, f8")
 _OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence", "moving")
 
-# The columns of the fields of `Objects` that are vectors.
+# The columns of the fields of `ObjectTable` that are vectors.
 _OBJECT_COLUMNS = {"centre": "xyz", "size": ("length", "width", "height"), "velocity": ("vx", "vy", "vz")}
 
 
-class Objects(np.ndarray):
+class ObjectTable(np.ndarray):
     """The moving objects of a result: a structured array, (K,), see `FlowResult.objects`.
 
     Examples:
@@ -318,7 +318,7 @@ class FlowResult:
         min_speed: float = 0.5,
         min_points: int = 10,
         min_moving: float = MIN_MOVING,
-    ) -> Objects:
+    ) -> ObjectTable:
         """List the moving objects at t+1.
 
         Args:
@@ -354,7 +354,7 @@ class FlowResult:
         points = points.points if isinstance(points, Sweep) else points
         values = self.numpy()
         clusters = _Clusters.of(as_numpy(self.cluster_id))
-        objects = np.zeros(len(clusters.id), _OBJECT).view(Objects)
+        objects = np.zeros(len(clusters.id), _OBJECT).view(ObjectTable)
         if len(objects) == 0:
             return objects
         objects["id"] = clusters.id

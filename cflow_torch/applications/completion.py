@@ -41,6 +41,10 @@ class TrackedPoints(NamedTuple):
         ids = np.append(self.id, np.full(len(row), number))
         return self._replace(row=np.append(self.row, row), id=ids)
 
+    def renumber(self, ids: np.ndarray) -> TrackedPoints:
+        """Give the points other ids, (M,) int64, and drop those with -1."""
+        return self._replace(row=self.row[ids >= 0], id=ids[ids >= 0])
+
     def track_id(self, kept: np.ndarray) -> np.ndarray:
         """Return the id of every point, (N,) int64; -1 = no track, or one that is not among the ids `kept`."""
         ids = np.full(self.num_points, -1)
@@ -86,6 +90,13 @@ class SeenPoints(NamedTuple):
             offset=np.concatenate([self.offset, (position - self.sensor).astype(np.float32)]),
             track=np.append(shifted, np.full(len(position), index)).astype(np.int32),
         )
+
+    def renumber(self, ids: np.ndarray) -> SeenPoints:
+        """Give the points other ids, (M,) int64, and drop those with -1. New tracks keep the velocity."""
+        is_kept = ids >= 0
+        new, first, track = np.unique(ids[is_kept], return_index=True, return_inverse=True)
+        velocity = self.velocity[self.track[is_kept][first]]
+        return self._replace(id=new, velocity=velocity, offset=self.offset[is_kept], track=track.astype(np.int32))
 
 
 def complete(table: Table, seen: Sequence[SeenPoints]) -> Table:

@@ -19,7 +19,7 @@ from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.writer import write_hdf5_labels
 from cflow_torch.data.log import CachedLog, Log, windows
 from cflow_torch.errors import import_optional
-from cflow_torch.stages import FlowModel
+from cflow_torch.model import SceneFlowModel
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, FlowResult, Sweep, Window, as_numpy
 
@@ -42,7 +42,7 @@ class DynamicPoints(NamedTuple):
     seconds: float  # time of the sweep
 
 
-def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", overwrite: bool = False) -> int:
+def label_scene(file: str | Path, model: SceneFlowModel, find_ground: str = "grid", overwrite: bool = False) -> int:
     """Estimate the flow of a scene, write labels of all sweeps into its file, and return the number of sweeps.
 
     Args:
@@ -61,7 +61,7 @@ def label_scene(file: str | Path, model: FlowModel, find_ground: str = "grid", o
 
 
 def find_labels(
-    log: Log, flows: Iterable[FlowResult], model: FlowModel, workers: int = 1
+    log: Log, flows: Iterable[FlowResult], model: SceneFlowModel, workers: int = 1
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Yield the labels of every sweep of a log.
 
@@ -126,7 +126,7 @@ def find_labels(
         )
 
 
-def flow_back(log: Log, model: FlowModel) -> FlowResult:
+def flow_back(log: Log, model: SceneFlowModel) -> FlowResult:
     """Estimate the flow of the last sweep to the one before it, by playing the log backwards.
 
     Up to `num_future` earlier sweeps take the place of `pcf`. The flow has the axes of the sweep before the last.
@@ -143,7 +143,7 @@ def _played_backwards(sweep: Sweep) -> Sweep:
     return replace(sweep, timestamp_ns=stamp, point_times=times)
 
 
-def _with_last(log: Log, flows: Iterable[FlowResult], model: FlowModel) -> Iterator[FlowResult]:
+def _with_last(log: Log, flows: Iterable[FlowResult], model: SceneFlowModel) -> Iterator[FlowResult]:
     count = 0
     for count, result in enumerate(flows, 1):  # noqa: B007 (the last one counts)
         yield result

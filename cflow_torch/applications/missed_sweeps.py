@@ -110,3 +110,24 @@ class SweepTracks:
         self.seen = self.seen.insert(at, number, velocity, self.free.position[index])
         self.free = self.free.without(index)
         return True
+
+    def divide(self, number: int, ids: np.ndarray) -> None:
+        """Give the points of the track `number` new ids, (P,) int64; -1 = no track.
+
+        Each id gets a copy of its row of the table. An id with few points is seen only if no other one is.
+        """
+        parts, count = np.unique(ids[ids >= 0], return_counts=True)
+        is_kept = count >= min(MIN_POINTS, count.max(initial=0))
+        parts = parts[is_kept]
+        at = int(np.searchsorted(self.table["id"], number))
+        others = np.delete(np.arange(len(self.table["id"])), at)
+        rows = np.append(others, np.full(len(parts), at))
+        columns = {name: column[rows] for name, column in self.table.items()}
+        columns["id"] = np.append(self.table["id"][others], parts)
+        columns["num_points"] = np.append(self.table["num_points"][others], count[is_kept])
+        order = np.argsort(columns["id"])
+        self.table = {name: column[order] for name, column in columns.items()}
+        id_of_point = self.points.id.copy()
+        id_of_point[self.points.id == number] = np.where(np.isin(ids, parts), ids, -1)
+        self.seen = self.seen.renumber(id_of_point)
+        self.points = self.points.renumber(id_of_point)

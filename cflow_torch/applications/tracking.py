@@ -13,6 +13,7 @@ from cflow_torch.applications.association import TrackMatches, enclosing_boxes, 
 from cflow_torch.applications.completion import SeenPoints, TrackedPoints, complete
 from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
+from cflow_torch.applications.people import divide_people
 from cflow_torch.applications.track_state import Times, TrackStates
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds_and_sizes, turned
@@ -395,5 +396,9 @@ class LogTracker:
 
     def table(self) -> dict[str, np.ndarray]:
         """Return the table of `track`."""
+        table = self._whole()
+        return self._whole() if divide_people(self._sweeps, table) else table
+
+    def _whole(self) -> dict[str, np.ndarray]:
         table = confirmed(join_tables([each.table for each in self._sweeps]))
         return complete(table, [each.seen for each in self._sweeps])

@@ -14,12 +14,14 @@ from cflow_torch.applications.smoothing import MotionState, smooth
 
 PEDESTRIAN, CYCLIST, CAR, TRUCK = range(4)
 KINDS = ("pedestrian", "cyclist", "car", "truck")
-# Length and width of each kind where they are not seen, metres. A walking adult: a step and the arms; a bicycle and its
-# handlebar; a car of the middle class without mirrors; a lorry.
-_TYPICAL = ((0.9, 0.65), (1.8, 0.7), (4.5, 1.9), (8.0, 2.5))
+# Length and width of each kind where they are not seen, metres: a step; a bicycle; a car of the middle class without
+# mirrors; a lorry. The width of people follows from what is seen of them.
+_TYPICAL = ((0.9, 0.0), (1.8, 0.0), (4.5, 1.9), (8.0, 2.5))
+_ARMS = 0.16  # metres that a person or a cyclist is wider than what one sweep usually shows; from simulated drives
+_WIDTHS = (0.5, 0.9)  # metres, least and most of people and cyclists
 _LEAST = (3.6, 1.5)  # metres, length and width of the smallest cars; a smaller visible part is not the whole
 _NARROW = (2.6, 1.2)  # metres, length and width below which an object is not a vehicle
-_SHORT, _RUNNING = 1.3, 3.0  # metres, m/s: narrow objects that are longer or faster are cyclists
+_SHORT, RUNNING = 1.3, 3.0  # metres, m/s: narrow objects that are longer or faster are cyclists
 _LONG_CAR, _HIGH_CAR = 6.0, 2.6  # metres; larger vehicles are trucks
 
 _SEEN_ANGLE = math.radians(15)  # a side is seen if the view of the sensor meets it at this angle at least
@@ -161,14 +163,16 @@ def kinds_and_sizes(edges: Edges, track: Tensor, count: int, speed: Tensor) -> t
 
     Returns:
         (K,) int64 kinds and (K, 3) float64 sizes, metres. Lengths and widths that are not seen are typical ones, or
-        what is visible if it is larger.
+        what is visible if it is larger. People and cyclists have a typical length.
     """
     every = torch.ones_like(track, dtype=torch.bool)
     size = torch.stack([_extent(edges, axis, track, count, every) for axis in range(3)], 1)
     kind = _kind(size, speed)
-    typical = size.new_tensor(_TYPICAL)[kind]
-    is_seen = edges.is_seen()
     is_person = kind <= CYCLIST
+    (usual_width,) = quantiles(edges.high[:, 1] - edges.low[:, 1], track, count, 0.5)
+    typical = size.new_tensor(_TYPICAL)[kind]
+    typical[:, 1] = torch.where(is_person, (usual_width + _ARMS).clamp(*_WIDTHS), typical[:, 1])
+    is_seen = edges.is_seen()
     for axis, least in enumerate(_LEAST):
         seen = _extent(edges, axis, track, count, is_seen[:, axis])
         visible = torch.maximum(size[:, axis], typical[:, axis])
@@ -180,7 +184,7 @@ def kinds_and_sizes(edges: Edges, track: Tensor, count: int, speed: Tensor) -> t
 def _kind(size: Tensor, speed: Tensor) -> Tensor:
     """Classify objects by their visible (K, 3) size and (K,) speed; (K,) int64."""
     is_narrow = (size[:, 0] < _NARROW[0]) & (size[:, 1] < _NARROW[1])
-    walks = (size[:, 0] < _SHORT) & (speed < _RUNNING)
+    walks = (size[:, 0] < _SHORT) & (speed < RUNNING)
     is_large = (size[:, 0] > _LONG_CAR) | (size[:, 2] > _HIGH_CAR)
     return torch.where(is_narrow, torch.where(walks, PEDESTRIAN, CYCLIST), torch.where(is_large, TRUCK, CAR))
 

@@ -15,7 +15,8 @@ from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, window
 from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.tables import markdown
-from cflow_torch.stages import FlowModel, TimedModel
+from cflow_torch.model import SceneFlowModel
+from cflow_torch.stages import TimedModel
 from cflow_torch.types import Window
 from cflow_torch.windows.memory import peak_memory
 
@@ -33,7 +34,9 @@ def task(cfg: Bench) -> None:
     print(f"written to {output / 'bench.json'}")
 
 
-def measure(model: FlowModel, windows: Sequence[Window], repeats: int, batches: Sequence[int] = ()) -> dict[str, Any]:
+def measure(
+    model: SceneFlowModel, windows: Sequence[Window], repeats: int, batches: Sequence[int] = ()
+) -> dict[str, Any]:
     """Measure the seconds and the memory of a method, `repeats` times for each window and batch size.
 
     A warm-up run comes first. A batch that is larger than the number of windows repeats windows.

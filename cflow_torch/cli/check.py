@@ -7,7 +7,8 @@ import sys
 from typing import Any, TextIO
 
 from cflow_torch.cli.commands import Check
-from cflow_torch.cli.logs import Sources, complete_data, find_logs, paths_of
+from cflow_torch.cli.logs import complete_data, find_logs, paths_of
+from cflow_torch.data.catalog import Logs, source_name
 from cflow_torch.data.log_check import WRONG, Finding, examine
 from cflow_torch.types import CFlowError
 
@@ -31,18 +32,17 @@ def task(cfg: Check) -> None:
 def _pages(data: dict[str, Any], out: TextIO) -> list[dict[str, Any]]:
     """Return the pages of the logs of one path."""
     data = complete_data(data, out)
-    sources = find_logs(data)
-    sources.settings["check"] = False  # `examine` says more
-    return [_page(sources, source, str(data["label"])) for source in sources.logs]
+    logs = find_logs({**data, "check": False})  # `examine` says more
+    return [_page(logs, source, str(data["label"])) for source in logs.sources]
 
 
-def _page(sources: Sources, source: Any, label: str) -> dict[str, Any]:
+def _page(logs: Logs, source: Any, label: str) -> dict[str, Any]:
     """Return the page of a log; one that cannot be opened has a single line, its error."""
     try:
-        with sources.open(source) as log:
+        with logs.open(source) as log:
             name, findings = log.log_id, examine(log)
     except (CFlowError, OSError) as error:
-        name = str(getattr(source, "name", source))
+        name = source_name(source)
         findings = [Finding("log", WRONG, str(error))]
     rows = [{"topic": each.topic, "status": each.status, "text": each.text} for each in findings]
     return {"log": name, "data": label, "findings": rows}

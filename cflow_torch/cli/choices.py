@@ -35,7 +35,8 @@ def choices(group: str) -> list[str]:
 
 
 def files(group: str) -> list[Path]:
-    return sorted((FOLDER / group).glob("*.yaml"))
+    """Return the files of the choices of a group. Files `_*.yaml` are no choices; others extend them."""
+    return sorted((FOLDER / group).glob("[!_]*.yaml"))
 
 
 def known_settings(command: type[Command]) -> Known:

@@ -13,6 +13,7 @@ from cflow_torch.config import Config
 from cflow_torch.setting import AUTO, Settings, bounds, checked, setting
 
 NOT_GIVEN = "???"  # a setting without a value
+PAIR_SETTINGS = ("data.first", "data.step")
 
 # Settings of data sets that we check before a reader gets them. configs/data/ has the defaults of all of them.
 DATA_SETTINGS: dict[str, dict[str, Any]] = {
@@ -118,6 +119,7 @@ class Command(Settings):
     """A command with settings."""
 
     SUMMARY: ClassVar[str]
+    CHOOSES_PAIRS: ClassVar[bool] = False  # the command uses `PAIR_SETTINGS`
 
     output: str = setting("outputs", "folder of the results")
     model: Config = group("default", kind=Config)
@@ -293,6 +295,7 @@ class Eval(Command):
     """
 
     SUMMARY: ClassVar[str] = "estimate and score all labelled pairs of a data set"
+    CHOOSES_PAIRS: ClassVar[bool] = True
 
     output: str = setting("outputs/eval", "folder of the results; each job of a sweep writes to a folder below it")
     overwrite: bool = setting(False, "true = repeat a run whose results.json exists")
@@ -468,6 +471,7 @@ class View(Command):
     """
 
     SUMMARY: ClassVar[str] = "write a 3-D page for the browser, or a recording for the viewer rerun"
+    CHOOSES_PAIRS: ClassVar[bool] = True
 
     output: str = setting("outputs/view", "local folder; each log gets <log id>.html or .rrd")
     format: str = setting(

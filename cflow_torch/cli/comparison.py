@@ -18,9 +18,8 @@ COMPARISON = "comparison.csv"
 _FEW = 1000
 # A setting and its value in the name of a job's folder.
 _SWEPT = re.compile(r"(?:^|,)([^=,]+)=(.*?)(?=,[^=,]+=|$)")
-_MOVING = "moving IoU"  # of jobs that have it
-_SCORES = {
-    _MOVING: "moving_iou",
+_SCORES = {  # those that no job has are left out
+    "moving IoU": "moving_iou",
     "mean dynamic error": "dynamic_error",
     "EPE FD [m]": "epe_fd",
     "EPE BS [m]": "epe_bs",
@@ -66,16 +65,13 @@ def compare(output: Path) -> tuple[list[str], list[list[Any]]]:
         name = file.parent.relative_to(output).as_posix()
         settings = {**(dict(_SWEPT.findall(name)) or {"job": name}), "scored data": digest}
         jobs.append((settings, ["" if math.isnan(scores[key]) else scores[key] for key in _SCORES.values()]))
-    columns = list(_SCORES)
-    if all(scores[0] == "" for _, scores in jobs):
-        columns.remove(_MOVING)
-        jobs = [(settings, scores[1:]) for settings, scores in jobs]
+    shown = [k for k in range(len(_SCORES)) if any(scores[k] != "" for _, scores in jobs)]
     names = list(dict.fromkeys(name for settings, _ in jobs for name in settings if name != "scored data"))
     if len({settings["scored data"] for settings, _ in jobs}) > 1:
         names.append("scored data")
-    rows = [[*(settings.get(name, "") for name in names), *scores] for settings, scores in jobs]
+    rows = [[settings.get(name, "") for name in names] + [scores[k] for k in shown] for settings, scores in jobs]
     rows.sort(key=lambda row: [_order(cell) for cell in row[: len(names)]])
-    return [*names, *columns], rows
+    return [*names, *(list(_SCORES)[k] for k in shown)], rows
 
 
 def _order(cell: str) -> tuple[bool, float, str]:

@@ -15,14 +15,13 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import MissingConfigException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cflow_torch.cli.choices import known_settings
 from cflow_torch.cli.commands import ENGINES, NOT_GIVEN, PICTURES, WITH_SETTINGS, Check, Command, Plot, own_fields
-from cflow_torch.cli.exits import exit_if_refused, exit_wrong
-from cflow_torch.cli.failures import UnfinishedJob
+from cflow_torch.cli.exits import UnfinishedJob, exit_if_refused, exit_wrong
 from cflow_torch.cli.words import Call, check_exists
 from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError
@@ -79,7 +78,7 @@ _register()
 
 def run_with_hydra(name: str, call: Call) -> None:
     """Let Hydra compose the settings of a command and run it with them, or with those of each job of a sweep."""
-    with wrong_call_told(name):
+    with errors_told(name):
         overrides = hydra_overrides(WITH_SETTINGS[name], call)
         # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
         parsed = _PARSER.parse_overrides(overrides)
@@ -101,7 +100,7 @@ def run_job(name: str, composed: Any) -> Any:
 
     Values are checked before torch is imported.
     """
-    with failed_job_told(name):
+    with errors_told(name):
         values: Any = OmegaConf.to_container(composed, resolve=True)
         values.pop("versions", None)  # of the config.yaml of an earlier run
         settings = WITH_SETTINGS[name].of(values)
@@ -159,26 +158,13 @@ def _complete(settings: Command) -> dict[str, Any]:
 
 
 @contextmanager
-def wrong_call_told(command: str) -> Iterator[None]:
-    """Exit with status 2 after an error of Hydra's or of the system, and with 1 if something is missing."""
-    try:
-        yield
-    except UnfinishedJob as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
-    except Exception as error:
-        exit_if_refused(error)
-        exit_wrong(explain(error, command))
-
-
-@contextmanager
-def failed_job_told(command: str) -> Iterator[None]:
-    """Exit with status 2 if a job is called wrongly. A bug raises `UnfinishedJob`: a sweep goes on."""
+def errors_told(command: str) -> Iterator[None]:
+    """Exit with status 2 if the call was wrong. A bug raises `UnfinishedJob`: a sweep goes on."""
     try:
         yield
     except UnfinishedJob:
         raise
-    except (CFlowError, OmegaConfBaseException) as error:
+    except (CFlowError, OmegaConfBaseException, HydraException) as error:
         exit_wrong(explain(error, command))
     except Exception as error:
         exit_if_refused(error)

@@ -13,7 +13,8 @@ import numpy as np
 
 from cflow_torch.cli.commands import Demo, Eval
 from cflow_torch.cli.comparison import RESULTS, headline, summary
-from cflow_torch.cli.failures import Failures, UnfinishedJob, finish
+from cflow_torch.cli.exits import UnfinishedJob
+from cflow_torch.cli.failures import Failures, finish
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import machine, output_folder, settings_record, versions, write_config
 from cflow_torch.cli.pairs import for_each_pair

@@ -6,6 +6,10 @@ import os
 import sys
 
 
+class UnfinishedJob(RuntimeError):
+    """Something is missing, and a message says what. The other jobs of a sweep still run."""
+
+
 def exit_wrong(message: object) -> None:
     print(f"error: {message}", file=sys.stderr)
     raise SystemExit(2) from None

@@ -9,14 +9,11 @@ from typing import Iterator, List, Tuple
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
+from cflow_torch.cli.exits import UnfinishedJob
 from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.progress import log_line
 
 Failures = List[Tuple[str, str]]  # name of a frame or log, and message
-
-
-class UnfinishedJob(RuntimeError):
-    """Something is missing, and a message says what. The other jobs of a sweep still run."""
 
 
 def is_sweep() -> bool:

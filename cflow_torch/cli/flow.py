@@ -34,11 +34,13 @@ from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
 from cflow_torch.cli.commands import Flow, FlowFiles
-from cflow_torch.cli.failures import Failures, UnfinishedJob, collect_failures, is_sweep
+from cflow_torch.cli.exits import UnfinishedJob
+from cflow_torch.cli.failures import Failures, collect_failures, is_sweep
 from cflow_torch.cli.flows import stored_flow
-from cflow_torch.cli.logs import Sources, chosen_pairs, find_logs
+from cflow_torch.cli.logs import chosen_pairs, find_logs
 from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config
 from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.catalog import Logs, source_name
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, has_track_ids, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.json_file import write_json
@@ -58,7 +60,7 @@ from cflow_torch.fleet.manifest import (
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
-from cflow_torch.fleet.work import open_quickly, source_name
+from cflow_torch.fleet.work import open_quickly
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, FlowResult
 
@@ -75,16 +77,16 @@ _TRACK_FILES = {
 class FlowRun(NamedTuple):
     """The logs, the job and this process's share of a run."""
 
-    sources: Sources
+    logs: Logs
     job: Job
     shard: Shard
 
     @property
     def parts(self) -> list[Part]:
         """The logs of this shard, or the parts of them that are its own."""
-        return self.shard.parts(self.sources.logs)
+        return self.shard.parts(self.logs.sources)
 
-    def logs(self) -> Iterator[Log]:
+    def open_logs(self) -> Iterator[Log]:
         """Open the logs of this shard one by one, without what takes time."""
         for part in self.parts:
             with suppress(Exception), open_quickly(self.job, part.source) as log:  # the worker reports the error
@@ -109,19 +111,19 @@ def compute(
     """
     columns = contents(cfg)
     layout = choose_layout(cfg.device, cfg.engine.workers, cfg.engine.batch, os.environ)
-    sources = find_logs(cfg.data)
+    logs = find_logs(cfg.data)
     output = output_folder(cfg)
     job = Job(
         config=cfg.model,
-        identity=make_identity(cfg.model, sources.reader, sources.settings, columns),
-        reader=sources.reader,
-        settings=sources.settings,
+        identity=make_identity(cfg.model, logs.name, logs.settings, columns),
+        reader=logs.name,
+        settings=dict(logs.settings),
         output=str(output),
         contents=columns,
         batch=layout.batch,
         redo=cfg.overwrite,
     )
-    flow = FlowRun(sources, job, find_shard(cfg.shard.index, cfg.shard.count, os.environ))
+    flow = FlowRun(logs, job, find_shard(cfg.shard.index, cfg.shard.count, os.environ))
     _check_output(cfg, flow, check)
     if cfg.dry_run:
         print(forecast(job, flow.parts))
@@ -132,7 +134,7 @@ def compute(
     name = settings.pop("name")
     own = {key: value for key, value in settings.items() if key not in ("workers", "batch")}
     with _ENGINES[name](job, layout, **own) as executors:
-        parts = flow.shard.parts(sources.logs, len(layout.devices))
+        parts = flow.shard.parts(logs.sources, len(layout.devices))
         about = {"config": settings_record(cfg), "versions": versions()}
         report = run_fleet(executors, parts, layout, flow.shard, job.output, name, about)
     _finish(cfg, flow, report, use)
@@ -148,7 +150,7 @@ def _check_output(cfg: FlowFiles, flow: FlowRun, check: Callable[[Any, FlowRun],
     names = [source_name(part.source) for part in flow.parts]
     check_logs(output, names, flow.job.identity, cfg.resume, cfg.overwrite, is_alone)
     if cfg.overwrite and is_alone and not cfg.dry_run:
-        for log in flow.logs():
+        for log in flow.open_logs():
             clear_log(output / log.log_id)
 
 
@@ -190,7 +192,7 @@ def _finish(
 def _check_results(cfg: Flow, flow: FlowRun) -> None:
     if cfg.masks:
         check_pillow()
-        for log in islice(flow.logs(), 1):
+        for log in islice(flow.open_logs(), 1):
             check_cameras(log, log.cameras(0))
     if cfg.result_name is None:
         return
@@ -199,7 +201,7 @@ def _check_results(cfg: Flow, flow: FlowRun) -> None:
     if flow.shard.count > 1:
         raise CFlowError("result_name= needs the flow of whole scenes: give it in a last run without shards")
     check_result_name(cfg.result_name)
-    for scene in flow.sources.logs:
+    for scene in flow.logs.sources:
         check_writable(scene)
 
 
@@ -229,7 +231,7 @@ def _write_more(cfg: Flow, flow: FlowRun, report: dict[str, Any]) -> Failures:
     """Write the scenes, the tracks and the labels that the settings ask for."""
     output, failures = as_path(flow.job.output), []
     if cfg.result_name is not None:
-        failures = _into_scenes(cfg.result_name, flow.sources.logs, output)
+        failures = _into_scenes(cfg.result_name, flow.logs.sources, output)
     if cfg.tracks or cfg.masks or cfg.labels is not None:
         failures += _write_logs(cfg, flow, output)
     return failures
@@ -244,17 +246,17 @@ def _write_logs(cfg: Flow, flow: FlowRun, output: Path) -> Failures:
     stored = stored_flow(output, ())
     # The flow files say which points are valid, so nothing here needs ground masks, and the log was checked before.
     cheap = {"check": False, "find_ground": None}
-    sources = flow.sources._replace(settings={**flow.sources.settings, **cheap})
+    logs = Logs(flow.logs.name, flow.logs.sources, {**flow.logs.settings, **cheap})
     wanted = [name for name in ("tracks", "labels", "masks") if getattr(cfg, name)]
     for part in tqdm(flow.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
-            log = sources.open(part.source)
+            log = logs.open(part.source)
             pairs = chosen_pairs(log, first=0, step=1)  # the pair over a gap has no flow
             if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
                 continue
             results = partial(_read_all, stored, log, pairs)
             if cfg.tracks or cfg.masks:
-                classes = CLASSES_OF_READER.get(flow.sources.reader, CLASSES)
+                classes = CLASSES_OF_READER.get(logs.name, CLASSES)
                 tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, classes))
             if cfg.masks:
                 tracks = read_tracks(output / log.log_id / TRACKS_FILE)

@@ -35,7 +35,7 @@ def _contents(cfg: Label) -> tuple[str, ...]:
 
 
 def _check(cfg: Label, flow: FlowRun) -> None:
-    for scene in flow.sources.logs:
+    for scene in flow.logs.sources:
         check_writable(scene)
         maker = None
         with suppress(CFlowError):  # a scene that cannot be read is reported later
@@ -58,7 +58,7 @@ def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
         with collect_failures(failures, scene.stem):
             if labelled_by(scene) == flow.job.identity["hash"] and not flow.job.redo:
                 continue
-            log = flow.sources.open(scene)
+            log = flow.logs.open(scene)
             stamps = log.timestamps[:-1]
             if not set(stamps) <= complete_frames(folder):
                 waiting.append(scene.name)  # failed frames are in the report; others belong to another shard

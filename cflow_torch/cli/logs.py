@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple, TextIO
+from typing import Any, TextIO
 
 from cflow_torch.cli.choices import FOLDER, read_settings
 from cflow_torch.cli.commands import NOT_GIVEN
 from cflow_torch.cli.failures import Failures, collect_failures
-from cflow_torch.data.catalog import find_sources, find_user_sources, open_log, recognise
+from cflow_torch.data.catalog import Logs, find_all_sources, find_user_sources, source_name, the_format
 from cflow_torch.data.log import Log
 from cflow_torch.setting import AUTO
 from cflow_torch.simulator.benchmark import benchmark_logs, format_of
@@ -19,13 +19,10 @@ def complete_data(data: dict[str, Any], out: TextIO | None = None) -> dict[str, 
     """Replace data=auto by the settings of the recognised format, and print it to `out`; None = standard output."""
     if data.get("name") != AUTO:
         return data
-    formats = {path: recognise(path) for path in paths_of(data)}
-    for path, name in formats.items():
+    paths = paths_of(data)
+    name = the_format(paths) if paths else "synthetic"
+    for path in paths:
         print(f"{path}: data={name}", file=out)
-    if len(set(formats.values())) > 1:
-        several = " and ".join(sorted(set(formats.values())))
-        raise CFlowError(f"the paths have several formats, {several}: give one command each")
-    name = next(iter(formats.values()), "synthetic")
     settings = dict(read_settings(FOLDER / "data" / f"{name}.yaml"))
     if "cache" in settings:
         settings["cache"] = os.environ.get("CFLOW_CACHE", "outputs/cache")
@@ -58,37 +55,23 @@ def check_pair(pair: int, log: Log) -> None:
         raise CFlowError(f"pair={pair}: log {log.log_id} has pairs 0 to {last}")
 
 
-class Sources(NamedTuple):
-    """Logs that are not open yet: name of their data set, settings of its reader, one source per log."""
-
-    reader: str
-    settings: dict[str, Any]
-    logs: list[Any]
-
-    def open(self, source: Any) -> Log:
-        return open_log(self.reader, source, **self.settings)
-
-
-def find_logs(data: dict[str, Any]) -> Sources:
+def find_logs(data: dict[str, Any]) -> Logs:
     """Find the logs of a data set; make simulated ones that are not cached. If there is none, raise a `CFlowError`."""
     settings = {key: value for key, value in data.items() if key not in ("label", "first", "step")}
     if "_target_" in settings:
         target = settings.pop("_target_")
-        return Sources(target, settings, list(find_user_sources(target, settings)))
+        return Logs(target, find_user_sources(target, settings), settings)
     if data["name"] == "synthetic":
         drives = benchmark_logs(data["cache"], "av2", [data["seed"]], data["num_sweeps"])
-        return Sources("av2", {"check": False}, drives)
+        return Logs("av2", drives, {"check": False})
     if data["name"] == "benchmark":
         seeds = range(data["first_seed"], data["first_seed"] + data["num_drives"])
         chosen = format_of(data["profile"])
         drives = benchmark_logs(data["cache"], data["profile"], seeds, data["num_sweeps"], data["scenes"])
-        return Sources(chosen.data_set, {"check": False, **chosen.settings}, drives)
+        return Logs(chosen.data_set, drives, {"check": False, **chosen.settings})
     name = settings.pop("name")
     del settings["root"]
-    logs: list[Any] = []
-    for path in paths_of(data):
-        logs += [source for source in find_sources(name, path) if source not in logs]  # paths may overlap
-    return Sources(name, settings, logs)
+    return Logs(name, find_all_sources(name, paths_of(data)), settings)
 
 
 def open_first_log(data: dict[str, Any]) -> Log:
@@ -96,16 +79,15 @@ def open_first_log(data: dict[str, Any]) -> Log:
     paths = paths_of(data)
     if len(paths) > 1:
         raise CFlowError(f"this command uses one log, but {len(paths)} paths were given: give one of them")
-    sources = find_logs(data)
-    return sources.open(sources.logs[0])
+    return find_logs(data)[0]
 
 
 def open_logs(data: dict[str, Any]) -> tuple[list[Log], Failures]:
     """Open the logs of a data set. Those that cannot be opened are reported and skipped."""
-    sources = find_logs(data)
-    logs: list[Log] = []
+    logs = find_logs(data)
+    opened: list[Log] = []
     failures: Failures = []
-    for source in sources.logs:
-        with collect_failures(failures, source.name):
-            logs.append(sources.open(source))
-    return logs, failures
+    for source in logs.sources:
+        with collect_failures(failures, source_name(source)):
+            opened.append(logs.open(source))
+    return opened, failures

@@ -8,7 +8,7 @@ from importlib import import_module
 from cflow_torch import __version__
 from cflow_torch.cli.choices import help_of
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS
-from cflow_torch.cli.exits import exit_if_refused, exit_wrong
+from cflow_torch.cli.exits import UnfinishedJob, exit_if_refused, exit_wrong
 from cflow_torch.cli.words import read_call
 from cflow_torch.errors import CFlowError, near
 
@@ -44,6 +44,9 @@ def main(argv: list[str] | None = None) -> None:
         sys.stdout.flush()
     except CFlowError as error:
         exit_wrong(error)
+    except UnfinishedJob as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
     except OSError as error:
         exit_if_refused(error)
         raise

@@ -66,15 +66,13 @@ def local_folder(cfg: Command) -> Path:
 
 
 def settings_record(cfg: Command) -> dict[str, Any]:
-    """Return the settings of a run as YAML and JSON have them; the command reads them again."""
-    values = {name: value for name, value in asdict(cfg).items() if name not in ("row", "experiment")}
-    return {**values, "model": cfg.model.as_dict()}
+    """Return the settings of a run for YAML and JSON; the command reads them again."""
+    return {name: value for name, value in asdict(cfg).items() if name not in ("row", "experiment")}
 
 
 def write_config(cfg: Command, folder: Path) -> None:
     """Write the settings and versions to `folder/config.yaml`."""
-    record = {**settings_record(cfg), "versions": versions()}
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(_plain(record))))
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(_config(cfg)))
 
 
 def claim_output(cfg: Command, folder: Path, ignored: Sequence[str]) -> None:
@@ -85,13 +83,10 @@ def claim_output(cfg: Command, folder: Path, ignored: Sequence[str]) -> None:
     file = ensure_writable(folder) / "config.yaml"
     if file.exists() and not getattr(cfg, "overwrite", False):
         before = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
-        now = {**settings_record(cfg), "versions": versions()}
-        check_same_run(folder, before, _plain(now), ("output", "overwrite", *ignored))
+        now = OmegaConf.to_container(_config(cfg))
+        check_same_run(folder, before, now, ("output", "overwrite", *ignored))
     write_config(cfg, folder)
 
 
-def _plain(value: Any) -> Any:
-    """Replace tuples by lists."""
-    if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
-    return [_plain(one) for one in value] if isinstance(value, (list, tuple)) else value
+def _config(cfg: Command) -> Any:
+    return OmegaConf.create({**settings_record(cfg), "versions": versions()})

@@ -16,10 +16,10 @@ from cflow_torch.cli.logs import check_pair, chosen_pairs, find_logs, paths_of
 from cflow_torch.cli.outputs import chosen_preset, local_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.catalog import source_name
 from cflow_torch.data.log import Log, window
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.work import source_name
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -55,15 +55,15 @@ def find_log(cfg: Plot) -> Log:
     """Open the log `cfg.log` of `cfg.data`, or the first one."""
     if cfg.log is None and len(paths_of(cfg.data)) > 1:
         raise CFlowError("a picture shows one log, but several paths were given: give one of them, or log=ID")
-    sources = find_logs(cfg.data)
-    named = {source_name(source): source for source in sources.logs}
+    logs = find_logs(cfg.data)
+    named = {source_name(source): source for source in logs.sources}
     if cfg.log is None:
-        return sources.open(sources.logs[0])
+        return logs[0]
     if cfg.log in named:
-        return sources.open(named[cfg.log])
-    for source in sources.logs:  # the id of some logs is not the name of their file or folder
+        return logs.open(named[cfg.log])
+    for source in logs.sources:  # the id of some logs is not the name of their file or folder
         with suppress(CFlowError, OSError):
-            log = sources.open(source)
+            log = logs.open(source)
             if log.log_id == cfg.log:
                 return log
     raise CFlowError(f"log={cfg.log}: there is no such log; give one of {', '.join(sorted(named))}")

@@ -7,7 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Iterator, NamedTuple
 
-from cflow_torch.cli.choices import files, known_settings
+from cflow_torch.cli.choices import FOLDER, files, known_settings
 from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Plot, as_yaml, setting_lines
 from cflow_torch.config import METHODS, PRESETS, WINDOW
 from cflow_torch.errors import CFlowError, near
@@ -94,10 +94,12 @@ def _sections() -> Iterator[Section]:
     for name, picture in PICTURES.items():
         about = str(picture.__doc__).partition("\n")[0]
         yield Section(f"picture={name}", _block(about, setting_lines(picture, Plot)))
+    of_all = (FOLDER / "data" / "_log.yaml").read_text(encoding="utf-8").partition("\n")[2]
     for group in _IN_FILES:
         for file in files(group):
-            lines = file.read_text(encoding="utf-8").strip().splitlines()
-            yield Section(f"{group}={file.stem}", ["```yaml", *lines, "```"])
+            about, extends, own = file.read_text(encoding="utf-8").partition("defaults:\n  - _log\n\n")
+            text = f"{about}{own}{of_all}" if extends else about
+            yield Section(f"{group}={file.stem}", ["```yaml", *text.strip().splitlines(), "```"])
 
 
 def _method_table(method: str, presets: list[str]) -> list[str]:

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from cflow_torch.cli.choices import choices, known_settings
-from cflow_torch.cli.commands import PICTURES, WITH_SETTINGS, Command
+from cflow_torch.cli.commands import PAIR_SETTINGS, PICTURES, WITH_SETTINGS, Command
 from cflow_torch.errors import CFlowError, near
 from cflow_torch.setting import checked
 
@@ -84,6 +84,9 @@ def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
             raise CFlowError(
                 f"setting {key!r} belongs to {' or '.join(known[key])}: give that as well, or leave it out"
             )
+        if key in PAIR_SETTINGS and not kind.CHOOSES_PAIRS:
+            choosing = [name for name, other in WITH_SETTINGS.items() if other.CHOOSES_PAIRS]
+            raise CFlowError(f"{key} is for cflow {' and cflow '.join(choosing)}: cflow {command} takes every pair")
         limits = known[key][owners[0]]
         if len(owners) == 1 and limits is not None:
             for plain in plain_values(value, limits["kind"] is str):

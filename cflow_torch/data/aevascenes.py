@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -58,14 +58,14 @@ class AevaScenesLog(BoxLog):
 
     Attributes:
         lidars: names of the LiDARs that are merged.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep.
 
     Convention:
         - Points are in the vehicle frame (x forward, y left, z up, origin at the rear axle), one LiDAR after the other.
           We transform them in float64 by `vehicle_to_lidar_extrinsics`, which is `T_vehicle_lidar` despite its name.
         - `T_world_ego` is `ego_pose`; the world is the vehicle frame of the first sweep.
         - Truth comes from box tracks. Boxes of background classes (mostly poles) are ignored.
-        - Class names are stored as pickled strings, which we decode without executing anything.
-          `semantic_labels_idx` is ignored, because its table is not published.
+        - Classes come from `semantic_labels`, not from `semantic_labels_idx`, because its table is not published.
     """
 
     def __init__(
@@ -86,27 +86,18 @@ class AevaScenesLog(BoxLog):
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _HINT):
             content = read_json(self._file)
-            self.lidars: Sequence[str] = self._choose(lidars, content["metadata"]["sensors"]["lidars"])
+            known: Sequence[str] = content["metadata"]["sensors"]["lidars"]
+            self.lidars = tuple(known if lidars is None else lidars)
+            if not self.lidars or not set(self.lidars) <= set(known):
+                raise CFlowError(f"it has the LiDARs {shortened(known)}, you asked for {shortened(list(self.lidars))}")
             by_time: dict[int, dict[str, Any]] = {frame["timestamp_ns"]: frame for frame in content["frames"]}
             self.timestamps = sorted(by_time)
             self._check_count(self._file)
             self._frames = [by_time[time] for time in self.timestamps]
             mounts = content["metadata"]["vehicle_to_lidar_extrinsics"]
             self._mounts = self._poses_of([mounts[name] for name in self.lidars], "extrinsics")
-            self._poses = self._poses_of([frame["ego_pose"] for frame in self._frames], "ego poses")
+            self.poses = self._poses = self._poses_of([frame["ego_pose"] for frame in self._frames], "ego poses")
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
-
-    def _choose(self, lidars: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
-        """Return the LiDARs to read; None = all that the sequence has."""
-        chosen = tuple(known if lidars is None else lidars)
-        if not chosen or not set(chosen) <= set(known):
-            raise CFlowError(f"{self._file} has the LiDARs {shortened(known)}, you asked for {shortened(list(chosen))}")
-        return chosen
-
-    @cached_property
-    def poses(self) -> np.ndarray:
-        """(K, 4, 4) float64 `T_world_ego` of every sweep."""
-        return self._poses
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`. If a cloud lacks class names, the mask is None; if a cloud lacks times, the times are."""

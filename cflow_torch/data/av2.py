@@ -17,7 +17,7 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.paths import PathLike, as_path, is_timestamp, remote_errors, safe_name
+from cflow_torch.data.paths import PathLike, as_path, exist, is_timestamp, remote_errors, safe_name
 from cflow_torch.transforms import poses_at, poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array, vector_columns
 
@@ -107,12 +107,14 @@ class AV2Log(BoxLog):
         self._files = {int(file.stem): file for file in sweeps.glob("*.feather") if is_timestamp(file.stem)}
         self.timestamps = sorted(self._files)
         self._check_count(f"{self.folder}: sensors/lidar/<nanoseconds>.feather")
-        stored = FeatherFile(self.folder / "city_SE3_egovehicle.feather")
-        row_of = {time: row for row, time in enumerate(stored.vector("timestamp_ns", np.int64).tolist())}
-        missing = [time for time in self.timestamps if time not in row_of]
-        if missing:
-            raise CFlowError(f"{stored.file} has no pose at the time of sweep {missing[0]} ({len(missing)} missing)")
-        self._poses = _poses(stored, np.array([row_of[time] for time in self.timestamps]), self.timestamps)
+        self._stored_poses = FeatherFile(self.folder / "city_SE3_egovehicle.feather")
+        times, rows = np.unique(self._stored_poses.vector("timestamp_ns", np.int64), return_index=True)
+        has_pose = np.isin(self.timestamps, times)
+        if not has_pose.all():
+            first = f"{self.timestamps[int(has_pose.argmin())]} ({(~has_pose).sum()} missing)"
+            raise CFlowError(f"{self._stored_poses.file} has no pose at the time of sweep {first}")
+        self._pose_rows = dict(zip(times.tolist(), rows.tolist()))  # time -> row
+        self._poses = self._poses_at(self.timestamps)
         if ground is not None and ground not in GROUND_RULES:
             raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
         self._rule, self._raster = ground, read_ground_raster(self.folder / "map") if ground else None
@@ -130,12 +132,11 @@ class AV2Log(BoxLog):
 
     def _labels(self, index: int) -> FlowLabels | None:
         folder, first_pair = self.folder / "flow_labels", self.folder / "flow_labels.feather"
-        with remote_errors(self.folder):
-            if folder.is_dir():
-                file = folder / f"{self.timestamps[index]}.feather"
-                return self._stored_labels(file, index) if file.exists() else None
-            if index == 0 and first_pair.exists():
-                return self._stored_labels(first_pair, index)
+        if exist(folder):
+            file = folder / f"{self.timestamps[index]}.feather"
+            return self._stored_labels(file, index) if exist(file) else None
+        if index == 0 and exist(first_pair):
+            return self._stored_labels(first_pair, index)
         return super()._labels(index)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
@@ -148,7 +149,7 @@ class AV2Log(BoxLog):
         cameras = []
         for name, (size, matrix, mount) in self._calibration.items():
             image_time = min(self._image_times[name], key=lambda each: abs(each - time), default=time)
-            pose = self._poses[index] if image_time == time else self._pose_at(image_time)
+            pose = self._poses[index] if image_time == time else poses_at(np.array([image_time]), *self._trajectory)[0]
             T_camera_ego = at_image(mount, pose, self._poses[index])
             cameras.append(Camera(name, str(image_time), size, matrix, T_camera_ego, (image_time - time) * 1e-9))
         return cameras
@@ -159,9 +160,8 @@ class AV2Log(BoxLog):
         intrinsics, mounts = (
             self.folder / "calibration" / f"{name}.feather" for name in ("intrinsics", "egovehicle_SE3_sensor")
         )
-        with remote_errors(self.folder):
-            if not (intrinsics.exists() and mounts.exists()):
-                return {}
+        if not exist(intrinsics, mounts):
+            return {}
         stored = FeatherFile(mounts)
         sensors: list[str] = stored.read(("sensor_name",)).column(0).to_pylist()
         poses = dict(zip(sensors, _poses(stored, np.arange(stored.num_rows), sensors)))
@@ -189,17 +189,13 @@ class AV2Log(BoxLog):
                 for name in self._calibration
             }
 
-    def _pose_at(self, time: int) -> np.ndarray:
-        """Return the (4, 4) pose of the vehicle at the time of an image."""
-        times, poses = self._trajectory
-        return poses_at(np.array([time]), times, poses)[0]  # type: ignore[no-any-return]
+    def _poses_at(self, times: Sequence[int]) -> np.ndarray:
+        return _poses(self._stored_poses, np.array([self._pose_rows[time] for time in times]), times)
 
     @cached_property
     def _trajectory(self) -> tuple[np.ndarray, np.ndarray]:
-        """All poses of the vehicle, (M, 4, 4), and their times, (M,) int64 nanoseconds."""
-        stored = FeatherFile(self.folder / "city_SE3_egovehicle.feather")
-        times, rows = np.unique(stored.vector("timestamp_ns", np.int64), return_index=True)
-        return times, _poses(stored, rows, times.tolist())
+        """All poses of the vehicle: (M,) int64 nanoseconds, and (M, 4, 4)."""
+        return np.array(list(self._pose_rows)), self._poses_at(list(self._pose_rows))
 
     def _points(self, index: int) -> np.ndarray:
         return FeatherFile(self._files[self.timestamps[index]]).matrix("xyz", np.float32)
@@ -219,8 +215,7 @@ class AV2Log(BoxLog):
     @cached_property
     def _annotations(self) -> FeatherFile | None:
         file = self.folder / "annotations.feather"
-        with remote_errors(self.folder):
-            return FeatherFile(file) if file.exists() else None
+        return FeatherFile(file) if exist(file) else None
 
     def _boxes(self, index: int) -> Boxes | None:
         """Read the boxes of a sweep, in the order of the file; None outside the annotated time."""

@@ -6,6 +6,7 @@ import inspect
 import logging
 from collections import Counter
 from dataclasses import replace
+from glob import glob
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
@@ -14,11 +15,11 @@ from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.folders import find_folders, visible
 from cflow_torch.data.log import Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
-from cflow_torch.data.paths import as_path, is_path_like, remote_errors, safe_name
+from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import read_as as read_log_as
 from cflow_torch.ground.segmentation import CHOICES, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
@@ -89,7 +90,7 @@ def recognise(root: Any) -> str:
             fitting = {name for name, one in DATA_SETS.items() for path in level if any(map(path.match, one.marks))}
             if fitting:
                 break
-            level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+            level = [path for folder in level for path in visible(folder)]
     if fitting == {"kitti"} and not _has_logs("kitti", root):
         fitting = set()
     found = [name for name in DATA_SETS if name in fitting] or ["arrays"]
@@ -102,11 +103,43 @@ def recognise(root: Any) -> str:
     return found[0]
 
 
+def matching_paths(path: Any) -> list[Any]:
+    """Return the paths that are given, one or several, with patterns replaced by what they match."""
+    paths = [path] if is_path_like(path) else list(path)
+    found = [
+        sorted(glob(str(each))) if set(str(each)) & set("*?[") and not exist(as_path(each)) else [each]
+        for each in paths
+    ]
+    for each, matches in zip(paths, found):
+        if not matches:
+            raise CFlowError(f"{each}: no file or folder matches this pattern")
+    return [each for matches in found for each in matches]
+
+
+def the_format(paths: Sequence[Any]) -> str:
+    """Return the format of paths. If they have several, that is a `CFlowError`."""
+    names = sorted({recognise(path) for path in paths})
+    if len(names) != 1:
+        raise CFlowError(f"the paths have several formats, {' and '.join(names)}: open those of each format alone")
+    return names[0]
+
+
+def find_all_sources(name: str, paths: Sequence[Any]) -> list[Any]:
+    """Return the sources of logs under several paths, which may overlap, see `find_sources`."""
+    found: dict[str, Any] = {}
+    for path in paths:
+        found.update({str(source): source for source in find_sources(name, path)})
+    return list(found.values())
+
+
 _CONVERSIONS = {
     **dict.fromkeys((".las", ".laz"), "convert them with pdal translate IN.las OUT.ply"),
     **dict.fromkeys((".xyz", ".txt", ".csv", ".asc", ".pts"), "convert them with numpy.save(OUT, numpy.loadtxt(IN))"),
     **dict.fromkeys((".pcap", ".pcapng"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"),
     **dict.fromkeys((".e57", ".drc", ".rcp"), "convert them to .ply"),
+    **dict.fromkeys((".gz", ".zip", ".tar", ".tgz", ".7z", ".zst", ".bz2"), "unpack them"),
+    **dict.fromkeys((".pt", ".pth", ".pkl", ".mat"), "convert the cloud of each sweep with numpy.save"),
+    **dict.fromkeys((".hdf5", ".hdf", ".he5"), "if they are scenes of OpenSceneFlow, rename them to .h5"),
     ".tfrecord": "Waymo's version 1 is not read; download version 2",
 }
 
@@ -118,7 +151,7 @@ def _why_nothing_fits(top: Path) -> str:
     level, suffixes = [top], Counter()  # type: ignore[var-annotated]
     for _ in range(_DEEPEST):
         suffixes.update(path.suffix.lower() for path in level if path.is_file())
-        level = [path for folder in level if folder.is_dir() for path in folder.iterdir() if path.name[0] != "."]
+        level = [path for folder in level for path in visible(folder)]
     if not suffixes:
         return "it has no files" if top.is_dir() else ""
     suffix, count = suffixes.most_common(1)[0]
@@ -167,6 +200,12 @@ def _user_logs(target: str, settings: Mapping[str, Any]) -> Sequence[Log]:
     if hasattr(made, "sweep"):
         return [made]
     return made if hasattr(made, "__getitem__") else list(made)
+
+
+def source_name(source: Any) -> str:
+    """Return the name of a log that is not open."""
+    names = (getattr(source, key, None) for key in ("scene", "stem", "name"))
+    return str(next(filter(None, names), source))
 
 
 def find_sources(name: str, root: Any) -> Sequence[Any]:
@@ -269,13 +308,17 @@ def _open(name: str, source: Any, settings: Mapping[str, Any]) -> Log:
 
 
 class Logs(Sequence[Log]):
-    """The logs of a folder. Each is opened when you ask for it, as `open_log` does with the same arguments."""
+    """The logs of a data set. Each is opened when you ask for it, as `open_log` does with the same arguments."""
 
     def __init__(self, name: str, sources: Sequence[Any], settings: Mapping[str, Any]) -> None:
-        self._name, self._sources, self._settings = name, sources, settings
+        self.name, self.sources, self.settings = name, sources, settings
+
+    def open(self, source: Any) -> Log:
+        """Open one of the `sources`."""
+        return open_log(self.name, source, **self.settings)
 
     def __len__(self) -> int:
-        return len(self._sources)
+        return len(self.sources)
 
     @overload
     def __getitem__(self, index: int) -> Log: ...
@@ -283,11 +326,11 @@ class Logs(Sequence[Log]):
     def __getitem__(self, index: slice) -> Logs: ...
     def __getitem__(self, index: int | slice) -> Log | Logs:
         if isinstance(index, slice):
-            return Logs(self._name, self._sources[index], self._settings)
-        return open_log(self._name, self._sources[index], **self._settings)
+            return Logs(self.name, self.sources[index], self.settings)
+        return self.open(self.sources[index])
 
     def __repr__(self) -> str:
-        return f"Logs(data={self._name}, {len(self)} logs)"
+        return f"Logs(data={self.name}, {len(self)} logs)"
 
     def windows(self, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
         """Iterate over the windows of each log in turn, see `Log.windows`."""
@@ -300,7 +343,7 @@ def open(path: Any, data: str = AUTO, **settings: Any) -> Log | Logs:
     """Open the log at a path, or the logs of a folder. `cflow_torch.open` is this function.
 
     Args:
-        path: file or folder.
+        path: file or folder, a pattern such as "/data/drive_*", or a sequence of these, which have one format.
         data: name of the format, a key of `DATA_SETS`; "auto" = recognise it.
         **settings: as for `open_log`: `find_ground`, `odometry`, `read_as`, `deskew`, ..., and those of the reader.
 
@@ -315,8 +358,9 @@ def open(path: Any, data: str = AUTO, **settings: Any) -> Log | Logs:
         >>> for window in cflow_torch.open("/data/my_drive").windows(num_history=4):
         ...     (result,) = model([window])
     """
-    name = recognise(path) if data == AUTO else data
-    logs = Logs(name, find_sources(name, path), settings)
+    paths = matching_paths(path)
+    name = the_format(paths) if data == AUTO else data
+    logs = Logs(name, find_all_sources(name, paths), settings)
     return logs[0] if len(logs) == 1 else logs
 
 

@@ -6,14 +6,14 @@ import re
 from typing import Iterable, Sequence
 
 # Names without punctuation and units, as drivers, odometry programs and exports of ROS messages write them.
-_ROTATION = "(q|.*quat|.*quaternion|.*orientation|.*rot|.*rotation|qrs)"
-_POSITION = "(t|p|pos|prsr|.*position|.*translation)?"
+_ROTATION = "(q|.*quat|.*quaternion|.*orientation|.*rot|.*rotation|.*heading|qrs)"
+_POSITION = "(t|p|pos|prsr|.*position|.*translation|.*location)?"
 _ROLES = {
     "sec": "(.*stamp)?secs?",
     "nsec": "(.*stamp)?(nsecs?|nanosec)",
     "time": "t|.*time|.*stamp|(time|timestamp|stamp|t)(s|sec|secs|ns|us|ms|unix)",
     **{axis: f"{_POSITION}{axis}m?" for axis in "xyz"},
-    **{f"q{axis}": _ROTATION + axis for axis in "wxyz"},
+    **{f"q{axis}": _ROTATION + axis for axis in "wxyz0123"},
     "roll": ".*roll(deg|degrees|rad|radians)?",
     "pitch": ".*pitch(deg|degrees|rad|radians)?",
     "yaw": ".*(yaw|heading)(deg|degrees|rad|radians)?",
@@ -28,7 +28,10 @@ def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
 
 
 def role_of_name(name: str) -> str | None:
-    """Return what a column holds: time, sec, nsec, x, y, z, qw, qx, qy, qz, roll, pitch or yaw; None = else."""
+    """Return what a column holds: time, sec, nsec, x, y, z, qw, qx, qy, qz, roll, pitch or yaw; None = else.
+
+    q0 to q3 are a quaternion of unknown order.
+    """
     plain = _plain(name)
     if re.search(_OTHERS, plain):
         return None

@@ -4,29 +4,45 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Callable
+from typing import Any, Callable, Sequence, TypeVar
 
 from cflow_torch.errors import CFlowError
 
-Test = Callable[[Path], bool]
+_T = TypeVar("_T")
 
 
-def find_folders(root: Path, is_log: Test, depth: int, what: str, is_passed: Test = lambda folder: True) -> list[Path]:
-    """Find the folders that are logs, sorted: `root` itself, or folders at most `depth` levels below it.
+def search(
+    root: Path,
+    find: Callable[[Path], Sequence[_T]],
+    depth: int,
+    what: str,
+    is_passed: Callable[[Path], bool] = lambda folder: True,
+) -> list[_T]:
+    """Collect what `find` returns for `root` and the folders at most `depth` levels below it, by levels.
 
-    We do not search inside logs, hidden folders, or folders for which `is_passed` is False. A root that is not a folder
-    is a `CFlowError`, which says `what` to pass.
+    We do not search below folders in which something is found, in hidden folders, or in folders for which `is_passed`
+    is False. A root that is not a folder is a `CFlowError`, which says `what` to pass.
     """
     if not root.is_dir():
         raise CFlowError(f"{root} is not a folder; pass {what}")
-    found: list[Path] = []
+    found: list[_T] = []
     level = [root]
     for _ in range(depth + 1):
-        logs = {folder for folder in level if is_log(folder)}
-        found += logs
-        children = (child for folder in level if folder not in logs for child in folder.iterdir())
-        level = [c for c in children if not c.name.startswith(".") and is_passed(c) and c.is_dir()]
-    return sorted(found)
+        here = [(folder, find(folder)) for folder in level]
+        found += [each for _, all_found in here for each in all_found]
+        children = [child for folder, all_found in here if not all_found for child in visible(folder)]
+        level = [child for child in children if is_passed(child) and child.is_dir()]
+    return found
+
+
+def find_folders(root: Path, is_log: Callable[[Path], bool], depth: int, what: str, **settings: Any) -> list[Path]:
+    """Find the folders that are logs, sorted, see `search`."""
+    return sorted(search(root, lambda folder: [folder] if is_log(folder) else [], depth, what, **settings))
+
+
+def visible(folder: Path) -> list[Path]:
+    """Return the files and folders in a folder that are not hidden; [] if it is a file."""
+    return [path for path in folder.iterdir() if path.name[0] != "."] if folder.is_dir() else []
 
 
 def natural_key(name: str) -> tuple[Any, ...]:

@@ -45,10 +45,7 @@ class FlowLabels:
 class Log(ABC):
     """One drive, a sequence of sweeps: `len(log)`, `log[-1]`, `log[1:3]`, `for sweep in log` and `with log` work.
 
-    `log.windows(num_history=4)` gives the input of a model for every pair of sweeps.
-
-    To write your own reader, inherit from this class, set `log_id` and `timestamps`, and implement `sweep`. If the log
-    has truth, implement `labels`, too.
+    To write your own reader, set `log_id` and `timestamps`, and implement `sweep` and, if the log has truth, `labels`.
 
     Attributes:
         log_id: name of the log, safe as a folder name; the name of its file or folder unless the reader says otherwise.
@@ -57,6 +54,7 @@ class Log(ABC):
             future, and `cflow flow` leaves out the pair over it.
         is_compensated: True = the format is known to be compensated for ego motion within a sweep.
         has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
+        has_sparse_poses: True = most poses are interpolated between sweeps.
         lidar_position: (3,) metres, position of the rotating LiDAR in the frame of the points.
         has_viewpoints: True = the poses come with the clouds, which are then often in the world's frame.
         turn_seconds: duration of a turn of the LiDAR; None = the median time between two sweeps.
@@ -65,16 +63,15 @@ class Log(ABC):
         times, and `sweep` and `labels` read the rest.
 
     Raises:
-        CFlowError: the constructors of our readers raise it for a file that is missing, damaged or incomplete, a
-            setting that is not allowed, and fewer than two sweeps. `sweep` and `labels` raise it if the index does
-            not exist, or if a file of the sweep is missing, damaged, or has another number of points than the others.
-            You can still read other sweeps.
+        CFlowError: a file is missing, damaged or incomplete, a setting is not allowed, or there are fewer than two
+            sweeps. After an error of `sweep` or `labels` you can still read other sweeps.
     """
 
     log_id: str
     timestamps: Sequence[int]
     gaps: frozenset[int] = frozenset()
     has_viewpoints: bool = False
+    has_sparse_poses: bool = False
     # What `cflow_torch.data.deskewing` must know of a reader.
     is_compensated: bool = False
     has_raw_times: bool = False
@@ -94,7 +91,7 @@ class Log(ABC):
         """Read the truth of a pair that exists."""
         return None
 
-    # What a log may have beyond sweeps and labels. None = it does not; readers and wrappers set or override it.
+    # What a log may have beyond sweeps and labels. Readers and wrappers set or override it.
 
     @cached_property
     def poses(self) -> np.ndarray | None:
@@ -264,9 +261,8 @@ def points_surround_poses(log: Log) -> bool:
 def window(log: Log, index: int, num_history: int = 0, num_future: int = 0) -> Window:
     """Read the window for the flow from sweep `index` to sweep `index + 1`.
 
-    If fewer than `num_history` sweeps precede `index`, or fewer than `num_future` follow `index + 1`, the window has
-    only these. It also ends at a gap of the log and, with a warning, at a sweep of the history or future whose file is
-    missing. If `index + 1` does not exist, or one of the pair cannot be read, that is a `CFlowError`.
+    It has fewer than `num_history` older or `num_future` later sweeps at the ends of the log, at its gaps and, with a
+    warning, at a sweep whose file is missing. A pair that cannot be read is a `CFlowError`.
     """
     count = len(log.timestamps)
     if not 0 <= index < count - 1:
@@ -297,11 +293,7 @@ def windows(log: Log, num_history: int = 0, num_future: int = 0) -> Iterator[Win
 
 
 class WindowDataset(Dataset):  # type: ignore[type-arg]
-    """The windows of one or more logs, for a `torch.utils.data.DataLoader`. Its workers read the files.
-
-    Args:
-        logs: one log or a sequence of logs. They must be picklable if the workers are not forked.
-        num_history, num_future: as in `window`.
+    """The windows of one or more logs, for a `torch.utils.data.DataLoader`. Logs must be picklable for its workers.
 
     Examples:
         >>> data = WindowDataset(logs, num_history=model.config.num_history)
@@ -332,77 +324,32 @@ class WindowDataset(Dataset):  # type: ignore[type-arg]
 
 
 class LogWrapper(Log):
-    """Base class of logs that change the sweeps of another log. Every other attribute comes from the other log."""
+    """Base class of logs that change the sweeps of another log. Every other member comes from the other log."""
 
     def __init__(self, log: Log) -> None:
-        self.log, self.log_id, self.timestamps = log, log.log_id, log.timestamps
-        self.gaps = log.gaps
-
-    def labels(self, index: int) -> FlowLabels | None:
-        return self.log.labels(index)
-
-    def columns(self, index: int) -> Mapping[str, np.ndarray]:
-        return self.log.columns(index)
-
-    def cameras(self, index: int) -> Sequence[Camera]:
-        return self.log.cameras(index)
-
-    @property
-    def notes(self) -> list[str]:
-        return self.log.notes
-
-    def _note(self, text: str, kind: str = "") -> None:
-        self.log._note(text, kind)
-
-    @cached_property
-    def poses(self) -> np.ndarray | None:
-        return self.log.poses
-
-    @cached_property
-    def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
-        return self.log.trajectory
-
-    @property
-    def readings(self) -> tuple[str, ...]:
-        return self.log.readings
-
-    @cached_property
-    def surrounds_poses(self) -> bool:
-        return self.log.surrounds_poses
-
-    @property
-    def judgement(self) -> Judgement | None:
-        return self.log.judgement
-
-    def findings(self) -> list[Finding]:
-        return self.log.findings()
-
-    def eval_mask(self, index: int) -> np.ndarray | None:
-        return self.log.eval_mask(index)
-
-    def stored_motion(self, index: int) -> Any:
-        return self.log.stored_motion(index)
-
-    def moving(self, index: int) -> np.ndarray | None:
-        return self.log.moving(index)
-
-    def units(self, index: int) -> Any:
-        return self.log.units(index)
-
-    def boxes(self, index: int) -> Any:
-        return self.log.boxes(index)
-
-    def close(self) -> None:
-        self.log.close()
-
-    @property
-    def unwrapped(self) -> Log:
-        return self.log.unwrapped
+        self.log, self.log_id, self.timestamps, self.gaps = log, log.log_id, log.timestamps, log.gaps
 
     def __getattr__(self, name: str) -> Any:
         if name == "log" or name.startswith("__"):  # Python asks for hooks while it unpickles, before `log` is set
             raise AttributeError(name)
         return getattr(self.log, name)
+
+
+class _OfLog:
+    """A member of a wrapper that is the member of the wrapped log."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, wrapper: Any, owner: Any = None) -> Any:
+        return self if wrapper is None else getattr(wrapper.log, self._name)
+
+
+for _name in (
+    *("labels", "columns", "cameras", "poses", "trajectory", "readings", "surrounds_poses", "judgement", "findings"),
+    *("eval_mask", "stored_motion", "moving", "units", "boxes", "notes", "_note", "close", "unwrapped"),
+):
+    setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has
 
 
 class CachedLog(LogWrapper):

@@ -13,9 +13,11 @@ from cflow_torch.transforms import turn_of
 from cflow_torch.types import Sweep
 from cflow_torch.windows.readings import (
     GIVEN,
+    LEAST_SHARE,
     OFF,
     STILL,
     TIMES,
+    UNKNOWN,
     WORLD,
     Judgement,
     Pair,
@@ -32,6 +34,7 @@ _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle sta
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
 _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
 _FEWEST_POSES = 5  # that tell a usual step
+_AS_AROUND, _CLEARLY = "as around it", 1.3  # factor by which another reading is better than the steps around
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
 
 
@@ -80,6 +83,11 @@ def _speed(poses: np.ndarray, first: int, second: int) -> float:
     return float(np.linalg.norm(poses[second, :3, 3] - poses[first, :3, 3])) / (second - first)
 
 
+def _usual_speed(poses: np.ndarray) -> float:
+    """Return the median metres between neighbouring poses, rotations at 20 m."""
+    return float(np.median([difference(_motion(poses, k, k + 1), np.eye(4)) for k in range(len(poses) - 1)]))
+
+
 def _turn(poses: np.ndarray, first: int, second: int) -> float:
     return turn_of(_motion(poses, first, second))
 
@@ -103,12 +111,19 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     steps = steps_of(log)
     chosen = choose_pairs(len(log.timestamps), poses, () if steps is None else steps.suspects)
     sweeps = {index: log.sweep(index) for pair in chosen for index in pair}
-    pairs = partial(_make_pairs, sweeps, chosen, poses, deskew)
+    # Where poses are interpolated over several sweeps, an error of it looks as if they were of another time.
+    neighbours = None if log.unwrapped.has_sparse_poses else poses
+    pairs = partial(_make_pairs, sweeps, chosen, poses, neighbours, deskew)
     if log.surrounds_poses:
         judgement = judge(pairs((OFF,), True))
         if WORLD in judgement.best:
             return judgement
     judgement = judge(pairs(scans, False))
+    if poses is not None and not judgement.best and _usual_speed(poses) < _LEAST_TIMED:
+        spread = choose_pairs(len(log.timestamps), None)
+        clouds = [[replace(log.sweep(index), pose=None) for index in pair] for pair in spread]
+        unposed = judge(make_pair(pc0, pc1) for pc0, pc1 in clouds)
+        judgement = unposed if UNKNOWN in unposed.best else judgement
     if STILL in judgement.best and log.unwrapped.has_viewpoints:
         return replace(judgement, shares={**judgement.shares, WORLD: judgement.shares[STILL]}, best=(WORLD,))
     return judgement
@@ -118,13 +133,15 @@ def _make_pairs(
     sweeps: Mapping[int, Sweep],
     chosen: Sequence[tuple[int, int]],
     poses: np.ndarray | None,
+    neighbours: np.ndarray | None,
     deskew: Callable[..., np.ndarray] | None,
     scans: Sequence[str],
     in_world: bool,
 ) -> Iterator[Pair | None]:
+    """Prepare the pairs; `neighbours` are the poses that tell those before and after a sweep, None = they do not."""
     for first, second in chosen:
-        before = None if poses is None or first == 0 else poses[[first - 1, second - 1]]
-        after = None if poses is None or second + 1 == len(poses) else poses[[first + 1, second + 1]]
+        before = None if neighbours is None or first == 0 else neighbours[[first - 1, second - 1]]
+        after = None if neighbours is None or second + 1 == len(neighbours) else neighbours[[first + 1, second + 1]]
         least = _LEAST_TIMED if TIMES in scans else _LEAST_SPEED
         is_fast = poses is not None and difference(_motion(poses, first, second), np.eye(4)) >= least * (second - first)
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}
@@ -186,7 +203,12 @@ def find_lapses(log: Log) -> list[Lapse]:
 
 
 def _contradicted(log: Log, index: int, step: np.ndarray, usual: np.ndarray) -> bool:
+    """Test whether a step fits best as those around it, and not under another reading of all poses."""
     pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
     if pair is None:
         return False
-    return bool(judge([replace(pair, transforms={GIVEN: step, "as around it": usual}, has_motion=True)]).best)
+    transforms = {GIVEN: step, _AS_AROUND: usual}
+    if not judge([replace(pair, transforms=transforms, has_motion=True)]).best:
+        return False
+    shares = replace(pair, transforms={**pair.transforms, **transforms}).shares_of_poses(OFF)
+    return max(shares.values()) < max(_CLEARLY * shares[_AS_AROUND], LEAST_SHARE)

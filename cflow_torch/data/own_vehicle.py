@@ -13,7 +13,8 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.stillness import REACH, Structure, are_finite, cell_keys
+from cflow_torch.windows.point_frame import frame_problem
+from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite, cell_keys
 
 _NEAR, _CELL = 2.7, 0.25  # metres from the origin along x and y, and side of a cell
 _LEAST_MOTION, _FEWEST_SWEEPS, _MOST_SWEEPS = 2.0, 3, 4  # metres between the compared sweeps, and their number
@@ -97,6 +98,8 @@ class OwnVehicleLog(LogWrapper):
         of_all = _cells_of(np.concatenate(near))
         if rides.sum() < _FEWEST_POINTS * len(clouds) or explained[rides].mean() > _IN_PLACE:
             return nothing
+        if frame_problem(self.log.sweep(chosen[0]).points)[1]:
+            return nothing  # then other points than those of the ground were taken for ground
         return np.unique(of_all[rides & ~explained], axis=0)
 
 
@@ -144,6 +147,7 @@ def _in_place(points: np.ndarray, T_other: np.ndarray, other: np.ndarray, cells:
     if len(points) == 0:
         return np.zeros(0, bool)
     moved = transform_points(points, T_other)
-    around = ((other > moved.min(0) - 2 * REACH) & (other < moved.max(0) + 2 * REACH)).all(1)  # the search costs less
+    reach = 2 * IN_PLACE
+    around = ((other > moved.min(0) - reach) & (other < moved.max(0) + reach)).all(1)  # the search costs less
     other = other[around]
     return Structure(other[~_contains(cells, _cells_of(other))]).in_place(moved)

@@ -16,7 +16,7 @@ from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels, Log
-from cflow_torch.data.paths import PathLike, as_path, read_bytes, remote_errors
+from cflow_torch.data.paths import PathLike, as_path, exist, read_bytes, remote_errors
 from cflow_torch.data.pickles import load_columns
 from cflow_torch.transforms import poses_from_json, transform_points, upright_poses
 from cflow_torch.types import CFlowError, Sweep
@@ -91,9 +91,8 @@ class PandaSetLog(Log):
 
     def _labels(self, index: int) -> FlowLabels | None:
         files = [self.folder / "annotations" / "cuboids" / self._files[k].name for k in (index, index + 1)]
-        with remote_errors(self.folder):
-            if not all(file.exists() for file in files):
-                return None
+        if not exist(*files):
+            return None
         points, _, lidars = self._cloud(index)
         labels = FlowLabels(
             flow=np.zeros((len(points), 3), np.float32),
@@ -178,9 +177,8 @@ class PandaSetLog(Log):
         """Read the names of classes, and the index of each point's class, (N,); None if the sequence has no classes."""
         folder = self.folder / "annotations" / "semseg"
         file, table = folder / self._files[index].name, folder / "classes.json"
-        with remote_errors(folder):
-            if not (file.exists() and table.exists()):
-                return None
+        if not exist(file, table):
+            return None
         classes = _columns(file, ("class",))["class"]
         if classes.shape != (num_points,):
             raise CFlowError(f"{file} has {len(classes)} classes for {num_points} points; copy the sequence again")

@@ -87,6 +87,12 @@ def remote_errors(path: Path) -> Iterator[None]:
         raise OSError(f"cannot reach {path} ({type(error).__name__}: {error})") from error
 
 
+def exist(*paths: Path) -> bool:
+    """Test whether all of these files or folders exist. Errors as in `remote_errors`."""
+    with remote_errors(paths[0]):
+        return all(path.exists() for path in paths)
+
+
 def forget_listings(path: Any) -> None:
     """Drop the folder listings that fsspec caches, also for `is_file`: other processes may have written since."""
     if is_remote(path):

@@ -44,6 +44,11 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
             - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
               camera's, or the x axis points to the left, backward or to the right of that of the points; "down": z
               points down, and y to the right;
+            - "opengl": the same of a camera as in OpenGL (x right, y up, z backward);
+            - "mirrored", "mirrored_back", "swapped": poses or points are left-handed: y or x is mirrored, or both are
+              interchanged;
+            - "transposed": the rotations are those of T_ego_world, the positions those of T_world_ego; "compass":
+              angles count clockwise from the y axis (north), while x is east;
             - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
             - "millimetres", "centimetres": unit of the poses;
             - "points_millimetres", "points_centimetres", "points_camera", "points_upside_down": unit or axes of the

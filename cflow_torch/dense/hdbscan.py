@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import DenseConfig
-from cflow_torch.dense.clustering import Clusters, Pixels, bounding_boxes
+from cflow_torch.dense.clustering import ClusterPixels, Clusters, bounding_boxes
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.errors import import_optional
 from cflow_torch.ops.groups import FAR, Groups
@@ -38,7 +38,7 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
         window=pixels.window[clusters.first()],
         first=top_left,
         size=size,
-        pixels=Pixels(
+        pixels=ClusterPixels(
             cluster=clusters.of_item[is_kept],
             step=pixels.step[is_kept],
             row=pixels.row[is_kept],

@@ -7,6 +7,7 @@ from typing import Any
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.errors import CFlowError
 
+OVERWRITE = "give overwrite=true"
 _SHOWN = 5  # changed settings that a message lists
 
 
@@ -20,20 +21,15 @@ def flatten(value: Any, name: str = "") -> dict[str, Any]:
     return leaves
 
 
-def check_same_run(folder: Any, before: Any, now: Any, free: Any = ()) -> None:
-    """Raise a `CFlowError`, which lists the changes, if `folder` has results of other settings. `free` may differ."""
-    changes = describe_changes(before, now, free)
-    if changes:
-        why = f"{folder} has results of another run ({changes})"
-        raise CFlowError(f"{why}: give overwrite=true, or output=FOLDER")
+def check_same_run(folder: Any, before: Any, now: Any, free: Any = (), remedy: str = OVERWRITE) -> None:
+    """Raise a `CFlowError`, which lists the changes, if `folder` has results of other settings.
 
-
-def describe_changes(before: Any, now: Any, ignored: Any = ()) -> str:
-    """List the settings that differ between two nested dictionaries, as "key was A, is B; ..."; "" if none do.
-
-    The keys `ignored`, joined by dots as in `flatten`, may differ.
+    The settings are nested dictionaries; the keys `free`, joined by dots as in `flatten`, may differ.
     """
     old, new = flatten(before), flatten(now)
-    changed = sorted(key for key in {*old, *new} - set(ignored) if old.get(key) != new.get(key))
-    shown = "; ".join(f"{key} was {shortened(old.get(key))}, is {shortened(new.get(key))}" for key in changed[:_SHOWN])
-    return shown + (f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else "")
+    changed = sorted(key for key in {*old, *new} - set(free) if old.get(key) != new.get(key))
+    if changed:
+        texts = [f"{key} was {shortened(old.get(key))}, is {shortened(new.get(key))}" for key in changed[:_SHOWN]]
+        more = f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else ""
+        why = f"{folder} has results of another run ({'; '.join(texts)}{more})"
+        raise CFlowError(f"{why}: {remedy}, or give output=FOLDER")

@@ -23,12 +23,11 @@ import torch
 
 from cflow_torch import __version__
 from cflow_torch.config import Config
-from cflow_torch.data.atomic import write_text
 from cflow_torch.data.flow_file import CONTENTS
-from cflow_torch.data.json_file import json_ready, read_json
+from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
-from cflow_torch.fleet.changes import describe_changes
+from cflow_torch.fleet.changes import OVERWRITE, check_same_run
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
@@ -38,7 +37,6 @@ _TRACKS = r"tracks\.parquet|mot\.txt|kitti\.txt|instances_info\.json|frame_insta
 _DETECTIONS = r"nuscenes_detection\.json|nuscenes_tracking\.json|result\.pkl"
 _OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|{_DETECTIONS}|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
-_OVERWRITE = "give overwrite=true"
 
 
 def make_identity(
@@ -58,7 +56,8 @@ def make_identity(
     identity = json_ready(
         {"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions}
     )
-    return {**identity, "hash": hashlib.sha256(_text(identity).encode()).hexdigest()}
+    text = json.dumps(identity, indent=1, sort_keys=True) + "\n"
+    return {**identity, "hash": hashlib.sha256(text.encode()).hexdigest()}
 
 
 def check_logs(
@@ -68,7 +67,7 @@ def check_logs(
 
     `resume` continues an earlier run of the same identity. `overwrite` replaces the results of other runs. It is
     allowed only if you are `alone`, that is, if no other shard works on these logs. A worker checks a log again when it
-    has opened it (`check_log`); in an object store, which takes a while for each log, we leave it to the workers.
+    has opened it (`checked_manifest`). An object store takes a while for each log, so there we leave it to the workers.
     """
     forget_listings(output)
     if (overwrite and alone) or (resume and is_remote(output)):
@@ -77,12 +76,13 @@ def check_logs(
         before = _read(folder / MANIFEST)
         if before is None or not complete_frames(folder):
             continue
-        _check_run(folder, before, identity, "remove that folder" if overwrite else _OVERWRITE)
+        remedy = "remove that folder" if overwrite else OVERWRITE
+        check_same_run(folder, before.get("run", {}), identity, ["hash"], remedy)
         if not (resume or overwrite):
             raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
 
 
-def check_log(folder: Path, log: Log, identity: Mapping[str, Any]) -> dict[str, Any]:
+def checked_manifest(folder: Path, log: Log, identity: Mapping[str, Any]) -> dict[str, Any]:
     """Make sure that the frames in a log's folder were computed from this log, and return its manifest.
 
     A log that has changed since, or another log of its name, is a `CFlowError`. Cost: reads three sweeps.
@@ -95,16 +95,16 @@ def check_log(folder: Path, log: Log, identity: Mapping[str, Any]) -> dict[str, 
 
 
 def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest of `check_log`, unless there is one. Call this before the first frame is written."""
+    """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written."""
     before = _read(folder / MANIFEST)
     if before is None or (before.get("run") != manifest["run"] and not complete_frames(folder)):
-        write_text(folder / MANIFEST, _text(manifest))
+        write_json(folder / MANIFEST, manifest)
         before = _read(folder / MANIFEST)  # another process may have been quicker
     _check_manifest(folder, before or {}, manifest)
 
 
 def _check_manifest(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    _check_run(folder, before, now["run"], _OVERWRITE)
+    check_same_run(folder, before.get("run", {}), now["run"], ["hash"])
     is_same = all(before.get(key) == now[key] for key in ("log_id", "timestamps"))
     both = now["sweeps"].keys() & (before.get("sweeps") or {}).keys()
     if not is_same or any(before["sweeps"][key] != now["sweeps"][key] for key in both):
@@ -112,20 +112,6 @@ def _check_manifest(folder: Path, before: Mapping[str, Any], now: Mapping[str, A
             f"{folder} has flow of other sweeps (the log has changed since, or two logs have the same name): "
             "remove that folder, or give output=FOLDER"
         )
-
-
-def _check_run(folder: Path, manifest: Mapping[str, Any], identity: Mapping[str, Any], remedy: str) -> None:
-    """Raise a `CFlowError`, which lists the changes of settings, if a log has results of another run."""
-    before: Any = manifest.get("run")
-    if before == identity:
-        return
-    is_known = isinstance(before, dict)  # earlier versions stored a hash
-    changes = describe_changes(before, identity, ["hash"]) if is_known else ""
-    if is_known and before["data"]["reader"] != identity["data"]["reader"]:
-        changes = f"of data={before['data']['reader']}, not {identity['data']['reader']}"
-    raise CFlowError(
-        f"{folder} has results of another run{f' ({changes})' if changes else ''}: {remedy}, or give output=FOLDER"
-    )
 
 
 def describe_log(log: Log) -> dict[str, Any]:
@@ -218,7 +204,3 @@ def _read(file: Path) -> dict[str, Any] | None:
         return None
     except CFlowError as error:
         raise CFlowError(f"{file} is not a manifest ({error}): remove it, or give output=FOLDER") from None
-
-
-def _text(content: Mapping[str, Any]) -> str:
-    return json.dumps(content, indent=1, sort_keys=True) + "\n"

@@ -13,10 +13,11 @@ from threading import Event as Flag
 from threading import Thread
 from typing import Any, Callable, Generator, Iterator, Sequence
 
+from cflow_torch.data.catalog import source_name
 from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.fleet.work import Worker, make_worker, source_name
+from cflow_torch.fleet.work import Worker, make_worker
 
 Events = Generator[Event, None, None]
 _POLL_S = 0.2  # how soon a signal is noticed

@@ -10,6 +10,7 @@ from contextlib import closing
 from typing import Any, Iterable, Iterator, Mapping, Sequence
 
 from cflow_torch.data.atomic import remove_stale
+from cflow_torch.data.catalog import source_name
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.executors import Executor, describe_error
@@ -19,7 +20,7 @@ from cflow_torch.fleet.manifest import complete_frames
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.stop_signal import StopSignal
-from cflow_torch.fleet.work import open_quickly, source_name
+from cflow_torch.fleet.work import open_quickly
 from cflow_torch.types import CFlowError
 
 _SHOWN_NOTES = 3  # how often a message is shown; the report names every log with this message

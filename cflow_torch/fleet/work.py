@@ -16,7 +16,7 @@ import pyarrow
 import torch
 
 from cflow_torch.data.atomic import remove_stale
-from cflow_torch.data.catalog import open_log
+from cflow_torch.data.catalog import open_log, source_name
 from cflow_torch.data.flow_file import POINTS, write_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
@@ -24,7 +24,7 @@ from cflow_torch.data.paths import as_path, safe_name
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.executors import describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
-from cflow_torch.fleet.manifest import check_log, claim_log, complete_frames, frame_file
+from cflow_torch.fleet.manifest import checked_manifest, claim_log, complete_frames, frame_file
 from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
@@ -66,26 +66,26 @@ class Worker:
         """Begin a part, if one is given, and return the next event of the part; None after the last one."""
         self._is_stopped = is_stopped
         if part is not None:
-            self._events = self.run(part, lambda: self._is_stopped)
+            self._events = self.run(part)
         return next(self._events, None)
 
-    def run(self, part: Part, stop: Callable[[], bool] = lambda: False) -> Iterator[Event]:
+    def run(self, part: Part) -> Iterator[Event]:
         """Do the frames of a part that are not complete. `BrokenExecutor` if the GPU can no longer be used.
 
-        We call `stop` before each frame and batch. Once it returns True, we write computed frames and begin no others.
+        After a stop, we write computed frames and begin no others.
 
         Yields:
             `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something other than a
             frame fails, `Failed` has no time stamp.
         """
         try:
-            yield from self._run(part, stop)
+            yield from self._run(part)
         except BrokenExecutor:
             raise
         except Exception as error:
             yield Failed(part.number, source_name(part.source), describe_error(error))
 
-    def _run(self, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
+    def _run(self, part: Part) -> Iterator[Event]:
         log = self._open(part.source)
         folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
         stamps = {i: int(log.timestamps[i]) for i in part.frames(len(log.timestamps) - 1) if i not in log.gaps}
@@ -93,7 +93,7 @@ class Worker:
             stamps = {i: stamp for i, stamp in stamps.items() if stamp == part.only}
         complete = set() if self._job.redo else complete_frames(folder)
         todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
-        manifest: Any = check_log(folder, log, self._job.identity) if todo or complete else None
+        manifest: Any = checked_manifest(folder, log, self._job.identity) if todo or complete else None
         remove_stale(folder)
         yield Opened(part.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
         checks = bool(self._job.settings.get("check", True))
@@ -102,7 +102,7 @@ class Worker:
                 for text in find_problems(log):
                     yield Noted(part.number, log.log_id, text)
         claim = lru_cache(partial(claim_log, folder, manifest))  # once, before the first frame
-        for frame in self._pass(log, partial(self._write, folder, claim), todo, stop):
+        for frame in self._pass(log, partial(self._write, folder, claim), todo):
             name = f"{log.log_id}/{frame.timestamp}"
             if checks and frame.is_repetition:
                 yield Noted(part.number, name, "the next sweep has the same points")
@@ -127,14 +127,12 @@ class Worker:
             self._source, self._log = source, CachedLog(log, self._job.config.num_sweeps)
         return self._log  # type: ignore[no-any-return]
 
-    def _pass(
-        self, log: Log, write: Callable[[_Frame], _Frame], todo: Iterable[int], stop: Callable[[], bool]
-    ) -> Iterator[_Frame]:
+    def _pass(self, log: Log, write: Callable[[_Frame], _Frame], todo: Iterable[int]) -> Iterator[_Frame]:
         """Pass frames through the reading thread, this thread and the writing thread."""
         size, ahead = self._job.batch, self._ahead * self._job.batch
-        begun = takewhile(lambda _: not stop(), todo)
+        begun = takewhile(lambda _: not self._is_stopped, todo)
         frames = (future.result() for future in run_ahead(self._reader, partial(self._read, log), begun, ahead))
-        batches = takewhile(lambda _: not stop(), iter(lambda: list(islice(frames, size)), []))
+        batches = takewhile(lambda _: not self._is_stopped, iter(lambda: list(islice(frames, size)), []))
         computed = (frame for batch in batches for frame in self._compute(batch))
         for future in run_ahead(self._writer, write, computed, ahead):
             yield future.result()
@@ -237,8 +235,3 @@ def _stage(frame: _Frame, name: str) -> Iterator[None]:
 def open_quickly(job: Job, source: Any) -> Log:
     """Open a log for its name and times, without what takes long."""
     return open_log(job.reader, source, **{**job.settings, "check": False, "odometry": False, "read_as": None})
-
-
-def source_name(source: Any) -> str:
-    """Return the name of a log that is not open."""
-    return str(getattr(source, "scene", None) or getattr(source, "stem", None) or source)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cflow_torch.ops.lower_surface import UNKNOWN
 
-REACH = 131.072  # metres; points with larger |x| or |y| are ignored
+FARTHEST = 131.072  # metres; points with larger |x| or |y| are ignored
 # Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
 _NEAR_BITS, _NEAR_CELLS = 11, 32  # 2.048 m, |x|, |y| < 32.768 m
 _STEP, _STEP_BITS = 2, 12  # the tilt is the median step between flat cells 4.096 m apart
@@ -117,5 +117,5 @@ def millimetres(positions: Tensor) -> tuple[Tensor, Tensor]:
     """Return (3, N) int64 mm, and (N,) bool: the point is finite and on the grid. Other points move to the origin."""
     x, y, z = positions.abs()
     # A millimetre less than the reach, because rounding must not leave the grid.
-    inside = (x < REACH - 0.001).logical_and_(y < REACH - 0.001).logical_and_(z < _FARTHEST_HEIGHT)
+    inside = (x < FARTHEST - 0.001).logical_and_(y < FARTHEST - 0.001).logical_and_(z < _FARTHEST_HEIGHT)
     return (positions * 1000).masked_fill_(~inside, 0).round_().long(), inside

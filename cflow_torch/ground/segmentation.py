@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.errors import import_optional
-from cflow_torch.ground.plane import REACH, millimetres, near_plane, order_statistics
+from cflow_torch.ground.plane import FARTHEST, millimetres, near_plane, order_statistics
 from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.tensors import choose_device, read_positions
@@ -75,7 +75,7 @@ def find_ground_batch(
     """
     if method not in CHOICES[1:]:
         raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CHOICES[1:]))}")
-    if isinstance(threshold, bool) or not isinstance(threshold, (int, float)) or not 0 <= threshold < REACH:
+    if isinstance(threshold, bool) or not isinstance(threshold, (int, float)) or not 0 <= threshold < FARTHEST:
         raise CFlowError(f"threshold={threshold!r}: give metres above the ground, for example 0.3")
     if not clouds:
         return []

@@ -6,7 +6,6 @@ BucketedSceneFlowEval and SceneFlowZoo pass such sequences and expect the flow i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any, Sequence
 
 import numpy as np
@@ -14,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import Config
-from cflow_torch.data.log import window
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.ground.segmentation import find_ground, has_ground
@@ -96,9 +94,13 @@ class SequenceFlow(nn.Module):
 
     def _windows(self, frames: Sequence[SequenceSweep], first: int) -> list[Window]:
         sweeps = self._sweeps(frames)
-        log: Any = SimpleNamespace(timestamps=sweeps, sweep=sweeps.__getitem__, gaps=frozenset())
-        indices = range(first, len(sweeps) - 1)
-        return [window(log, i, self.num_history, self.model.config.num_future) for i in indices]
+        num_future = self.model.config.num_future
+        windows = []
+        for i in range(first, len(sweeps) - 1):
+            older = sweeps[max(i - self.num_history, 0) : i][::-1]
+            later = sweeps[i + 2 : i + 2 + num_future]
+            windows.append(Window(sweeps[i], sweeps[i + 1], tuple(older), tuple(later)))
+        return windows
 
     def _sweeps(self, frames: Sequence[SequenceSweep]) -> list[Sweep]:
         points = [frame.ego_points() for frame in frames]

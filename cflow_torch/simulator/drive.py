@@ -10,6 +10,7 @@ from typing import Callable, Mapping, TypeVar
 import numpy as np
 import torch
 
+from cflow_torch.data.av2 import GroundRaster
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.simulator.car_park import build_car_park
@@ -20,10 +21,11 @@ from cflow_torch.simulator.motion import SceneMotion
 from cflow_torch.simulator.narrow import build_narrow
 from cflow_torch.simulator.objects import own_truck
 from cflow_torch.simulator.profiles import PROFILES, WEATHER, in_weather
-from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid, UnitReturns
+from cflow_torch.simulator.recording import AnnotationBoxes, UnitReturns
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile
 from cflow_torch.simulator.street import build_street
+from cflow_torch.transforms import transform_each
 from cflow_torch.types import CFlowError, Sweep
 
 SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
@@ -120,7 +122,7 @@ class Drive(Log):
         body = self._body_of(returns)
         points = returns.points.numpy().astype(np.float64)
         motion = motions[body]
-        flow = np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - points
+        flow = transform_each(points, motion) - points
         now = np.append(self._is_annotated[index], True)
         then = np.append(self._is_annotated[index + 1], True)
         category = np.where(now, np.append(self._category, 0), 0).astype(np.uint8)
@@ -189,23 +191,18 @@ class Drive(Log):
                 return np.radians(np.sort(np.array(candidate.elevations, np.float64)))
         raise CFlowError(f"log {self.log_id} has no LiDAR {unit!r}; it has {', '.join(self.calibration)}")
 
-    def ground_raster(self) -> GroundGrid:
+    def ground_raster(self) -> GroundRaster:
         """Ground height of the area within the LiDARs' range."""
         reach = self._profile.max_range + 1
         low = np.floor(self.poses[:, :2, 3].min(0) - reach)
         count = np.ceil((self.poses[:, :2, 3].max(0) + reach - low) / _RASTER_STEP).astype(int)
         x, y = (low[k] + _RASTER_STEP * (np.arange(count[k]) + 0.5) for k in (0, 1))
         height = self.scene.ground.height(*np.meshgrid(x, y))
-        return GroundGrid(height, (float(low[0]), float(low[1])), _RASTER_STEP)
+        return GroundRaster(height, np.eye(2), -low, 1 / _RASTER_STEP)
 
     def returns(self, index: int) -> Returns:
-        """Returns of all LiDARs in sweep `index`.
-
-        Raises:
-            CFlowError: there is no sweep of this index.
-        """
-        if not 0 <= index < len(self.timestamps):
-            raise CFlowError(f"log {self.log_id} has sweeps 0 ... {len(self.timestamps) - 1}, got index {index}")
+        """Returns of all LiDARs in sweep `index`; an index that does not exist is a `CFlowError`."""
+        self._timestamp(index)
         if index not in self._cache:
             self._cache[index] = self._scan(index)
             if len(self._cache) > _CACHED_SWEEPS:
@@ -230,13 +227,13 @@ class Drive(Log):
         points = returns.points.numpy().astype(np.float64)
         if not self._profile.is_deskewed:
             moved = np.linalg.inv(self.poses[index]) @ self.poses_at(index, returns.offset_ns.numpy())
-            points = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
+            points = transform_each(points, moved)
         body = self._body_of(returns)
         chosen = np.append(self._category > 0, False)[body]
         points = points[chosen]
         body = body[chosen]
         T_body_ego = (np.linalg.inv(self._body_poses[index]) @ self.poses[index])[body]
-        local = np.abs(np.einsum("nij,nj->ni", T_body_ego[:, :3, :3], points) + T_body_ego[:, :3, 3])
+        local = np.abs(transform_each(points, T_body_ego))
         extent = np.zeros((len(self.scene.bodies), 3))
         np.maximum.at(extent, body, local * (2, 2, 1))
         return extent + _ROUNDING

@@ -11,6 +11,7 @@ from cflow_torch.simulator.lidar import EgoMotion, Returns
 from cflow_torch.simulator.rolling import MovingSolids
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile
+from cflow_torch.transforms import transform_each
 
 _NUM_INTERVALS = 4  # per sweep; poses are interpolated within each, element by element: legs are exact to 0.3 mm
 _DERIVATIVE_STEP = 1e-3  # half the interval of central differences, seconds
@@ -106,7 +107,7 @@ class SceneMotion:
             slope = self._slopes(shot[:1])[0, row_of_hit]
         sensor, point = self._ray_ends(seconds, shot, returns, rows)
         ray = (point - sensor) / np.linalg.norm(point - sensor, axis=1, keepdims=True)
-        at_point = np.einsum("nij,nj->ni", slope[:, :, :3], point) + slope[:, :, 3]
+        at_point = transform_each(point, slope)
         velocity[rows] = (at_point * ray).sum(1)
         return velocity
 
@@ -140,11 +141,11 @@ class SceneMotion:
         ego = self.ego_poses(shot)
         ego[is_virtual] = stamped
         mounts = np.stack([u.T_ego_sensor for u in profile.units])
-        sensor = np.einsum("nij,nj->ni", ego[:, :3, :3], mounts[unit, :3, 3]) + ego[:, :3, 3]
+        sensor = transform_each(mounts[unit, :3, 3], ego)
         if profile.is_deskewed:
             ego = np.broadcast_to(stamped, ego.shape)
         points = returns.points.numpy()[rows].astype(np.float64)
-        return sensor, np.einsum("nij,nj->ni", ego[:, :3, :3], points) + ego[:, :3, 3]
+        return sensor, transform_each(points, ego)
 
     def _knots(self, seconds: float) -> np.ndarray:
         interval = self._profile.sweep_interval_ns * 1e-9

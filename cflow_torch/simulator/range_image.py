@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.simulator.ground import Ground
-from cflow_torch.simulator.raycast import RayBlocks, Solids, UnitRays, nearest_hits, ray_directions, take
+from cflow_torch.simulator.raycast import RayBlocks, Solids, nearest_hits, ray_directions, take
 from cflow_torch.simulator.rolling import MovingSolids, RollingRays, Shots, covered_blocks
 from cflow_torch.simulator.sensors import SpinningLidar
 
@@ -87,21 +87,10 @@ def cast_solids(
     Convention: a solid that contains the sensor is not hit. Of solids at equal range, the first is hit.
     """
     shots = Shots.at_once(azimuth, elevation)
-    blocks = covered_blocks(MovingSolids.standing(kind, T_solid_sensor[:, :3], half_size), shots, max_range)
+    solids = MovingSolids.standing(kind, T_solid_sensor[:, :3], half_size)
+    blocks = covered_blocks(solids, shots, max_range)
     blocks = blocks.at(blocks.solid.argsort(stable=True))
-    # From the sensor frame to the unit coordinates of each solid.
-    to_unit = T_solid_sensor[:, :3] / half_size[:, :, None]
-    origin, matrix = to_unit[..., 3].T.float(), to_unit[..., :3].permute(1, 2, 0).float()  # (3, P), (3, 3, P)
-    cos_azimuth = azimuth.cos().float()
-    sin_azimuth = azimuth.sin().float()
-
-    def rays_at(block: Tensor, column: Tensor) -> UnitRays:
-        solid = take(blocks.solid, block)
-        level = take(matrix[:, 0], solid) * take(cos_azimuth, column)
-        level += take(matrix[:, 1], solid) * take(sin_azimuth, column)
-        return UnitRays(take(origin, solid), level, take(matrix[:, 2], solid))
-
-    distance, block = nearest_hits(kind, blocks, rays_at, len(azimuth), elevation)
+    distance, block = nearest_hits(kind, blocks, RollingRays(solids, shots, blocks), len(azimuth), elevation)
     return distance, _solid_of(blocks, block)
 
 

@@ -1,4 +1,4 @@
-"""What a simulated drive has for writers, besides sweeps and labels: boxes, ground heights, returns of each LiDAR."""
+"""What a simulated drive has for writers, besides sweeps and labels: boxes, returns of each LiDAR."""
 
 from __future__ import annotations
 
@@ -24,21 +24,6 @@ class AnnotationBoxes:
     size: np.ndarray
     pose: np.ndarray
     num_points: np.ndarray
-
-
-@dataclass(frozen=True)
-class GroundGrid:
-    """Ground height on a grid.
-
-    Args:
-        height: (H, W) world z of the middle of each cell, metres; row from y, column from x; NaN = unknown.
-        origin: world x, y of the outer corner of cell (0, 0), metres.
-        step: side of a cell, metres.
-    """
-
-    height: np.ndarray
-    origin: tuple[float, float]
-    step: float
 
 
 @dataclass(frozen=True)

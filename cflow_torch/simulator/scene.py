@@ -13,6 +13,7 @@ from cflow_torch.simulator.ground import Ground
 from cflow_torch.simulator.objects import HIP, Body, Solid
 from cflow_torch.simulator.raycast import Solids
 from cflow_torch.simulator.trajectories import Route
+from cflow_torch.transforms import as_matrix, rotations_about
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,9 @@ class Scene:
         # In the body frame: rotate about x, then y; move to the centre; swing about the y axis through the hip.
         angle = of["swing"] * np.sin(2 * math.pi * of["stride"] * seconds + of["phase"])
         hip = np.where(angle[:, None] == 0, 0, (0, 0, HIP))
-        pose = _rotation(1, of["pitch"]) @ _rotation(0, of["roll"])
+        pose = as_matrix(rotations_about(1, of["pitch"])) @ as_matrix(rotations_about(0, of["roll"]))
         pose[:, :3, 3] = of["centre"] - hip
-        pose = _rotation(1, angle) @ pose
+        pose = as_matrix(rotations_about(1, angle)) @ pose
         pose[:, :3, 3] += hip
         return Solids(
             torch.from_numpy(of["kind"]),
@@ -75,14 +76,3 @@ class Scene:
             torch.from_numpy(of["albedo"]).float(),
             torch.from_numpy(of["is_foliage"]),
         )
-
-
-def _rotation(axis: int, angle: np.ndarray) -> np.ndarray:
-    """(P, 4, 4) rotations by `angle` (P,) radians about x (0), y (1) or z (2)."""
-    first = (axis + 1) % 3
-    second = (axis + 2) % 3
-    rotation = np.tile(np.eye(4), (len(angle), 1, 1))
-    rotation[:, first, first] = rotation[:, second, second] = np.cos(angle)
-    rotation[:, second, first] = np.sin(angle)
-    rotation[:, first, second] = -rotation[:, second, first]
-    return rotation

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import VerifiedConfig
-from cflow_torch.dense.clustering import Clusters
-from cflow_torch.dense.clustering import Pixels as ClusterPixels
+from cflow_torch.dense.clustering import ClusterPixels, Clusters
 from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.groups import FAR, Groups

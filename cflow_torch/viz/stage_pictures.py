@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +29,7 @@ _MARGIN = 2.0  # metres around the object in the close-up
 _SMALLEST = 4.0  # metres, least half side of the close-up
 _COLORMAP = "viridis"
 _PEAK = "#e6194b"
+_LEAST_ASPECT = 0.35  # pixels of longer and thinner images are not square, or nothing would be visible
 _MOST_LINES = 160  # lines of the surface along each axis, at most
 _HALF_VIEW = np.array((5.0, 3.6))  # metres, half width and height of the view
 _CELL = 4.0  # metres, side of the cells in which matches are added up to choose the view
@@ -68,58 +69,31 @@ def plot_scales(window: Window, config: Config | None = None, *, cluster_id: int
     shown = np.full(len(of_point), False) if cluster_id is None else of_point == cluster_id
     _, alone = scales(window, config.replace(pixel_sizes=config.pixel_sizes[-1:]))
     flows = [*(scale.flow for scale in found), alone.residual_flow.double().numpy()]
-    panels = _ScalePanels.blank(len(found) + 1)
+    figure, above, below, legends = _scale_panels(len(found) + 1)
     title = "coarse to fine: " + " → ".join(f"{size:g} m" for size in config.pixel_sizes)
-    style.add_heading(panels.figure, 0.32, title if cluster_id is None else f"{title}; cluster {cluster_id}")
+    figure.suptitle(title if cluster_id is None else f"{title}; cluster {cluster_id}", fontsize=17, color=style.INK)
     position = point_rows("points", window.pc0.points) + result.pose_flow.numpy()
-    _draw_close_up(panels.above, position, found, shown)
-    max_flow = _draw_flows(panels.below, config, position, flows, result.is_valid.numpy())
-    panels.add_names_and_legends(max_flow)
-    return panels.figure
+    _draw_close_up(above, position, found, shown)
+    max_flow = _draw_flows(below, config, position, flows, result.is_valid.numpy())
+    legends[0].legend(handles=sweep_marks(), loc="center", frameon=False, fontsize=11, labelcolor=style.INK)
+    style.fill_wheel(legends[1], max_flow)
+    figure.supxlabel(FLOW_CAPTION, fontsize=11, color=style.FAINT)
+    return figure
 
 
-@dataclass(frozen=True)
-class _ScalePanels:
-    """Two rows of panels, with room for the legends on their right."""
+def _scale_panels(count: int) -> tuple[Figure, list[Axes], list[Axes], list[Axes]]:
+    """Create a figure with two rows of `count` panels, and an empty panel for a legend at the end of each row."""
+    figure = style.blank_figure((16.0, 30.4 / (count + 0.5) + 1.9), 100, layout="constrained")
+    panels = figure.subplots(2, count + 1, width_ratios=[1.0] * count + [0.45])
+    for legend in panels[:, -1]:
+        legend.axis("off")
+    return figure, list(panels[0, :-1]), list(panels[1, :-1]), list(panels[:, -1])
 
-    figure: Figure
-    above: list[Axes]
-    below: list[Axes]
-    width: float  # inches, of a panel, which is a square
-    num_lines: int  # of the panels' names
 
-    _SIDE: ClassVar[float] = 1.75  # inches, for the legends
-    _BOTTOM: ClassVar[float] = 0.5  # inches, below the lower row
-
-    @classmethod
-    def blank(cls, count: int) -> _ScalePanels:
-        """Make a figure, 16 inches wide, with `count` panels a row."""
-        left = 0.8  # inches
-        gap = 0.22
-        width = (16.0 - left - gap * count - cls._SIDE) / count
-        num_lines = 1 if count <= 4 else 2
-        more = 0.2 * (num_lines - 1)
-        figure = style.blank_figure((16.0, 2 * width + 2.3 + 2 * more), 100)
-        above, below = (
-            [style.add_panel(figure, left + i * (width + gap), bottom, width, width) for i in range(count)]
-            for bottom in (width + 1.2 + more, cls._BOTTOM)
-        )
-        return cls(figure, above, below, width, num_lines)
-
-    def add_names_and_legends(self, max_flow: float) -> None:
-        """Set the names of the drawn panels, and add the legends; full colour is `max_flow`, metres per sweep."""
-        for axes in (*self.above, *self.below):
-            name = axes.get_title().replace(": ", ":\n", self.num_lines - 1)
-            axes.set_title(name, fontsize=min(12, 8 * self.width), color=style.INK, pad=6)
-        above_y = self.width + 1.2 + 0.2 * (self.num_lines - 1)
-        marks = style.add_panel(self.figure, 16.0 - self._SIDE, above_y, self._SIDE, self.width)
-        marks.legend(handles=sweep_marks(), loc="center left", frameon=False, fontsize=11, labelcolor=style.INK)
-        side, high = style.WHEEL_INCHES
-        box = style.add_panel(self.figure, 16.0 - side, self._BOTTOM + (self.width - high) / 2, side, high)
-        style.fill_wheel(box, max_flow)
-        for axes in (marks, box):
-            axes.axis("off")
-        style.add_caption(self.figure, FLOW_CAPTION)
+def _name_panel(axes: Axes, name: str, count: int) -> None:
+    """Write the name above one of `count` panels in a row; narrow panels have two lines for it."""
+    width = 15.0 / count  # inches, about
+    axes.set_title(name.replace(": ", ":\n", int(count > 4)), fontsize=min(12, 4.4 * width), color=style.INK, pad=6)
 
 
 def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale], shown: np.ndarray) -> None:
@@ -137,7 +111,7 @@ def _draw_close_up(panels: list[Axes], position: np.ndarray, found: list[Scale],
     for axes, image, name, words in zip(panels, images, names, moved):
         image.draw(axes)
         style.set_view(axes, middle - half, middle + half, has_ticks=True)
-        axes.set_title(f"{name}: t {words}")
+        _name_panel(axes, f"{name}: t {words}", len(panels))
         style.name_axes(axes, "x, m", "y, m" if axes is panels[0] else "")
         axes.tick_params(labelleft=axes is panels[0])
 
@@ -155,7 +129,7 @@ def _draw_flows(
     for axes, name, flow in zip(panels, names, flows):
         style.set_view(axes, *view)
         draw_flow(axes, position[keep], flow[keep], None, max_flow)
-        axes.set_title(name)
+        _name_panel(axes, name, len(panels))
     return max_flow
 
 
@@ -180,24 +154,30 @@ def plot_correlation(window: Window, config: Config | None = None, *, cluster_id
         config = make_config("paper")
         window = replace(window, pch=(), pcf=())
     found = cluster_correlation(window, config, cluster_id)
-    figure, panels = _lay_out(found.images.t.shape)
-    style.add_heading(figure, 0.35, _title(found, config))
     images = found.images
-    nothing = np.zeros_like(found.images.t)
+    nothing = np.zeros_like(images.t)
     height, width = nothing.shape
+    figure = style.blank_figure((16.0, 7.0), 100, layout="constrained")
+    panels = figure.subplot_mosaic(
+        [["t", "t1", "surface"], ["both", "map", "surface"]],
+        width_ratios=(1, 1, 1.5),
+        per_subplot_kw={"surface": {"projection": "3d"}},
+    )
+    figure.suptitle(_title(found, config), fontsize=17, color=style.INK)
     # A shift is shorter than the box, so with this margin pixels that leave the box do not wrap around.
     padded = np.pad(images.t, ((0, height), (0, width)))
     moved = np.roll(padded, tuple(found.shift), (0, 1))[:height, :width]
-    names = (
-        "template: t moved by the coarser scales" if len(config.pixel_sizes) > 1 else "template: sweep t",
-        "target: sweep t+1",
-        "t moved by the chosen shift, and t+1",
-    )
-    for axes, name, t, t1 in zip(panels, names, (images.t, nothing, moved), (nothing, images.t1, images.t1)):
-        replace(images, t=t, t1=t1).draw(axes, aspect="auto")
-        _name(axes, name, "x, m", "y, m")
-    _draw_map(panels[3], panels[4], found)
-    _draw_surface(panels[5], found)
+    template = "template: t moved by the coarser scales" if len(config.pixel_sizes) > 1 else "template: sweep t"
+    aspect = "equal" if min(height, width) > _LEAST_ASPECT * max(height, width) else "auto"
+    for name, title, t, t1 in (
+        ("t", template, images.t, nothing),
+        ("t1", "target: sweep t+1", nothing, images.t1),
+        ("both", "t moved by the chosen shift, and t+1", moved, images.t1),
+    ):
+        replace(images, t=t, t1=t1).draw(panels[name], aspect=aspect)
+        _name(panels[name], title, "x, m", "y, m")
+    _draw_map(panels["map"], found, aspect)
+    _draw_surface(panels["surface"], found)
     return figure
 
 
@@ -210,23 +190,6 @@ def _title(found: ClusterCorrelation, config: Config) -> str:
     return f"{title}; with {' and '.join(others)} {_pair(*found.flow[:2])} m" if others else title
 
 
-def _lay_out(shape: tuple[int, int]) -> tuple[Figure, list[Any]]:
-    """Create the figure and its axes: four images, colour bar, surface."""
-    left = 0.7
-    right = 5.25
-    # Pixels are square, unless the box is so long and thin that nothing would be visible.
-    height, width = np.maximum(3.35 * np.array(shape) / max(shape), 1.2)
-    total = max(2 * height + 2.9, 6.4)
-    lower = 0.65 + (total - 2 * height - 2.9) / 2
-    upper = lower + height + 1.2
-    figure = style.blank_figure((16.0, total), 100)
-    corners = [(left, upper), (right, upper), (left, lower), (right, lower)]
-    panels = [style.add_panel(figure, x, y, width, height) for x, y in corners]
-    panels.append(style.add_panel(figure, right + width + 0.2, lower, 0.13, height))
-    panels.append(style.add_panel(figure, 9.6, 0.2, 6.1, total - 0.9, projection="3d"))
-    return figure, panels
-
-
 def _name(axes: Axes, title: str, x: str, y: str) -> None:
     axes.set_title(title, fontsize=12, color=style.INK, pad=8)
     style.name_axes(axes, x, y)
@@ -234,20 +197,20 @@ def _name(axes: Axes, title: str, x: str, y: str) -> None:
     style.thin_frame(axes)
 
 
-def _draw_map(axes: Axes, colors: Axes, found: ClusterCorrelation) -> None:
+def _draw_map(axes: Axes, found: ClusterCorrelation, aspect: str) -> None:
     """Draw the scores as an image with its colour bar; shifts in pixels, those outside the search range in grey."""
     height, width = found.ncc.shape
     low_y = -(height // 2) - 0.5
     low_x = -(width // 2) - 0.5
     axes.set_facecolor("#d5d9de")
     extent = (low_x, low_x + width, low_y, low_y + height)
-    options: Any = {"origin": "lower", "interpolation": "nearest", "aspect": "auto"}
+    options: Any = {"origin": "lower", "interpolation": "nearest", "aspect": aspect}
     image = axes.imshow(found.ncc, extent=extent, cmap=_COLORMAP, vmin=0, **options)
     dy, dx = found.shift
     axes.plot(0, 0, "+", color="white", markersize=9, markeredgewidth=1.2)
     axes.plot(dx, dy, "o", markersize=13, markeredgewidth=2.2, markerfacecolor="none", markeredgecolor=_PEAK)
     _name(axes, "score of every shift (+: no shift)", *_shift_names(found))
-    bar: Any = axes.figure.colorbar(image, cax=colors)
+    bar: Any = axes.figure.colorbar(image, cax=axes.inset_axes((1.03, 0, 0.03, 1)))
     bar.ax.tick_params(labelsize=9, labelcolor=style.INK, color=style.INK, length=2)
     bar.outline.set_visible(False)
 
@@ -268,7 +231,7 @@ def _draw_surface(axes: Any, found: ClusterCorrelation) -> None:
     size = found.images.pixel_size
     axes.text(dx, dy, 1.18 * top, f"{_pair(dx * size, dy * size)} m", fontsize=12, color=_PEAK, ha="center")
     stretch = np.array(found.ncc.shape[::-1]) / max(found.ncc.shape)
-    axes.set_box_aspect((*np.maximum(stretch, 0.45), 0.6), zoom=0.9)
+    axes.set_box_aspect((*np.maximum(stretch, 0.45), 0.6), zoom=0.8)
     axes.set_zlim(0, 1.15 * top)
     axes.view_init(elev=32, azim=-62)
     names = (*_shift_names(found), "score (NCC)")
@@ -301,25 +264,26 @@ def plot_keypoints(window: Window, config: Config | None = None) -> Figure:
     Raises:
         CFlowError: matplotlib is not installed, the config is of another method, or the input is invalid.
     """
-    figure = style.blank_figure((16.0, 6.9), 100)
+    figure = style.blank_figure((16.0, 6.9), 100, layout="constrained")
     if config is None:
         config = make_config("keypoints")
         window = replace(window, pch=(), pcf=())
     found = keypoint_matches(window, config)
     low, high = _busiest_view(found.start, found.end)
     title = f"{len(found.key_points)} key points at t, {len(found.start)} of them matched; the view shows a part"
-    style.add_heading(figure, 0.31, title)
-    panels = [style.add_panel(figure, left, 0.9, 7.12, 5.1) for left in (0.64, 8.56)]
+    figure.suptitle(title, fontsize=17, color=style.INK)
+    panels = figure.subplots(1, 2)
     for axes, fade, name in zip(panels, (0.0, _FADE), ("occupancy and key points", "matches")):
         found.images.draw(axes, fade)
         style.set_view(axes, low, high, has_ticks=True)
         axes.set_title(name, fontsize=14, color=style.INK, pad=7)
         style.name_axes(axes, "x, m (forward)", "y, m (left)" if axes is panels[0] else "", 10)
-    pixel = 72 * 7.12 * found.images.pixel_size / (2 * _HALF_VIEW[0])  # in typographic points
+    _draw_legend(figure)
+    figure.draw_without_rendering()  # now, so that sizes in inches are right from here on
+    pixel = 72 * style.inches_of(panels[0])[0] * found.images.pixel_size / (2 * _HALF_VIEW[0])  # typographic points
     dot = max(0.45 * pixel, 1.5)
     panels[0].plot(*found.key_points.T, "o", color=_POINT_COLOR, markersize=dot, markeredgewidth=0, zorder=3)
     _draw_matches(panels[1], found, low, high)
-    _draw_legend(figure)
     return figure
 
 
@@ -363,4 +327,6 @@ def _draw_legend(figure: Figure) -> None:
     marks.append(Line2D([], [], marker="o", linestyle="", markersize=7, color=_POINT_COLOR, label="key point of t"))
     marks.append(Line2D([], [], linewidth=2.5, color="#00a0b0", label="moving match, dot at t+1"))
     marks.append(Line2D([], [], marker="o", linestyle="", markersize=4, color=style.FAINT, label="static match"))
-    figure.legend(handles=marks, loc="lower center", ncol=len(marks), frameon=False, fontsize=11, labelcolor=style.INK)
+    figure.legend(
+        handles=marks, loc="outside lower center", ncol=len(marks), frameon=False, fontsize=11, labelcolor=style.INK
+    )

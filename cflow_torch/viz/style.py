@@ -31,13 +31,13 @@ def checked_path(path: str | Path, *endings: str) -> Path:
     return Path(path)
 
 
-def blank_figure(inches: tuple[float, float], dpi: int) -> Figure:
+def blank_figure(inches: tuple[float, float], dpi: int, **settings: Any) -> Figure:
     """Create an empty white figure without touching pyplot's state; a missing matplotlib is a `CFlowError`."""
     import_optional("matplotlib", "pictures need matplotlib (extra viz): pip install matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=inches, dpi=dpi, facecolor="white")
+    figure = Figure(figsize=inches, dpi=dpi, facecolor="white", **settings)
     FigureCanvasAgg(figure)
     return figure
 

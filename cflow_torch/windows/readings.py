@@ -36,6 +36,12 @@ CAUSES = {
     HALF_LATE: "the poses are half a sweep late (or the times of the sweeps are half a sweep early)",
     HALF_EARLY: "the poses are half a sweep early (or the times of the sweeps are half a sweep late)",
     CAMERA: "the poses are of a camera (x right, y down, z forward)",
+    "opengl": "the poses are of a camera as in OpenGL (x right, y up, z backward)",
+    "mirrored": "the y axis of the points or that of the poses is mirrored (left-handed)",
+    "mirrored_back": "the x axis of the points or that of the poses is mirrored (left-handed)",
+    "swapped": "x and y of the points or of the poses are interchanged (left-handed)",
+    "transposed": "the rotations of the poses are transposed, but not their positions",
+    "compass": "the angles of the poses are compass headings (clockwise from north)",
     "left": f"{_FRAME} x axis points to the left of the points' x axis",
     "back": f"{_FRAME} x axis points backward",
     "right": f"{_FRAME} x axis points to the right of the points' x axis",
@@ -48,10 +54,16 @@ CAUSES = {
 # ego_T_stored of frames with other axes: x, y and z of the stored frame, as columns.
 AXES = {
     CAMERA: np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float),  # x right, y down, z forward
+    "opengl": np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]], float),  # x right, y up, z backward
     "left": np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], float),  # x to the left of the vehicle
     "back": np.diag([-1.0, -1.0, 1.0]),
     "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
     "down": np.diag([1.0, -1.0, -1.0]),  # x forward, y right, z down, as of inertial units
+}
+_MIRRORED = {  # the same of left-handed frames
+    "mirrored": np.diag([1.0, -1.0, 1.0]),
+    "mirrored_back": np.diag([-1.0, 1.0, 1.0]),
+    "swapped": np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1]], float),
 }
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}
 
@@ -63,9 +75,9 @@ _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a f
 _LEAST_MOTION, _ARM = 0.2, 20.0  # metres; poses that move points 20 m away by less do not show anything
 LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 _LEAST_DIFFERENCE = 0.05  # metres; a pair shows only the readings that move these points otherwise by this
-# The best share must exceed the share as given by this factor (`_MARGINS` has others), and be at least `_LEAST_SHARE`.
+# The best share must exceed the share as given by this factor (`_MARGINS` has others), and be at least `LEAST_SHARE`.
 _MARGIN = 1.3
-_LEAST_SHARE = 0.1
+LEAST_SHARE = 0.1
 _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
@@ -88,6 +100,11 @@ def _reordered(order: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
     return lambda pose: as_matrix(to_rotations(to_quaternions(pose[None, :3, :3])[:, order])[0], pose[:3, 3])
 
 
+def _mirrored(axes: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    mirror = as_matrix(axes)
+    return lambda pose: mirror @ pose @ mirror
+
+
 def _moved(stored_T_ego: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     return lambda pose: pose @ stored_T_ego
 
@@ -101,6 +118,9 @@ MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, m
 OF_POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     STILL: lambda pose: np.eye(4),
     INVERTED: np.linalg.inv,
+    **{name: _mirrored(axes) for name, axes in _MIRRORED.items()},
+    "transposed": lambda pose: as_matrix(pose[:3, :3].T, pose[:3, 3]),
+    "compass": lambda pose: as_matrix(AXES["left"] @ pose[:3, :3].T, pose[:3, 3]),
     **{name: _moved(as_matrix(AXES[name].T)) for name in AXES},
     **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
     **{name: _scaled(unit) for name, unit in _UNITS.items()},
@@ -119,7 +139,8 @@ _OPPOSITES = {
 _MARGINS = {
     **dict.fromkeys((WORLD, OFF, TIMES, HALF_LATE, HALF_EARLY, *SCANS, *MOUNTS), 1.1),
     **dict.fromkeys((STILL, *_UNITS), 1.7),
-    "down": 1.15,  # up to 0.99 for right poses, as it changes little on a straight road
+    # up to 0.99 for right poses, as they change little on a straight road
+    **dict.fromkeys(("down", *_MIRRORED), 1.15),
 }
 
 
@@ -284,7 +305,7 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
     turn = 0.0
-    if np.mean([each[GIVEN] for each in of_pairs]) < _LEAST_SHARE and not any(WORLD in each for each in of_pairs):
+    if np.mean([each[GIVEN] for each in of_pairs]) < LEAST_SHARE and not any(WORLD in each for each in of_pairs):
         turn, of_turns = _find_turn(moving)
         of_pairs = [{**each, TURNED: share} for each, share in zip(of_pairs, of_turns)]
     shares, clear = _compare(of_pairs)
@@ -390,7 +411,7 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
         share, as_given = np.mean([(each.get(name, each[given]), each[given]) for each in of_pairs], axis=0)
         shares[name] = float(share)
         gains[name] = float(share / max(as_given, 1e-9))
-        if share >= _LEAST_SHARE and all(each[name] > each[given] for each in of_pairs if name in each):
+        if share >= LEAST_SHARE and all(each[name] > each[given] for each in of_pairs if name in each):
             better.append(name)
     clear = [name for name in better if gains[name] >= _MARGINS.get(name, _MARGIN)]
     clear = [name for name in clear if gains.get(_OPPOSITES.get(name, ""), 0) <= _OPPOSITE]

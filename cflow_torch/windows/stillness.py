@@ -11,7 +11,7 @@ from cflow_torch.types import Sweep, as_numpy
 
 NEAREST, FARTHEST = 3.0, 40.0  # metres from the origin in the plane: beyond the vehicle itself, and dense enough
 VOXEL = 0.3  # metres; one point per voxel, so that near surfaces do not outvote the rest
-REACH = 0.1  # metres; a point is in place if another is this near
+IN_PLACE = 0.1  # metres; a point is in place if another is this near
 _OFFSETS = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], np.int64)
 _MOST = 1e5  # metres; coordinates are clamped to it, so that absurd poses do not overflow
 _COLUMN, _TALL = 0.8, 0.35  # metres, side and least height of the columns of structure; ground is flatter
@@ -82,7 +82,7 @@ class Structure:
 
     def __init__(self, points: np.ndarray) -> None:
         points = np.clip(np.asarray(points, np.float64), -_MOST, _MOST)
-        keys = cell_keys(np.floor(points / REACH).astype(np.int64))
+        keys = cell_keys(np.floor(points / IN_PLACE).astype(np.int64))
         order = np.argsort(keys, kind="stable")
         self._points = points[order]
         self._sorted = keys[order]
@@ -113,7 +113,7 @@ class Structure:
         """Test which points, (N, 3) in the frame of the structure, are in place, (N,) bool."""
         moved = np.clip(points, -_MOST, _MOST)
         in_place = np.zeros(len(moved), bool)
-        cell = np.floor(moved / REACH).astype(np.int64)
+        cell = np.floor(moved / IN_PLACE).astype(np.int64)
         order = np.argsort(cell_keys(cell))  # the searches below are several times faster in this order
         moved = moved[order]
         cell = cell[order]
@@ -124,7 +124,7 @@ class Structure:
             row = np.repeat(np.arange(len(moved)), count)
             neighbour = np.arange(len(row)) + np.repeat(start - np.cumsum(count) + count, count)
             distance = np.linalg.norm(moved[row] - self._points[neighbour], axis=1)
-            in_place[order[row[distance <= REACH]]] = True
+            in_place[order[row[distance <= IN_PLACE]]] = True
         return in_place
 
 

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from labelled import true_residual
 
 from cflow_torch import make_model
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.config import make_config
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import CachedLog, Log, window
-from cflow_torch.types import Window
 
 HISTORY, NEAR = 4, 35.0
 
@@ -54,20 +54,11 @@ def measure(model: torch.nn.Module, log: Log) -> tuple[float, float | None]:
         labels = log.labels(index)
         if labels is None:
             continue
-        truth = residual_truth(sweeps, log, index)
+        truth = true_residual(log, index)
         speed = np.linalg.norm(truth, axis=1)
         is_scored = is_near & labels.is_valid & (speed >= MOVING)
         sums[2:] += np.linalg.norm(flow - truth, axis=1)[is_scored].sum(), speed[is_scored].sum()
     return sums[0] / sums[1], sums[2] / sums[3] if sums[3] > 0 else None
-
-
-def residual_truth(sweeps: Window, log: Log, index: int) -> np.ndarray:
-    """Return the true residual flow, (N, 3), metres per sweep interval."""
-    labels = log.labels(index)
-    assert labels is not None
-    points = np.asarray(sweeps.pc0.points, dtype=np.float64)
-    T_ego1_ego0 = np.linalg.inv(sweeps.pc1.pose) @ sweeps.pc0.pose
-    return labels.flow - (points @ T_ego1_ego0[:3, :3].T + T_ego1_ego0[:3, 3] - points)
 
 
 if __name__ == "__main__":

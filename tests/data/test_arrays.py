@@ -21,6 +21,7 @@ from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.writer import write_array_log
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
+from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
 
 STAMP = 1_700_000_000_123_456_789
 
@@ -180,7 +181,6 @@ def test_columns_are_found_by_name_or_position(tmp_path):
 
 def test_files_with_other_contents_are_refused(tmp_path):
     np.save(tmp_path / "flat.npy", np.zeros(9))
-    np.save(tmp_path / "whole.npy", np.zeros((9, 3), np.int32))
     np.save(tmp_path / "pickle.npy", np.array([{}, 1], dtype=object), allow_pickle=True)
     np.savez(tmp_path / "two.npz", a=np.zeros((3, 3)), b=np.zeros((3, 3)))
     np.savez(tmp_path / "ragged.npz", x=np.zeros(3), y=np.zeros(2), z=np.zeros(3))
@@ -278,20 +278,23 @@ def test_names_are_sorted_naturally_and_read_as_times(tmp_path):
 
 
 def test_poses_of_another_rate_are_interpolated(tmp_path):
-    """Constant speed and yaw rate are reproduced between the poses of a 50 Hz trajectory."""
+    """An arc of constant speed and yaw rate is reproduced between the poses of a 50 Hz trajectory."""
     folder = write_array_log(SmallLog(), tmp_path)
+
+    def on_arc(s: float) -> np.ndarray:
+        return scenes.pose(20 * np.sin(0.5 * s), 20 * (1 - np.cos(0.5 * s)), 0.5 * s)
+
     seconds = np.arange(-1, 14) * 0.02
-    truth = np.stack([scenes.pose(10 * s, 0, 0.5 * s) for s in seconds])
+    truth = np.stack([on_arc(s) for s in seconds])
     write_tum(folder / "poses.txt", [STAMP + 7_000_000 + round(s * 1e9) for s in seconds], truth)
     for k, pose in enumerate(ArraysLog(folder).poses):
-        at = 0.1 * k - 0.007
-        assert np.abs(pose - scenes.pose(10 * at, 0, 0.5 * at)).max() < 1e-12
+        assert np.abs(pose - on_arc(0.1 * k - 0.007)).max() < 1e-12
     poses_text.write_times(folder / "times.txt", [time + 10**12 for time in SmallLog().timestamps])
     with pytest.raises(CFlowError, match="clocks differ by about 999.973 s"):
         ArraysLog(folder)
-    gap = poses_text.Trajectory(truth[:2], np.array([0, 10**9]), "tum", "x")
-    assert np.array_equal(poses_text.fit_to_sweeps(gap, [0, 10**9])[0], gap.poses), "a pose at its time is kept"
-    assert poses_text.fit_to_sweeps(gap, [0, 5 * 10**8, 10**9 + 10**6, 10**9 + 10**7])[1].tolist() == [1, 0, 1, 0]
+    gap = Trajectory(truth[:2], np.array([0, 10**9]), False, "x")
+    assert np.array_equal(fit_to_sweeps(gap, [0, 10**9])[0], gap.poses), "a pose at its time is kept"
+    assert fit_to_sweeps(gap, [0, 5 * 10**8, 10**9 + 10**6, 10**9 + 10**7])[1].tolist() == [1, 0, 1, 0]
 
 
 def test_kitti_camera_poses_become_lidar_poses(tmp_path, folder):

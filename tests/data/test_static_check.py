@@ -198,8 +198,8 @@ def test_opening_a_folder_finds_points_in_the_world(thin, tmp_path):
         log = open_log("arrays", tmp_path / "log", find_ground="grid")
     assert np.allclose(log.sweep(11).points, thin.sweep(11).points, atol=1e-3)
     assert not np.allclose(open_log("arrays", tmp_path / "log", read_as=None).sweep(11).points, log.sweep(11).points)
-    with pytest.raises(CFlowError, match="read_as='mirrored': give one of auto, null, world"):
-        open_log("arrays", tmp_path / "log", read_as="mirrored")
+    with pytest.raises(CFlowError, match="read_as='sideways': give one of auto, null, world"):
+        open_log("arrays", tmp_path / "log", read_as="sideways")
 
 
 def test_scenes_and_bags_in_the_world_are_found_when_they_are_opened(thin, tmp_path):

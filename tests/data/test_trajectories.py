@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from cflow_torch.data.arrays.folder import find_array_logs
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.log import Log, window
-from cflow_torch.transforms import as_matrix, rotations_about
+from cflow_torch.transforms import as_matrix, rotations_about, to_quaternions
 from cflow_torch.types import CFlowWarning, Sweep
 
 START, COUNT = 1_700_000_000_123_456_789, 12
@@ -219,6 +220,58 @@ def test_a_plane_pose_and_a_pose_without_a_time(tmp_path) -> None:
     assert np.allclose(plane.poses[0], as_matrix(rotations_about(2, 0.5), (2, 3, 0)))
     assert untimed.times_ns is None and np.allclose(untimed.poses[1, :3, 3], (3, 4, 0))
     assert np.allclose(untimed.poses[1, :2, 0], (1 - 2 * 0.36, 2 * 0.6 * 0.8))
+
+
+QUATERNIONS = to_quaternions(POSES[:, :3, :3]).tolist()
+FRAMES = [{"file_path": f"clouds/{name}.npy", "transform_matrix": POSES[name].tolist()} for name in range(12)]
+JSON: dict[str, Any] = {
+    "nerfstudio": {"camera_model": "PINHOLE", "fl_x": 500.0, "frames": FRAMES[6:] + FRAMES[:6]},
+    "frames by name": {f"{name}.pcd": pose.tolist() for name, pose in reversed(list(enumerate(POSES)))},
+    "open3d": {
+        "class_name": "PinholeCameraTrajectory",
+        "parameters": [
+            {"extrinsic": np.linalg.inv(pose).T.reshape(16).tolist(), "intrinsic": {"intrinsic_matrix": [0.5] * 9}}
+            for pose in POSES
+        ],
+    },
+    "a list of matrices": POSES.tolist(),
+    "three rows": {"sensor": "roof", "poses": POSES[:, :3].tolist()},
+    "vectors, w first": [{"translation": pose[:3, 3].tolist(), "rotation": q} for pose, q in zip(POSES, QUATERNIONS)],
+    "vectors, w last": [
+        {
+            "timestamp": float(k),
+            "position": POSES[k, :3, 3].tolist(),
+            "orientation": [*QUATERNIONS[k][1:], QUATERNIONS[k][0]],
+        }
+        for k in range(12)
+    ],
+    "objects": [
+        {"pose": {"position": dict(zip("xyz", pose[:3, 3])), "heading": dict(zip("wxyz", q))}, "speed": 3}
+        for pose, q in zip(POSES, QUATERNIONS)
+    ],
+    "by columns": {
+        **{f"t{axis}": POSES[:, k, 3].tolist() for k, axis in enumerate("xyz")},
+        **{f"q{axis}": [q[k] for q in QUATERNIONS] for k, axis in enumerate("wxyz")},
+    },
+}
+
+
+@pytest.mark.parametrize("layout", JSON)
+def test_poses_in_json_are_found_and_read_in_the_order_of_the_clouds(tmp_path, layout) -> None:
+    clouds(tmp_path, range(12))
+    (tmp_path / "transforms.json").write_text(json.dumps(JSON[layout]))
+    (tmp_path / "sensors.json").write_text(json.dumps({"front": np.eye(4).tolist(), "rear": np.eye(4).tolist()}))
+    with pytest.warns(CFlowWarning, match="its poses are those of transforms.json"):
+        log: Any = ArraysLog(tmp_path)
+    assert np.allclose(log.poses, POSES, atol=1e-9)
+
+
+def test_json_without_poses_is_an_error_that_says_what_poses_are(tmp_path) -> None:
+    clouds(tmp_path, range(12))
+    (tmp_path / "a.json").write_text(json.dumps({"frames": [{"speed": k, "gps": [49.0, 8.4]} for k in range(12)]}))
+    assert ArraysLog(tmp_path).poses is None
+    with pytest.raises(CFlowError, match="no list of poses: matrices of 16"):
+        ArraysLog(tmp_path, poses="a.json")
 
 
 @pytest.mark.parametrize(

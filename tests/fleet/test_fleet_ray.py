@@ -36,13 +36,13 @@ def test_equals_the_local_engine_byte_for_byte(fleet, single, tmp_path):
 class LethalWorker(Worker):
     """A worker whose process is killed at each part that still has a file next to the output."""
 
-    def run(self, part: Part, *stop: Any) -> Any:
+    def run(self, part: Part) -> Any:
         file = Path(self._job.output).parent / f"kills-{part.number}"
         count = int(file.read_text()) if file.exists() else 0
         if count > 0:
             file.write_text(str(count - 1))
             os.kill(os.getpid(), signal.SIGKILL)
-        yield from super().run(part, *stop)
+        yield from super().run(part)
 
 
 def make_lethal_worker(folder: str, job: Job, device: str) -> Worker:

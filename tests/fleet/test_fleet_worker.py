@@ -269,9 +269,9 @@ class SilentExecutor(HereExecutor):
 
 
 def test_a_stop_does_not_wait_for_a_worker_that_hangs(source, tmp_path, monkeypatch):
-    monkeypatch.setattr(parallel, "_GRACE_S", 1.0)
+    monkeypatch.setattr(parallel, "_GRACE_S", 0.3)
     start = time.monotonic()
-    stop = lambda: time.monotonic() > start + 1  # noqa: E731
+    stop = lambda: time.monotonic() > start + 0.3  # noqa: E731
     executor = SilentExecutor(make_job(tmp_path))
     assert not list(run_parallel([executor], parts_of([source]), stop))
     assert time.monotonic() - start < 20 and executor.is_closed.is_set()
@@ -323,10 +323,10 @@ def test_a_process_whose_library_exits_or_loses_its_gpu_ends():
 
 
 def test_a_silent_process_is_ended_and_replaced():
-    executor = ProcessExecutor(partial(eval, "__import__('os')"), timeout=5.0)
+    executor = ProcessExecutor(partial(eval, "__import__('os')"), timeout=3.0)
     try:
         first = executor.call("getpid")
-        with pytest.raises(BrokenExecutor, match="no answer for 5 s"):
+        with pytest.raises(BrokenExecutor, match="no answer for 3 s"):
             executor.call("kill", first, signal.SIGSTOP)
         assert executor.call("getpid") != first
     finally:

@@ -338,6 +338,110 @@ def test_a_phone_shows_all_controls(browser: Any, drive_page: Path) -> None:
     context.close()
 
 
+# What is drawn at the middle of the label of the chosen object.
+COVER = """(() => {
+  const {x, y, width, height} = document.querySelector("#labels .chosen:not([hidden])").getBoundingClientRect();
+  return document.elementFromPoint(x + width / 2, y + height / 2).tagName;
+})()"""
+
+
+@pytest.mark.parametrize("size", [(390, 760), (360, 640)])
+def test_a_phone_shows_the_object_that_it_follows_beside_its_panel(
+    browser: Any, drive_page: Path, size: tuple[int, int]
+) -> None:
+    context = browser.new_context(viewport={"width": size[0], "height": size[1]}, has_touch=True)
+    tab = context.new_page()
+    tab.goto(drive_page.as_uri())
+    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+    boxes = content_of(drive_page.read_text(encoding="utf-8"))["frames"][0]["boxes"]
+    for box in boxes[:3]:
+        tab.evaluate("id => viewer.choose(id)", box["id"])
+        assert tab.evaluate(COVER) == "CANVAS", "no panel covers its label"
+        panel, close = tab.locator("#objects").bounding_box(), tab.locator("#release").bounding_box()
+        assert panel["y"] > size[1] / 2 and close["y"] + close["height"] <= panel["y"] + panel["height"]
+    tab.locator("#release").tap()
+    tab.wait_for_function("viewer.state.chosen === null")
+    context.close()
+
+
+def test_every_key_and_control_does_what_it_says(browser: Any, drive_page: Path) -> None:
+    context = browser.new_context(viewport={"width": 1000, "height": 700})
+    tab = context.new_page()
+    tab.goto(drive_page.as_uri())
+    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+
+    def state(name: str) -> Any:
+        tab.evaluate("viewer.go(viewer.state.frame)")  # what was asked for is done
+        return tab.evaluate(f"viewer.state.{name}")
+
+    def camera() -> np.ndarray:
+        """(6,) position of the camera, and the point that it looks at, metres."""
+        return np.array(tab.evaluate("viewer.K3D.getWorld().controls.getCameraArray()")[:6])
+
+    start = camera()
+    for key, name, value in [
+        ("ArrowRight", "frame", 1),
+        ("ArrowRight", "frame", 2),
+        ("ArrowRight", "frame", 0),
+        ("ArrowLeft", "frame", 2),
+        ("ArrowLeft", "frame", 1),
+        ("[", "pace", 0.5),
+        ("]", "pace", 1),
+        ("]", "pace", 2),
+    ]:
+        tab.keyboard.press(key)
+        assert state(name) == value, key
+    assert tab.locator("#pace").input_value() == "2"
+    tab.locator("#pace").select_option("0.25")
+    assert state("pace") == 0.25
+    tab.locator("#pace").blur()
+    tab.keyboard.press("Space")
+    tab.wait_for_function("viewer.state.frame !== 1", timeout=20_000)
+    assert state("timer") and tab.locator("#play").inner_text() != "▶"
+    tab.keyboard.press("Space")
+    assert state("timer") is None and tab.locator("#play").inner_text() == "▶"
+
+    tab.locator("#slider").fill("0")
+    assert state("frame") == 0 and np.allclose(camera(), start, atol=1e-3), "the camera goes with the vehicle"
+    for above, reset in (("t", "r"), ("#above", "#reset")):
+        press = tab.keyboard.press if above == "t" else lambda name: tab.locator(name).click()
+        press(above)
+        assert np.linalg.norm((camera()[:3] - camera()[3:])[:2]) < 0.1, "straight from above"
+        press(reset)
+        assert state("frame") == 0 and np.allclose(camera(), start, atol=1e-3)
+    tab.locator("#show-follow").uncheck()
+    tab.locator("#slider").fill("1")
+    assert state("frame") == 1 and np.allclose(camera(), start, atol=1e-3), "the camera stays"
+
+    rows = tab.locator("#list tbody tr")
+    rows.nth(1).click()
+    chosen = state("chosen")
+    assert rows.nth(1).inner_text().split("\t")[0].endswith(f"#{chosen}") and "chosen" in rows.nth(1).get_attribute(
+        "class"
+    )
+    tab.locator("#pursue").uncheck()
+    before = camera()
+    plot = tab.locator("#plot").bounding_box()
+    tab.mouse.click(plot["x"] + plot["width"] - 8, plot["y"] + 20)
+    assert state("frame") == 2 and np.allclose(camera(), before), "the plot chooses a sweep; the camera stays"
+    tab.locator("#pursue").check()
+    assert not np.allclose(camera(), before)
+    tab.locator("#release").click()
+    assert state("chosen") is None and tab.locator("#object").is_hidden()
+    tab.evaluate(f"location.hash = '#sweep=1&object={chosen}'")
+    tab.wait_for_function(f"viewer.state.chosen === {chosen}")
+    assert state("frame") == 1
+    tab.keyboard.press("r")
+    assert state("chosen") is None and tab.evaluate("location.hash") == "#sweep=1"
+
+    count = rows.count()
+    tab.locator("#threshold").fill("1")
+    assert state("threshold") == 1 and tab.locator("#likely span").inner_text() == "1.00" and rows.count() < count
+    tab.locator("#size").fill("3")
+    assert state("size") == 3
+    context.close()
+
+
 def test_a_notebook_shows_the_page_inline(browser: Any) -> None:
     tab = browser.new_page()
     tab.set_content(show(window(Street(), 0), result_of())._repr_html_())

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from cflow_torch.transforms import transform_points
-from cflow_torch.windows.stillness import REACH, Structure, static_rows, thinned_rows
+from cflow_torch.windows.stillness import IN_PLACE, Structure, static_rows, thinned_rows
 
 
 def test_the_share_equals_that_of_all_pairwise_distances():
@@ -14,7 +14,7 @@ def test_the_share_equals_that_of_all_pairwise_distances():
     T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     T[:3, 3] = 0.2, -0.1, 0.05
     distances = np.linalg.norm(transform_points(source, T)[:, None] - target[None], axis=2)
-    expected = (distances.min(axis=1) <= REACH).mean()
+    expected = (distances.min(axis=1) <= IN_PLACE).mean()
     assert 0.05 < expected < 0.95
     assert Structure(target).share(source, T) == expected
 

@@ -46,10 +46,9 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
         content: the whole file.
         columns: numbers per point; None = find out.
 
-    Convention: the type is the one, float32 or float64, in which numbers have sizes of coordinates. The columns of a
-        point differ in size (z is smaller than x and y, intensities are larger), so the column of a number explains a
-        part of the variance of log sizes. We choose the number of columns, 3 to 8, that explains most. Ties: the
-        smallest. The order of the points does not matter. A file that is empty or too short to tell is KITTI's.
+    Convention: the type is the one, float32 or float64, in which numbers have sizes of coordinates. Columns differ in
+        size (z is smaller than x and y, intensities are larger). We choose the number of columns, 3 to 8, that explains
+        most of the variance of log sizes. Ties: the smallest. A file that is empty or too short to tell is KITTI's.
 
     Raises:
         CFlowError: no layout fits. The message names `bin_columns`.

@@ -18,10 +18,13 @@ from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.tensors import resolution
 from cflow_torch.types import CFlowError, check_array
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
 _AXES = ("x", "y", "z")
+_COARSEST = 1e-3  # metres
+_MOST_COLUMNS = 64  # of a cloud with fewer points than columns; more are those of a cloud that is transposed
 _TABLES: dict[str, Any] = {  # suffix -> function that reads, and one that writes
     ".feather": (feather.read_table, feather.write_feather),
     ".parquet": (parquet.read_table, parquet.write_table),
@@ -38,7 +41,8 @@ def read_cloud(path: PathLike, bin_columns: int | BinLayout | None = None) -> np
             layout is used if the file fits it.
 
     Returns:
-        (N, 3) in the precision of the file: float32 or float64; float16 becomes float32.
+        (N, 3) in the precision of the file: float32 or float64; float16 and integers of up to 16 bits become float32,
+        other integers float64. Integers are usually millimetres, which `read_as` converts.
 
     Convention:
         - `.npy`: (N, 3+) floats, columns x, y, z first; or a structured array with fields x, y, z.
@@ -60,8 +64,8 @@ def read_table(path: PathLike, bin_columns: int | BinLayout | None = None) -> tu
     with file_errors(path, _hint(path)):
         fields = _read(path, bin_columns)
         points = np.stack(_positions(fields), axis=1)
-        check_array(points, "its cloud", (None, 3), "f", "(N,) floating-point metres each for x, y and z")
-    precision = np.float32 if points.dtype.itemsize < 8 else np.float64
+        check_array(points, "its cloud", (None, 3), "fiu", "(N,) numbers each for x, y and z, metres")
+    precision = np.float64 if np.result_type(points, np.float32) == np.float64 else np.float32
     return points.astype(precision, copy=False), _other_columns(fields)
 
 
@@ -71,9 +75,7 @@ def read_columns(path: PathLike, bin_columns: int | BinLayout | None = None) -> 
     Columns without a name (`.bin` files, plain arrays) are called column_3, column_4, ... We leave out texts, objects
     and columns of several numbers per point.
     """
-    path = as_path(path)
-    with file_errors(path, _hint(path)):
-        return _other_columns(_read(path, bin_columns))
+    return read_table(path, bin_columns)[1]
 
 
 def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -84,6 +86,14 @@ def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         if name.lower() not in _AXES and values.shape == shape and kind.kind in "biuf" and kind.itemsize <= 8:
             kept[name] = values.astype(kind.newbyteorder("="), copy=False)
     return kept
+
+
+def in_single(points: np.ndarray) -> np.ndarray:
+    """Return points as float32, unless this type holds them by millimetres only, as in a map's frame."""
+    if points.dtype == np.float32:
+        return points
+    farthest = float(np.abs(points[np.isfinite(points)]).max(initial=0))
+    return points if resolution(np.dtype(np.float32), farthest) > _COARSEST else points.astype(np.float32)
 
 
 def write_cloud(
@@ -166,7 +176,7 @@ def copy_rows(source: PathLike, target: PathLike, is_kept: np.ndarray, layout: B
             read, write = _TABLES[suffix]
             write(read(pa.BufferReader(content), use_threads=False).filter(pa.array(is_kept)), file)
         elif suffix == ".npy":
-            np.save(file, np.load(io.BytesIO(content), allow_pickle=False)[is_kept])
+            np.save(file, _by_rows(np.load(io.BytesIO(content), allow_pickle=False))[is_kept])
         elif suffix == ".npz":
             arrays: Any = _plain_arrays(content).items()
             np.savez(file, **{k: v[is_kept] if v.shape[:1] == is_kept.shape else v for k, v in arrays})
@@ -247,11 +257,18 @@ def _layout_of(content: bytes, expected: int | BinLayout | None) -> BinLayout:
 
 
 def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
+    array = _by_rows(array)
     if array.dtype.names is not None:
         return {name: array[name] for name in array.dtype.names}
-    if array.ndim != 2 or array.shape[1] < 3:
+    if array.ndim != 2 or array.shape[1] < 3 or array.shape[1] > max(_MOST_COLUMNS, len(array)):
         raise CFlowError(f"it has an array of shape {array.shape}; it must be (N, 3+), columns x, y, z first")
     return dict(zip((*_AXES, *(f"column_{k}" for k in range(3, array.shape[1]))), array.T))
+
+
+def _by_rows(array: np.ndarray) -> np.ndarray:
+    """Return an organised cloud, (H, W) or (H, W, C), with a row per point."""
+    num_axes = 1 if array.dtype.names is not None else 2
+    return array.reshape(-1, *array.shape[-1:][: num_axes - 1]) if array.ndim == num_axes + 1 else array
 
 
 def _plain_arrays(content: bytes) -> dict[str, np.ndarray]:

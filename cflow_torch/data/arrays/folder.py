@@ -11,8 +11,8 @@ import numpy as np
 from cflow_torch.data.arrays.cloud_file import SUFFIXES
 from cflow_torch.data.arrays.poses_text import files_of_poses, parse_poses, parse_times
 from cflow_torch.data.arrays.stamps import times_of_names
-from cflow_torch.data.folders import find_folders, natural_key
-from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start
+from cflow_torch.data.folders import find_folders, natural_key, visible
+from cflow_torch.data.paths import PathLike, as_path, is_remote, read_bytes, read_start
 from cflow_torch.types import CFlowError
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
@@ -20,7 +20,7 @@ POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajecto
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test for poses and times
+_TABLES = (".txt", ".csv", ".tum", ".json")  # suffixes of files that we test for poses and times
 _TESTED = 8192  # bytes of a file that tell what it holds
 
 
@@ -32,7 +32,7 @@ def find_array_logs(root: PathLike) -> list[Path]:
     """
     what = "a folder with one point cloud per file, or a folder of such"
     is_log, is_passed = (lambda folder: bool(_clouds(folder)[1])), (lambda child: child.name != GROUND_FOLDER)
-    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed)
+    return find_folders(as_path(root), is_log, SEARCH_DEPTH, what, is_passed=is_passed)
 
 
 def _clouds(folder: Path) -> tuple[Path, dict[str, list[Path]]]:
@@ -64,12 +64,24 @@ def other_folders(folder: Path, parent: Path) -> list[str]:
 
 
 def _kinds(folder: Path) -> dict[str, list[Path]]:
-    """Return the clouds in a folder, of each suffix that has two or more."""
+    """Return the clouds in a folder, of each suffix that has two or more, or of each pattern of names.
+
+    Clouds have several patterns if their names differ only by what is not a number: front_001.pcd, rear_001.pcd.
+    """
+    suffixes: dict[str, list[Path]] = {}
+    for path in visible(folder):
+        if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS:
+            suffixes.setdefault(path.suffix.lower(), []).append(path)
     kinds: dict[str, list[Path]] = {}
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS and path.name[0] != ".":
-            kinds.setdefault(path.suffix.lower(), []).append(path)
-    return {suffix: files for suffix, files in kinds.items() if len(files) > 1}
+    for suffix, files in suffixes.items():
+        patterns: dict[str, list[Path]] = {}
+        for path in files:
+            patterns.setdefault(re.sub(r"\d+", "*", path.stem) + suffix, []).append(path)
+        numbers = {
+            tuple(sorted("-".join(re.findall(r"\d+", path.stem)) for path in same)) for same in patterns.values()
+        }
+        kinds.update(patterns if len(numbers) == 1 < len(patterns) < len(files) else {suffix: files})
+    return {kind: files for kind, files in kinds.items() if len(files) > 1}
 
 
 def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
@@ -79,7 +91,7 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
     """
     parent, kinds = _clouds(folder)
     if suffix is not None:
-        kinds = {kind: files for kind, files in kinds.items() if kind == "." + suffix.lower().lstrip(".")}
+        kinds = {kind: files for kind, files in kinds.items() if kind in (suffix, "." + suffix.lower().lstrip("."))}
     if not kinds:
         raise CFlowError(
             f"{folder} and its subfolders {', '.join(POINT_FOLDERS)} have fewer than two point clouds "
@@ -135,7 +147,7 @@ def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
 def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
     """Parse the first lines of a file; None = this is not possible."""
     try:
-        start = read_start(path, _TESTED)
+        start = read_bytes(path) if path.suffix.lower() == ".json" else read_start(path, _TESTED)
         if len(start) == _TESTED:  # whole lines, and whole matrices of four
             lines = start.splitlines(keepends=True)[:-1]
             start = b"".join(lines[: len(lines) // 4 * 4])

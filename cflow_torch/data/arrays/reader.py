@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import read_columns, read_table
+from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
     POSE_FILES,
@@ -21,20 +21,20 @@ from cflow_torch.data.arrays.folder import (
     resolve,
 )
 from cflow_torch.data.arrays.pcd import LONGEST_HEADER, pcd_viewpoint
-from cflow_torch.data.arrays.poses_text import Trajectory
 from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transform
 from cflow_torch.data.file_errors import file_errors
+from cflow_torch.data.folders import natural_key
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, is_path_like, read_bytes, read_start
 from cflow_torch.data.point_times import find_times
-from cflow_torch.tensors import resolution
+from cflow_torch.data.trajectory import Trajectory, checked_poses, fit_to_sweeps
 from cflow_torch.transforms import poses_from_quaternions, rigid_transform, transform_points
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 
 _VIEWPOINT = "VIEWPOINT"
-_COARSEST = 1e-3  # metres
 _LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
@@ -42,12 +42,11 @@ class ArraysLog(Log):
     """A folder of point clouds.
 
     Args:
-        folder: holds two or more clouds of one suffix (`cloud_file.SUFFIXES`), or has a subfolder points, lidar,
-            velodyne, clouds or pcd that does, or one of any name if it holds poses or times.txt. Clouds are sorted
-            naturally: 2 before 10.
-        poses: "auto" = poses.txt, odometry.csv or the like (`POSE_FILES`) in the folder, or KITTI's
-            ../../poses/<name>.txt, if there is one, or the only file or folder there whose contents are poses, or
-            VIEWPOINT of `.pcd` files if it is set; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
+        folder: of a log, see `find_array_logs`. Clouds are sorted by the times in their names, else naturally: 2
+            before 10.
+        poses: "auto" = one of `POSE_FILES` in the folder, or KITTI's ../../poses/<name>.txt, or the only file or
+            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set; None = no poses; or a file
+            (see `read_poses`); or a (K, 4, 4) array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
@@ -55,7 +54,7 @@ class ArraysLog(Log):
         ground: "auto" = the subfolder `ground`, if there is one; None = no masks; or a folder. It has one .npy file per
             cloud, of the same name, with (N,) bool or 0 and 1.
         ego_T_lidar: (4, 4), maps the frame of the stored points to the ego frame; None = they are the same.
-        suffix: suffix of the clouds to read, if a folder has several kinds.
+        suffix: suffix, or pattern of the names ("front_*.pcd"), of the clouds to read, if a folder has several kinds.
         bin_columns: numbers per point of `.bin` files: 4 in KITTI, 5 in nuScenes; "auto" = `find_bin_layout`.
 
     Attributes:
@@ -63,18 +62,14 @@ class ArraysLog(Log):
         timestamps: nanoseconds from `times`, else from file names (see `times_of_names`), else from TUM poses, if each
             cloud has one, else from the only file named so with one time per cloud. Otherwise 0, 1, 2, ..., and sweeps
             have no `timestamp_ns`.
-        poses: (K, 4, 4) float64 `T_world_ego` of every sweep; None = unknown. Sweeps before the first pose, after the
-            last one, or in a gap of the poses of more than half a second are left out. If a table has more poses than
-            there are clouds, each takes that of its number.
-        gaps: indices of sweeps after which sweeps were left out.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep, see `fit_to_sweeps`; None = unknown. Without times, there
+            is one pose per sweep, or each sweep takes that of its name or number.
         bin_layout: numbers of a point of `.bin` files, None for files of another suffix.
         has_viewpoints: whether the poses come from VIEWPOINT. Such clouds are often in the world's frame (`read_as`).
 
     Convention:
-        `missing_returns` stay, as NaN, so that results have a row for every row of the file.
-        Sweeps are in the ego frame: points are transformed by `ego_T_lidar` in float64, then rounded to float32. Poses
-        with times (TUM) are interpolated at the times of the sweeps, if these are known. Otherwise there must be one
-        pose per sweep. The ego frame should have z up, because the method works in the bird's-eye view.
+        `missing_returns` stay, as NaN, so that results have a row for every row of the file. Sweeps are in the ego
+        frame, which should have z up: points are transformed by `ego_T_lidar` in float64, then rounded to float32.
     """
 
     has_raw_times: bool = True
@@ -135,7 +130,7 @@ class ArraysLog(Log):
         is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
         pose = None if self.poses is None else self.poses[index].copy()
         seconds = None if times is None else times.seconds
-        return Sweep(_in_single(points), is_ground, pose, time, seconds)
+        return Sweep(in_single(points), is_ground, pose, time, seconds)
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
@@ -156,20 +151,34 @@ class ArraysLog(Log):
     def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, bool]:
         """Return the poses, and whether a calibration converted them to the LiDAR's."""
         if poses is not None and not is_path_like(poses):
-            return Trajectory(poses_text.checked_poses(np.asarray(poses), "poses"), None, "matrix", "poses"), False
+            return Trajectory(checked_poses(np.asarray(poses), "poses"), None, False, "poses"), False
         kitti = self.folder.resolve().parent.parent / "poses" / f"{self.log_id}.txt"
         file = resolve(self.folder, poses, POSE_FILES, "poses", kitti)
         if file is None and poses == "auto":
-            file = only_one(find_tables(self.folder)[0], self.folder, "poses")
+            found = [path for path in find_tables(self.folder)[0] if path.suffix.lower() != ".json" or self._fits(path)]
+            file = only_one(found, self.folder, "poses")
             self._note(f"its poses are those of {file.name}" if file else "")
         if file is None:
             return self._viewpoints() if poses == "auto" else None, False
         trajectory = poses_text.read_poses(file)
         chosen = resolve(self.folder, calibration, ("calib.txt",), "calibration")
-        if chosen is None or (calibration == "auto" and trajectory.layout != "kitti"):
+        if chosen is None or (calibration == "auto" and not trajectory.is_kitti):
             return trajectory, False
-        T_cam_lidar = poses_text.read_calibration(chosen)
-        return trajectory._replace(poses=np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar), True
+        T_cam_lidar = transform(read_calibration(chosen), chosen, *CAMERA_KEYS)
+        converted = np.linalg.inv(T_cam_lidar) @ trajectory.poses @ T_cam_lidar
+        if calibration == "auto" and _drives_along_x(trajectory.poses) and not _drives_along_x(converted):
+            self._note(
+                f"{file} has poses that drive along x, the LiDAR's axis ahead, not along z, the camera's. So we take "
+                f"them for poses of the LiDAR, and ignore Tr of {chosen.name}"
+            )
+            return trajectory, True
+        return trajectory._replace(poses=converted), True
+
+    def _fits(self, path: Path) -> bool:
+        """Test whether a JSON file has poses of the sweeps, because such files often hold other poses."""
+        trajectory = poses_text.read_poses(path)
+        rows = self._labelled_rows(trajectory.labels)
+        return trajectory.times_ns is not None or len(trajectory.poses) == len(self.files) or rows is not None
 
     def _viewpoints(self) -> Trajectory | None:
         """Read the poses in VIEWPOINT of `.pcd` files; None if no file has one."""
@@ -183,7 +192,7 @@ class ArraysLog(Log):
         if (numbers == np.eye(7)[3]).all():
             return None
         poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
-        return Trajectory(poses, None, "matrix", _VIEWPOINT)
+        return Trajectory(poses, None, False, _VIEWPOINT)
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
@@ -205,14 +214,24 @@ class ArraysLog(Log):
         self._note(f"the times of its sweeps are those of {file.name}" if file else "")
         return None if file is None else poses_text.read_times(file).tolist()
 
-    def _rows(self, count: int, what: str) -> np.ndarray | None:
+    def _labelled_rows(self, labels: Sequence[str]) -> np.ndarray | None:
+        """Return the row of each file in a table whose rows have labels: by its name, or in the order of numbers."""
+        row_of = {Path(label).stem: row for row, label in enumerate(labels)}
+        if row_of.keys() >= {path.stem for path in self.files}:
+            return np.array([row_of[path.stem] for path in self.files])
+        if len(row_of) != len(self.files) or len({re.sub(r"\d+", "", label) for label in labels}) > 1:
+            return None
+        return np.array(sorted(range(len(labels)), key=lambda row: natural_key(labels[row])))
+
+    def _rows(self, count: int, what: str, labels: Sequence[str] = ()) -> np.ndarray | None:
         """Return the row of each file in a table of `count` rows, one per sweep; None = the table does not fit.
 
-        If files are missing, their numbers tell the rows, from 0 or 1 on, and we say so. The last number must be near
-        the end of the table, else the table is of another rate.
+        Labels of the rows may be the names of the files. If files are missing, their numbers tell the rows, from 0 or 1
+        on, and we say so. The last number must be near the end of the table, else the table is of another rate.
         """
-        if count == len(self.files):
-            return np.arange(count)
+        labelled = self._labelled_rows(labels) if len(labels) == count else None
+        if count == len(self.files) or labelled is not None:
+            return np.arange(count) if labelled is None else labelled
         digits = [re.findall(r"\d+", path.stem) for path in self.files]
         numbers = np.array([int(runs[-1][-9:]) if runs else -1 for runs in digits])
         fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
@@ -225,10 +244,11 @@ class ArraysLog(Log):
         source = trajectory.source
         rows = np.arange(len(self.files))
         if trajectory.times_ns is not None and stamps is not None:
-            poses, is_known, note = poses_text.fit_to_sweeps(trajectory, stamps)
+            poses, is_known, note = fit_to_sweeps(trajectory, stamps)
             self._note(note)
+            self.has_sparse_poses = trajectory.is_sparse(stamps)
         else:
-            given = self._rows(len(trajectory.poses), f"poses in {source}")
+            given = self._rows(len(trajectory.poses), f"poses in {source}", trajectory.labels)
             if given is None:
                 raise CFlowError(
                     f"{source} has {len(trajectory.poses)} poses for {len(self.files)} sweeps: pass one each, or poses "
@@ -248,12 +268,11 @@ class ArraysLog(Log):
         return poses
 
 
-def _in_single(points: np.ndarray) -> np.ndarray:
-    """Return points as float32, unless this type holds them by millimetres only, as in a map's frame."""
-    if points.dtype == np.float32:
-        return points
-    farthest = float(np.abs(points[np.isfinite(points)]).max(initial=0))
-    return points if resolution(np.dtype(np.float32), farthest) > _COARSEST else points.astype(np.float32)
+def _drives_along_x(poses: np.ndarray) -> bool:
+    """Test whether poses (K, 4, 4) move along their own x axis more than along y and z."""
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    along = np.abs(steps[:, :3, 3]).sum(axis=0)
+    return bool(along[0] > along[1] + along[2])
 
 
 def _read_mask(folder: Path, stem: str, rows: int) -> np.ndarray:

@@ -8,6 +8,8 @@ from decimal import Decimal
 from typing import Sequence
 
 _UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))  # sizes of unix times, and the ns of their unit; else seconds
+_STEPS = ((5 * 10**6, 1), (5 * 10**3, 10**3), (5, 10**6))  # the same, by the step from one time to the next
+_FIRST_UNIX = 10**9  # seconds; smaller times have another start
 _DATE = re.compile(r"(?<!\d)(\d{4})\D?(\d\d)\D?(\d\d)\D(\d\d)\D?(\d\d)\D?(\d\d)(?:\D(\d+))?")
 _STAMP = re.compile(r"(?<!\d)([1-9]\d{12}|[1-9]\d{15,17}|[1-8]\d{18})(?!\d)")  # no numbers with zeros in front
 # Seconds and a fraction: unix seconds anywhere in a name, or the only number of a name.
@@ -18,11 +20,16 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 def nanoseconds_of_numbers(words: Sequence[str]) -> list[int]:
     """Convert texts of times to nanoseconds exactly: unix times need 19 digits, a float has 16.
 
-    Unix times may be in s, ms, us or ns, which the largest tells. Smaller times are seconds.
+    They may be in s, ms, us or ns: the largest tells the unit of unix times, and the median step that of others.
     """
     numbers = [Decimal(word) for word in words]
     largest = max(map(abs, numbers))
-    unit = next((unit for first, unit in _UNITS if largest >= first), 10**9)
+    unit = next((unit for first, unit in _UNITS if largest >= first), None)
+    if unit is None and largest >= _FIRST_UNIX:
+        unit = 10**9
+    if unit is None:  # times from another start than 1970
+        steps = sorted(after - before for before, after in zip(numbers, numbers[1:])) or [Decimal(0)]
+        unit = next((unit for first, unit in _STEPS if steps[len(steps) // 2] >= first), 10**9)
     return [int((number * unit).to_integral_value()) for number in numbers]
 
 

@@ -7,7 +7,7 @@ from typing import Any, Mapping, NamedTuple
 
 import numpy as np
 
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, in_single, write_cloud
 from cflow_torch.data.arrays.folder import GROUND_FOLDER
 from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
 from cflow_torch.data.atomic import new_folder
@@ -16,7 +16,6 @@ from cflow_torch.transforms import to_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep
 
 POINTS_FOLDER = "points"
-_FARTHEST = 8000.0  # metres; float32 resolves half a millimetre up to here
 
 
 class SweepSides(NamedTuple):
@@ -72,7 +71,7 @@ def write_sweep(file: Path, log: Log, index: int, sweep: Sweep, viewpoint: str |
     points = np.asarray(sweep.points)[:, :3]
     where = None if viewpoint is None else _viewpoint(sweep.pose, f"log {log.log_id}: sweep {index}")
     if viewpoint == "world":
-        points = _rounded(transform_points(points, np.asarray(sweep.pose)))
+        points = in_single(transform_points(points, np.asarray(sweep.pose)))
     write_cloud(file, points, log.columns(index), where)
 
 
@@ -98,9 +97,3 @@ def _viewpoint(pose: Any, what: str) -> list[float]:
         raise CFlowError(f"{what} has no pose for VIEWPOINT; pass viewpoint=None")
     matrix = np.asarray(pose, np.float64)
     return [*matrix[:3, 3].tolist(), *to_quaternions(matrix[None, :3, :3])[0].tolist()]
-
-
-def _rounded(points: np.ndarray) -> np.ndarray:
-    """Return float32 points, which most programs expect, if these resolve a millimetre there."""
-    farthest = float(np.abs(points[np.isfinite(points)]).max(initial=0))
-    return points.astype(np.float32) if farthest < _FARTHEST else points

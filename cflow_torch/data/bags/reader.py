@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import Trajectory, fit_to_sweeps
-from cflow_torch.data.bags.messages import Frames, cloud_columns, sample, sorted_poses
+from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.folders import search
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, check_file, is_remote
 from cflow_torch.data.point_times import find_times
+from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep
@@ -40,6 +40,7 @@ _CONVERTERS = {
 }
 _REPAIR = "a recording that was cut off is repaired by rosbag reindex (.bag), mcap recover (.mcap) or sqlite3 (.db3)"
 _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped" for name in ("", "WithCovariance")))
+_OTHER_POSES = ("nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped")  # used if there are no others
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
@@ -55,8 +56,7 @@ def find_bags(root: PathLike) -> list[Path]:
     root = as_path(root)
     if root.is_file():
         return [root]
-    folders = find_folders(root, lambda folder: bool(_bags_in(folder)), SEARCH_DEPTH, "a bag, or a folder of bags")
-    return sorted(bag for folder in folders for bag in _bags_in(folder))
+    return sorted(search(root, _bags_in, SEARCH_DEPTH, "a bag, or a folder of bags"))
 
 
 class BagLog(Log):
@@ -136,15 +136,19 @@ class BagLog(Log):
             return "tf"
         if poses in (None, "tf") or (poses == "auto" and not has_tracks):
             return None if poses == "auto" else poses
-        return self._chosen(topics, _POSE_TYPES, None if poses == "auto" else poses, "poses")
+        if poses != "auto":
+            return self._chosen(topics, (*_POSE_TYPES, *_OTHER_POSES), poses, "poses")
+        has_usual = not set(_POSE_TYPES).isdisjoint(topics.values())
+        return self._chosen(topics, _POSE_TYPES if has_usual else _OTHER_POSES, None, "poses")
 
     def _use_poses(self, source: str, tracks: dict[str, list[Any]]) -> None:
         """Take the poses of "tf" or of a topic, and keep the sweeps that have one."""
         self.trajectory = times, matrices = self._find_trajectory(source, tracks)
         self._set_clock(times)
-        trajectory = Trajectory(matrices, times, "bag", f"{source} of {self.path}")
+        trajectory = Trajectory(matrices, times, False, f"{source} of {self.path}")
         self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
         self._note(note)
+        self.has_sparse_poses = trajectory.is_sparse(self.timestamps)
         self.timestamps = [time for time, has_pose in zip(self.timestamps, is_covered) if has_pose]
 
     def _mount_at(self, time: int) -> np.ndarray:
@@ -238,7 +242,8 @@ class BagLog(Log):
         links: dict[str, list[Any]] = {}
         tracks: dict[str, list[Any]] = {}
         reader = self._reader()
-        wanted = [c for c in reader.connections if c.topic == self.topic or c.msgtype in (*_POSE_TYPES, *_TF_TYPES)]
+        types = (*_POSE_TYPES, *_OTHER_POSES, *_TF_TYPES)
+        wanted = [c for c in reader.connections if c.topic == self.topic or c.msgtype in types]
         for connection, arrived, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
             if connection.topic == self.topic:
@@ -249,13 +254,16 @@ class BagLog(Log):
                     self._pose_delays.append(arrived - _stamp(link, arrived))
                     child = link.child_frame_id.lstrip("/")  # ROS 1 allows a leading slash
                     parents[child] = link.header.frame_id.lstrip("/")
-                    at = sample(_stamp(link, arrived), link.transform.translation, link.transform.rotation)
-                    links.setdefault(child, []).append(at)
+                    links.setdefault(child, []).append(_pose_of(link, arrived))
             else:
-                pose = getattr(message.pose, "pose", message.pose)
-                at = sample(_stamp(message, arrived), pose.position, pose.orientation)
-                self._pose_delays.append(arrived - _stamp(message, arrived))
-                tracks.setdefault(connection.topic, []).append(at)
+                poses = [_pose_of(each, arrived) for each in getattr(message, "poses", [message])]
+                times = [each[0] for each in poses]
+                if not times or len(set(times)) < len(times):
+                    continue  # a path that is planned, and not driven, has no times
+                if hasattr(message, "poses"):
+                    tracks[connection.topic] = []  # each message repeats the path so far
+                tracks.setdefault(connection.topic, []).extend(poses)
+                self._pose_delays.append(arrived - times[-1])
                 self._child[connection.topic] = getattr(message, "child_frame_id", "").lstrip("/")
         self._frames = Frames(parents, links)
         return self._arrivals(stamps), tracks
@@ -341,6 +349,14 @@ def _stamp(message: Any, arrived: int) -> int:
     """Return the time of a header in nanoseconds; if it is 0, the time of arrival."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
+
+
+def _pose_of(message: Any, arrived: int) -> Sample:
+    """Return the pose of an Odometry, a PoseStamped, a PoseWithCovarianceStamped or a TransformStamped."""
+    if hasattr(message, "transform"):
+        return sample(_stamp(message, arrived), message.transform.translation, message.transform.rotation)
+    pose = getattr(message.pose, "pose", message.pose)
+    return sample(_stamp(message, arrived), pose.position, pose.orientation)
 
 
 def _check_version(files: list[Path]) -> None:

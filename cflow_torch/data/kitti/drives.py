@@ -7,8 +7,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cflow_torch.data.folders import search
 from cflow_torch.data.paths import PathLike, as_path
-from cflow_torch.errors import CFlowError
 
 _DEEPEST = 6  # levels below the root; <root>/kitti/raw/<date>/<drive> has four
 _FRAME = re.compile(r"[0-9]{6}|[0-9]{10}")  # names of clouds without .bin
@@ -38,17 +38,7 @@ def find_kitti_drives(root: PathLike) -> list[KITTIDrive]:
         You may also pass a folder inside a drive, down to its clouds.
     """
     top = as_path(root)
-    if not top.is_dir():
-        raise CFlowError(f"{root} is not a folder; pass a drive of KITTI, or a folder of drives")
-    found: list[KITTIDrive] = []
-    level = [top]
-    for _ in range(_DEEPEST + 1):
-        deeper = []
-        for folder in level:
-            drives = _drives_of(folder)
-            found += drives
-            deeper += [] if drives else [child for child in folder.iterdir() if child.name[0] != "." and child.is_dir()]
-        level = deeper
+    found = search(top, _drives_of, _DEEPEST, "a drive of KITTI, or a folder of drives")
     if not found:
         resolved = top.resolve()
         found = [drive for parent in (resolved.parent, resolved.parent.parent) for drive in _drives_of(parent)]

@@ -1,4 +1,4 @@
-"""Calibration and GPS/IMU measurements (OXTS) of KITTI as transforms, in float64."""
+"""GPS/IMU measurements (OXTS) of KITTI as poses, and what its images show."""
 
 from __future__ import annotations
 
@@ -8,26 +8,13 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.file_errors import file_errors
-from cflow_torch.data.paths import read_bytes, read_start
-from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about
+from cflow_torch.data.paths import read_start
+from cflow_torch.transforms import as_matrix, rotations_about
 from cflow_torch.types import CFlowError
 
 _EARTH = 6378137.0  # metres, radius of the Mercator projection
 _NUM_OXTS = 30  # numbers per measurement: latitude, longitude, altitude, roll, pitch, yaw, ...
 IMAGE_SIZE = (1242, 375)  # pixels; the rectified images of all days are within 18 pixels of it
-
-
-def read_calibration(file: Path) -> dict[str, np.ndarray]:
-    """Read lines `KEY: numbers` as key -> (K,) float64. Lines without numbers (the time of calibration) are ignored."""
-    found = {}
-    with file_errors(file):
-        for line in read_bytes(file).decode("utf-8").splitlines():
-            key, *words = line.replace(":", " ", 1).split() or [""]
-            try:
-                found[key] = np.array(words, np.float64)
-            except ValueError:
-                continue
-    return found
 
 
 def png_size(file: Path) -> tuple[int, int]:
@@ -37,26 +24,6 @@ def png_size(file: Path) -> tuple[int, int]:
         if start[:8] != b"\x89PNG\r\n\x1a\n" or len(start) < 24:
             raise ValueError("it is not a PNG file")
         return int.from_bytes(start[16:20], "big"), int.from_bytes(start[20:24], "big")
-
-
-def transform(values: dict[str, np.ndarray], file: Path, *names: str) -> np.ndarray:
-    """Return the (4, 4) rigid transform of a calibration.
-
-    `names` are alternative names of a line with 12 numbers, or two names of lines with 9 and 3 numbers, joined by a
-    space. A line with 9 numbers alone is a rotation.
-    """
-    for name in names:
-        parts = [values[key] for key in name.split() if key in values]
-        sizes = [len(part) for part in parts]
-        if len(parts) == len(name.split()) and sizes in ([12], [9], [9, 3]):
-            T = np.eye(4)
-            if sizes == [12]:
-                T[:3] = parts[0].reshape(3, 4)
-            else:
-                T[:3, :3] = parts[0].reshape(3, 3)
-                T[:3, 3] = parts[1] if len(parts) > 1 else 0
-            return rigid_transform(T, f"{name} of {file}")
-    raise CFlowError(f"{file} has no line {' or '.join(names)}; it has {', '.join(values)}; copy it again")
 
 
 def poses_from_oxts(table: np.ndarray, file: Any) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Mapping, NamedTuple
+from typing import Any, NamedTuple, Sequence
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +12,7 @@ from cflow_torch.data.boxes import Boxes, category_indices
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_bytes
-from cflow_torch.transforms import upright_poses
+from cflow_torch.transforms import as_matrix, rotations_about, upright_poses
 from cflow_torch.types import CFlowError
 
 CATEGORY_NAME = {
@@ -60,44 +60,27 @@ class FrameBoxes(NamedTuple):
 
 def read_tracklets(file: Path) -> dict[int, FrameBoxes]:
     """Read tracklet_labels.xml: number of the frame -> boxes. The file states positions of the middle of the base."""
-    rows: dict[int, list[_Row]] = {}
+    rows: dict[int, list[Any]] = {}  # frame -> track, type, length width height, heading x y z
     content = read_bytes(file)
     with file_errors(file):
         if b"<!ENTITY" in content:
             raise CFlowError("it defines entities, which are not read; copy it again")
         root: Any = ElementTree.fromstring(content)
         for number, track in enumerate(root.find("tracklets").findall("item")):
+            size = [float(track.findtext(key)) for key in "lwh"]
             first_frame = int(track.findtext("first_frame"))
             for step, pose in enumerate(track.find("poses").findall("item")):
                 if int(pose.findtext("truncation", "0")) != _OUT_OF_IMAGE:
-                    rows.setdefault(first_frame + step, []).append(_Row.of(number, track, pose))
-        return {frame: _upright(of_frame) for frame, of_frame in rows.items()}
+                    heading, x, y, z = (float(pose.findtext(key)) for key in ("rz", "tx", "ty", "tz"))
+                    place = (heading, x, y, z + size[2] / 2)
+                    rows.setdefault(first_frame + step, []).append(
+                        (str(number), track.findtext("objectType"), size, place)
+                    )
+        return {frame: _upright(*zip(*of_frame)) for frame, of_frame in rows.items()}
 
 
-class _Row(NamedTuple):
-    """A tracklet in one frame."""
-
-    track: str
-    kind: str
-    size: tuple[float, float, float]  # length, width, height, metres
-    place: tuple[float, float, float, float]  # heading, radians; x, y, z of the middle of the box, metres
-
-    @classmethod
-    def of(cls, number: int, track: Any, pose: Any) -> _Row:
-        """Read a pose of track `number`; the file states the middle of the base of the box."""
-        length, width, height = (float(track.findtext(key)) for key in ("l", "w", "h"))
-        heading, x, y, z = (float(pose.findtext(key)) for key in ("rz", "tx", "ty", "tz"))
-        return cls(
-            track=str(number),
-            kind=track.findtext("objectType"),
-            size=(length, width, height),
-            place=(heading, x, y, z + height / 2),
-        )
-
-
-def _upright(rows: list[_Row]) -> FrameBoxes:
-    tracks, kinds, sizes, places = zip(*rows)
-    boxes = Boxes(list(tracks), category_indices(kinds, CATEGORY_NAME), sizes, upright_poses(places))
+def _upright(tracks: Sequence[str], kinds: Sequence[str], sizes: Any, places: Any) -> FrameBoxes:
+    boxes = Boxes(tracks, category_indices(kinds, CATEGORY_NAME), sizes, upright_poses(places))
     return FrameBoxes(boxes, np.zeros((0, 4)))
 
 
@@ -121,29 +104,17 @@ def _camera_boxes(rows: list[list[str]], T_lidar_camera: np.ndarray) -> FrameBox
     is_box = np.array([words[2] != "DontCare" for words in rows])
     kept = [words for words, keep in zip(rows, is_box) if keep]
     boxes = numbers[is_box]
+    centres = boxes[:, 7:10] - boxes[:, 4:5] * (0, 0.5, 0)
+    T_camera_box = as_matrix(rotations_about(1, boxes[:, 10]) @ _OBJECT_FROM_BOX, centres)
     return FrameBoxes(
         boxes=Boxes(
             [words[1] for words in kept],
             category_indices([words[2] for words in kept], CATEGORY_NAME),
             boxes[:, [6, 5, 4]],
-            T_lidar_camera @ _camera_poses(boxes),
+            T_lidar_camera @ T_camera_box,
         ),
         ignored=numbers[~is_box, :4],
     )
-
-
-def _camera_poses(boxes: np.ndarray) -> np.ndarray:
-    """Return T_camera_box, (K, 4, 4) float64, of boxes given by numbers of the file, (K, 11)."""
-    height = boxes[:, 4]
-    cos = np.cos(boxes[:, 10])
-    sin = np.sin(boxes[:, 10])
-    turned = np.tile(np.eye(4), (len(boxes), 1, 1))
-    turned[:, 0, 0] = turned[:, 2, 2] = cos
-    turned[:, 0, 2] = sin
-    turned[:, 2, 0] = -sin
-    turned[:, :3, 3] = boxes[:, 7:10] - height[:, None] * (0, 0.5, 0)
-    turned[:, :3, :3] = turned[:, :3, :3] @ _OBJECT_FROM_BOX
-    return turned
 
 
 def read_classes(file: Path, rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -164,5 +135,4 @@ def class_categories() -> np.ndarray:
 
 
 def no_boxes() -> FrameBoxes:
-    empty: Mapping[str, Any] = {"size": np.zeros((0, 3)), "pose": np.zeros((0, 4, 4))}
-    return FrameBoxes(Boxes([], np.zeros(0, np.uint8), **empty), np.zeros((0, 4)))
+    return FrameBoxes(Boxes([], [], [], []), np.zeros((0, 4)))

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-from pathlib import Path
-from typing import Any, Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import Trajectory, read_times
+from cflow_torch.data.arrays.poses_text import read_times
 from cflow_torch.data.arrays.reader import ArraysLog
+from cflow_torch.data.arrays.tables import read_numbers
 from cflow_torch.data.boxes import flow_from_boxes
+from cflow_torch.data.calibration import CAMERA_KEYS, read_calibration, transform
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.kitti import labels as stored_labels
 from cflow_torch.data.kitti.drives import KITTIDrive, find_kitti_drives
-from cflow_torch.data.kitti.geometry import IMAGE_SIZE, in_image, png_size, poses_from_oxts, read_calibration, transform
+from cflow_torch.data.kitti.geometry import IMAGE_SIZE, in_image, png_size, poses_from_oxts
 from cflow_torch.data.kitti.labels import FrameBoxes
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import PathLike, read_bytes, remote_errors
-from cflow_torch.errors import CFlowError, warn
+from cflow_torch.data.paths import PathLike, exist, remote_errors
+from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep
 
@@ -74,14 +75,10 @@ class KITTILog(ArraysLog):
                 super().__init__(source.clouds, None if is_auto else poses, times=None, ground=None, suffix=".bin")
         self.log_id = source.name
         self._frames = [int(file.stem) for file in self.files]
-        self._boxes_of = lru_cache(1)(self._read_boxes)
         if source.layout == "raw":
             self._read_times()
         if is_auto and not is_sequence:
             self.poses = self._poses_from_oxts()
-
-    def __reduce__(self) -> Any:
-        return _restored, ({key: value for key, value in self.__dict__.items() if key != "_boxes_of"},)
 
     def sweep(self, index: int) -> Sweep:
         sweep = super().sweep(index)
@@ -108,7 +105,7 @@ class KITTILog(ArraysLog):
         return (classes >= first) & (classes <= last)  # type: ignore[no-any-return]
 
     def _labels(self, index: int) -> FlowLabels | None:
-        boxes = self._boxes_of()
+        boxes = self._boxes
         if self.poses is None or (self._label_files is None and not boxes):
             return None
         points = np.asarray(super().sweep(index).points, np.float64)
@@ -133,25 +130,11 @@ class KITTILog(ArraysLog):
         folder: Any = self._label_files
         return stored_labels.read_classes(folder / f"{self.files[index].stem}.label", rows)
 
-    def _trajectory(self, poses: Any, calibration: Any) -> tuple[Trajectory | None, bool]:
-        trajectory, is_converted = super()._trajectory(poses, calibration)
-        if trajectory is None or not is_converted:
-            return trajectory, is_converted
-        stored, _ = super()._trajectory(poses, None)
-        if stored is not None and _drives_along_x(stored.poses) and not _drives_along_x(trajectory.poses):
-            warn(
-                f"log {self.folder.resolve().name}: {stored.source} has poses that drive along x, the LiDAR's axis "
-                "ahead, not along z, the camera's. So we take them for poses of the LiDAR, and ignore Tr of calib.txt"
-            )
-            return stored, True
-        return trajectory, True
-
     def _read_times(self) -> None:
         """Read the times of a raw drive: a line per frame, YYYY-MM-DD hh:mm:ss and 9 decimals."""
         file = self.drive.root / "velodyne_points" / "timestamps.txt"
-        with remote_errors(file):
-            if not file.exists():
-                return
+        if not exist(file):
+            return
         with file_errors(file):
             self.timestamps = read_times(file)[self._frames].tolist()
         self._has_times = True
@@ -160,41 +143,50 @@ class KITTILog(ArraysLog):
         """Return the poses of the LiDAR; None, with a warning, if a file that they need is missing."""
         root, name = self.drive.root, self.drive.clouds.name
         is_raw = self.drive.layout == "raw"
-        calibration = self._calibration("calib_imu_to_velo.txt") if is_raw else root / "calib" / f"{name}.txt"
+        folder = root / "oxts" / "data" if is_raw else root / "oxts"
+        wanted = [f"{file.stem}.txt" for file in self.files] if is_raw else [f"{name}.txt"]
         with remote_errors(root):
-            if is_raw:
-                files = {int(file.stem): file for file in (root / "oxts" / "data").glob("*.txt") if file.stem.isdigit()}
-                wanted = [files.get(frame) for frame in self._frames]
-                has_oxts = all(file is not None for file in wanted)
-                what = f"oxts/data has {sum(file is not None for file in wanted)} measurements for {len(wanted)} sweeps"
-            else:
-                wanted = [root / "oxts" / f"{name}.txt"]
-                has_oxts = bool(wanted[0] and wanted[0].exists())
-                what = f"there is no oxts/{name}.txt"
-            has_calibration = calibration is not None and calibration.exists()
-        if not has_oxts or not has_calibration or calibration is None:
-            missing = "calib_imu_to_velo.txt of its day is missing" if is_raw else f"calib/{name}.txt is missing"
-            warn(
-                f"log {self.log_id}: {missing if has_oxts else what}, so it has no poses. Download it to {root}"
-                f"{' or the folder of the day' if is_raw else ''}, or set data.odometry=true"
-            )
+            known = {file.name for file in folder.glob("*.txt")}
+        lost = [each for each in wanted if each not in known]
+        calibration = self._calibration("imu_to_velo")
+        if lost or calibration is None:
+            what = f"there is no oxts/{name}.txt"
+            if calibration is None:
+                what = "calib_imu_to_velo.txt of its day is missing" if is_raw else f"calib/{name}.txt is missing"
+            elif is_raw:
+                what = f"oxts/data has {len(wanted) - len(lost)} measurements for {len(wanted)} sweeps"
+            where = f"{root}{' or the folder of the day' if is_raw else ''}"
+            self._note(f"{what}, so it has no poses. Download it to {where}, or set data.odometry=true")
             return None
-        table = np.concatenate([_numbers(file) for file in wanted if file is not None])
+        table = np.concatenate([read_numbers(folder / each) for each in wanted])
         if not is_raw and len(table) <= max(self._frames):
             raise CFlowError(
-                f"{wanted[0]} has {len(table)} lines; sweep {max(self._frames)} needs its own; copy it again"
+                f"{folder / wanted[0]} has {len(table)} lines; sweep {max(self._frames)} needs its own; copy it again"
             )
-        poses = poses_from_oxts(table, wanted[0])
+        poses = poses_from_oxts(table, folder / wanted[0])
         poses = poses if is_raw else poses[self._frames]
-        values = read_calibration(calibration)
-        T_lidar_imu = transform(values, calibration, "R T", "Tr_imu_velo", "Tr_imu_to_velo")
-        T_world_lidar = poses @ np.linalg.inv(T_lidar_imu)
+        names = ("imu_to_velo.R imu_to_velo.T", "Tr_imu_velo", "Tr_imu_to_velo")
+        T_world_lidar = poses @ np.linalg.inv(transform(calibration, root, *names))
         return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar  # type: ignore[no-any-return]
 
-    def _calibration(self, name: str) -> Path | None:
-        """Return a calibration of a raw drive, in its folder or that of its day."""
-        files = [folder / name for folder in (self.drive.root, self.drive.root.resolve().parent)]
-        return next((file for file in files if file.exists()), None)
+    def _calibration(self, *names: str) -> dict[str, np.ndarray] | None:
+        """Read the calibration of the drive: key of a line -> numbers; None if a file is missing.
+
+        Raw drives have a file for each of the `names`, in their folder or that of their day, and its name is put in
+        front of the keys: `velo_to_cam.R`. Other layouts have one file for all.
+        """
+        root, values = self.drive.root, {}
+        single = (
+            root / "calib.txt" if self.drive.layout == "sequence" else root / "calib" / f"{self.drive.clouds.name}.txt"
+        )
+        for name in names:
+            places = [folder / f"calib_{name}.txt" for folder in (root, root.resolve().parent)]
+            file = next(filter(exist, places if self.drive.layout == "raw" else [single]), None)
+            if file is None:
+                return None
+            prefix = f"{name}." if self.drive.layout == "raw" else ""
+            values.update({prefix + key: numbers for key, numbers in read_calibration(file).items()})
+        return values
 
     def cameras(self, index: int) -> list[Camera]:
         """Return the colour cameras, image_02 and image_03, whose images are rectified."""
@@ -223,73 +215,38 @@ class KITTILog(ArraysLog):
 
     def _camera(self, name: str = _ANNOTATED_CAMERA) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the (4, 4) `T_camera0_lidar` with rectification, and the (3, 4) projection of a camera."""
-        if self.drive.layout == "sequence":
-            file: Any = self.drive.root / "calib.txt"
-            if not file.exists():
-                return None
-            values = read_calibration(file)
-            T_camera_lidar = transform(values, file, "Tr")
-            rectification = np.eye(4)
-            projection = values.get(f"P{int(name)}")
-        elif self.drive.layout == "tracking":
-            file = self.drive.root / "calib" / f"{self.drive.clouds.name}.txt"
-            if not file.exists():
-                return None
-            values = read_calibration(file)
-            T_camera_lidar = transform(values, file, "Tr_velo_cam", "Tr_velo_to_cam")
-            rectification = transform(values, file, "R_rect", "R0_rect")
-            projection = values.get(f"P{int(name)}")
-        else:
-            file, to_camera = (self._calibration(f"calib_{name}.txt") for name in ("cam_to_cam", "velo_to_cam"))
-            if file is None or to_camera is None:
-                return None
-            values = read_calibration(file)
-            T_camera_lidar = transform(read_calibration(to_camera), to_camera, "R T")
-            rectification = transform(values, file, "R_rect_00")
-            projection = values.get(f"P_rect_{name}")
+        values = self._calibration("cam_to_cam", "velo_to_cam")
+        if values is None:
+            return None
+        root = self.drive.root
+        rotation = np.eye(4)
+        if self.drive.layout != "sequence":
+            rotation = transform(values, root, "cam_to_cam.R_rect_00", "R_rect", "R0_rect")
+        projection = values.get(f"cam_to_cam.P_rect_{name}", values.get(f"P{int(name)}"))
         if projection is None and name != _ANNOTATED_CAMERA:
             return None
         if projection is None or len(projection) != 12:
-            raise CFlowError(f"{file} has no projection of camera {int(name)} with 12 numbers; copy it again")
-        return rectification @ T_camera_lidar, projection.reshape(3, 4)
+            raise CFlowError(
+                f"{root}: its calibration has no projection of camera {int(name)} with 12 numbers; copy it again"
+            )
+        T_camera_lidar = transform(values, root, "velo_to_cam.R velo_to_cam.T", *CAMERA_KEYS)
+        return rotation @ T_camera_lidar, projection.reshape(3, 4)
 
     def _projection(self) -> np.ndarray | None:
         camera = self._camera()
         return None if camera is None else camera[1] @ camera[0]
 
-    def _read_boxes(self) -> dict[int, FrameBoxes]:
-        """Read the boxes of all frames; {} if the drive has none."""
+    @cached_property
+    def _boxes(self) -> dict[int, FrameBoxes]:
+        """Boxes by the number of the frame; {} if the drive has none."""
         root = self.drive.root
         tracklets = root / "tracklet_labels.xml"
         tracks = root / "label_02" / f"{self.drive.clouds.name}.txt"
-        with remote_errors(root):
-            if self.drive.layout == "raw" and tracklets.exists():
-                return stored_labels.read_tracklets(tracklets)
-            if self.drive.layout == "tracking" and tracks.exists():
-                camera = self._camera()
-                if camera is None:
-                    raise CFlowError(
-                        f"{tracks} needs the calibration calib/{tracks.name}, which is missing; download it"
-                    )
-                return stored_labels.read_tracking_labels(tracks, np.linalg.inv(camera[0]))
+        if self.drive.layout == "raw" and exist(tracklets):
+            return stored_labels.read_tracklets(tracklets)
+        if self.drive.layout == "tracking" and exist(tracks):
+            camera = self._camera()
+            if camera is None:
+                raise CFlowError(f"{tracks} needs the calibration calib/{tracks.name}, which is missing; download it")
+            return stored_labels.read_tracking_labels(tracks, np.linalg.inv(camera[0]))
         return {}
-
-
-def _restored(state: dict[str, Any]) -> KITTILog:
-    log = KITTILog.__new__(KITTILog)
-    log.__dict__.update(state)
-    log._boxes_of = lru_cache(1)(log._read_boxes)
-    return log
-
-
-def _drives_along_x(poses: np.ndarray) -> bool:
-    """Test whether poses (K, 4, 4) move along their own x axis more than along y and z."""
-    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
-    along = np.abs(steps[:, :3, 3]).sum(axis=0)
-    return bool(along[0] > along[1] + along[2])
-
-
-def _numbers(file: Path) -> np.ndarray:
-    with file_errors(file):
-        lines: Sequence[str] = read_bytes(file).decode("utf-8").splitlines()
-        return np.array([line.split() for line in lines if line.strip()], np.float64)

@@ -12,7 +12,7 @@ from cflow_torch.data.boxes import Boxes, category_indices, flow_from_boxes, poi
 from cflow_torch.data.camera import Camera, at_image
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.log import FlowLabels, Log
-from cflow_torch.data.nuscenes.tables import CameraChain, LidarChain, SceneSource, Tables, Tracks, find_scenes
+from cflow_torch.data.nuscenes.tables import Chain, SceneSource, Tables, Tracks, find_scenes
 from cflow_torch.data.paths import PathLike, as_path, path_inside, read_bytes, remote_errors
 from cflow_torch.transforms import poses_at, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep
@@ -80,6 +80,7 @@ class NuScenesLog(Log):
 
     Attributes:
         log_id: name of the scene.
+        poses: (K, 4, 4) float64 `T_world_ego` of every sweep.
         timestamps: sweep times of the data set, in microseconds; `Sweep.timestamp_ns` is in nanoseconds.
         sample_tokens: token of each key frame; None = the sweep is not a key frame.
 
@@ -108,13 +109,14 @@ class NuScenesLog(Log):
         if sweep_step < 1:
             raise CFlowError(f"sweep_step={sweep_step}: pass 1 for all sweeps, 2 for every second one")
         self.log_id = source.name
-        self._source = source
         self._root = as_path(source.root)
         self._deskew = deskew
         self.is_compensated = deskew and self._has_times
         self._own_vehicle = self.OWN_VEHICLE if own_vehicle == "auto" else own_vehicle
         folder = self._root / source.version
-        sample_times, known, annotations = (source.tables or Tables(folder)).scene(source.name)
+        self._tables = source.tables or Tables(folder)
+        sample_times, annotations = self._tables.scene(source.name)
+        known = self._tables.chains(source.name, "lidar")
         with file_errors(folder / "category.json"):
             category_indices(annotations.category, self._categories)
         missing = [] if lidars is None else [name for name in lidars if name not in known]
@@ -128,7 +130,7 @@ class NuScenesLog(Log):
         self._odometry = (reference.times, reference.ego)
         self._tracks = Tracks(sample_times, annotations)
 
-    def _keep_sweeps(self, reference: LidarChain, sweep_step: int, folder: Path) -> None:
+    def _keep_sweeps(self, reference: Chain, sweep_step: int, folder: Path) -> None:
         """Keep key frames, and every `sweep_step`-th sweep counted from the last key frame."""
         row = np.arange(len(reference.times))
         last_key = np.maximum.accumulate(np.where(reference.is_key_frame, row, 0))
@@ -136,16 +138,11 @@ class NuScenesLog(Log):
         self.timestamps = reference.times[kept].tolist()
         self._check_count(f"scene {self.log_id} in {folder}")
         self._check_files(reference, kept, int((row - last_key).max()) + 1)
-        self._poses = reference.ego[kept]
+        self.poses: np.ndarray = reference.ego[kept]
         self.sample_tokens = [reference.samples[k] if reference.is_key_frame[k] else None for k in kept.tolist()]
-        self._T_ego_world = np.linalg.inv(self._poses)
+        self._T_ego_world = np.linalg.inv(self.poses)
 
-    @cached_property
-    def poses(self) -> np.ndarray:
-        """(K, 4, 4) float64 `T_world_ego` of every sweep."""
-        return self._poses
-
-    def _check_files(self, chain: LidarChain, kept: np.ndarray, step: int) -> None:
+    def _check_files(self, chain: Chain, kept: np.ndarray, step: int) -> None:
         """Say in one error if only key frames are there, or no file of the scene. We look at three files of a kind."""
         kinds = []
         for is_key_frame in (True, False):
@@ -174,32 +171,31 @@ class NuScenesLog(Log):
         """Read sweep `index`: all LiDARs in one ego frame, in the order of `lidars`, else of sensor.json."""
         points, lag = self._cloud(index)
         times = lag * 1e-6 if lag.any() else None
-        return Sweep(points, None, self._poses[index].copy(), self.timestamps[index] * 1000, times)
+        return Sweep(points, None, self.poses[index].copy(), self.timestamps[index] * 1000, times)
 
     def cameras(self, index: int) -> list[Camera]:
         """Return all cameras of the scene, each with its image nearest in time."""
         time = self._timestamp(index)
         cameras = []
-        for name, chain in self._camera_chains.items():
+        for name, chain in self._camera_chains:
             row = int(np.abs(chain.times - time).argmin())
             image = Path(chain.files[row]).stem
             width, height = chain.sizes[row].tolist()
-            T_camera_ego = at_image(chain.mount[row], chain.ego[row], self._poses[index])
+            T_camera_ego = at_image(chain.mount[row], chain.ego[row], self.poses[index])
             seconds = int(chain.times[row] - time) * 1e-6
             cameras.append(Camera(name, image, (width, height), chain.matrix[row], T_camera_ego, seconds))
         return cameras
 
     @cached_property
-    def _camera_chains(self) -> dict[str, CameraChain]:
-        tables = self._source.tables or Tables(self._root / self._source.version)
-        return tables.cameras(self.log_id)
+    def _camera_chains(self) -> list[tuple[str, Chain]]:
+        return sorted(self._tables.chains(self.log_id, "camera").items())
 
     def _labels(self, index: int) -> FlowLabels | None:
         time0, time1 = self.timestamps[index : index + 2]
         if time0 < self._tracks.start or time1 > self._tracks.end:
             return None
         points, lag = self._cloud(index)
-        T_ego1_ego0 = self._T_ego_world[index + 1] @ self._poses[index]
+        T_ego1_ego0 = self._T_ego_world[index + 1] @ self.poses[index]
         flow = np.zeros((len(points), 3), dtype=np.float32)
         category, is_valid = np.zeros(len(points), dtype=np.uint8), np.zeros(len(points), dtype=bool)
         # A shot hits an object where its box is at the time of the shot, so we add the lag to the times of both boxes.
@@ -233,7 +229,7 @@ class NuScenesLog(Log):
                 clouds.append(self._lidar_points(chain, row, index))
         return np.concatenate([points for points, _ in clouds]), np.concatenate([lag for _, lag in clouds])
 
-    def _lidar_points(self, chain: LidarChain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
+    def _lidar_points(self, chain: Chain, row: int, index: int) -> tuple[np.ndarray, np.ndarray]:
         file = path_inside(self._root, chain.files[row], f"scene {self.log_id}: the filename in sample_data.json")
         local, times = self._points_of(file)
         points = transform_points(local, chain.mount[row])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Collection, Dict, NamedTuple, Sequence
+from typing import Any, Collection, Dict, Mapping, NamedTuple, Sequence
 
 import numpy as np
 
@@ -36,6 +36,7 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "instance": ("token", "category_token"),
     "sample_annotation": ("sample_token", "instance_token", "translation", "size", "rotation"),
 }
+_CAMERA_FIELDS = {"calibrated_sensor": ("camera_intrinsic",), "sample_data": ("width", "height")}
 
 
 @dataclass(frozen=True)
@@ -49,26 +50,17 @@ class SceneSource:
     tables: Tables | None = field(default=None, repr=False, compare=False)
 
 
-class LidarChain(NamedTuple):
-    """The M sweeps of one LiDAR in one scene, ordered by time."""
+class Chain(NamedTuple):
+    """The M sweeps of one LiDAR, or images of one camera, in one scene, ordered by time."""
 
     times: np.ndarray  # (M,) int64, microseconds
     is_key_frame: np.ndarray  # (M,) bool
     files: tuple[str, ...]  # relative to the data root
-    ego: np.ndarray  # (M, 4, 4) float64 `T_world_ego` at each sweep's own time
+    ego: np.ndarray  # (M, 4, 4) float64 `T_world_ego` at each one's own time
     mount: np.ndarray  # (M, 4, 4) float64 `T_ego_sensor`
-    samples: tuple[str, ...]  # token of the sample that each sweep belongs to
-
-
-class CameraChain(NamedTuple):
-    """The M images of one camera in one scene, ordered by time."""
-
-    times: np.ndarray  # (M,) int64, microseconds
-    files: tuple[str, ...]  # relative to the data root
-    sizes: np.ndarray  # (M, 2) int64 width and height, pixels
-    ego: np.ndarray  # (M, 4, 4) float64 `T_world_ego` at each image's own time
-    mount: np.ndarray  # (M, 4, 4) float64 `T_ego_camera`
-    matrix: np.ndarray  # (M, 3, 3) float64 intrinsic matrix
+    samples: tuple[str, ...]  # token of the sample that each belongs to
+    sizes: np.ndarray  # (M, 2) int64 width and height of images, pixels; 0 for LiDARs
+    matrix: np.ndarray  # (M, 3, 3) float64 intrinsic matrices of a camera; (0, 3, 3) for LiDARs
 
 
 class Annotations(NamedTuple):
@@ -89,10 +81,11 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
     all versions, that is a `CFlowError`.
     """
     what = "the data root, which holds v1.0-mini or the like"
-    versions = find_folders(
-        *(as_path(root), lambda folder: (folder / "scene.json").is_file(), SEARCH_DEPTH, what),
-        lambda child: child.name not in _SENSOR_FOLDERS,
+    is_version, is_passed = (
+        (lambda folder: (folder / "scene.json").is_file()),
+        (lambda c: c.name not in _SENSOR_FOLDERS),
     )
+    versions = find_folders(as_path(root), is_version, SEARCH_DEPTH, what, is_passed=is_passed)
     alien = [v for v in versions if any((v / f"{table}.json").exists() for table in foreign)]
     if alien and len(alien) == len(versions):
         raise CFlowError(f"{alien[0]} is not {data_set}: it has one of {sorted(foreign)}; choose the other reader")
@@ -104,9 +97,9 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
 
 
 def read_table(
-    folder: Path, table: str, key: str = "", values: Collection[str] = (), more: Sequence[str] = ()
+    folder: Path, table: str, key: str = "", values: Collection[str] = (), more: Mapping[str, Sequence[str]] = {}
 ) -> list[Row]:
-    """Read the rows of a table with the fields of `FIELDS` and `more`.
+    """Read the rows of a table with the fields of `FIELDS`, and `more` of some tables.
 
     With a `key`, we read only rows whose `key` is one of `values`.
 
@@ -117,7 +110,7 @@ def read_table(
     def use(row: Row) -> Row | None:  # called while parsing, so dropped rows and fields need no memory
         if key and row[key] not in values:
             return None
-        return {name: row[name] for name in (*FIELDS[table], *more)}
+        return {name: row[name] for name in (*FIELDS[table], *more.get(table, ()))}
 
     with file_errors(file, "copy all tables of the version"):
         rows = read_json(file, use)
@@ -126,17 +119,23 @@ def read_table(
         return [row for row in rows if row is not None]
 
 
-class Tables:
-    """The tables of one version, `<data root>/<version>`. We read them once, when they are first needed.
+class _Measured(NamedTuple):
+    """What all sensors of one modality measured."""
 
-    Cost: about 5 s per million rows (measured on one core). We drop rows of cameras and radars while we read.
+    rows: dict[str, list[Row]]  # token of the scene -> rows of sample_data
+    mounts: dict[str, Row]
+    poses: dict[str, Row]
+
+
+class Tables:
+    """The tables of one version, `<data root>/<version>`. We read each once, when it is first needed.
+
+    Cost: about 5 s per million rows (measured on one core). We drop rows of other modalities while we read.
     """
 
     def __init__(self, folder: PathLike) -> None:
         self.folder = as_path(folder)
-        self._rows: dict[str, dict[str, list[Row]]] = {}  # table -> token of the scene -> its rows
-        self._by_token: dict[str, dict[str, Row]] = {}
-        self._images: dict[str, list[Row]] | None = None  # token of the scene -> its images
+        self._measured: dict[str, _Measured] = {}
 
     @cached_property
     def scenes(self) -> dict[str, str]:
@@ -148,79 +147,55 @@ class Tables:
             raise CFlowError(f"{file} has {len(rows)} scenes but {len(scenes)} names; {_COPY}")
         return scenes
 
-    def scene(self, name: str) -> tuple[np.ndarray, dict[str, LidarChain], Annotations]:
-        """Return the rows of a scene, linked and checked: sample times, LiDARs by channel as in sensor.json, and boxes.
+    def scene(self, name: str) -> tuple[np.ndarray, Annotations]:
+        """Return the times of the samples of a scene, ascending int64 microseconds, and its boxes.
 
-        The times are ascending int64 microseconds. If a row refers to a missing one, or if two sweeps of a LiDAR or two
-        samples have the same time, that is a `CFlowError`.
+        If a row refers to a missing one, or two samples have the same time, that is a `CFlowError`.
         """
         with file_errors(f"{self.folder}, {name}", _COPY):
-            if not self._rows:
-                self._load()
-            rows = {table: by_scene[self.scenes[name]] for table, by_scene in self._rows.items()}
-            samples = self._ordered("sample", rows["sample"])
-            channels: dict[str, list[Row]] = {row["channel"]: [] for row in self._by_token["sensor"].values()}
-            for row in self._ordered("sample_data", rows["sample_data"], "calibrated_sensor_token"):
-                mount = self._by_token["calibrated_sensor"][row["calibrated_sensor_token"]]
-                channels[self._by_token["sensor"][mount["sensor_token"]]["channel"]].append(row)
-            lidars = {channel: self._chain(sweeps) for channel, sweeps in channels.items() if sweeps}
-            return _times(samples), lidars, self._annotations(rows["sample_annotation"])
+            token = self.scenes[name]
+            samples = [row for row in self._by_token["sample"].values() if row["scene_token"] == token]
+            return _times(self._ordered("sample", samples)), self._annotations(self._boxes_of_scene[token])
 
-    def cameras(self, name: str) -> dict[str, CameraChain]:
-        """Read the cameras of a scene, by channel. The tables of images are read when this is first called."""
+    def chains(self, name: str, modality: str) -> dict[str, Chain]:
+        """Return what the sensors of a modality, "lidar" or "camera", measured in a scene, as in sensor.json.
+
+        If a row refers to a missing one, or two rows of a sensor have the same time, that is a `CFlowError`.
+        """
         with file_errors(f"{self.folder}, {name}", _COPY):
-            if self._images is None:
-                self._images = self._load_images()
-            channels: dict[str, list[Row]] = defaultdict(list)
-            for row in self._ordered("sample_data", self._images[self.scenes[name]], "calibrated_sensor_token"):
-                sensor = row["mount"]["sensor_token"]
-                channels[self._by_token["sensor"][sensor]["channel"]].append(row)
-            return {channel: self._camera_chain(rows) for channel, rows in sorted(channels.items())}
+            if modality not in self._measured:
+                self._measured[modality] = self._read_measured(modality)
+            rows, mounts, poses = self._measured[modality]
+            sensors = self._by_token["sensor"]
+            channels: dict[str, list[Row]] = {row["channel"]: [] for row in sensors.values()}
+            for row in self._ordered("sample_data", rows[self.scenes[name]], "calibrated_sensor_token"):
+                sensor = mounts[row["calibrated_sensor_token"]]["sensor_token"]
+                channels[sensors[sensor]["channel"]].append(row)
+            return {channel: self._chain(of_one, mounts, poses) for channel, of_one in channels.items() if of_one}
 
-    def _load_images(self) -> dict[str, list[Row]]:
-        """Return the rows of images of each scene, each with the rows of its mount and its ego pose."""
-        if not self._rows:
-            self._load()
-        cameras = [token for token, row in self._by_token["sensor"].items() if row["modality"] == "camera"]
-        rows = read_table(self.folder, "calibrated_sensor", "sensor_token", cameras, ("camera_intrinsic",))
-        mounts = {row["token"]: row for row in rows}
-        images = read_table(self.folder, "sample_data", "calibrated_sensor_token", mounts, ("width", "height"))
-        poses = read_table(self.folder, "ego_pose", "token", {row["ego_pose_token"] for row in images})
-        pose_of = {row["token"]: row for row in poses}
+    @cached_property
+    def _by_token(self) -> dict[str, dict[str, Row]]:
+        tables = ("sensor", "category", "instance", "sample")
+        return {table: _by_token(read_table(self.folder, table)) for table in tables}
+
+    @cached_property
+    def _boxes_of_scene(self) -> dict[str, list[Row]]:
+        return self._by_scene(read_table(self.folder, "sample_annotation"))
+
+    def _by_scene(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
         grouped: dict[str, list[Row]] = defaultdict(list)
-        for row in images:
-            row["mount"] = mounts[row["calibrated_sensor_token"]]
-            row["ego"] = pose_of[row["ego_pose_token"]]
+        for row in rows:
             grouped[self._by_token["sample"][row["sample_token"]]["scene_token"]].append(row)
         return grouped
 
-    def _camera_chain(self, rows: Sequence[Row]) -> CameraChain:
-        return CameraChain(
-            times=_times(rows),
-            files=tuple(row["filename"] for row in rows),
-            sizes=np.array([(row["width"], row["height"]) for row in rows], dtype=np.int64),
-            ego=self._poses("ego_pose", [row["ego"] for row in rows]),
-            mount=self._poses("calibrated_sensor", [row["mount"] for row in rows]),
-            matrix=np.array([row["mount"]["camera_intrinsic"] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
-        )
-
-    def _load(self) -> None:
-        by_token = self._by_token
-        for table in ("sensor", "category", "instance", "sample"):
-            by_token[table] = {row["token"]: row for row in read_table(self.folder, table)}
-        lidars = [token for token, row in by_token["sensor"].items() if row["modality"] == "lidar"]
-        mounts = read_table(self.folder, "calibrated_sensor", "sensor_token", lidars)
-        by_token["calibrated_sensor"] = {row["token"]: row for row in mounts}
-        sweeps = read_table(self.folder, "sample_data", "calibrated_sensor_token", by_token["calibrated_sensor"])
-        poses = read_table(self.folder, "ego_pose", "token", {row["ego_pose_token"] for row in sweeps})
-        by_token["ego_pose"] = {row["token"]: row for row in poses}
-        rows = {"sample_data": sweeps, "sample_annotation": read_table(self.folder, "sample_annotation")}
-        for table, content in (*rows.items(), ("sample", list(by_token["sample"].values()))):
-            grouped: dict[str, list[Row]] = defaultdict(list)
-            for row in content:
-                sample = row if table == "sample" else by_token["sample"][row["sample_token"]]
-                grouped[sample["scene_token"]].append(row)
-            self._rows[table] = grouped
+    def _read_measured(self, modality: str) -> _Measured:
+        sensors = [token for token, row in self._by_token["sensor"].items() if row["modality"] == modality]
+        more = _CAMERA_FIELDS if modality == "camera" else {}
+        read = partial(read_table, self.folder, more=more)
+        mounts = _by_token(read("calibrated_sensor", "sensor_token", sensors))
+        rows = read("sample_data", "calibrated_sensor_token", mounts)
+        poses = _by_token(read("ego_pose", "token", {row["ego_pose_token"] for row in rows}))
+        return _Measured(self._by_scene(rows), mounts, poses)
 
     def _ordered(self, table: str, rows: Sequence[Row], key: str = "scene_token") -> list[Row]:
         """Sort rows by time. Two rows with the same time and `key` are an error."""
@@ -228,15 +203,18 @@ class Tables:
             raise CFlowError(f"{self.folder / table}.json has two rows of one {key} and one time; {_COPY}")
         return sorted(rows, key=lambda row: row["timestamp"])
 
-    def _chain(self, rows: Sequence[Row]) -> LidarChain:
-        mounts = [self._by_token["calibrated_sensor"][row["calibrated_sensor_token"]] for row in rows]
-        return LidarChain(
+    def _chain(self, rows: Sequence[Row], mounts: Mapping[str, Row], poses: Mapping[str, Row]) -> Chain:
+        of_rows = [mounts[row["calibrated_sensor_token"]] for row in rows]
+        matrices = [mount["camera_intrinsic"] for mount in of_rows if "camera_intrinsic" in mount]
+        return Chain(
             times=_times(rows),
             is_key_frame=np.array([row["is_key_frame"] for row in rows], dtype=bool),
             files=tuple(row["filename"] for row in rows),
-            ego=self._poses("ego_pose", [self._by_token["ego_pose"][row["ego_pose_token"]] for row in rows]),
-            mount=self._poses("calibrated_sensor", mounts),
+            ego=self._poses("ego_pose", [poses[row["ego_pose_token"]] for row in rows]),
+            mount=self._poses("calibrated_sensor", of_rows),
             samples=tuple(row["sample_token"] for row in rows),
+            sizes=np.array([(row.get("width", 0), row.get("height", 0)) for row in rows], dtype=np.int64),
+            matrix=np.array(matrices, dtype=np.float64).reshape(-1, 3, 3),
         )
 
     def _annotations(self, rows: Sequence[Row]) -> Annotations:
@@ -254,6 +232,10 @@ class Tables:
         """Return (K, 4, 4) float64."""
         translation, rotation = ([row[key] for row in rows] for key in ("translation", "rotation"))
         return poses_from_quaternions(translation, rotation, lambda _: f"{self.folder / table}.json: a pose")
+
+
+def _by_token(rows: Sequence[Row]) -> dict[str, Row]:
+    return {row["token"]: row for row in rows}
 
 
 def _times(rows: Sequence[Row]) -> np.ndarray:

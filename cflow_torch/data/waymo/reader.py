@@ -13,9 +13,9 @@ import pyarrow.parquet as pq
 
 from cflow_torch.data.boxes import Boxes, BoxLog, category_indices
 from cflow_torch.data.file_errors import check_columns, file_errors
-from cflow_torch.data.folders import find_folders
+from cflow_torch.data.folders import search
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.data.paths import PathLike, as_path, remote_errors, source_for_mmap, source_for_random_access
+from cflow_torch.data.paths import PathLike, as_path, exist, source_for_mmap, source_for_random_access
 from cflow_torch.data.waymo.range_image import LASERS, NO_LABEL_ZONE, TOP, LaserCalibration, range_image_points
 from cflow_torch.transforms import rigid_transform, upright_poses
 from cflow_torch.types import CFlowError, Sweep
@@ -57,8 +57,7 @@ def find_waymo_segments(root: PathLike) -> list[Path]:
             f"{root}: .tfrecord is version 1 of the Waymo Open Dataset, which we do not read; download the parquet "
             "files of version 2 (same drives): lidar, lidar_pose, lidar_calibration, vehicle_pose, lidar_box"
         )
-    splits = find_folders(root, lambda folder: (folder / "lidar").is_dir(), SEARCH_DEPTH, what)
-    return sorted(file for split in splits for file in (split / "lidar").glob("*.parquet"))
+    return sorted(search(root, lambda split: list((split / "lidar").glob("*.parquet")), SEARCH_DEPTH, what))
 
 
 class WaymoLog(BoxLog):
@@ -170,9 +169,8 @@ class WaymoLog(BoxLog):
     def _box_rows(self) -> dict[int, list[list[Any]]]:
         """Read the rows of boxes by frame time; empty if the segment has no labels (the testing split)."""
         component, by_frame = Component(self.file, "lidar_box"), defaultdict(list)
-        with remote_errors(component.file):
-            if not component.file.exists():
-                return {}
+        if not exist(component.file):
+            return {}
         for time, *row in component.rows((TIME, TRACK, *(f"{BOX}{name}" for name in _BOX_COLUMNS))):
             by_frame[time].append(row)
         return by_frame

@@ -11,9 +11,10 @@ import pyarrow as pa
 from pyarrow import feather
 
 from cflow_torch.data.atomic import new_folder
+from cflow_torch.data.av2 import GroundRaster
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.simulator.drive import Drive
-from cflow_torch.simulator.recording import AnnotationBoxes, GroundGrid
+from cflow_torch.simulator.recording import AnnotationBoxes
 from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import Sweep
 
@@ -100,16 +101,15 @@ def _annotations(stamp: int, boxes: AnnotationBoxes) -> Mapping[str, np.ndarray]
     }
 
 
-def _write_map(folder: Path, log_id: str, raster: GroundGrid) -> None:
+def _write_map(folder: Path, log_id: str, raster: GroundRaster) -> None:
     """Write the ground raster, its transform, and a vector map with the raster's outline as drivable area."""
-    (x0, y0), step = raster.origin, raster.step
-    rows, columns = raster.height.shape
     folder.mkdir()
-    np.save(folder / f"{log_id}_ground_height_surface____{CITY}.npy", raster.height.astype(np.float16))
-    # Pixel = s (R x + t) at the world position x, so t is in metres.
-    sim2 = {"R": [1.0, 0.0, 0.0, 1.0], "t": [-x0, -y0], "s": 1.0 / step}
+    np.save(folder / f"{log_id}_ground_height_surface____{CITY}.npy", raster.heights.astype(np.float16))
+    sim2 = {"R": raster.rotation.ravel().tolist(), "t": raster.translation.tolist(), "s": raster.scale}
     (folder / f"{log_id}___img_Sim2_city.json").write_text(json.dumps(sim2))
-    x1, y1 = x0 + columns * step, y0 + rows * step
+    x0, y0 = -raster.translation
+    rows, columns = raster.heights.shape
+    x1, y1 = x0 + columns / raster.scale, y0 + rows / raster.scale
     outline = [{"x": x, "y": y, "z": 0.0} for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
     archive = {
         "pedestrian_crossings": {},

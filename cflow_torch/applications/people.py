@@ -1,0 +1,102 @@
+"""Divide the tracks of people who walk together, whose points the flow takes for one object."""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cflow_torch.applications.missed_sweeps import SweepTracks
+from cflow_torch.applications.moving_groups import MIN_POINTS
+from cflow_torch.applications.track_table import Table
+from cflow_torch.applications.whole_boxes import RUNNING, turned
+from cflow_torch.ops.labeling import connected_components
+from cflow_torch.ops.nearest import nearest_set_pixel
+
+_REACH = 3.0  # metres from the middle of the group; strays are farther
+_CELL = 0.15  # metres
+_GAP = 0.1  # in the gap between two people, a cell has at most this share of the points of the fullest cell
+_LEAST_SHARE = 0.1  # of the points of the group that a person has
+_LEAST_DISTANCE = 0.4  # metres between the middles of two people
+_LEAST_HEIGHT, _MOST_HEIGHT = 0.5, 2.2  # metres that nine tenths of the points of a person span; walls are higher
+_MOST_WIDTH = 1.0  # metres that they span along and across
+_LEAST_SWEEPS = 0.5  # share of the sweeps of the group in which a person is seen
+
+
+def divide_people(sweeps: Sequence[SweepTracks], table: Table) -> bool:
+    """Give each person of a group a track. `table` has the boxes of the groups. Returns whether a group was divided."""
+    row_of = {(sweep, number): row for row, (sweep, number) in enumerate(zip(table["sweep"], table["id"]))}
+    next_id = 1 + max((int(each.seen.id.max(initial=-1)) for each in sweeps), default=-1)
+    is_divided = False
+    for number in np.unique(table["id"]).tolist():
+        rows = np.flatnonzero(table["id"] == number)
+        if np.median(np.hypot(table["vx"][rows], table["vy"][rows])) >= RUNNING:
+            continue
+        seen = [each for each in sweeps if (each.points.sweep, number) in row_of and number in each.seen.id]
+        points = [_in_box(each, table, row_of[each.points.sweep, number]) for each in seen]
+        sweep = torch.arange(len(seen)).repeat_interleave(torch.tensor([len(each) for each in points]))
+        person = people(torch.cat(points), sweep)
+        others = int(person.max())
+        is_on_foot = table["class"][rows[0]] in ("pedestrian", "cyclist")
+        if others > 0 and person.min() >= 0 or is_on_foot and person.min() < 0:
+            ids = np.array([number, *range(next_id, next_id + others), -1])  # of person 0, 1, ...; of nobody
+            for index, each in enumerate(seen):
+                each.divide(number, ids[person[sweep == index].numpy()])
+            next_id += others
+            is_divided = True
+    return is_divided
+
+
+def _in_box(sweep: SweepTracks, table: Table, row: int) -> Tensor:
+    """Return the points of a track along the axes of its box, (P, 3) metres from its centre."""
+    index = int(np.searchsorted(sweep.seen.id, table["id"][row]))
+    offset = sweep.seen.positions(index) - [table[axis][row] for axis in "xyz"]
+    return turned(torch.from_numpy(offset), torch.full((len(offset),), -table["heading"][row], dtype=torch.float64))
+
+
+def people(points: Tensor, sweep: Tensor) -> Tensor:
+    """Tell the people of a group apart by the gaps between them.
+
+    Seen from the group, people who walk together stay in place. Over many sweeps, gaps between them remain.
+
+    Args:
+        points: (P, 3) metres in all sweeps, along the axes of the box of the group, from its centre.
+        sweep: (P,) int64 sweep of each point, from 0.
+
+    Returns:
+        (P,) int64 person of each point, 0 for the one with most points; -1 = it belongs to nobody. All 0 if there is
+        one person.
+    """
+    part = _parts(points[:, :2])
+    count = int(part.max()) + 1
+    of_part = [points[part == number] for number in range(count)]
+    middle = torch.stack([each.quantile(0.5, 0) for each in of_part])
+    length, width, height = torch.stack([each.quantile(0.95, 0) - each.quantile(0.05, 0) for each in of_part], 1)
+    if count == 1 or height.min() < _LEAST_HEIGHT or torch.pdist(middle[:, :2]).min() < _LEAST_DISTANCE:
+        return torch.zeros_like(part)
+    num_sweeps = torch.stack([(torch.bincount(sweep[part == k]) >= MIN_POINTS).sum() for k in range(count)])
+    is_person = num_sweeps >= _LEAST_SWEEPS * num_sweeps.max()
+    is_person &= (height <= _MOST_HEIGHT) & (torch.maximum(length, width) <= _MOST_WIDTH)
+    return torch.where(is_person, is_person.cumsum(0) - 1, -1)[part] if is_person.any() else torch.zeros_like(part)
+
+
+def _parts(points: Tensor) -> Tensor:
+    """Number the parts of a group of (P, 2) points between which there are gaps, (P,) int64, the largest part first."""
+    side = int(2 * _REACH / _CELL) + 1
+    cell = ((points.clamp(-_REACH, _REACH) + _REACH) / _CELL).long()
+    pixel = cell[:, 0] * side + cell[:, 1]
+    count = torch.bincount(pixel, minlength=side**2)
+    is_full = count > _GAP * count.max()
+    full = is_full.nonzero()[:, 0]
+    component = torch.full_like(count, -1)
+    component[full] = connected_components(is_full.view(1, side, side), full)
+
+    def nearest() -> Tensor:
+        return component[nearest_set_pixel(is_full.view(1, side, side), pixel)]
+
+    is_large = torch.bincount(nearest()) >= _LEAST_SHARE * len(points)
+    is_full &= is_large[component]
+    _, part, size = torch.unique(nearest(), return_inverse=True, return_counts=True)
+    return size.argsort(descending=True, stable=True).argsort()[part]

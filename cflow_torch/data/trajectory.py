@@ -1,0 +1,111 @@
+"""Poses over time: which of them belong to the sweeps of a log."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Sequence
+
+import numpy as np
+
+from cflow_torch.transforms import interpolate_motion, rigid_transform
+from cflow_torch.types import CFlowError
+
+_LONGEST_GAP_NS = 500_000_000  # longest time between two poses over which we interpolate
+_FEWEST_COVERED = 0.5  # share of sweeps at a pose, if poses are farther apart than that
+_SPARSE = 1.5  # sweep intervals between poses
+_TOLERANCE_NS = 1_000_000  # by which programs round times
+
+
+class Trajectory(NamedTuple):
+    """K poses, and their `source` for messages."""
+
+    # (K, 4, 4) float64 `T_world_frame`; the file does not say which frame. Without times, NaN where the file has NaN.
+    poses: np.ndarray
+    times_ns: np.ndarray | None  # (K,) int64 nanoseconds, ascending; None if the format has no times
+    is_kitti: bool  # 12 numbers without names, as KITTI's poses of a camera
+    source: str
+    labels: Sequence[str] = ()  # names of the rows, such as those of the clouds; () = unknown
+
+    def is_sparse(self, times_ns: Sequence[int]) -> bool:
+        """Test whether poses are clearly rarer than sweeps at these times."""
+        known: np.ndarray = np.zeros(0) if self.times_ns is None else self.times_ns
+        return bool(np.median(np.diff(known)) > _SPARSE * np.median(np.diff(times_ns)))
+
+
+def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
+    """Check (K, 4, 4) or (K, 3, 4) rigid motions and return them as (K, 4, 4) float64. Errors name the `source`."""
+    if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or matrices.dtype.kind not in "fiu":
+        raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; pass (K, 4, 4) numbers")
+    poses = np.tile(np.eye(4), (len(matrices), 1, 1))
+    poses[:, : matrices.shape[1]] = matrices
+    for row, pose in enumerate(poses):
+        rigid_transform(pose, f"pose {row} of {source}")
+    return poses
+
+
+def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.ndarray, np.ndarray, str]:
+    """Interpolate a trajectory at the times of sweeps, with constant speed and rate of turn between two poses.
+
+    Args:
+        trajectory: poses with times.
+        times_ns: M nanoseconds.
+
+    Returns:
+        (K, 4, 4) float64 poses of the sweeps that have one; which sweeps these are, (M,) bool; and how many have none,
+        and where, "" if all have one. At exactly the time of a pose, the result is this pose, unchanged.
+
+    Raises:
+        CFlowError: no sweep has a pose, or poses are mostly more than half a second apart.
+
+    Convention: a sweep has no pose more than a millisecond before the first pose or after the last one, and within a
+        gap of more than half a second.
+    """
+    known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
+    before, after, covered = _neighbours(known, wanted)
+    is_rare = bool(np.median(np.diff(known)) > _LONGEST_GAP_NS) and covered.mean() < _FEWEST_COVERED
+    if is_rare or not covered.any():
+        raise CFlowError(_describe_misfit(trajectory.source, known, wanted))
+    left, right, time = before[covered], after[covered], wanted[covered]
+    share = np.where(left == right, 0.0, (time - known[left]) / np.maximum(known[right] - known[left], 1))
+    poses = interpolate_motion(trajectory.poses[left], trajectory.poses[right], share)
+    return poses, covered, _describe_uncovered(trajectory.source, known, wanted, covered)
+
+
+def _describe_misfit(source: str, known: np.ndarray, wanted: np.ndarray) -> str:
+    where = f"the sweeps are at {wanted[0]} ... {wanted[-1]} ns"
+    if (wanted < known[0]).all() or (wanted > known[-1]).all():
+        lag = wanted[len(wanted) // 2] - known[len(known) // 2]
+        return (
+            f"{source} covers {known[0]} ... {known[-1]} ns, and {where}: the clocks differ by about "
+            f"{lag * 1e-9:.6g} s. Both must count from the same time; shift the times of one, or pass no poses"
+        )
+    rate = np.median(np.diff(known)) * 1e-9
+    return f"{source} has a pose every {rate:.3g} s; between poses, we interpolate up to 0.5 s; {where}"
+
+
+def _describe_uncovered(source: str, known: np.ndarray, wanted: np.ndarray, covered: np.ndarray) -> str:
+    """Say how many sweeps have no pose, and where; "" if all have one."""
+    lost = wanted[~covered]
+    if not len(lost):
+        return ""
+    early, late = int((lost < known[0]).sum()), int((lost > known[-1]).sum())
+    in_gaps = len(lost) - early - late
+    places = ((early, "before the first pose"), (late, "after the last pose"), (in_gaps, "in gaps"))
+    where = ", ".join(f"{count} {place}" for count, place in places if count)
+    gaps = f" of more than {_LONGEST_GAP_NS * 1e-9:g} s without poses" if in_gaps else ""
+    return f"{len(lost)} of {len(wanted)} sweeps have no pose in {source} and are left out: {where}{gaps}"
+
+
+def _neighbours(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the index of the pose before each time, of the one after it, and whether we may interpolate, (M,) each.
+
+    A time at a pose has this pose on both sides. So has a time outside of all poses or in a gap, if a pose is within a
+    millisecond: programs round times.
+    """
+    after = np.searchsorted(known, wanted).clip(0, len(known) - 1)  # the first pose at the time or after it
+    before = np.where(known[after] == wanted, after, after - 1).clip(0)
+    is_far = (wanted < known[0]) | (wanted > known[-1]) | (known[after] - known[before] > _LONGEST_GAP_NS)
+    nearest = np.where(np.abs(known[after] - wanted) <= np.abs(known[before] - wanted), after, before)
+    is_rounded = is_far & (np.abs(known[nearest] - wanted) <= _TOLERANCE_NS)
+    before = np.where(is_rounded, nearest, before)
+    after = np.where(is_rounded, nearest, after)
+    return before, after, ~is_far | is_rounded
