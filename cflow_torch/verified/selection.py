@@ -3,7 +3,7 @@
 A component wins if its motion has more evidence than its children together. But it may hold two objects, and the motion
 of the larger one wins. Where the smaller one is, hardly anything is found, neither in place nor at the targets of that
 motion, so the evidence does not fall. Therefore a node inside a winner *dissents* if its own motion, or "static", beats
-the motion of the winner in its own pixels:
+the motion of the winner in its own pixels. Two sweeps are too few to tell:
 
     winner     [   A     A  c  p ]     a car A, a cyclist c behind it and a parked car p: all move as A
     dissent              [c][p]        c moves by itself, p is static
@@ -56,8 +56,8 @@ def select_objects(
     Convention:
         The value of a child is its own evidence or the sum of its children's values, whichever is more, minus `price`,
         but at least 0. The coarsest node with more evidence than its children wins. Ties: the children win.
-        A node inside a winner dissents if its motion differs from that of the winner, and from the one it would take
-        from its parent, by a pixel per sweep interval in y or in x, and gains more than `price`.
+        With history, a node inside a winner dissents if its motion differs from that of the winner, and from the one it
+        would take from its parent, by a pixel per sweep interval in y or in x, and gains more than `price`.
 
     Cost: a few passes over the nodes for each level, and over the members; the paired test of nodes that may dissent.
     """
@@ -106,7 +106,8 @@ def _with_dissent(
     node = torch.arange(none, device=winner.device)
     motion = verdict.motion
     motion_around = Groups(winner, none).spread(motion)  # [N, 2]
-    is_inside = (tree.kind < tree.num_levels) & (winner < none) & (winner != node)
+    has_history = sweeps.has_history.index_select(0, tree.window)
+    is_inside = (tree.kind < tree.num_levels) & (winner < none) & (winner != node) & has_history
     inside = flat_nonzero(is_inside & _differ(motion, motion_around))
     if len(inside) == 0:
         return winner

@@ -105,12 +105,13 @@ def cut(nodes: Sequence[Node], evidence: Sequence[int]) -> list[int]:
 def dissent(sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], winner: Sequence[int], z: float) -> list[int]:
     """The node whose motion each node takes, -1 = none, from the winners of the cut.
 
-    A node inside a winner takes its own motion, or is static, if that differs from the motion of the winner, and from
-    what its parent takes, by a pixel in y or in x, and gains more than `PRICE` against the winner in its own pixels.
+    With history, a node inside a winner takes its own motion, or is static, if that differs from the motion of the
+    winner, and from what its parent takes, by a pixel in y or in x, and gains more than `PRICE` against the winner in
+    its own pixels.
     """
     taken = list(winner)
     for i, node in enumerate(tree.nodes):
-        if node.level >= len(tree.levels) or winner[i] in (-1, i):
+        if node.level >= len(tree.levels) or winner[i] in (-1, i) or not sweeps.has_history:
             continue
         taken[i] = taken[node.parent]
         around = motions[taken[i]] if taken[i] >= 0 else (0.0, 0.0)
