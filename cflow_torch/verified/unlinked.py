@@ -31,7 +31,6 @@ from cflow_torch.verified.unmatched import are_unmatched, find_unmatched
 
 # We chose these values on simulated highways, seeds 820 and 821.
 _LONGEST = 8.0  # metres, of a part
-_LEAST_REACH = 3  # pixels; sparse points are a part alone if their reach is as large (`Spacing`)
 _CELL = 0.8  # metres, of the map of the parts; a cell holds one part
 _NEAR = 2  # cells, around the place where a velocity puts a part
 _REACH = 8  # cells; objects that move farther from sweep to sweep are not linked
@@ -52,11 +51,11 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         max_speed: m/s; None = 60.
 
     Convention:
-        Parts have the pixels of a sweep that most other sweeps lack (`ChangedPixels.may_be_fast`). A part of t takes
-        its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least
-        half of the older sweeps. Of the velocities of a part of t, or of t+1, the one with the most sweeps wins, then
-        the one with the smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A
-        part belongs to its first node. The velocity of a node must win more slices near its targets than it loses.
+        Parts have the pixels of a sweep that are missing, or that every other sweep lacks. A part of t takes its
+        velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least half of
+        the older sweeps. Of the velocities of a part of t, or of t+1, the one with the most sweeps wins, then the one
+        with the smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part
+        belongs to its first node. The velocity of a node must win more slices near its targets than it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
@@ -95,7 +94,7 @@ class _Parts(NamedTuple):
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
-        """Select the parts that are at most `_LONGEST` long, of at least two pixels, or of one with a large reach."""
+        """Select the parts of at least two pixels that are at most `_LONGEST` long."""
         pixel = components.fast
         parts = components.parts
         if sweeps.batch.has_pairs:
@@ -105,9 +104,7 @@ class _Parts(NamedTuple):
         pixels = sweeps.pixels[pixel]
         extent = parts.max(pixels.row_col, empty=0) - parts.min(pixels.row_col, empty=FAR)  # [2, count]
         length = extent.amax(0) + 1
-        size, reach = parts.sum(torch.stack((torch.ones_like(pixel), sweeps.columns.reach_of(pixels).long())))
-        is_large = (size >= 2) | (reach >= _LEAST_REACH)
-        kept = flat_nonzero((length * sweeps.grid.pixel_size <= _LONGEST) & is_large)
+        kept = flat_nonzero((length * sweeps.grid.pixel_size <= _LONGEST) & (parts.size() >= 2))
         parts = parts.select(kept)
         image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
         window, step = split_index(image, sweeps.num_steps)
@@ -306,7 +303,7 @@ def _are_found(sweeps: HeightSlicedSweeps, pixels: Pixels, objects: Groups, velo
     """Tell which objects win more slices near their targets than they lose, (N,) bool.
 
     The exact test of their velocities follows (`verify`). This one rejects most links between plants, whose long boxes
-    would otherwise be correlated, for 4 % of the time of a window of KITTI.
+    would otherwise be correlated.
     """
     member = flat_nonzero(objects.is_member)
     near = count_wins(sweeps, pixels[member], objects[member], velocity[:, None]).near

@@ -64,10 +64,6 @@ CHEAP = (
     ("eval -m hydra/launcher=joblib data.seed=1,2", "pip install hydra-joblib-launcher hydra-submitit-launcher"),
     ("eval model.pixel_sizes=[0.2", "cannot read 'model.pixel_sizes=[0.2'"),
     ("eval model.method=dense", "is a setting of method verified"),
-    (
-        "flow data.first=6",
-        "cflow flow does not choose pairs by data.first: leave it out; `cflow eval` and `cflow view` do",
-    ),
     ("eval data.step=0", "data.step=0: give a whole number of at least 1"),
     ("flow data.first=6", "data.first is for cflow eval and cflow view: cflow flow takes every pair"),
     ("eval overwrite=maybe", "overwrite='maybe': give True or False"),

@@ -17,13 +17,11 @@ GAP, LONGEST, CELL = 0.4, 8.0, 0.8  # metres: pixels of a part, length of a part
 NEAR, REACH = 2, 8  # cells
 ERROR, SHARE = 0.7, 0.05  # metres, and metres for each metre
 NARROWEST = 0.4  # metres
-LEAST_REACH = 3  # pixels, of a part of one pixel
 LEAST_SIZE, LIKE = 16, 2  # in a pair: pixels times their reach of an unmatched component; ratio of numbers of pixels
 
 
 def parts_of(sweeps: SlicedSweeps, may_be_fast: np.ndarray) -> list[np.ndarray]:
-    """Pixels of a sweep that may be fast and touch in pixels of 0.4 m, at most 8 m long: at least two, or one with a
-    reach of three pixels."""
+    """Pixels of a sweep that may be fast and touch in pixels of 0.4 m: at least two, at most 8 m long."""
     block = max(1, round(GAP / sweeps.size))
     parts = []
     for step in range(len(sweeps.elapsed)):
@@ -39,13 +37,9 @@ def parts_of(sweeps: SlicedSweeps, may_be_fast: np.ndarray) -> list[np.ndarray]:
         )
         for part in found:
             extent = np.ptp(sweeps.pixels[part, 1:], axis=0).max()
-            if is_large(sweeps, part) and extent * sweeps.size <= LONGEST:
+            if len(part) >= 2 and extent * sweeps.size <= LONGEST:
                 parts.append(part)
     return parts
-
-
-def is_large(sweeps: SlicedSweeps, part: np.ndarray) -> bool:
-    return len(part) >= 2 or sweeps.reach[tuple(sweeps.pixels[part[0], 1:])] >= LEAST_REACH
 
 
 def parts_of_pair(sweeps: SlicedSweeps, component: np.ndarray) -> list[np.ndarray]:
@@ -60,7 +54,7 @@ def parts_of_pair(sweeps: SlicedSweeps, component: np.ndarray) -> list[np.ndarra
             size = reach[part].sum()
             length = (np.ptp(sweeps.pixels[part, 1:], axis=0).max() + 1) * sweeps.size
             is_unmatched = 8 * reach[part[is_matched[part]]].sum() < size
-            if is_unmatched and size >= LEAST_SIZE and is_large(sweeps, part) and length <= LONGEST:
+            if is_unmatched and size >= LEAST_SIZE and len(part) >= 2 and length <= LONGEST:
                 parts.append(part)
     return parts
 
