@@ -364,6 +364,7 @@ def test_a_phone_shows_the_object_that_it_follows_beside_its_panel(
     context.close()
 
 
+@pytest.mark.slow
 def test_every_key_and_control_does_what_it_says(browser: Any, drive_page: Path) -> None:
     context = browser.new_context(viewport={"width": 1000, "height": 700})
     tab = context.new_page()
