@@ -93,10 +93,10 @@ def _parts(points: Tensor) -> Tensor:
     component = torch.full_like(count, -1)
     component[full] = connected_components(is_full.view(1, side, side), full)
 
-    def nearest() -> Tensor:
-        return component[nearest_set_pixel(is_full.view(1, side, side), pixel)]
-
-    is_large = torch.bincount(nearest()) >= _LEAST_SHARE * len(points)
-    is_full &= is_large[component]
-    _, part, size = torch.unique(nearest(), return_inverse=True, return_counts=True)
+    component_of_point = component[nearest_set_pixel(is_full.view(1, side, side), pixel)]
+    is_large = torch.bincount(component_of_point) >= _LEAST_SHARE * len(points)
+    # Points of small components go to the nearest large one.
+    is_kept = is_full & is_large[component]
+    component_of_point = component[nearest_set_pixel(is_kept.view(1, side, side), pixel)]
+    _, part, size = torch.unique(component_of_point, return_inverse=True, return_counts=True)
     return size.argsort(descending=True, stable=True).argsort()[part]

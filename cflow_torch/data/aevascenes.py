@@ -86,16 +86,14 @@ class AevaScenesLog(BoxLog):
         self._file = self.folder / "sequence.json"
         with file_errors(self._file, _HINT):
             content = read_json(self._file)
-            known: Sequence[str] = content["metadata"]["sensors"]["lidars"]
-            self.lidars = tuple(known if lidars is None else lidars)
-            if not self.lidars or not set(self.lidars) <= set(known):
-                raise CFlowError(f"it has the LiDARs {shortened(known)}, you asked for {shortened(list(self.lidars))}")
+            self.lidars = _chosen(content["metadata"]["sensors"]["lidars"], lidars)
             by_time: dict[int, dict[str, Any]] = {frame["timestamp_ns"]: frame for frame in content["frames"]}
             self.timestamps = sorted(by_time)
             self._check_count(self._file)
             self._frames = [by_time[time] for time in self.timestamps]
-            mounts = content["metadata"]["vehicle_to_lidar_extrinsics"]
-            self._mounts = self._poses_of([mounts[name] for name in self.lidars], "extrinsics")
+            self._mounts = self._poses_of(
+                [content["metadata"]["vehicle_to_lidar_extrinsics"][name] for name in self.lidars], "extrinsics"
+            )
             self.poses = self._poses = self._poses_of([frame["ego_pose"] for frame in self._frames], "ego poses")
             self._has_boxes = any(frame.get("boxes") for frame in self._frames)
 
@@ -190,3 +188,11 @@ class Cloud:
         if not all(isinstance(text, str) for text in array.ravel().tolist()):
             raise ValueError("it must hold strings")
         return array
+
+
+def _chosen(known: Sequence[str], lidars: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the names of the LiDARs that are merged; None = all that are known."""
+    chosen = tuple(known if lidars is None else lidars)
+    if not chosen or not set(chosen) <= set(known):
+        raise CFlowError(f"it has the LiDARs {shortened(known)}, you asked for {shortened(list(chosen))}")
+    return chosen

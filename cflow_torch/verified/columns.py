@@ -338,15 +338,16 @@ class Columns:
         self.slices.view(torch.int64).copy_(words | self._or_within_reach(words) << NUM_SLICES)
         drawn = slices.t().contiguous()  # [S, C + 1]
         step, column = nonzero_pairs(drawn.bool())
-        if len(self.image) > 2 * self._area:
-            window = floor_divide(self.position.index_select(0, column), self._area)
+        area = num_positions(self.grid, 1)
+        if len(self.image) > 2 * area:  # several windows
+            window = floor_divide(self.position.index_select(0, column), area)
             step, column = gather(window.sort(stable=True).indices, step, column)
         entry = step * len(self.position) + column
         number = torch.arange(pixels_before, pixels_before + len(entry), dtype=torch.int32, device=entry.device)
         self.rank.view(-1).index_copy_(0, entry, number)
         first_slot = (column + columns_before) * self.num_slots
         window, row_col = _split(self.grid, self.position.index_select(0, column))
-        start = window * self._area + REACH * (self.stride + 1)
+        start = window * area + REACH * (self.stride + 1)
         place = torch.stack((first_slot, start, window, step, *row_col), 1)
         # With copies, there are at most twice as many columns.
         dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
@@ -355,11 +356,6 @@ class Columns:
     def window_row_col(self) -> tuple[Tensor, Tensor]:
         """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
         return _split(self.grid, self.position)
-
-    @property
-    def _area(self) -> int:
-        """Number of positions of a window."""
-        return (self.grid.height + 2 * REACH) * self.stride
 
     def fill(self, is_unknown: Tensor) -> None:
         """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.

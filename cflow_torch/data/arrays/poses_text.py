@@ -142,8 +142,13 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
     angles = np.stack([values.get(name, zeros) for name in _ANGLES])
     if "deg" in names[roles["yaw"]].lower() or np.abs(angles).max() > 2 * np.pi:
         angles = np.radians(angles)
+    return as_matrix(_rotations(angles), positions)
+
+
+def _rotations(angles: np.ndarray) -> np.ndarray:
+    """Return the rotations, (K, 3, 3), of roll, pitch and yaw, (3, K) radians."""
     roll, pitch, yaw = (rotations_about(axis, angle) for axis, angle in enumerate(angles))
-    return as_matrix(yaw @ pitch @ roll, positions)
+    return yaw @ pitch @ roll
 
 
 def _times_of_columns(roles: Mapping[str, int], words: np.ndarray, path: Path) -> np.ndarray | None:

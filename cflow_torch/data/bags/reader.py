@@ -256,14 +256,13 @@ class BagLog(Log):
                     parents[child] = link.header.frame_id.lstrip("/")
                     links.setdefault(child, []).append(_pose_of(link, arrived))
             else:
-                poses = [_pose_of(each, arrived) for each in getattr(message, "poses", [message])]
-                times = [each[0] for each in poses]
-                if not times or len(set(times)) < len(times):
-                    continue  # a path that is planned, and not driven, has no times
+                poses = _driven(message, arrived)
+                if not poses:
+                    continue
                 if hasattr(message, "poses"):
                     tracks[connection.topic] = []  # each message repeats the path so far
                 tracks.setdefault(connection.topic, []).extend(poses)
-                self._pose_delays.append(arrived - times[-1])
+                self._pose_delays.append(arrived - poses[-1][0])
                 self._child[connection.topic] = getattr(message, "child_frame_id", "").lstrip("/")
         self._frames = Frames(parents, links)
         return self._arrivals(stamps), tracks
@@ -357,6 +356,13 @@ def _pose_of(message: Any, arrived: int) -> Sample:
         return sample(_stamp(message, arrived), message.transform.translation, message.transform.rotation)
     pose = getattr(message.pose, "pose", message.pose)
     return sample(_stamp(message, arrived), pose.position, pose.orientation)
+
+
+def _driven(message: Any, arrived: int) -> list[Sample]:
+    """Return the poses of a message, or of the path in it; none if the path is only planned, so without times."""
+    poses = [_pose_of(each, arrived) for each in getattr(message, "poses", [message])]
+    times = {pose[0] for pose in poses}
+    return poses if len(times) == len(poses) else []
 
 
 def _check_version(files: list[Path]) -> None:
