@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.lower_surface import UNKNOWN
+from cflow_torch.ops.lower_surface import NO_HEIGHT
 
 FARTHEST = 131.072  # metres; points with larger |x| or |y| are ignored
 # Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
@@ -157,7 +157,7 @@ class _Steps(NamedTuple):
         is_level = step.abs() <= _MAX_STEP
         is_level &= is_flat.narrow(axis, _STEP, length)
         is_level &= is_flat.narrow(axis, 0, length)
-        ordered = step.masked_fill_(~is_level, UNKNOWN).flatten(1).sort(1).values
+        ordered = step.masked_fill_(~is_level, NO_HEIGHT).flatten(1).sort(1).values
         num_pairs = is_level.flatten(1).sum(1)
         median = _of_rows(ordered, num_pairs // 2)
         return cls(torch.where(num_pairs > 0, median, 0), num_pairs)

@@ -19,12 +19,17 @@ from torch import Tensor
 from cflow_torch.errors import import_optional
 from cflow_torch.ground.plane import FARTHEST, CellHeights, Points, near_plane
 from cflow_torch.ops.indices import lookup
-from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
+from cflow_torch.ops.lower_surface import NO_HEIGHT, lower_surface
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.tensors import choose_device, read_positions
 from cflow_torch.types import Array, CFlowError, Sweep, Window, check_points
 
-CHOICES = (None, "auto", "grid", "patchwork")  # None = do not look for ground; "auto" = "grid" where there is no mask
+GROUND_METHODS = (
+    None,
+    "auto",
+    "grid",
+    "patchwork",
+)  # None = do not look for ground; "auto" = "grid" where there is no mask
 THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster
 
 # Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
@@ -74,8 +79,8 @@ def find_ground_batch(
     Cost: two sorts of all points, and some 60 passes over 256 x 256 cells per sweep. 100,000 points take 20 ms on one
     CPU thread (docs/data.md).
     """
-    if method not in CHOICES[1:]:
-        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CHOICES[1:]))}")
+    if method not in GROUND_METHODS[1:]:
+        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, GROUND_METHODS[1:]))}")
     if isinstance(threshold, bool) or not isinstance(threshold, (int, float)) or not 0 <= threshold < FARTHEST:
         raise CFlowError(f"threshold={threshold!r}: give metres above the ground, for example 0.3")
     if not clouds:
@@ -120,7 +125,7 @@ def _grid(points: Points, threshold: int) -> Tensor:
     height = plane.below(points).clamp_(-_HIGHEST, _HIGHEST)
     cell = points.cell(_CELL_BITS, _CELLS)
     cells = CellHeights.of(points, height, cell, _CELLS)
-    surface = lower_surface(cells.low.masked_fill(cells.count == 0, UNKNOWN).int())
+    surface = lower_surface(cells.low.masked_fill(cells.count == 0, NO_HEIGHT).int())
     is_low = height <= lookup(surface.flatten(), cell) + threshold
     return is_low.logical_and_(points.is_active).logical_and_(plane.is_there.index_select(0, points.sweep))
 
