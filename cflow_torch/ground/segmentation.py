@@ -24,12 +24,8 @@ from cflow_torch.ops.threads import one_thread
 from cflow_torch.tensors import choose_device, read_positions
 from cflow_torch.types import Array, CFlowError, Sweep, Window, check_points
 
-GROUND_METHODS = (
-    None,
-    "auto",
-    "grid",
-    "patchwork",
-)  # None = do not look for ground; "auto" = "grid" where there is no mask
+# None = do not look for ground; "auto" = "grid" where there is no mask.
+GROUND_METHODS = (None, "auto", "grid", "patchwork")
 THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster
 
 # Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
