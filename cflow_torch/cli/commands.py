@@ -568,16 +568,12 @@ class ListSettings(Words):
 
     With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
 
-    --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-    cflow_live.yaml, cflow_paper.yaml, ... The package contains the same files.
-
     examples:
       cflow settings max_speed          default, allowed values and meaning of a setting
       cflow settings data.find_ground   a setting of several data sets
       cflow settings data               the choices of a group
       cflow settings data=hdf5 eval     all settings of a data set and of a command
       cflow settings > settings.md
-      cflow settings --opensceneflow conf/model
     """
 
     SUMMARY: ClassVar[str] = "list all settings with defaults and explanations"

@@ -183,9 +183,3 @@ def test_settings_explains_one_name(name, expected, cflow, capsys):
     assert all(part in text for part in expected) and len(text) < 4500
     assert cflow("settings", "max_sped") == 2
     assert "nothing has this name (did you mean model.max_speed?)" in capsys.readouterr().err
-
-
-def test_the_harness_models_are_those_in_the_package(tmp_path: Path, cflow) -> None:
-    assert cflow("settings", "--opensceneflow", tmp_path / "model") == 0
-    committed = {file.name: file.read_text() for file in (FOLDER / "opensceneflow" / "model").glob("*.yaml")}
-    assert committed == {file.name: file.read_text() for file in (tmp_path / "model").iterdir()}
