@@ -8,6 +8,7 @@ from __future__ import annotations
 import glob
 import math
 import os
+import re
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -22,13 +23,25 @@ _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
 _LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan": math.nan}
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
+_PATHS = {"data.root", "data.cache"}  # text, even if they look like numbers
+# Values that Hydra must read by itself: null, a list, a reference, a function, a quoted text.
+_SYNTAX = re.compile(
+    r"null|\[.*\]|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
+)
 
 
-class Call(NamedTuple):
+class Words(NamedTuple):
     """The words of a call. A word without "=" is a path."""
 
     settings: list[str]
     paths: list[str]
+    options: list[str]
+
+
+class Call(NamedTuple):
+    """A call as Hydra reads it."""
+
+    overrides: list[str]
     options: list[str]
 
 
@@ -37,6 +50,7 @@ def read_call(words: list[str], command: str) -> Call:
 
     With `--config-dir`, your own configurations may have other choices and settings of groups; Hydra knows them.
     """
+    kind = WITH_SETTINGS[command]
     call = split(words)
     given = {option.partition("=")[0] for option in call.options if option.startswith("-")}
     for option in given - {*_FLAGS, *_WITH_VALUE}:
@@ -44,12 +58,12 @@ def read_call(words: list[str], command: str) -> Call:
     for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
         check_exists(path)
     _check_settings(call.settings, command, bool(given & set(_OWN_CONFIGS)))
-    return call
+    return Call(hydra_overrides(kind, call), call.options)
 
 
-def split(words: list[str]) -> Call:
+def split(words: list[str]) -> Words:
     """Split the words of a call. Hydra accepts no option, such as `-m`, between two settings."""
-    call = Call([], [], [])
+    call = Words([], [], [])
     for before, word in zip(["", *words], words):
         if word.startswith("-") or before in _WITH_VALUE:
             call.options.append(word)
@@ -144,6 +158,29 @@ def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
 def _is_for_hydra(key: str) -> bool:
     """Test whether a key adds or removes a setting, moves a group, or is a setting of Hydra itself."""
     return key.startswith(("+", "~", "hydra")) or "@" in key
+
+
+def hydra_overrides(command: type[Command], call: Words) -> list[str]:
+    """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
+    known = known_settings(command).items()
+    texts = {name for name, owners in known if any(limits and limits["kind"] is str for limits in owners.values())}
+    overrides = []
+    for word in call.settings:
+        key, _, value = word.partition("=")
+        overrides.append(f"{key}={_as_text(value)}" if key.lstrip("+") in {*texts, *_PATHS} else word)
+    paths = [_quoted(path) for path in call.paths]
+    if paths:
+        overrides.append(f"data.root={paths[0] if len(paths) == 1 else '[' + ','.join(paths) + ']'}")
+    return overrides
+
+
+def _as_text(value: str) -> str:
+    """Quote text, or each text of a sweep (a,b), so that Hydra reads no other type: the name 1e5 is not a number."""
+    return value if _SYNTAX.fullmatch(value) else ",".join(map(_quoted, value.split(",")))
+
+
+def _quoted(value: str) -> str:
+    return '"' + value.replace('"', r"\"") + '"'
 
 
 def check_exists(path: str) -> None:

@@ -14,9 +14,8 @@ from omegaconf import OmegaConf
 from cflow_torch import make_config
 from cflow_torch.cli.choices import FOLDER, choices, help_of, names_in, read_settings
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
-from cflow_torch.cli.compose import hydra_overrides
 from cflow_torch.cli.main import HELP
-from cflow_torch.cli.words import read_call, split
+from cflow_torch.cli.words import hydra_overrides, read_call, split
 from cflow_torch.config import METHODS, PRESETS, Config
 from cflow_torch.data.catalog import DATA_SETS
 
