@@ -10,9 +10,9 @@ import math
 import os
 import re
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any, Iterable, Mapping, NamedTuple
 
-from cflow_torch.cli.choices import choices, known_settings
+from cflow_torch.cli.choices import Limits, choices, known_settings
 from cflow_torch.cli.commands import PAIR_SETTINGS, PICTURES, WITH_SETTINGS, Command
 from cflow_torch.errors import CFlowError, near
 from cflow_torch.setting import checked
@@ -82,29 +82,36 @@ def _is_path(word: str) -> bool:
 def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
     """Reject names that do not exist and plain values that are not allowed."""
     kind = WITH_SETTINGS[command]
-    chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
     known = known_settings(kind)
+    chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
     for word in settings:
         key, _, value = word.partition("=")
         is_group = key in chosen or any(name.startswith(f"{key}.") for name in known)
         if is_group or _is_for_hydra(key) or (has_own and key.partition(".")[0] in chosen):
             continue
         if key not in known:
-            of_value = [group for group in chosen if value in choices(group)]  # preset=live
-            hint = f" (did you mean {of_value[0]}={value}?)" if of_value else near(key, [*chosen, *known])
+            hint = _group_of(value, chosen) or near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
-        owners = [choice for choice in known[key] if _is_chosen(choice, chosen)]
-        if not owners:
-            raise CFlowError(
-                f"setting {key!r} belongs to {' or '.join(known[key])}: give that as well, or leave it out"
-            )
         if key in PAIR_SETTINGS and not kind.CHOOSES_PAIRS:
             choosing = [name for name, other in WITH_SETTINGS.items() if other.CHOOSES_PAIRS]
             raise CFlowError(f"{key} is for cflow {' and cflow '.join(choosing)}: cflow {command} takes every pair")
-        limits = known[key][owners[0]]
-        if len(owners) == 1 and limits is not None:
-            for plain in plain_values(value, limits["kind"] is str):
-                checked(key, plain, limits)
+        _check_value(key, value, known[key], chosen)
+
+
+def _group_of(value: str, groups: Iterable[str]) -> str:
+    """Return the hint that a value is a choice of a group, as in preset=live; "" if it is not."""
+    of_value = [group for group in groups if value in choices(group)]
+    return f" (did you mean {of_value[0]}={value}?)" if of_value else ""
+
+
+def _check_value(key: str, value: str, owners: Mapping[str, Limits], chosen: dict[str, list[str]]) -> None:
+    """Reject a setting of a choice that is not in effect, and plain values that are not allowed."""
+    limits = [limits for choice, limits in owners.items() if _is_chosen(choice, chosen)]
+    if not limits:
+        raise CFlowError(f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out")
+    if len(limits) == 1 and limits[0] is not None:
+        for plain in plain_values(value, limits[0]["kind"] is str):
+            checked(key, plain, limits[0])
 
 
 def _is_chosen(choice: str, chosen: dict[str, list[str]]) -> bool:
