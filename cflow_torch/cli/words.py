@@ -169,16 +169,21 @@ def _is_for_hydra(key: str) -> bool:
 
 def hydra_overrides(command: type[Command], call: Words) -> list[str]:
     """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
-    known = known_settings(command).items()
-    texts = {name for name, owners in known if any(limits and limits["kind"] is str for limits in owners.values())}
-    overrides = []
-    for word in call.settings:
-        key, _, value = word.partition("=")
-        overrides.append(f"{key}={_as_text(value)}" if key.lstrip("+") in {*texts, *_PATHS} else word)
-    paths = [_quoted(path) for path in call.paths]
-    if paths:
-        overrides.append(f"data.root={paths[0] if len(paths) == 1 else '[' + ','.join(paths) + ']'}")
+    texts = set(_PATHS)
+    for name, owners in known_settings(command).items():
+        if any(limits and limits["kind"] is str for limits in owners.values()):
+            texts.add(name)
+    overrides = [_override(word, texts) for word in call.settings]
+    if len(call.paths) == 1:
+        overrides.append(f"data.root={_quoted(call.paths[0])}")
+    elif call.paths:
+        overrides.append(f"data.root=[{','.join(map(_quoted, call.paths))}]")
     return overrides
+
+
+def _override(word: str, texts: set[str]) -> str:
+    key, _, value = word.partition("=")
+    return f"{key}={_as_text(value)}" if key.lstrip("+") in texts else word
 
 
 def _as_text(value: str) -> str:
