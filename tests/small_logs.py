@@ -22,11 +22,11 @@ SMALL_LOGS = ("av2", "aevascenes", "arrays", "bags", "hdf5", "nuscenes", "trucks
 
 
 @lru_cache(maxsize=None)
-def make_small_drive(num_sweeps: int) -> Drive:
-    """A street that many tests write, with every second column of the profile demo."""
+def make_small_drive(num_sweeps: int, seed: int = 3) -> Drive:
+    """A street that many tests write, with half of the columns of the profile demo."""
     (unit,) = PROFILES["demo"].units
     profile = replace(PROFILES["demo"], units=(replace(unit, num_columns=unit.num_columns // 2),))
-    return Drive(make_drive(seed=3, profile="demo").scene, profile, 3, num_sweeps, "synthetic-demo-0003")
+    return Drive(make_drive(seed, 1, "demo").scene, profile, seed, num_sweeps, f"synthetic-demo-{seed:04d}")
 
 
 def write_small_log(name: str, folder: Path) -> Path:
