@@ -67,7 +67,7 @@ class Plane:
     step_y: Tensor  # (B,) int64, rise in mm per 4096 mm along y
     height: Tensor  # (B,) int64, mm, at the origin
 
-    def below(self, points: Points) -> Tensor:
+    def heights(self, points: Points) -> Tensor:
         """Return the height of each point above the plane of its sweep, (N,) int64, mm."""
         x, y, z = points.position
         rise = self.step_x.index_select(0, points.sweep).mul_(x)

@@ -101,7 +101,7 @@ def is_upside_down(cloud: Array) -> bool:
     """Test whether z points down: nearly all points more than half a metre from the ground are below it."""
     points = _thinned(cloud)
     plane = near_plane(points)
-    height = plane.below(points)
+    height = plane.heights(points)
     is_near = points.is_active & (points.position[:2].abs() < _NEAR).all(0)
     num_below = int((is_near & (height < -_FAR)).sum())
     num_above = int((is_near & (height > _FAR)).sum())
@@ -118,7 +118,7 @@ def _thinned(cloud: Array) -> Points:
 def _grid(points: Points, threshold: int) -> Tensor:
     """Segment the ground by the method "grid", (N,) bool. The threshold is in mm."""
     plane = near_plane(points)
-    height = plane.below(points).clamp_(-_HIGHEST, _HIGHEST)
+    height = plane.heights(points).clamp_(-_HIGHEST, _HIGHEST)
     cell = points.cell(_CELL_BITS, _CELLS)
     cells = CellHeights.of(points, height, cell, _CELLS)
     surface = lower_surface(cells.low.masked_fill(cells.count == 0, NO_HEIGHT).int())
