@@ -74,7 +74,7 @@ class GroundHeights:
         blocks = self._blocks_around(centre, window)
         fits = [_Fit.of(blocks, blocks.is_known)]
         while len(fits) < _NUM_FITS:
-            distance = (blocks.height - fits[-1].heights()).abs()
+            distance = (blocks.height - fits[-1].heights(blocks)).abs()
             fits.append(_Fit.of(blocks, blocks.is_known & (distance <= _FARTHEST)))
         num_blocks = torch.stack([fit.num_blocks for fit in fits])
         determinant = torch.stack([fit.determinant for fit in fits])
@@ -93,7 +93,9 @@ class GroundHeights:
         around = self._around(_REACH)[:, window % self._sums.shape[1], row, col]  # [2, G, 5, 5]
         height, count = around.flatten(2)
         mean = torch.div(10 * height, count.clamp(min=1), rounding_mode="floor").double()
-        return _Blocks(mean, count >= _FEWEST_POINTS)
+        design = constant(_DESIGN, torch.float64, centre.device)
+        terms = torch.cat((design.t().expand(len(mean), 3, -1), mean[:, None]), 1)
+        return _Blocks(design, terms, count >= _FEWEST_POINTS)
 
     def _around(self, reach: int) -> Tensor:
         """Return the sums of the blocks at most `reach` away each way, (2, B, Y, X, K, K); outside they are 0."""
@@ -110,8 +112,13 @@ class GroundHeights:
 class _Blocks(NamedTuple):
     """The 5 x 5 blocks around G objects, row by row."""
 
-    height: Tensor  # (G, 25) float64, the mean in whole millimetres
+    design: Tensor  # (25, 3) float64: 1, column and row, from the middle block
+    terms: Tensor  # (G, 4, 25) float64: 1, column, row, and the mean height in whole millimetres
     is_known: Tensor  # (G, 25) bool
+
+    @property
+    def height(self) -> Tensor:
+        return self.terms[:, 3]
 
 
 class _Fit(NamedTuple):
@@ -124,14 +131,11 @@ class _Fit(NamedTuple):
     @classmethod
     def of(cls, blocks: _Blocks, is_used: Tensor) -> _Fit:
         """Fit planes by least squares to the blocks that are used, (G, 25) bool."""
-        design = constant(_DESIGN, torch.float64, is_used.device)  # [25, 3]
-        terms = torch.cat((design.t().expand(len(is_used), 3, -1), blocks.height[:, None]), 1)  # [G, 4, 25]
-        sums = ((terms * is_used[:, None]) @ design).permute(1, 2, 0)  # [4, 3, G]
+        sums = ((blocks.terms * is_used[:, None]) @ blocks.design).permute(1, 2, 0)  # [4, 3, G]
         cofactors, determinant = adjugate(upper(sums[:3]))
         plane = matvec(full(cofactors), sums[3]) / determinant
         return cls(plane, sums[0, 0], determinant)
 
-    def heights(self) -> Tensor:
+    def heights(self, blocks: _Blocks) -> Tensor:
         """Return the height of each plane at the blocks around its object, (G, 25) float64, millimetres."""
-        design = constant(_DESIGN, torch.float64, self.plane.device)
-        return (self.plane[:, :, None] * design.t()[:, None, :]).sum(0)
+        return (self.plane[:, :, None] * blocks.design.t()[:, None]).sum(0)
