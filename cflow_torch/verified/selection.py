@@ -8,10 +8,12 @@ the motion of the winner in its own pixels. Two sweeps are too few to tell:
     winner     [   A     A  c  p ]     a car A, a cyclist c behind it and a parked car p: all move as A
     dissent              [c][p]        c moves by itself, p is static
 
-The pixels of copies follow the drawn ones, and P' counts both.
+P is the number of drawn pixels. The pixels of copies follow, and P' counts both.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -19,14 +21,33 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.verified.component_tree import PER_SLICE, Components, NodeKind, Objects, Tree
+from cflow_torch.verified.component_tree import Components, NodeKind, Tree, corners_at_newest, longer_side
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.paired_test import NEAR_Z, Counts, Verdict, count_wins
+from cflow_torch.verified.paired_test import NEAR_Z, PER_SLICE, Counts, Verdict, count_wins
 
 # The price of an object on each level. Children move separately only if that gains more evidence.
 PRICE = 4 * PER_SLICE
 _DISSENT_Z = 2.0  # factor of z for nodes that dissent
 _LEAST_DIFFERENCE = 1.0  # finest pixels per sweep interval, between the motions of a winner and of a node that dissents
+
+
+@dataclass(frozen=True)
+class Objects:
+    """The selected objects, in order of their first pixel in the list: those of copies come last."""
+
+    pixels: Groups  # the P' pixels, grouped by object
+    # The G objects, grouped by their node. Static objects whose component is not a node are in no group.
+    by_node: Groups
+    first: Tensor  # (G,) int64, position of the first pixel of each object in the list
+
+    @property
+    def count(self) -> int:
+        """Number of objects, G."""
+        return self.pixels.count
+
+    def length_at_newest(self, sweeps: HeightSlicedSweeps) -> Tensor:
+        """(G,) float64, metres, longer side of the bounding box of the pixels at t+1; 0 without any."""
+        return longer_side(corners_at_newest(sweeps.pixels, self.pixels), sweeps.grid.pixel_size)
 
 
 def select_objects(
