@@ -65,12 +65,8 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
     tracks = _tracks(sweeps, parts, _FASTEST if max_speed is None else max_speed)
     objects = _pixels_of(tracks, parts)
     pixels = sweeps.pixels[parts.pixel]
-    are_objects = (
-        _are_linked(pixels, objects)
-        & _are_wide(sweeps, pixels, objects, tracks.velocity)
-        & _are_found(sweeps, pixels, objects, tracks.velocity)
-    )
-    kept = flat_nonzero(are_objects)
+    is_wide = _are_wide(sweeps, pixels, objects, tracks.velocity)
+    kept = flat_nonzero(is_wide & _are_found(sweeps, pixels, objects, tracks.velocity))
     objects = objects.select(kept)
     member = flat_nonzero(objects.is_member)
     return tree.with_nodes(
@@ -283,11 +279,6 @@ def _pixels_of(tracks: _Tracks, parts: _Parts) -> Groups:
     of_track = Groups(tracks.part.reshape(-1), len(parts)).where(tracks.is_found.reshape(-1))
     first_track = of_track.min(track.reshape(-1), empty=count)  # [Q]
     return Groups(parts.pixels.spread(first_track, none=count), count)
-
-
-def _are_linked(pixels: Pixels, objects: Groups) -> Tensor:
-    """Tell which objects have pixels at t+1 and before, (N,) bool."""
-    return objects.any(pixels.step == 0) & objects.any(pixels.step > 0)
 
 
 def _are_wide(sweeps: HeightSlicedSweeps, pixels: Pixels, objects: Groups, velocity: Tensor) -> Tensor:

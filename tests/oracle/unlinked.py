@@ -103,13 +103,12 @@ def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> 
     nodes = []
     for number, track in enumerate(chosen):
         own = [parts[part] for part in range(len(parts)) if owner.get(part) == number]
-        members = np.sort(np.concatenate(own)) if own else np.zeros(0, dtype=int)
-        steps = sweeps.pixels[members, 0]
+        members = np.sort(np.concatenate(own))
         shifts = [(centres[track[1]] - centres[p]) / since[step_of[p]] for p in track.values() if step_of[p] != 1]
         velocity = tuple(median(axis) for axis in np.transpose(shifts).tolist())
         speed = max(math.hypot(*velocity), 1)
         side = sweeps.pixels[members, 1:] @ (np.array([velocity[1], -velocity[0]]) / speed)
-        if not ((steps == 0).any() and (steps > 0).any() and np.ptp(side) * sweeps.size >= NARROWEST):
+        if np.ptp(side) * sweeps.size < NARROWEST:
             continue
         won, lost = count_wins(sweeps, members, velocity, is_near=True).sum(1)
         if won > lost:
