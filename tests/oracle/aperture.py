@@ -16,14 +16,14 @@ COVERED = 65  # per cent
 def slides_along_itself(sweeps: SlicedSweeps, members: np.ndarray, motion: Vector) -> bool:
     """Whether a line that stays where it is explains a motion of a component: it is a line at t+1 that is low and of a
     standard deviation of 2 m or more, or covered without both of its ends moving (in pairs, whatever they do); and the
-    motion points along it (the sine of the angle is at most 0.2) and leads at least 1.2 m over the window."""
+    motion points along it (the sine of the angle is at most 0.2)."""
     newest = members[sweeps.pixels[members, 0] == 0]
-    axis, speed = principal_axis(sweeps, newest), math.hypot(*motion)
-    if axis is None or speed * np.ptp(sweeps.elapsed) < LEAST_TRAVEL / sweeps.size:
+    axis = principal_axis(sweeps, newest)
+    if axis is None:
         return False
     is_long = np.var(sweeps.pixels[newest, 1:] @ axis) >= (2.0 / sweeps.size) ** 2
     is_rail = is_long and COUNT[sweeps.slices[newest]].sum() < 2 * len(newest)
-    along = abs(axis[0] * motion[1] - axis[1] * motion[0]) <= 0.2 * speed
+    along = abs(axis[0] * motion[1] - axis[1] * motion[0]) <= 0.2 * math.hypot(*motion)
     is_static = is_covered(sweeps, members) and not (sweeps.has_history and both_ends_move(sweeps, members))
     return bool(along and (is_rail or is_static))
 
