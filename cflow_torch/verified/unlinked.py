@@ -47,11 +47,11 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         max_speed: m/s; None = 60.
 
     Convention:
-        Parts have the pixels of a sweep that every other sweep lacks. A part of t takes a velocity from each part of
-        t+1. In the other sweeps, we take the parts where it puts them. Of the velocities of a part of t, or of t+1, the
-        one with parts in the most sweeps wins, then the one with the smallest errors. In a pair, parts are unmatched
-        components, and the lowest velocity wins. A part belongs to its first node. The velocity of a node must win more
-        slices near its targets than it loses.
+        Parts have the pixels of a sweep that are missing, or that every other sweep lacks. A part of t takes a velocity
+        from each part of t+1. In the other sweeps, we take the parts where it puts them. Of the velocities of a part of
+        t, or of t+1, the one with parts in the most sweeps wins, then the one with the smallest errors. In a pair,
+        parts are unmatched components, and the lowest velocity wins. A part belongs to its first node. The velocity of
+        a node must win more slices near its targets than it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """

@@ -16,8 +16,8 @@ def find_changed(
     sweeps: SlicedSweeps, in_sight: Sequence[np.ndarray], origins: Sequence[Sequence[float]]
 ) -> np.ndarray:
     """(3, P) bool: pixels of which a slice is missing in another sweep and not hidden there; those of which one is
-    missing in another sweep that saw its place; those of which every other sweep lacks a slice. None in windows of two
-    sweeps.
+    missing in another sweep that saw its place; the first ones, and those of which every other sweep lacks a slice.
+    None in windows of two sweeps.
 
     Args:
         in_sight: (N, 3) of each sweep: its points, those that are not drawn included.
@@ -43,7 +43,7 @@ def find_changed(
         is_seen, is_unknown = farthest[direction] >= distance, farthest[direction] == -np.inf
         is_missing[pixel[is_seen | is_unknown]] = True
         has_changed[pixel[is_seen]] = True
-    may_be_fast |= (num_lacking == len(in_sight) - 1) & sweeps.has_history
+    may_be_fast |= is_missing | ((num_lacking == len(in_sight) - 1) & sweeps.has_history)
     return change
 
 
