@@ -9,7 +9,6 @@ The columns are those of run.py.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -58,7 +57,7 @@ STEPS: dict[str, dict[str, Any]] = {
     "no static test": {"find_components": _linked_may_move},
     "no objects under overhangs": {"add_overhung": lambda sweeps, components, tree: (sweeps, tree)},
     "no aperture test": {"verify": partial(paired_test.verify, slides=_nothing_slides)},
-    "no least gain": {"verify": partial(paired_test.verify, least_share=math.inf)},
+    "no confirmation": {"verify": partial(paired_test.verify, unconfirmed=0.0)},
     "no price of an object": {"select_objects": partial(selection.select_objects, price=0)},
     "no margin": {"motion_margin": _without_margin},
     "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
