@@ -21,8 +21,8 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper": (small("paper", num_history=0), 608, 32, 637),
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3510, 129, 3539),
     "keypoints": (small("keypoints"), 868, 35, 898),
-    "default": (small("default"), 3389, 105, 3427),
-    "offline": (small("offline"), 3692, 115, 3707),
+    "default": (small("default"), 3340, 105, 3378),
+    "offline": (small("offline"), 3640, 115, 3655),
 }
 
 

@@ -1,10 +1,8 @@
 """The aperture problem: static lines seem to slide along themselves, and long vehicles really do.
 
 A moving sensor samples walls, hedges and guard rails at positions that move with it, so they seem to slide along
-themselves. Such a line is static if t+1 has most of it at the old position, or if the older sweeps have most of it at
-the new one. One of the two suffices, because one end of the line may enter or leave the view. The side of a car is a
-line as well, but its rear leaves the old position and its front reaches a new one. A low line of 7 m or more is a guard
-rail, which is always static.
+themselves. Such a line is static if the other sweeps have most of it at its position in t+1. The side of a car is a
+line as well, but its front reaches a new position. A low line of 7 m or more is a guard rail, which is always static.
 
 Both ends of a bus or a tram move, although most of it is covered. If a wall seems to move, one of its ends stays, or
 its ends are only the limits of the view. The ends of a guard rail or a noise barrier may keep pace with the ego

@@ -14,6 +14,7 @@ P is the number of drawn pixels. The pixels of copies follow, and P' counts both
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Callable
 
 import torch
 import torch.nn.functional as F
@@ -57,6 +58,7 @@ def select_objects(
     verdict: Verdict,
     significance: float,
     price: int = PRICE,
+    dissent: Callable[..., Tensor] | None = None,
 ) -> Objects:
     """Select objects from the leaves up, then let nodes inside the winners dissent.
 
@@ -65,6 +67,7 @@ def select_objects(
         verdict: the best motion of each node, and its evidence; 0 = none is significant.
         significance: z of the paired test. For a node against the winner around it, z is twice as large.
         price: of an object, in units of `PER_SLICE`.
+        dissent: `with_dissent`, or what an ablation puts in its place.
 
     Returns:
         The objects. A pixel belongs to the first of these that exists:
@@ -84,7 +87,7 @@ def select_objects(
     none = tree.count
     node = torch.arange(none, device=verdict.evidence.device)
     winner = _winners(tree, node, verdict.evidence, price)
-    taken = _with_dissent(sweeps, tree, verdict, winner, significance, price)
+    taken = (dissent or with_dissent)(sweeps, tree, verdict, winner, significance, price)
     by_pixel = Groups(tree.pixel, sweeps.num_pixels)  # the members
     moving = _moving_nodes(tree, by_pixel, taken, verdict.evidence)
 
@@ -115,7 +118,7 @@ def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
     return winner
 
 
-def _with_dissent(
+def with_dissent(
     sweeps: HeightSlicedSweeps, tree: Tree, verdict: Verdict, winner: Tensor, significance: float, price: int
 ) -> Tensor:
     """Return the node whose motion each node takes, (N,) int64; N = it is static.
@@ -157,7 +160,7 @@ def _gain(sweeps: HeightSlicedSweeps, tree: Tree, node: Tensor, motion: Tensor, 
 def _moving_nodes(tree: Tree, by_pixel: Groups, taken: Tensor, evidence: Tensor) -> Tensor:
     """Return the moving node of each pixel, (P',) int64, N = none; see `select_objects`.
 
-    `by_pixel` groups the members by pixel, `taken` is the result of `_with_dissent`.
+    `by_pixel` groups the members by pixel, `taken` is the result of `with_dissent`.
     """
     none = tree.count
     node = torch.arange(none, device=taken.device)
