@@ -27,6 +27,7 @@ from cflow_torch.windows.readings import (
 )
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
+_REACH = 10  # sweeps before and after a pair, whose poses may be those of the pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
 _DOUBTFUL = 0.2  # share in place, below which poses that hardly move are compared with the motion of the sensor
@@ -142,13 +143,14 @@ def _make_pairs(
 ) -> Iterator[Pair | None]:
     """Prepare the pairs; `neighbours` are the poses that tell those before and after a sweep, None = they do not."""
     for first, second in chosen:
-        before = None if neighbours is None or first == 0 else neighbours[[first - 1, second - 1]]
-        after = None if neighbours is None or second + 1 == len(neighbours) else neighbours[[first + 1, second + 1]]
+        start = max(first - _REACH, 0)
+        around = None if neighbours is None else neighbours[start : second + _REACH + 1]
         least = _LEAST_TIMED if TIMES in scans else _LEAST_SPEED
         is_fast = poses is not None and difference(_motion(poses, first, second), np.eye(4)) >= least * (second - first)
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}
         shown = scans if is_fast else scans[:1]
-        yield make_pair(sweeps[first], sweeps[second], before, after, in_world, scans=shown, **how)
+        rows = (0, 1) if around is None else (first - start, second - start)
+        yield make_pair(sweeps[first], sweeps[second], around, rows, in_world, scans=shown, **how)
 
 
 class Steps(NamedTuple):

@@ -75,7 +75,8 @@ def extrapolated(step):
     def change(poses):
         first = poses[0] @ np.linalg.inv(poses[1]) @ poses[0]
         last = poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
-        return np.concatenate([poses[1:], [last]]) if step > 0 else np.concatenate([[first], poses[:-1]])
+        moved = np.concatenate([poses[1:], [last]]) if step > 0 else np.concatenate([[first], poses[:-1]])
+        return moved if abs(step) == 1 else extrapolated(step - np.sign(step))(moved)
 
     return change
 
@@ -154,6 +155,9 @@ WRONG_POSES = {
     "half_early": half(1),
     "millimetres": scaled(1000),
     "centimetres": scaled(100),
+    "feet": scaled(1 / 0.3048),
+    "steps": lambda poses: np.concatenate([poses[:1], np.linalg.inv(poses[:-1]) @ poses[1:]]),
+    "steps_back": lambda poses: np.concatenate([np.linalg.inv(poses[:1]), np.linalg.inv(poses[1:]) @ poses[:-1]]),
 }
 
 
@@ -188,19 +192,20 @@ def test_mirrored_clouds_are_named_and_no_pose_is_blamed(drive, name):
     assert "(left-handed)" in problem and f"data.read_as={name}" in problem
 
 
-@pytest.mark.parametrize("factor", [0.5, 3.28])
+@pytest.mark.parametrize("factor", [0.5, 2.5])
 def test_positions_of_another_scale_are_named_with_the_factor(drive, factor):
     (problem,) = find_problems(Wrong(drive, poses=scaled(factor)))
     found = re.search(r"positions multiplied by ([0-9.]+)", problem)
     assert found and abs(float(found[1]) * factor - 1) < 0.04
 
 
-def test_poses_that_are_only_steps_are_told_by_the_motion_of_the_sensor(drive):
-    steps = each(lambda pose: pose)
-    relative = Wrong(
-        drive, poses=lambda poses: np.concatenate([np.eye(4)[None], np.linalg.inv(steps(poses)[:-1]) @ poses[1:]])
-    )
-    assert any("the poses hardly move, but the sensor moves" in text for text in find_problems(relative))
+@pytest.mark.parametrize("sweeps", [5, -3])
+def test_poses_that_are_several_sweeps_late_are_named_with_their_number(turning, sweeps):
+    wrong = Wrong(turning, poses=extrapolated(-sweeps))
+    name = f"late_{sweeps}" if sweeps > 0 else f"early_{-sweeps}"
+    (problem,) = [text for text in find_problems(wrong) if "ground masks" not in text]
+    assert problem.endswith(f"data.read_as={name}") and f"of sweep i {'-+'[sweeps < 0]} {abs(sweeps)})" in problem
+    assert find_problems(read_as(wrong, name)) == []
 
 
 @pytest.mark.parametrize("source", ["drive", "real"])
