@@ -27,6 +27,7 @@ from cflow_torch.windows.readings import (
 )
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
+_CHANGES = (-4, -1, 1, 4)  # sweeps between a pair and those whose motion should differ
 _REACH = 10  # sweeps before and after a pair, whose poses may be those of the pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
@@ -65,8 +66,7 @@ def choose_pairs(num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int]
     smooth = [pair for pair in pairs if pair[0] not in jumps] or pairs
     inner = [pair for pair in smooth if pair[0] > 0 and pair[1] + 1 < num_sweeps]  # with poses before and after
     inner = [pair for pair in inner if not {pair[0] - 1, pair[1]} & set(jumps)] or inner
-    changes = [partial(_change, poses, -1), partial(_change, poses, 1)] if inner else []
-    criteria = (partial(_turn, poses), partial(_speed, poses), *changes)
+    criteria = (partial(_turn, poses), partial(_speed, poses), *([partial(_change, poses)] if inner else []))
     return sorted({max(inner or smooth, key=lambda pair: criterion(*pair)) for criterion in criteria})
 
 
@@ -94,9 +94,11 @@ def _turn(poses: np.ndarray, first: int, second: int) -> float:
     return turn_of(_motion(poses, first, second))
 
 
-def _change(poses: np.ndarray, step: int, first: int, second: int) -> float:
-    """Return how much the motion of a pair differs from that of the pair `step` sweeps later, metres."""
-    return difference(_motion(poses, first, second), _motion(poses, first + step, second + step))
+def _change(poses: np.ndarray, first: int, second: int) -> float:
+    """Return how much the motion of a pair differs from that some sweeps earlier and later, metres."""
+    given = _motion(poses, first, second)
+    firsts = [first + step for step in _CHANGES if 0 <= first + step and second + step < len(poses)]
+    return sum(difference(given, _motion(poses, other, other + second - first)) for other in firsts)
 
 
 def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: Sequence[str] = (OFF,)) -> Judgement:
