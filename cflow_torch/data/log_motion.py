@@ -97,7 +97,7 @@ def _turn(poses: np.ndarray, first: int, second: int) -> float:
 def _change(poses: np.ndarray, first: int, second: int) -> float:
     """Return how much the motion of a pair differs from that some sweeps earlier and later, metres."""
     given = _motion(poses, first, second)
-    firsts = [first + step for step in _CHANGES if 0 <= first + step and second + step < len(poses)]
+    firsts = [first + step for step in _CHANGES if first + step >= 0 and second + step < len(poses)]
     return sum(difference(given, _motion(poses, other, other + second - first)) for other in firsts)
 
 

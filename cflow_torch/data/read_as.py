@@ -12,20 +12,17 @@ from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper, points_surround_poses
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.errors import CFlowError
+from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.transforms import rigid_transform, transform_points
-from cflow_torch.types import Sweep
-from cflow_torch.windows.readings import AXES, CAMERA, CAUSES, MOUNT, OF_POSES, SHIFTS, STEPS, WORLD
+from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.windows.point_frame import OF_POINTS
+from cflow_torch.windows.readings import CAUSES, MOUNT, OF_POSES, SHIFTS, STEPS, WORLD
 
-_OF_POINTS = {  # what converts points as stored to metres, x forward and z up
-    "points_millimetres": 1e-3 * np.eye(3),
-    "points_centimetres": 1e-2 * np.eye(3),
-    "points_camera": AXES[CAMERA],
-    "points_upside_down": AXES["down"],
-}
 _OF_POSES = [name for name in OF_POSES if not name.startswith(MOUNT)]
-CHANGES_POINTS = frozenset(_OF_POINTS)
+_LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
+CHANGES_POINTS = frozenset(OF_POINTS)
 """Readings under which the numbers of the points are others than those in the files."""
-READ_AS = ("auto", None, WORLD, *_OF_POSES, *_OF_POINTS)
+READ_AS = ("auto", None, WORLD, *_OF_POSES, *OF_POINTS)
 
 
 def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
@@ -52,9 +49,10 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
               angles count clockwise from the y axis (north), while x is east;
             - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
             - "millimetres", "centimetres", "feet": unit of the poses;
-            - "points_millimetres", "points_centimetres", "points_camera", "points_upside_down": unit or axes of the
-              points (a camera's: x right, y down, z forward; upside down: y to the right). The poses stay, so give
-              ("points_camera", "camera") if they have these axes, too.
+            - "points_millimetres", "points_centimetres", "points_feet", "points_camera", "points_upside_down": unit or
+              axes of the points (a camera's: x right, y down, z forward; upside down: y to the right). The poses stay,
+              so give ("points_camera", "camera") if they have these axes, too;
+            - "points_spherical": the columns are range, azimuth (counterclockwise) and elevation, radians or degrees.
     """
     if isinstance(reading, Sequence) and not isinstance(reading, str):
         for each in reading:
@@ -70,9 +68,22 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
 def _is_in_world(log: Log) -> bool:
     """Test whether the points of a log are in the world's frame; by one sweep, if it is not there."""
     try:
-        return (log.unwrapped.has_viewpoints or log.surrounds_poses) and WORLD in judge_log(log).best
+        if not (log.unwrapped.has_viewpoints or log.surrounds_poses) or WORLD not in judge_log(log).best:
+            return False
+        return not begins_late(log)
     except (CFlowError, OSError):
         return False  # `sweep` raises the error
+
+
+def begins_late(log: Log) -> bool:
+    """Test whether clouds have another column before x, y and z: the second to fourth have ground, the others none."""
+    columns = as_numpy(log.sweep(0).points)[:, :3]
+    if len(columns) == 0 or not np.nanmin(columns[:, 0]) >= 0 or has_ground(columns):
+        return False
+    fourth = log.columns(0).get("column_3", np.zeros(0))
+    if len(fourth) != len(columns) or np.ptp(np.quantile(fourth, (0.05, 0.95))) < _LEAST_HEIGHT:
+        return False
+    return has_ground(np.column_stack([columns[:, 1:], fourth]).astype(np.float32))
 
 
 class ReadAs(LogWrapper):
@@ -102,7 +113,7 @@ class ReadAs(LogWrapper):
 
     def _labels(self, index: int) -> FlowLabels | None:
         labels = self.log.labels(index)
-        if labels is None or self.reading not in (WORLD, *_OF_POINTS):
+        if labels is None or self.reading not in (WORLD, *OF_POINTS):
             return labels
         sweep, pose1 = self.log.sweep(index), self.log.sweep(index + 1).pose
         points = np.asarray(sweep.points)[:, :3].astype(np.float64)
@@ -143,7 +154,7 @@ class ReadAs(LogWrapper):
         """Convert points of sweep `index`, (N, 3+), to metres in the frame of the vehicle."""
         if self.reading == WORLD:
             return transform_points(points[:, :3], np.linalg.inv(self._given(index, pose)))
-        return points[:, :3] @ _OF_POINTS[self.reading].T if self.reading in _OF_POINTS else points[:, :3]
+        return OF_POINTS[self.reading](points) if self.reading in OF_POINTS else points[:, :3]
 
     def _given(self, index: int, pose: Any = None) -> np.ndarray:
         if pose is None:

@@ -37,7 +37,7 @@ CAUSES = {
     "half_late": "the poses are half a sweep late (or the times of the sweeps are half a sweep early)",
     "half_early": "the poses are half a sweep early (or the times of the sweeps are half a sweep late)",
     **{
-        name: f"the poses are {'late' if by > 0 else 'early'} (sweep i has the pose of sweep i {'-+'[by < 0]} {abs(by)})"
+        name: f"the poses are {('early', 'late')[by > 0]} (sweep i has the pose of sweep i {'+-'[by > 0]} {abs(by)})"
         for name, by in SHIFTS.items()
         if abs(by) >= 1
     },
@@ -256,7 +256,7 @@ class Judgement:
         name = self.best[0]
         share = f"({self.given:.2f} of the static structure is in place as given, {self.shares.get(name, 0):.2f} then)"
         if name == NO_READING:
-            return f"the sweeps fit under no reading of the poses (only {self.given:.2f} of the structure is in place)"
+            return f"the sweeps fit under no reading (only {self.given:.2f} of the static structure is in place)"
         if self.motion is not None:
             return f"the sensor moves by about {np.hypot(*self.motion[:2, 3]):.1f} m between two sweeps {share}"
         return f"{', or '.join(map(self._cause, self.best))} {share}"
@@ -346,7 +346,9 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     moving = [pair for pair in usable if pair.has_motion]
     if not moving:
         shares, clear = _compare([pair.among(STEPS).shares_of_poses(OFF) for pair in usable])
-        return Judgement(shares, tuple(clear[:1])) if clear else _judge_motion(usable)
+        judgement = Judgement(shares, tuple(clear[:1])) if clear else _judge_motion(usable)
+        is_hopeless = not judgement.best and len(usable) > 1 and judgement.given < _HOPELESS
+        return replace(judgement, best=(NO_READING,)) if is_hopeless else judgement
     fast = [pair for pair in moving if len(pair.scans) > 1]
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]

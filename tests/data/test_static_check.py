@@ -393,6 +393,15 @@ def camera_points(points, _):
     return points @ AXES[CAMERA]
 
 
+def spherical(unit):
+    def change(points, _):
+        flat = np.hypot(points[:, 0], points[:, 1])
+        azimuth, elevation = np.arctan2(points[:, 1], points[:, 0]), np.arctan2(points[:, 2], flat)
+        return np.column_stack([np.hypot(flat, points[:, 2]), azimuth / unit, elevation / unit])
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "found"),
     [
@@ -402,8 +411,15 @@ def camera_points(points, _):
         (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
         (lambda points, _: points @ AXES["down"], "data.read_as=points_upside_down"),
         (camera_points, "data.read_as=points_camera"),
+        (spherical(1.0), "data.read_as=points_spherical"),
+        (spherical(np.pi / 180), "data.read_as=points_spherical"),
+        (lambda points, _: points @ rotations_about(1, 0.5), "degrees (turn it by +30 about y)"),
+        (lambda points, _: points @ rotations_about(0, -0.4), "data.ego_T_lidar"),
     ],
-    ids=["millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera"],
+    ids=[
+        *("millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera"),
+        *("radians", "degrees", "pitch", "roll"),
+    ],
 )
 @pytest.mark.parametrize("source", ["drive", pytest.param("real", marks=pytest.mark.slow)])
 def test_wrong_units_and_axes_are_recognised(source, change, found, request):
@@ -420,6 +436,41 @@ def test_wrong_units_and_axes_are_recognised(source, change, found, request):
         again = read_as(Wrong(good, points=change, masks=False), reading)
         assert np.allclose(again.sweep(3).points, good.sweep(3).points, atol=1e-3)
         assert find_problems(again) == []
+
+
+def test_points_in_feet_are_told_by_the_motion(drive):
+    feet = Wrong(drive, lambda points, _: points / 0.3048)
+    (problem,) = find_problems(feet)
+    assert "give data.read_as=points_feet" in problem and find_problems(read_as(feet, "points_feet")) == []
+
+
+@pytest.mark.parametrize("first", [np.linalg.norm, lambda points, axis: np.arange(len(points)) % 32])
+def test_a_column_before_x_is_told_and_no_pose_is_blamed(thin, tmp_path, first):
+    write_array_log(thin, tmp_path)
+    for file in (tmp_path / thin.log_id / "points").iterdir():
+        points = np.load(file)
+        np.save(file, np.column_stack([first(points, axis=1), points]).astype(np.float32))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        open_log("arrays", tmp_path / thin.log_id, ground=None)
+    texts = [str(each.message) for each in caught]
+    assert any("first column does not seem to be x" in text for text in texts)
+    assert not any("the poses" in text or "world's frame" in text for text in texts)
+
+
+@pytest.mark.parametrize("has_poses", [True, False])
+def test_sweeps_that_measure_parts_of_a_turn_are_told(drive, has_poses):
+    """A cloud per packet, or two sensors in turns."""
+
+    class Part(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index // 3)
+            azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) % 1
+            keep = np.floor(3 * azimuth) == index % 3
+            return replace(sweep, points=sweep.points[keep], is_ground=sweep.is_ground[keep])
+
+    texts = find_problems(Part(drive, poses=None if has_poses else lambda _: None))
+    assert any("share 0 % of the directions" in text or "share 4 %" in text for text in texts), texts
 
 
 def test_points_in_the_world_without_poses_are_told_by_the_last_sweep(drive):
