@@ -9,20 +9,33 @@ from typing import Any, Callable, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import SUFFIXES
-from cflow_torch.data.arrays.poses_text import files_of_poses, parse_poses, parse_times, read_poses
+from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.folders import find_folders, natural_key, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start
 from cflow_torch.types import CFlowError
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
-POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
+POSE_FILES = (
+    *("poses.txt", "poses.npy", "poses.npz", "poses.csv", "trajectory.txt", "trajectory.csv", "trajectory.npz"),
+    "odometry.csv",
+)
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_TABLES = (".txt", ".csv", ".tum", ".json", ".jsonl")  # suffixes of files that we test for poses and times
+_TABLES = (
+    ".txt",
+    ".csv",
+    ".tum",
+    ".log",
+    ".g2o",
+    ".json",
+    ".jsonl",
+    ".yaml",
+    ".yml",
+)  # suffixes of files that we test for poses and times
 _TESTED = 8192  # bytes of a file that tell what it holds
-_LARGEST_JSON = 1 << 24  # bytes; JSON must be whole to be read, and poses take less
+_LARGEST = 1 << 24  # bytes; structured files must be whole to be read, and poses take less
 
 
 def find_array_logs(root: PathLike) -> list[Path]:
@@ -154,11 +167,11 @@ def _has_one_pose(path: Path) -> bool:
 def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
     """Parse the first lines of a file; None = this is not possible."""
     try:
-        is_json = path.suffix.lower() in (".json", ".jsonl")
-        start = read_start(path, _LARGEST_JSON if is_json else _TESTED)
-        if not is_json and len(start) == _TESTED:  # whole lines, and whole matrices of four
+        is_whole = path.suffix.lower() in STRUCTURED
+        start = read_start(path, _LARGEST if is_whole else _TESTED)
+        if not is_whole and len(start) == _TESTED:  # whole lines, and whole matrices of four or five
             lines = start.splitlines(keepends=True)[:-1]
-            start = b"".join(lines[: len(lines) // 4 * 4])
+            start = b"".join(lines[: len(lines) // 20 * 20] or lines[: len(lines) // 4 * 4])
         return parse(start, path)
     except (CFlowError, OSError):
         return None

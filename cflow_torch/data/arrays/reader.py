@@ -35,6 +35,7 @@ from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 
 _VIEWPOINT = "VIEWPOINT"
+_LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
 _LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
@@ -156,7 +157,9 @@ class ArraysLog(Log):
         file = resolve(self.folder, poses, POSE_FILES, "poses", kitti)
         if file is None and poses == "auto":
             found = [
-                path for path in find_tables(self.folder)[0] if ".json" not in path.suffix.lower() or self._fits(path)
+                path
+                for path in find_tables(self.folder)[0]
+                if path.suffix.lower() not in poses_text.STRUCTURED or self._fits(path)
             ]
             file = only_one(found, self.folder, "poses")
             self._note(f"its poses are those of {file.name}" if file else "")
@@ -177,7 +180,7 @@ class ArraysLog(Log):
         return trajectory._replace(poses=converted), True
 
     def _fits(self, path: Path) -> bool:
-        """Test whether a JSON file has poses of the sweeps, because such files often hold other poses."""
+        """Test whether a structured file has poses of the sweeps, because such files often hold other poses."""
         trajectory = poses_text.read_poses(path)
         rows = self._labelled_rows(trajectory.labels)
         return trajectory.times_ns is not None or len(trajectory.poses) == len(self.files) or rows is not None
@@ -217,10 +220,21 @@ class ArraysLog(Log):
         return None if file is None else poses_text.read_times(file).tolist()
 
     def _labelled_rows(self, labels: Sequence[str]) -> np.ndarray | None:
-        """Return the row of each file in a table whose rows have labels: by its name, or in the order of numbers."""
-        row_of = {Path(label).stem: row for row, label in enumerate(labels)}
+        """Return the row of each file in a table whose rows have labels: by its name, its number, or in their order.
+
+        If the numbers of more than half of the files are there, and there are fewer or more rows than files, the others
+        have none (-1).
+        """
+        stems = [Path(label).stem for label in labels]
+        row_of = dict(zip(stems, range(len(stems))))
         if row_of.keys() >= {path.stem for path in self.files}:
             return np.array([row_of[path.stem] for path in self.files])
+        numbers = [_number_of(path.stem) for path in self.files]
+        numbered = dict(zip(map(_number_of, stems), range(len(stems))))
+        rows = np.array([numbered.get(number, -1) for number in numbers])
+        is_enough = (rows >= 0).mean() > (_LEAST_NAMED if len(stems) != len(self.files) else 1 - 1e-9)
+        if len(numbered) == len(stems) > 0 and is_enough and max(numbers) >= _LEAST_REACH * max(numbered):
+            return rows
         if len(row_of) != len(self.files) or len({re.sub(r"\d+", "", label) for label in labels}) > 1:
             return None
         return np.array(sorted(range(len(labels)), key=lambda row: natural_key(labels[row])))
@@ -234,8 +248,7 @@ class ArraysLog(Log):
         labelled = self._labelled_rows(labels) if len(labels) == count else None
         if count == len(self.files) or labelled is not None:
             return np.arange(count) if labelled is None else labelled
-        digits = [re.findall(r"\d+", path.stem) for path in self.files]
-        numbers = np.array([int(runs[-1][-9:]) if runs else -1 for runs in digits])
+        numbers = np.array([_number_of(path.stem) % 10**9 for path in self.files])
         fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
         if len(fitting) != 1 or len(set(numbers)) < len(numbers) or fitting[0].max() < _LEAST_REACH * count:
             return None
@@ -243,6 +256,7 @@ class ArraysLog(Log):
         return fitting[0]
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
+        trajectory = trajectory.counted(stamps)
         source = trajectory.source
         rows = np.arange(len(self.files))
         if trajectory.times_ns is not None and stamps is not None:
@@ -257,9 +271,10 @@ class ArraysLog(Log):
                     "with times (TUM) and the times of the sweeps in times.txt, or no poses"
                 )
             rows = given
-            is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2))
+            is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2)) & (rows >= 0)
             if not is_known.all():
-                self._note(f"{(~is_known).sum()} of {len(rows)} sweeps have a pose of NaN in {source} and are left out")
+                count = f"{(~is_known).sum()} of {len(rows)} sweeps"
+                self._note(f"{count} have no pose, or one of NaN, in {source} and are left out")
             poses = trajectory.poses[rows][is_known]
         kept = np.flatnonzero(is_known)
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
@@ -268,6 +283,12 @@ class ArraysLog(Log):
         gaps = np.flatnonzero(is_gap).tolist()
         self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
         return poses
+
+
+def _number_of(stem: str) -> int:
+    """Return the last number in the name of a file; -1 = it has none."""
+    digits = re.findall(r"\d+", stem)
+    return int(digits[-1]) if digits else -1
 
 
 def _drives_along_x(poses: np.ndarray) -> bool:
