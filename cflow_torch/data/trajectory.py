@@ -31,6 +31,12 @@ class Trajectory(NamedTuple):
         known: np.ndarray = np.zeros(0) if self.times_ns is None else self.times_ns
         return bool(np.median(np.diff(known)) > _SPARSE * np.median(np.diff(times_ns)))
 
+    def covers(self, times_ns: Sequence[int]) -> bool:
+        """Test whether it has poses at most of these times."""
+        if self.times_ns is None:
+            return False
+        return bool(_neighbours(self.times_ns, np.asarray(times_ns, np.int64))[2].mean() > _FEWEST_COVERED)
+
     def counted(self, times_ns: Sequence[int] | None) -> Trajectory:
         """Return the poses by number of the sweep, if their times are 0, 1, 2, ... and not those of the sweeps."""
         known: np.ndarray = np.zeros(0, np.int64) if self.times_ns is None else self.times_ns

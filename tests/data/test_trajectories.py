@@ -326,6 +326,27 @@ def test_poses_belong_to_the_numbers_of_sweeps(tmp_path) -> None:
     assert np.allclose(ArraysLog(named).poses, POSES, atol=1e-9)
 
 
+def test_poses_near_a_folder_are_those_at_its_times(tmp_path) -> None:
+    """MulRan and Newer College: poses lie two levels above the clouds, or in a folder next to them."""
+    (tmp_path / "truth").mkdir()
+    folder = clouds(tmp_path / "sensor_data" / "Ouster")
+    (tmp_path / "truth" / "poses.csv").write_text("\n".join(EXACT))
+    (tmp_path / "other.csv").write_text("\n".join(line(k, f"{k / 10}") for k in range(12)))
+    with pytest.warns(CFlowWarning, match="its poses are those of .*truth.*poses.csv"):
+        assert ArraysLog(folder).poses[:, 0, 3].tolist() == list(range(12))
+    (tmp_path / "global.txt").write_text("\n".join(EXACT))
+    with pytest.warns(CFlowWarning, match="global.txt and .*poses.csv: choose one with data.poses"):
+        assert ArraysLog(folder).poses is None
+
+
+def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
+    for k, pose in enumerate(POSES):
+        np.savez(tmp_path / f"{k}.npz", points=np.ones((5, 3)), pose=pose, stamp=0.1 * k)
+    with pytest.warns(CFlowWarning, match="its poses come from the array pose"):
+        log: Any = ArraysLog(tmp_path)
+    assert np.array_equal(log.poses, POSES) and log.has_viewpoints
+
+
 def test_numbers_of_sweeps_are_no_times(tmp_path) -> None:
     clouds(tmp_path)
     (tmp_path / "poses.txt").write_text("\n".join(line(k, f"{k}") for k in range(12)))

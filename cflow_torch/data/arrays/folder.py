@@ -13,6 +13,7 @@ from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.folders import find_folders, natural_key, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start
+from cflow_torch.data.trajectory import Trajectory
 from cflow_torch.types import CFlowError
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
@@ -34,6 +35,8 @@ _TABLES = (
     ".yaml",
     ".yml",
 )  # suffixes of files that we test for poses and times
+_NEAR_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test in other folders
+_FIRST_UNIX, _MOST = 10**17, 50  # nanoseconds in 1973; files or folders
 _TESTED = 8192  # bytes of a file that tell what it holds
 _LARGEST = 1 << 24  # bytes; structured files must be whole to be read, and poses take less
 
@@ -155,6 +158,24 @@ def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
         files = files_of_poses(path)
         poses += [path] if len(files) > 1 and _has_one_pose(files[0]) else []
     return poses, times
+
+
+def find_poses_near(folder: Path, times_ns: Sequence[int]) -> list[Trajectory]:
+    """Find files of text that have poses at the unix times of most sweeps: below a folder, and two levels above it.
+
+    Of folders next to the log or below it, we look only into those that hold nothing but tables, as others are logs. We
+    read the start of at most 50 files in each of at most 50 folders.
+    """
+    if is_remote(folder) or times_ns[0] < _FIRST_UNIX:
+        return []
+    top = folder.resolve()
+    levels = [top, *top.parents[:2]]
+    children = {child: sorted(visible(child))[:_MOST] for level in levels for child in sorted(visible(level))[:_MOST]}
+    plain = [files for files in children.values() if all(file.suffix in _TABLES for file in files)]
+    files = [file for files in (*map(visible, levels), *plain) for file in files if file.suffix in _NEAR_TABLES]
+    starts = ((file, _start_of(file, parse_poses)) for file in files)
+    timed = [read_poses(file) for file, start in starts if start is not None and start.times_ns is not None]
+    return [trajectory for trajectory in timed if trajectory.covers(times_ns)]
 
 
 def _has_one_pose(path: Path) -> bool:
