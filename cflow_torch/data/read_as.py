@@ -46,7 +46,7 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
             - "mirrored", "mirrored_back", "swapped": poses or points are left-handed: y or x is mirrored, or both are
               interchanged;
             - "transposed": the rotations are those of T_ego_world, the positions those of T_world_ego; "compass":
-              angles count clockwise from the y axis (north), while x is east;
+              angles count clockwise from the y axis (north), while x is east; "degrees": angles were read as radians;
             - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
             - "millimetres", "centimetres", "feet": unit of the poses;
             - "points_millimetres", "points_centimetres", "points_feet", "points_camera", "points_upside_down": unit or

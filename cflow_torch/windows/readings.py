@@ -50,6 +50,7 @@ CAUSES = {
     "swapped": "x and y of the points or of the poses are interchanged (left-handed)",
     "transposed": "the rotations of the poses are transposed, but not their positions",
     "compass": "the angles of the poses are compass headings (clockwise from north)",
+    "degrees": "the angles of the poses are degrees, but were read as radians",
     "left": f"{_FRAME} x axis points to the left of the points' x axis",
     "back": f"{_FRAME} x axis points backward",
     "right": f"{_FRAME} x axis points to the right of the points' x axis",
@@ -126,6 +127,18 @@ def _transposed(axes: np.ndarray) -> _OfPoses:
     return lambda poses: as_matrix(axes @ poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3])
 
 
+def _from_degrees(poses: np.ndarray) -> np.ndarray:
+    """Return poses whose angles were degrees, but were read as radians. Neighbours differ by less than pi."""
+    r = poses[:, :3, :3]
+    angles = (
+        np.arctan2(r[:, 2, 1], r[:, 2, 2]),
+        -np.arcsin(r[:, 2, 0].clip(-1, 1)),
+        np.arctan2(r[:, 1, 0], r[:, 0, 0]),
+    )
+    roll, pitch, yaw = (rotations_about(axis, np.radians(np.unwrap(angle))) for axis, angle in enumerate(angles))
+    return as_matrix(yaw @ pitch @ roll, poses[:, :3, 3])
+
+
 def _later(by: float) -> _OfPoses:
     """Return what gives each sweep the pose `by` sweeps later. Beyond the ends, the motion continues."""
 
@@ -163,6 +176,7 @@ OF_POSES: dict[str, _OfPoses] = {
     **{name: _mirrored(axes) for name, axes in _MIRRORED.items()},
     "transposed": _transposed(np.eye(3)),
     "compass": _transposed(AXES["left"]),
+    "degrees": _from_degrees,
     **{name: _moved(as_matrix(AXES[name].T)) for name in AXES},
     **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
     **{name: _scaled(unit) for name, unit in _UNITS.items()},

@@ -131,6 +131,14 @@ def mirrored(axes):
     return lambda pose: as_matrix(axes) @ pose @ as_matrix(axes)
 
 
+def in_degrees(pose):
+    """A pose whose roll, pitch and yaw are written in degrees, and read as radians."""
+    r = pose[:3, :3]
+    angles = np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(r[2, 0]), np.arctan2(r[1, 0], r[0, 0])
+    roll, pitch, yaw = (rotations_about(axis, np.degrees(angle)) for axis, angle in enumerate(angles))
+    return as_matrix(yaw @ pitch @ roll, pose[:3, 3])
+
+
 POSES = {
     "inverted": np.linalg.inv,
     CAMERA: lambda pose: pose @ as_matrix(AXES[CAMERA]),
@@ -156,6 +164,7 @@ WRONG_POSES = {
     "millimetres": scaled(1000),
     "centimetres": scaled(100),
     "feet": scaled(1 / 0.3048),
+    "degrees": each(in_degrees),
     "steps": lambda poses: np.concatenate([poses[:1], np.linalg.inv(poses[:-1]) @ poses[1:]]),
     "steps_back": lambda poses: np.concatenate([np.linalg.inv(poses[:1]), np.linalg.inv(poses[1:]) @ poses[:-1]]),
 }
