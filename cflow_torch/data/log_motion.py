@@ -27,6 +27,7 @@ from cflow_torch.windows.readings import (
 )
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
+_BEFORE = 100  # sweeps before a suspect step, from whose poses other readings of it follow
 _CHANGES = (-4, -1, 1, 4)  # sweeps between a pair and those whose motion should differ
 _REACH = 10  # sweeps before and after a pair, whose poses may be those of the pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
@@ -210,7 +211,10 @@ def find_lapses(log: Log) -> list[Lapse]:
 
 def _contradicted(log: Log, index: int, step: np.ndarray, usual: np.ndarray) -> bool:
     """Test whether a step fits best as those around it, and not under another reading of all poses."""
-    pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
+    start = max(index - _BEFORE, 0)
+    poses = known_poses(log)
+    around = None if poses is None else poses[start : index + 2]
+    pair = make_pair(log.sweep(index), log.sweep(index + 1), around, (index - start, index + 1 - start), False)
     if pair is None:
         return False
     transforms = {GIVEN: step, _AS_AROUND: usual}

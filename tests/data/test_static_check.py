@@ -164,7 +164,7 @@ WRONG_POSES = {
     "millimetres": scaled(1000),
     "centimetres": scaled(100),
     "feet": scaled(1 / 0.3048),
-    "degrees": each(in_degrees),
+    "degrees": lambda poses: each(in_degrees)(np.linalg.inv(poses[0]) @ poses),
     "steps": lambda poses: np.concatenate([poses[:1], np.linalg.inv(poses[:-1]) @ poses[1:]]),
     "steps_back": lambda poses: np.concatenate([np.linalg.inv(poses[:1]), np.linalg.inv(poses[1:]) @ poses[:-1]]),
 }
