@@ -120,13 +120,8 @@ class BagLog(Log):
             self.frame = frame or self._ego_frame()
             self.timestamps = sorted(self._arrival)
             self._check_count(f"{self.path}: {self.topic}")
-            trajectory = self._poses_of_file(poses)
-            source = None if trajectory else self._pose_source(topics, poses, bool(tracks))
-            if source is not None:
-                times, matrices = self._find_trajectory(source, tracks)
-                self._set_clock(times)
-                trajectory = Trajectory(matrices, times, False, f"{source} of {self.path}")
-            elif trajectory is None and poses == "auto":
+            trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
+            if trajectory is None and poses == "auto":
                 trajectory = self._poses_near()
             if trajectory is not None:
                 self._use_poses(trajectory)
@@ -150,6 +145,15 @@ class BagLog(Log):
             return self._chosen(topics, (*_POSE_TYPES, *_OTHER_POSES), poses, "poses")
         has_usual = not set(_POSE_TYPES).isdisjoint(topics.values())
         return self._chosen(topics, _POSE_TYPES if has_usual else _OTHER_POSES, None, "poses")
+
+    def _poses_of_bag(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
+        """Return the poses of transforms or of a topic; None = there are none. Clouds of another clock are shifted."""
+        source = self._pose_source(topics, poses, bool(tracks))
+        if source is None:
+            return None
+        times, matrices = self._find_trajectory(source, tracks)
+        self._set_clock(times)
+        return Trajectory(matrices, times, False, f"{source} of {self.path}")
 
     def _poses_of_file(self, poses: str | None) -> Trajectory | None:
         """Return the poses of a file next to the bag, or of any other, see `read_poses`; None = this is not a file."""
