@@ -12,7 +12,7 @@ _ROLES = {
     "sec": "(.*stamp)?secs?",
     "nsec": "(.*stamp)?(nsecs?|nanosec)",
     "time": "t|.*time|.*stamp|(time|timestamp|stamp|t)(s|sec|secs|ns|us|ms|unix)",
-    **{axis: f"{_POSITION}{axis}m?" for axis in "xyz"},
+    **{axis: f"{_POSITION}({axis}|{name})m?" for axis, name in zip("xyz", ("easting", "northing", "altitude"))},
     **{f"q{axis}": _ROTATION + axis for axis in "wxyz0123"},
     "roll": ".*roll(deg|degrees|rad|radians)?",
     "pitch": ".*pitch(deg|degrees|rad|radians)?",

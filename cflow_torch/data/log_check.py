@@ -9,15 +9,26 @@ import numpy as np
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, known_poses
 from cflow_torch.data.log_motion import find_lapses, judge_log
-from cflow_torch.data.read_as import ReadAs
+from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.inspection import REPEATED, repeats
-from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import MOUNTS, NO_READING, SCALED, STILL, TURNED, UNKNOWN, WORLD, Judgement
+from cflow_torch.windows.point_frame import OF_POINTS, frame_problem
+from cflow_torch.windows.readings import (
+    LEAST_SHARE,
+    MOUNTS,
+    NO_READING,
+    SCALED,
+    STILL,
+    TURNED,
+    UNKNOWN,
+    WORLD,
+    Judgement,
+)
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
+_DIRECTIONS, _LEAST_SHARED = 72, 0.5  # and the share of them in which neighbouring sweeps both measure
 _TOPICS = (
     *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
     *("labels", "reader"),
@@ -90,17 +101,28 @@ def _frame(log: Log) -> list[Finding]:
         if problem:
             fix = f"; {_setting(log, reading)} converts them" if reading else ""
             return [Finding("frame", WRONG, f"in the {name} sweep {problem}{fix}", True)]
+    if begins_late(log):
+        text = "the first column does not seem to be x: give x, y, z first, and then others such as intensity or time"
+        return [Finding("frame", WRONG, text, True)]
     return [Finding("frame", RIGHT, "metres, around the vehicle, z up", True)]
 
 
 def _motion(log: Log) -> list[Finding]:
-    reading, _ = frame_problem(log.sweep(0).points)
+    reading, problem = frame_problem(log.sweep(0).points)
+    if (problem and not reading) or begins_late(log):
+        return []  # in another frame, readings of the poses mean nothing
     if reading:  # the poses are judged in the frame that the points will have
         log = ReadAs(log, reading)
     judgement = judge_log(log) if reading else log.judgement or judge_log(log)
     if not judgement.shares:
         return []
     has_poses = log.sweep(0).pose is not None
+    if NO_READING in judgement.best and has_poses:
+        fits = {name: judge_log(ReadAs(log, name)) for name in OF_POINTS}
+        fitting = [name for name, each in fits.items() if not each.best and each.given >= LEAST_SHARE]
+        if fitting:
+            text = f"{judgement}, unless points are converted: give {_setting(log, fitting[0])}"
+            return [Finding("frame", WRONG, text, True)]
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]
@@ -109,7 +131,8 @@ def _motion(log: Log) -> list[Finding]:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
         fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
     elif name == NO_READING:
-        why, fix = "", "check that the poses belong to this log, their times, units and quaternions"
+        why, fix = "", "check that the points are x, y, z in metres, and "
+        fix += "that the poses belong to this log, their times, units and quaternions" if has_poses else "pass poses"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
         fix = " or ".join(_fix(log, judgement, each) for each in judgement.best)
@@ -182,7 +205,23 @@ def _repeated(log: Log) -> list[Finding]:
     first = [log.sweep(index) for index in range(min(3, len(log.timestamps)))]
     if any(repeats(pc0, pc1) for pc0, pc1 in zip(first, first[1:])):
         return [Finding("sweeps", WRONG, REPEATED, True)]
+    seen = [_directions(sweep) for sweep in first]
+    shared = max(float((a & b).sum() / max(min(a.sum(), b.sum()), 1)) for a, b in zip(seen, seen[1:]))
+    if shared < _LEAST_SHARED and all(each.any() for each in seen):
+        text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
+        fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
+        return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
     return []
+
+
+def _directions(sweep: Sweep) -> np.ndarray:
+    """Return in which of 72 directions a sweep has points, (72,) bool."""
+    x, y = as_numpy(sweep.points)[:, :2].astype(np.float64).T
+    angle = np.arctan2(y, x)[np.isfinite(x + y)]
+    return (
+        np.bincount(np.floor((angle / (2 * np.pi)) % 1 * _DIRECTIONS).astype(int) % _DIRECTIONS, minlength=_DIRECTIONS)
+        > 0
+    )
 
 
 def _unreadable(log: Log) -> list[Finding]:

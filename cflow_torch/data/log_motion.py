@@ -27,6 +27,9 @@ from cflow_torch.windows.readings import (
 )
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
+_BEFORE = 100  # sweeps before a suspect step, from whose poses other readings of it follow
+_CHANGES = (-4, -1, 1, 4)  # sweeps between a pair and those whose motion should differ
+_REACH = 10  # sweeps before and after a pair, whose poses may be those of the pair
 # Metres a sweep, of points 20 m away. If it is less, a wrong direction moves static objects by millimetres only.
 _LEAST_SPEED, _LEAST_TIMED = 0.5, 0.1
 _DOUBTFUL = 0.2  # share in place, below which poses that hardly move are compared with the motion of the sensor
@@ -64,8 +67,7 @@ def choose_pairs(num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int]
     smooth = [pair for pair in pairs if pair[0] not in jumps] or pairs
     inner = [pair for pair in smooth if pair[0] > 0 and pair[1] + 1 < num_sweeps]  # with poses before and after
     inner = [pair for pair in inner if not {pair[0] - 1, pair[1]} & set(jumps)] or inner
-    changes = [partial(_change, poses, -1), partial(_change, poses, 1)] if inner else []
-    criteria = (partial(_turn, poses), partial(_speed, poses), *changes)
+    criteria = (partial(_turn, poses), partial(_speed, poses), *([partial(_change, poses)] if inner else []))
     return sorted({max(inner or smooth, key=lambda pair: criterion(*pair)) for criterion in criteria})
 
 
@@ -93,9 +95,11 @@ def _turn(poses: np.ndarray, first: int, second: int) -> float:
     return turn_of(_motion(poses, first, second))
 
 
-def _change(poses: np.ndarray, step: int, first: int, second: int) -> float:
-    """Return how much the motion of a pair differs from that of the pair `step` sweeps later, metres."""
-    return difference(_motion(poses, first, second), _motion(poses, first + step, second + step))
+def _change(poses: np.ndarray, first: int, second: int) -> float:
+    """Return how much the motion of a pair differs from that some sweeps earlier and later, metres."""
+    given = _motion(poses, first, second)
+    firsts = [first + step for step in _CHANGES if first + step >= 0 and second + step < len(poses)]
+    return sum(difference(given, _motion(poses, other, other + second - first)) for other in firsts)
 
 
 def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: Sequence[str] = (OFF,)) -> Judgement:
@@ -142,13 +146,14 @@ def _make_pairs(
 ) -> Iterator[Pair | None]:
     """Prepare the pairs; `neighbours` are the poses that tell those before and after a sweep, None = they do not."""
     for first, second in chosen:
-        before = None if neighbours is None or first == 0 else neighbours[[first - 1, second - 1]]
-        after = None if neighbours is None or second + 1 == len(neighbours) else neighbours[[first + 1, second + 1]]
+        start = max(first - _REACH, 0)
+        around = None if neighbours is None else neighbours[start : second + _REACH + 1]
         least = _LEAST_TIMED if TIMES in scans else _LEAST_SPEED
         is_fast = poses is not None and difference(_motion(poses, first, second), np.eye(4)) >= least * (second - first)
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}
         shown = scans if is_fast else scans[:1]
-        yield make_pair(sweeps[first], sweeps[second], before, after, in_world, scans=shown, **how)
+        rows = (0, 1) if around is None else (first - start, second - start)
+        yield make_pair(sweeps[first], sweeps[second], around, rows, in_world, scans=shown, **how)
 
 
 class Steps(NamedTuple):
@@ -206,7 +211,10 @@ def find_lapses(log: Log) -> list[Lapse]:
 
 def _contradicted(log: Log, index: int, step: np.ndarray, usual: np.ndarray) -> bool:
     """Test whether a step fits best as those around it, and not under another reading of all poses."""
-    pair = make_pair(log.sweep(index), log.sweep(index + 1), in_world=False)
+    start = max(index - _BEFORE, 0)
+    poses = known_poses(log)
+    around = None if poses is None else poses[start : index + 2]
+    pair = make_pair(log.sweep(index), log.sweep(index + 1), around, (index - start, index + 1 - start), False)
     if pair is None:
         return False
     transforms = {GIVEN: step, _AS_AROUND: usual}

@@ -12,20 +12,17 @@ from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper, points_surround_poses
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.errors import CFlowError
-from cflow_torch.transforms import halfway, rigid_transform, transform_points
-from cflow_torch.types import Sweep
-from cflow_torch.windows.readings import AXES, CAMERA, CAUSES, HALF_EARLY, HALF_LATE, MOUNT, OF_POSES, SHIFTS, WORLD
+from cflow_torch.ground.segmentation import has_ground
+from cflow_torch.transforms import rigid_transform, transform_points
+from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.windows.point_frame import OF_POINTS
+from cflow_torch.windows.readings import CAUSES, MOUNT, OF_POSES, SHIFTS, STEPS, WORLD
 
-_OF_POINTS = {  # what converts points as stored to metres, x forward and z up
-    "points_millimetres": 1e-3 * np.eye(3),
-    "points_centimetres": 1e-2 * np.eye(3),
-    "points_camera": AXES[CAMERA],
-    "points_upside_down": AXES["down"],
-}
 _OF_POSES = [name for name in OF_POSES if not name.startswith(MOUNT)]
-CHANGES_POINTS = frozenset(_OF_POINTS)
+_LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
+CHANGES_POINTS = frozenset(OF_POINTS)
 """Readings under which the numbers of the points are others than those in the files."""
-READ_AS = ("auto", None, WORLD, *SHIFTS, *_OF_POSES, *_OF_POINTS)
+READ_AS = ("auto", None, WORLD, *_OF_POSES, *OF_POINTS)
 
 
 def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
@@ -39,8 +36,9 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
             - "world": points are in the world's frame, and we move them to the frame of the vehicle;
             - "inverted": poses are T_ego_world;
             - "still": ignore the poses;
-            - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; the first, or last, is extrapolated;
-              "half_late", "half_early": it is halfway there;
+            - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; those at an end are extrapolated;
+              "half_late", "half_early": it is halfway there; "late_2" to "early_10": it is so many sweeps away;
+            - "steps": each pose is that of a sweep in the frame of the sweep before; "steps_back": it is the inverse;
             - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
               camera's, or the x axis points to the left, backward or to the right of that of the points; "down": z
               points down, and y to the right;
@@ -48,12 +46,13 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
             - "mirrored", "mirrored_back", "swapped": poses or points are left-handed: y or x is mirrored, or both are
               interchanged;
             - "transposed": the rotations are those of T_ego_world, the positions those of T_world_ego; "compass":
-              angles count clockwise from the y axis (north), while x is east;
+              angles count clockwise from the y axis (north), while x is east; "degrees": angles were read as radians;
             - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
-            - "millimetres", "centimetres": unit of the poses;
-            - "points_millimetres", "points_centimetres", "points_camera", "points_upside_down": unit or axes of the
-              points (a camera's: x right, y down, z forward; upside down: y to the right). The poses stay, so give
-              ("points_camera", "camera") if they have these axes, too.
+            - "millimetres", "centimetres", "feet": unit of the poses;
+            - "points_millimetres", "points_centimetres", "points_feet", "points_camera", "points_upside_down": unit or
+              axes of the points (a camera's: x right, y down, z forward; upside down: y to the right). The poses stay,
+              so give ("points_camera", "camera") if they have these axes, too;
+            - "points_spherical": the columns are range, azimuth (counterclockwise) and elevation, radians or degrees.
     """
     if isinstance(reading, Sequence) and not isinstance(reading, str):
         for each in reading:
@@ -69,9 +68,22 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
 def _is_in_world(log: Log) -> bool:
     """Test whether the points of a log are in the world's frame; by one sweep, if it is not there."""
     try:
-        return (log.unwrapped.has_viewpoints or log.surrounds_poses) and WORLD in judge_log(log).best
+        if not (log.unwrapped.has_viewpoints or log.surrounds_poses) or WORLD not in judge_log(log).best:
+            return False
+        return not begins_late(log)
     except (CFlowError, OSError):
         return False  # `sweep` raises the error
+
+
+def begins_late(log: Log) -> bool:
+    """Test whether clouds have another column before x, y and z: the second to fourth have ground, the others none."""
+    columns = as_numpy(log.sweep(0).points)[:, :3]
+    if len(columns) == 0 or not np.nanmin(columns[:, 0]) >= 0 or has_ground(columns):
+        return False
+    fourth = log.columns(0).get("column_3", np.zeros(0))
+    if len(fourth) != len(columns) or np.ptp(np.quantile(fourth, (0.05, 0.95))) < _LEAST_HEIGHT:
+        return False
+    return has_ground(np.column_stack([columns[:, 1:], fourth]).astype(np.float32))
 
 
 class ReadAs(LogWrapper):
@@ -97,11 +109,11 @@ class ReadAs(LogWrapper):
         sweep = self.log.sweep(index)
         points = np.asarray(sweep.points)
         moved = self._move(points, index, sweep.pose).astype(np.float32)
-        return replace(sweep, points=moved, pose=self._pose(index, sweep.pose))
+        return replace(sweep, points=moved, pose=None if sweep.pose is None else self._converted[index].copy())
 
     def _labels(self, index: int) -> FlowLabels | None:
         labels = self.log.labels(index)
-        if labels is None or self.reading not in (WORLD, *_OF_POINTS):
+        if labels is None or self.reading not in (WORLD, *OF_POINTS):
             return labels
         sweep, pose1 = self.log.sweep(index), self.log.sweep(index + 1).pose
         points = np.asarray(sweep.points)[:, :3].astype(np.float64)
@@ -120,43 +132,29 @@ class ReadAs(LogWrapper):
 
     @cached_property
     def poses(self) -> np.ndarray | None:
-        given = self.log.poses
-        return None if given is None else np.array([self._pose(index, pose) for index, pose in enumerate(given)])
+        return None if self.log.poses is None else self._converted
 
     @cached_property
     def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
         given = self.log.trajectory
-        if given is None or self.reading in SHIFTS:
+        if given is None or self.reading in (*SHIFTS, *STEPS):
             return None
         times, poses = given
-        return times, np.array([self._convert(pose) for pose in poses])
+        return times, self._convert(poses)
+
+    @cached_property
+    def _converted(self) -> np.ndarray:
+        """The (K, 4, 4) poses of all sweeps, as `T_world_ego`."""
+        return self._convert(np.stack([self._given(index) for index in range(len(self))]))
+
+    def _convert(self, poses: np.ndarray) -> np.ndarray:
+        return OF_POSES[self.reading](poses) if self.reading in OF_POSES else poses
 
     def _move(self, points: np.ndarray, index: int, pose: Any) -> np.ndarray:
         """Convert points of sweep `index`, (N, 3+), to metres in the frame of the vehicle."""
         if self.reading == WORLD:
             return transform_points(points[:, :3], np.linalg.inv(self._given(index, pose)))
-        return points[:, :3] @ _OF_POINTS[self.reading].T if self.reading in _OF_POINTS else points[:, :3]
-
-    def _pose(self, index: int, pose: Any) -> np.ndarray | None:
-        """Convert the pose of sweep `index`."""
-        if pose is None:
-            return None
-        if self.reading in SHIFTS:
-            neighbour = self._neighbour(index, SHIFTS[self.reading])
-            is_half = self.reading in (HALF_LATE, HALF_EARLY)
-            return halfway(self._given(index, pose)[None], neighbour[None])[0] if is_half else neighbour
-        return self._convert(self._given(index, pose))
-
-    def _convert(self, pose: np.ndarray) -> np.ndarray:
-        """Convert a pose to `T_world_ego`."""
-        return OF_POSES[self.reading](pose) if self.reading in OF_POSES else pose
-
-    def _neighbour(self, index: int, step: int) -> np.ndarray:
-        """Return the pose of the next or last sweep; beyond the end the vehicle moves as between the two before."""
-        if 0 <= index + step < len(self):
-            return self._given(index + step)
-        here, before = self._given(index), self._given(index - step)
-        return here @ np.linalg.inv(before) @ here
+        return OF_POINTS[self.reading](points) if self.reading in OF_POINTS else points[:, :3]
 
     def _given(self, index: int, pose: Any = None) -> np.ndarray:
         if pose is None:

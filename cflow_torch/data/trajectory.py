@@ -11,6 +11,7 @@ from cflow_torch.types import CFlowError
 
 _LONGEST_GAP_NS = 500_000_000  # longest time between two poses over which we interpolate
 _FEWEST_COVERED = 0.5  # share of sweeps at a pose, if poses are farther apart than that
+_SECOND = 10**9  # nanoseconds
 _SPARSE = 1.5  # sweep intervals between poses
 _TOLERANCE_NS = 1_000_000  # by which programs round times
 
@@ -30,16 +31,29 @@ class Trajectory(NamedTuple):
         known: np.ndarray = np.zeros(0) if self.times_ns is None else self.times_ns
         return bool(np.median(np.diff(known)) > _SPARSE * np.median(np.diff(times_ns)))
 
+    def covers(self, times_ns: Sequence[int]) -> bool:
+        """Test whether it has poses at most of these times."""
+        if self.times_ns is None:
+            return False
+        return bool(_neighbours(self.times_ns, np.asarray(times_ns, np.int64))[2].mean() > _FEWEST_COVERED)
+
+    def counted(self, times_ns: Sequence[int] | None) -> Trajectory:
+        """Return the poses by number of the sweep, if their times are 0, 1, 2, ... and not those of the sweeps."""
+        known: np.ndarray = np.zeros(0, np.int64) if self.times_ns is None else self.times_ns
+        if not len(known) or (known % _SECOND).any() or np.median(np.diff(known)) != _SECOND:
+            return self
+        if times_ns is not None and known[0] <= times_ns[-1] and times_ns[0] <= known[-1]:
+            return self
+        return self._replace(times_ns=None, labels=[f"sweep {time // _SECOND}" for time in known])
+
 
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
     """Check (K, 4, 4) or (K, 3, 4) rigid motions and return them as (K, 4, 4) float64. Errors name the `source`."""
     if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or matrices.dtype.kind not in "fiu":
         raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; pass (K, 4, 4) numbers")
-    poses = np.tile(np.eye(4), (len(matrices), 1, 1))
+    poses = np.tile(np.eye(4, dtype=np.result_type(matrices, np.float16)), (len(matrices), 1, 1))
     poses[:, : matrices.shape[1]] = matrices
-    for row, pose in enumerate(poses):
-        rigid_transform(pose, f"pose {row} of {source}")
-    return poses
+    return np.stack([rigid_transform(pose, f"pose {row} of {source}") for row, pose in enumerate(poses)])
 
 
 def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.ndarray, np.ndarray, str]:

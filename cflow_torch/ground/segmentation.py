@@ -35,7 +35,7 @@ _HIGHEST = 1 << 28  # heights are clamped to this, mm
 # Of the points within 32 m and farther than half a metre from the ground, less than 1.5 % lie below it on four real
 # drives and 15 simulated ones, but more than 97 % if z points down.
 _NEAR, _FAR, _SHARE_BELOW, _FEWEST_BELOW = 32_000, 500, 0.8, 200
-_MOST_POINTS = 30_000  # `has_ground` and `is_upside_down` take every second, third, ... point of larger sweeps
+_MOST_POINTS = 30_000  # `has_ground` and `ground_side` take every second, third, ... point of larger sweeps
 _PATCHWORK_HEIGHT = 1.723  # metres, height of the sensor above ground in Patchwork++'s default settings
 
 
@@ -97,15 +97,19 @@ def has_ground(cloud: Array) -> bool:
 
 
 @one_thread()
-def is_upside_down(cloud: Array) -> bool:
-    """Test whether z points down: nearly all points more than half a metre from the ground are below it."""
+def ground_side(cloud: Array) -> int:
+    """Return 0 if a sweep has no ground, else the side of it on which points are: 1 = z points up, -1 = z points down.
+
+    z points down if nearly all points more than half a metre from the ground are below it.
+    """
     points = _thinned(cloud)
     plane = near_plane(points)
     height = plane.heights(points)
     is_near = points.is_active & (points.position[:2].abs() < _NEAR).all(0)
     num_below = int((is_near & (height < -_FAR)).sum())
     num_above = int((is_near & (height > _FAR)).sum())
-    return bool(plane.is_there) and num_below >= max(_FEWEST_BELOW, _SHARE_BELOW * (num_below + num_above))
+    is_down = num_below >= max(_FEWEST_BELOW, _SHARE_BELOW * (num_below + num_above))
+    return (-1 if is_down else 1) if bool(plane.is_there) else 0
 
 
 def _thinned(cloud: Array) -> Points:

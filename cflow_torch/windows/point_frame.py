@@ -1,10 +1,14 @@
-"""Recognise points that are not in metres, not near the vehicle, or whose z axis does not point up."""
+"""Recognise points that are not x, y, z in metres, not near the vehicle, or whose z axis does not point up."""
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Callable
+
 import numpy as np
 
-from cflow_torch.ground.segmentation import has_ground, is_upside_down
+from cflow_torch.ground.segmentation import ground_side, has_ground
+from cflow_torch.transforms import rotations_about
 from cflow_torch.types import Array, as_numpy
 from cflow_torch.windows.readings import AXES, CAMERA
 
@@ -14,6 +18,33 @@ _SMALLEST, _LARGEST, _MILLIMETRES = 2.0, 1000.0, 10_000.0
 _FAR = 50.0  # metres; a LiDAR has more than a twentieth of its points nearer than this
 _MOST_POINTS = 20_000
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
+_FULL = 0.95  # least share of a turn that azimuths of a cloud span
+_TILTS = range(15, 60, 5)  # degrees; without them, ground is found up to a tilt of 14
+
+
+def _from_spherical(points: np.ndarray) -> np.ndarray:
+    """Return x, y, z of range, azimuth and elevation, which are degrees if one is larger than 2 pi."""
+    distance, azimuth, elevation = np.asarray(points[:, :3], np.float64).T
+    if np.nanmax(np.abs(azimuth), initial=0) > _TURN:
+        azimuth, elevation = np.radians(azimuth), np.radians(elevation)
+    flat = distance * np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+
+
+def _transformed(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points[:, :3] @ matrix.T  # type: ignore[no-any-return]
+
+
+_TURN = 2 * np.pi + 1e-3
+# Value of `read_as` -> what converts points as stored, (N, 3+), to metres, x forward and z up.
+OF_POINTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "points_millimetres": partial(_transformed, 1e-3 * np.eye(3)),
+    "points_centimetres": partial(_transformed, 1e-2 * np.eye(3)),
+    "points_feet": partial(_transformed, 0.3048 * np.eye(3)),
+    "points_camera": partial(_transformed, AXES[CAMERA]),
+    "points_upside_down": partial(_transformed, AXES["down"]),
+    "points_spherical": _from_spherical,
+}
 
 
 def frame_problem(points: Array) -> tuple[str, str]:
@@ -37,15 +68,42 @@ def frame_problem(points: Array) -> tuple[str, str]:
         return f"points_{unit}", f"{spans}: they seem to be in {unit}, give points in metres"
     if max(widest, farthest) < _SMALLEST:
         return "", f"{spans}: are they in metres?"
+    if _is_spherical(positions):
+        return "points_spherical", "the columns seem to be range, azimuth and elevation: give x, y, z in metres"
     if nearest >= _FAR:
         where = f"the points lie around x = {middle[0]:.6g} m, y = {middle[1]:.6g} m"
         return "", f"{where}: give points in the frame of the LiDAR or of the vehicle, not of a map"
-    if is_upside_down(positions):
+    side = ground_side(positions)
+    if side < 0:
         return "points_upside_down", "z seems to point down, because nearly all points lie below the ground: " + _UP
     is_tall = extent[2] > _FLAT * max(extent[0], extent[1]) and extent[1] < _FLAT * max(extent[0], extent[2])
-    if is_tall and not has_ground(positions) and has_ground(positions @ AXES[CAMERA].T):
+    if side > 0:
+        return "", ""
+    if is_tall and has_ground(positions @ AXES[CAMERA].T):
         return "points_camera", "the points seem to have a camera's axes (x right, y down, z forward): " + _UP
-    return "", ""
+    tilt = _tilt_of(positions)
+    return "", f"the sensor seems to be tilted by about {tilt}: {_UP} (data.ego_T_lidar)" if tilt else ""
+
+
+def _is_spherical(positions: np.ndarray) -> bool:
+    """Test whether columns are a range, an azimuth of a whole turn, and an elevation."""
+    low, high = np.quantile(positions, (0.001, 0.999), axis=0)
+    for turn in (2 * np.pi, 360.0):
+        is_turn = _FULL * turn <= high[1] - low[1] <= 1.001 * turn and max(-low[1], high[1]) <= 1.001 * turn
+        if is_turn and low[0] >= 0 and max(-low[2], high[2]) <= turn / 4:
+            return has_ground(_from_spherical(positions))
+    return False
+
+
+def _tilt_of(positions: np.ndarray) -> str:
+    """Return the angle and the axis about which points without ground must be turned to have some; "" = none is."""
+    for name, axis, sign in (("y", 1, 1), ("y", 1, -1), ("x", 0, 1), ("x", 0, -1)):
+        turned = {tilt: positions @ rotations_about(axis, np.radians(sign * tilt)).T for tilt in _TILTS}
+        found = [tilt for tilt, points in turned.items() if has_ground(points)]
+        if found:
+            tilt = np.mean(found)
+            return f"{tilt:.0f} degrees (turn it by {sign * tilt:+.0f} about {name})"
+    return ""
 
 
 _UP = "give points with z up"

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, Callable, Iterable, Mapping, Sequence
+from itertools import accumulate
+from typing import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -20,10 +21,12 @@ from cflow_torch.windows.stillness import Structure, structure_rows
 
 GIVEN = "as given"
 OFF, TIMES = "off", "times"  # scans: the points stay, or move by their times
-STILL, WORLD, INVERTED, LATE, EARLY, CAMERA = "still", "world", "inverted", "late", "early", "camera"
-HALF_LATE, HALF_EARLY = "half_late", "half_early"
-SHIFTS = {LATE: 1, EARLY: -1, HALF_LATE: 1, HALF_EARLY: -1}
-"""Readings of poses of another time, and the neighbour whose pose is right, or that from which the other half comes."""
+STILL, WORLD, INVERTED, CAMERA = "still", "world", "inverted", "camera"
+STEPS = ("steps", "steps_back")
+_LATEST = 10  # sweeps
+SHIFTS: dict[str, float] = {"half_late": 0.5, "half_early": -0.5, "late": 1, "early": -1}
+SHIFTS.update({f"{name}_{k}": SHIFTS[name] * k for k in range(2, _LATEST + 1) for name in ("late", "early")})
+"""Readings of poses of another time, and how many sweeps later the pose is that is right."""
 MOUNT, UNKNOWN, TURNED, SCALED, NO_READING = "mount", "unknown", "turned", "scaled", "none"
 _FRAME = "the poses are of a frame whose"
 # What each reading says. The settings are values of `read_as` in `cflow_torch.data.catalog.open_log`.
@@ -31,10 +34,15 @@ CAUSES = {
     WORLD: "the points are in the world's frame",
     INVERTED: "the poses are inverted (T_ego_world instead of T_world_ego), or the sweeps are interchanged",
     STILL: "the static world stands still without the poses, so they are of another log, or the points are compensated",
-    LATE: "the poses are one sweep late (sweep i has the pose of sweep i - 1)",
-    EARLY: "the poses are one sweep early (sweep i has the pose of sweep i + 1)",
-    HALF_LATE: "the poses are half a sweep late (or the times of the sweeps are half a sweep early)",
-    HALF_EARLY: "the poses are half a sweep early (or the times of the sweeps are half a sweep late)",
+    "half_late": "the poses are half a sweep late (or the times of the sweeps are half a sweep early)",
+    "half_early": "the poses are half a sweep early (or the times of the sweeps are half a sweep late)",
+    **{
+        name: f"the poses are {('early', 'late')[by > 0]} (sweep i has the pose of sweep i {'+-'[by > 0]} {abs(by)})"
+        for name, by in SHIFTS.items()
+        if abs(by) >= 1
+    },
+    "steps": "the poses are steps (each is that of a sweep in the frame of the sweep before)",
+    "steps_back": "the poses are steps (each maps the sweep before to the frame of the sweep)",
     CAMERA: "the poses are of a camera (x right, y down, z forward)",
     "opengl": "the poses are of a camera as in OpenGL (x right, y up, z backward)",
     "mirrored": "the y axis of the points or that of the poses is mirrored (left-handed)",
@@ -42,6 +50,7 @@ CAUSES = {
     "swapped": "x and y of the points or of the poses are interchanged (left-handed)",
     "transposed": "the rotations of the poses are transposed, but not their positions",
     "compass": "the angles of the poses are compass headings (clockwise from north)",
+    "degrees": "the angles of the poses are degrees, but were read as radians",
     "left": f"{_FRAME} x axis points to the left of the points' x axis",
     "back": f"{_FRAME} x axis points backward",
     "right": f"{_FRAME} x axis points to the right of the points' x axis",
@@ -50,6 +59,7 @@ CAUSES = {
     "w_last": "the quaternions of the poses end with w, but were read with w first",
     "millimetres": "the poses are in millimetres",
     "centimetres": "the poses are in centimetres",
+    "feet": "the poses are in feet",
 }
 # ego_T_stored of frames with other axes: x, y and z of the stored frame, as columns.
 AXES = {
@@ -65,7 +75,7 @@ _MIRRORED = {  # the same of left-handed frames
     "mirrored_back": np.diag([-1.0, 1.0, 1.0]),
     "swapped": np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1]], float),
 }
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
@@ -78,7 +88,7 @@ _LEAST_DIFFERENCE = 0.05  # metres; a pair shows only the readings that move the
 # The best share must exceed the share as given by this factor (`_MARGINS` has others), and be at least `LEAST_SHARE`.
 _MARGIN = 1.3
 LEAST_SHARE = 0.1
-_OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most
+_OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most, or half of what this has
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
@@ -93,21 +103,62 @@ _TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4]).tolist()
 _FARTHEST_SHIFT = 5.0  # metres
 
 
-def _scaled(unit: float) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda pose: as_matrix(pose[:3, :3], unit * pose[:3, 3])
+_OfPoses = Callable[[np.ndarray], np.ndarray]
 
 
-def _reordered(order: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda pose: as_matrix(to_rotations(to_quaternions(pose[None, :3, :3])[:, order])[0], pose[:3, 3])
+def _scaled(unit: float) -> _OfPoses:
+    return lambda poses: as_matrix(poses[..., :3, :3], unit * poses[..., :3, 3])
 
 
-def _mirrored(axes: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def _reordered(order: Sequence[int]) -> _OfPoses:
+    return lambda poses: as_matrix(to_rotations(to_quaternions(poses[:, :3, :3])[:, order]), poses[:, :3, 3])
+
+
+def _mirrored(axes: np.ndarray) -> _OfPoses:
     mirror = as_matrix(axes)
-    return lambda pose: mirror @ pose @ mirror
+    return lambda poses: mirror @ poses @ mirror
 
 
-def _moved(stored_T_ego: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda pose: pose @ stored_T_ego
+def _moved(stored_T_ego: np.ndarray) -> _OfPoses:
+    return lambda poses: poses @ stored_T_ego
+
+
+def _transposed(axes: np.ndarray) -> _OfPoses:
+    return lambda poses: as_matrix(axes @ poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3])
+
+
+def _from_degrees(poses: np.ndarray) -> np.ndarray:
+    """Return poses whose angles were degrees, but were read as radians. Neighbours differ by less than pi."""
+    r = poses[:, :3, :3]
+    angles = (
+        np.arctan2(r[:, 2, 1], r[:, 2, 2]),
+        -np.arcsin(r[:, 2, 0].clip(-1, 1)),
+        np.arctan2(r[:, 1, 0], r[:, 0, 0]),
+    )
+    roll, pitch, yaw = (rotations_about(axis, np.radians(np.unwrap(angle))) for axis, angle in enumerate(angles))
+    return as_matrix(yaw @ pitch @ roll, poses[:, :3, 3])
+
+
+def _later(by: float) -> _OfPoses:
+    """Return what gives each sweep the pose `by` sweeps later. Beyond the ends, the motion continues."""
+
+    def convert(poses: np.ndarray) -> np.ndarray:
+        if abs(by) < 1:
+            return halfway(poses, _later(np.sign(by))(poses))
+        rows = np.arange(len(poses)) + int(by)
+        moved = poses[rows.clip(0, len(poses) - 1)]
+        for row in np.flatnonzero((rows < 0) | (rows >= len(poses))):
+            end, before = (0, 1) if by < 0 else (-1, -2)
+            step = np.linalg.inv(poses[before]) @ poses[end]
+            beyond = -rows[row] if by < 0 else rows[row] - len(poses) + 1
+            moved[row] = poses[end] @ np.linalg.matrix_power(step, int(beyond))
+        return moved
+
+    return convert
+
+
+def _joined(poses: np.ndarray) -> np.ndarray:
+    return np.array(list(accumulate(poses, np.matmul)))
 
 
 MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, metres
@@ -115,13 +166,17 @@ MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, m
     for size in (0.7, 1.4, 2.7, 4.0)
     for x, y in ((size, 0), (-size, 0), (0, size), (0, -size))
 }
-# Reading -> what converts a pose as given, (4, 4) float64, to `T_world_ego`.
-OF_POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    STILL: lambda pose: np.eye(4),
+# Reading -> what converts the poses of consecutive sweeps as given, (K, 4, 4) float64, to `T_world_ego`.
+OF_POSES: dict[str, _OfPoses] = {
+    STILL: lambda poses: np.tile(np.eye(4), (len(poses), 1, 1)),
     INVERTED: np.linalg.inv,
+    **{name: _later(by) for name, by in SHIFTS.items()},
+    STEPS[0]: _joined,
+    STEPS[1]: lambda poses: _joined(np.linalg.inv(poses)),
     **{name: _mirrored(axes) for name, axes in _MIRRORED.items()},
-    "transposed": lambda pose: as_matrix(pose[:3, :3].T, pose[:3, 3]),
-    "compass": lambda pose: as_matrix(AXES["left"] @ pose[:3, :3].T, pose[:3, 3]),
+    "transposed": _transposed(np.eye(3)),
+    "compass": _transposed(AXES["left"]),
+    "degrees": _from_degrees,
     **{name: _moved(as_matrix(AXES[name].T)) for name in AXES},
     **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
     **{name: _scaled(unit) for name, unit in _UNITS.items()},
@@ -129,16 +184,13 @@ OF_POSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 # Readings that differ little from another one, and the opposite mistakes: if the one is right, the other doubles it.
 _OPPOSITES = {
-    LATE: EARLY,
-    EARLY: LATE,
-    HALF_LATE: HALF_EARLY,
-    HALF_EARLY: HALF_LATE,
+    **{name: name.replace("late", "early") if by > 0 else name.replace("early", "late") for name, by in SHIFTS.items()},
     **{name: f"{MOUNT} {0 - x:g} {0 - y:g}" for name, (x, y) in MOUNTS.items()},
     **{scan: next(other for other in DIRECTIONS if not scan.startswith(other)) for scan in SCANS},
 }
 # Small mistakes make a small difference. Vehicles of the same speed stand still without the ego motion: up to 1.56.
 _MARGINS = {
-    **dict.fromkeys((WORLD, OFF, TIMES, HALF_LATE, HALF_EARLY, *SCANS, *MOUNTS), 1.1),
+    **dict.fromkeys((WORLD, OFF, TIMES, "half_late", "half_early", *SCANS, *MOUNTS), 1.1),
     **dict.fromkeys((STILL, *_UNITS), 1.7),
     # up to 0.99 for right poses, as they change little on a straight road
     **dict.fromkeys(("down", *_MIRRORED), 1.15),
@@ -183,6 +235,11 @@ class Pair:
         rivals = [name for name, share in shares.items() if share >= _NEAR_GIVEN * shares[GIVEN]]
         return {**shares, **self._shares(rivals, scan, _MOST_POINTS)}
 
+    def among(self, readings: Sequence[str]) -> Pair:
+        """Return the pair with these readings of the poses, and that as given."""
+        kept = {name: T for name, T in self.transforms.items() if name in (GIVEN, *readings)}
+        return replace(self, transforms=kept)
+
     def _shares(self, readings: Sequence[str], scan: str, count: int) -> dict[str, float]:
         transforms = np.stack([self.transforms[name] for name in readings])
         shares = self.target.structure(scan).shares(self.source.points(scan)[:count], transforms)
@@ -213,7 +270,7 @@ class Judgement:
         name = self.best[0]
         share = f"({self.given:.2f} of the static structure is in place as given, {self.shares.get(name, 0):.2f} then)"
         if name == NO_READING:
-            return f"the sweeps fit under no reading of the poses (only {self.given:.2f} of the structure is in place)"
+            return f"the sweeps fit under no reading (only {self.given:.2f} of the static structure is in place)"
         if self.motion is not None:
             return f"the sensor moves by about {np.hypot(*self.motion[:2, 3]):.1f} m between two sweeps {share}"
         return f"{', or '.join(map(self._cause, self.best))} {share}"
@@ -240,8 +297,8 @@ def _as_it_is(sweep: Sweep, rows: np.ndarray, scan: str) -> np.ndarray:
 def make_pair(
     pc0: Sweep,
     pc1: Sweep,
-    before: np.ndarray | None = None,
-    after: np.ndarray | None = None,
+    around: np.ndarray | None = None,
+    rows: tuple[int, int] = (0, 1),
     in_world: bool | None = None,
     deskew: Sequence[Callable[[Sweep, np.ndarray, str], np.ndarray]] = (_as_it_is, _as_it_is),
     scans: Sequence[str] = (OFF,),
@@ -250,7 +307,8 @@ def make_pair(
 
     Args:
         pc0, pc1: the sweeps, in the order of time.
-        before, after: poses of the sweeps before, and after, `pc0` and `pc1`, (2, 4, 4) float64; None = unknown.
+        around: (L, 4, 4) float64, poses of consecutive sweeps, of which `pc0` and `pc1` are the two `rows`; None = only
+            those of the two sweeps are known.
         in_world: the points lie around the positions of the poses, see `is_around`; None = test it.
         deskew: for each sweep, a function that returns some of its rows, (K, 3), at its instant, for one of the scans.
         scans: the scans that are compared, values of `deskew`; the first one is that as given.
@@ -264,7 +322,7 @@ def make_pair(
     num_points = [len(cloud.points(OFF)) for cloud in clouds]
     if min(num_points) < _FEWEST_POINTS or _num_blocks(clouds[0].points(OFF)) < _FEWEST_BLOCKS:
         return None
-    transforms = _transforms(poses, before, after) if has_poses else {GIVEN: np.eye(4)}
+    transforms = _transforms(poses if around is None else around, rows) if has_poses else {GIVEN: np.eye(4)}
     if in_world:
         transforms = {name: _about(centre, T) for name, T in transforms.items()}
         transforms[WORLD] = transforms.pop(STILL)
@@ -277,13 +335,10 @@ def _cloud(sweep: Sweep, centre: np.ndarray, move: Callable[[Sweep, np.ndarray, 
     return ScannedStructure(lambda scan: (_as_it_is if scan == OFF else move)(sweep, rows, scan) - centre)
 
 
-def _transforms(poses: np.ndarray, before: np.ndarray | None, after: np.ndarray | None) -> dict[str, np.ndarray]:
-    """Return T_1_0 under each reading of the poses, (2, 4, 4), that moves points otherwise than as given."""
-    T = _between(poses)
-    read = {name: _between([convert(pose) for pose in poses]) for name, convert in OF_POSES.items()}
-    for whole, half, other in ((LATE, HALF_LATE, after), (EARLY, HALF_EARLY, before)):
-        if other is not None:
-            read.update({whole: _between(other), half: _between(halfway(poses, other))})
+def _transforms(poses: np.ndarray, rows: tuple[int, int]) -> dict[str, np.ndarray]:
+    """Return T_1_0 of two rows of poses, (L, 4, 4), under each reading that moves points otherwise than as given."""
+    T = _between(poses, rows)
+    read = {name: _between(convert(poses), rows) for name, convert in OF_POSES.items()}
     for name in _UNITS:  # under them the vehicle still moves, else they say no more than `STILL`
         if np.linalg.norm(read[name][:3, 3]) < _LEAST_DIFFERENCE:
             del read[name]
@@ -291,8 +346,8 @@ def _transforms(poses: np.ndarray, before: np.ndarray | None, after: np.ndarray 
     return {GIVEN: T, **shown}
 
 
-def _between(poses: Any) -> np.ndarray:
-    return np.linalg.inv(poses[1]) @ poses[0]  # type: ignore[no-any-return]
+def _between(poses: np.ndarray, rows: tuple[int, int]) -> np.ndarray:
+    return np.linalg.inv(poses[rows[1]]) @ poses[rows[0]]  # type: ignore[no-any-return]
 
 
 def judge(pairs: Iterable[Pair | None]) -> Judgement:
@@ -304,7 +359,10 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     usable = [pair for pair in pairs if pair is not None]
     moving = [pair for pair in usable if pair.has_motion]
     if not moving:
-        return _judge_motion(usable)
+        shares, clear = _compare([pair.among(STEPS).shares_of_poses(OFF) for pair in usable])
+        judgement = Judgement(shares, tuple(clear[:1])) if clear else _judge_motion(usable)
+        is_hopeless = not judgement.best and len(usable) > 1 and judgement.given < _HOPELESS
+        return replace(judgement, best=(NO_READING,)) if is_hopeless else judgement
     fast = [pair for pair in moving if len(pair.scans) > 1]
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
@@ -326,12 +384,12 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
 def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...]:
     """Return the best of the readings, best first, and those that are about as good; small mistakes only with others.
 
-    Of mountings, only one is named.
+    Of mountings and of times, only one is named, and no factor beside a reading.
     """
     best = [name for name in clear if shares[name] >= _EQUAL * shares[clear[0]]]
     best = [name for name in best if (name in _OPPOSITES) == (clear[0] in _OPPOSITES)]
-    other_mountings = [name for name in best if name in MOUNTS][1:]
-    return tuple(name for name in best if name not in other_mountings)
+    others = [name for kind in (MOUNTS, SHIFTS) for name in [name for name in best if name in kind][1:]]
+    return tuple(name for name in best if name not in others and (name != SCALED or name == best[0]))
 
 
 def _find_similarity(pairs: Sequence[Pair]) -> tuple[float, float, list[dict[str, float]]]:
@@ -412,7 +470,7 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
 
     A reading is clearly better than as given if it is so in the mean, and better in each pair that shows it. It may be
     a small mistake, such as the direction of the scan or another mounting: then a smaller margin is enough, but the
-    opposite mistake must be worse than as given.
+    opposite mistake must be worse than as given, or much worse than the reading.
 
     Returns:
         The mean share of each reading, and those that are clearly better than as given, best first.
@@ -428,7 +486,7 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
         if share >= LEAST_SHARE and all(each[name] > each[given] for each in of_pairs if name in each):
             better.append(name)
     clear = [name for name in better if gains[name] >= _MARGINS.get(name, _MARGIN)]
-    clear = [name for name in clear if gains.get(_OPPOSITES.get(name, ""), 0) <= _OPPOSITE]
+    clear = [name for name in clear if gains.get(_OPPOSITES.get(name, ""), 0) <= max(_OPPOSITE, gains[name] / 2)]
     return shares, sorted(clear, key=gains.__getitem__, reverse=True)
 
 

@@ -19,6 +19,7 @@ from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.log import window
 from cflow_torch.data.log_check import check_log, examine
+from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import CFlowWarning
 
 
@@ -95,6 +96,23 @@ def test_a_bag_without_poses_is_read(recording: TinyRecording, tmp_path: Path) -
     assert sweep.pose is None and sweep.point_times is not None
     expected = recording.units(0)[0].points @ MOUNT[:3, :3].T + MOUNT[:3, 3]
     assert np.allclose(sweep.points, expected, atol=1e-4)
+
+
+def test_poses_of_a_bag_may_lie_next_to_it(recording: TinyRecording, tmp_path: Path) -> None:
+    """An odometry program wrote them, in text."""
+    path = write_bag(tmp_path, "ros1", recording, "none")
+    quaternions = to_quaternions(recording.poses[:, :3, :3])[:, [1, 2, 3, 0]]
+    rows = np.column_stack([recording.poses[:, :3, 3], quaternions])
+    lines = [f"{t // 10**9}.{t % 10**9:09d} " + " ".join(map(str, row)) for t, row in zip(recording.timestamps, rows)]
+    (tmp_path / "tum.txt").write_text("\n".join(lines))
+    with pytest.warns(CFlowWarning, match="it has no poses, so we take those of .*tum.txt"):
+        log: Any = BagLog(path)
+    assert np.allclose(log.poses, recording.poses, atol=1e-6)
+    (tmp_path / "tum.txt").rename(tmp_path / "other.tum")
+    (tmp_path / "poses.txt").write_text("\n".join(line.split(maxsplit=1)[1] for line in lines))
+    assert np.allclose(BagLog(path, poses="other.tum").poses, recording.poses, atol=1e-6)  # type: ignore[arg-type]
+    with pytest.raises(CFlowError, match="has no times: give a bag poses with times"):
+        BagLog(path, poses="poses.txt")
 
 
 def test_missing_times_of_points_are_on_the_page(recording: TinyRecording, tmp_path: Path) -> None:

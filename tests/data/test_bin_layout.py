@@ -25,7 +25,7 @@ def street(columns: int, kind: str = "<f4", count: int = 2400, shuffled: bool = 
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
-@pytest.mark.parametrize("kind", ["<f4", "<f8"])
+@pytest.mark.parametrize("kind", ["<f4", "<f8", ">f4", ">f8"])
 @pytest.mark.parametrize("columns", [3, 4, 5, 6, 8])
 def test_the_layout_is_recognised(tmp_path, columns: int, kind: str, shuffled: bool) -> None:
     table = street(columns, kind, shuffled=shuffled)
@@ -36,7 +36,7 @@ def test_the_layout_is_recognised(tmp_path, columns: int, kind: str, shuffled: b
     assert find_bin_layout(table.astype("f4").astype(kind).tobytes()) == BinLayout(columns, kind)
     (tmp_path / "a.bin").write_bytes(table.tobytes())
     found = read_cloud(tmp_path / "a.bin")
-    assert found.dtype == np.dtype(kind) and np.array_equal(found, table[:, :3])
+    assert found.dtype == np.dtype(kind).newbyteorder("=") and np.array_equal(found, table[:, :3])
     assert np.array_equal(read_cloud(tmp_path / "a.bin", columns), table[:, :3])
 
 

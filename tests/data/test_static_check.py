@@ -75,7 +75,8 @@ def extrapolated(step):
     def change(poses):
         first = poses[0] @ np.linalg.inv(poses[1]) @ poses[0]
         last = poses[-1] @ np.linalg.inv(poses[-2]) @ poses[-1]
-        return np.concatenate([poses[1:], [last]]) if step > 0 else np.concatenate([[first], poses[:-1]])
+        moved = np.concatenate([poses[1:], [last]]) if step > 0 else np.concatenate([[first], poses[:-1]])
+        return moved if abs(step) == 1 else extrapolated(step - np.sign(step))(moved)
 
     return change
 
@@ -130,6 +131,14 @@ def mirrored(axes):
     return lambda pose: as_matrix(axes) @ pose @ as_matrix(axes)
 
 
+def in_degrees(pose):
+    """A pose whose roll, pitch and yaw are written in degrees, and read as radians."""
+    r = pose[:3, :3]
+    angles = np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(r[2, 0]), np.arctan2(r[1, 0], r[0, 0])
+    roll, pitch, yaw = (rotations_about(axis, np.degrees(angle)) for axis, angle in enumerate(angles))
+    return as_matrix(yaw @ pitch @ roll, pose[:3, 3])
+
+
 POSES = {
     "inverted": np.linalg.inv,
     CAMERA: lambda pose: pose @ as_matrix(AXES[CAMERA]),
@@ -154,6 +163,10 @@ WRONG_POSES = {
     "half_early": half(1),
     "millimetres": scaled(1000),
     "centimetres": scaled(100),
+    "feet": scaled(1 / 0.3048),
+    "degrees": lambda poses: each(in_degrees)(np.linalg.inv(poses[0]) @ poses),
+    "steps": lambda poses: np.concatenate([poses[:1], np.linalg.inv(poses[:-1]) @ poses[1:]]),
+    "steps_back": lambda poses: np.concatenate([np.linalg.inv(poses[:1]), np.linalg.inv(poses[1:]) @ poses[:-1]]),
 }
 
 
@@ -188,19 +201,20 @@ def test_mirrored_clouds_are_named_and_no_pose_is_blamed(drive, name):
     assert "(left-handed)" in problem and f"data.read_as={name}" in problem
 
 
-@pytest.mark.parametrize("factor", [0.5, 3.28])
+@pytest.mark.parametrize("factor", [0.5, 2.5])
 def test_positions_of_another_scale_are_named_with_the_factor(drive, factor):
     (problem,) = find_problems(Wrong(drive, poses=scaled(factor)))
     found = re.search(r"positions multiplied by ([0-9.]+)", problem)
     assert found and abs(float(found[1]) * factor - 1) < 0.04
 
 
-def test_poses_that_are_only_steps_are_told_by_the_motion_of_the_sensor(drive):
-    steps = each(lambda pose: pose)
-    relative = Wrong(
-        drive, poses=lambda poses: np.concatenate([np.eye(4)[None], np.linalg.inv(steps(poses)[:-1]) @ poses[1:]])
-    )
-    assert any("the poses hardly move, but the sensor moves" in text for text in find_problems(relative))
+@pytest.mark.parametrize("sweeps", [5, -3])
+def test_poses_that_are_several_sweeps_late_are_named_with_their_number(turning, sweeps):
+    wrong = Wrong(turning, poses=extrapolated(-sweeps))
+    name = f"late_{sweeps}" if sweeps > 0 else f"early_{-sweeps}"
+    (problem,) = [text for text in find_problems(wrong) if "ground masks" not in text]
+    assert problem.endswith(f"data.read_as={name}") and f"of sweep i {'-+'[sweeps < 0]} {abs(sweeps)})" in problem
+    assert find_problems(read_as(wrong, name)) == []
 
 
 @pytest.mark.parametrize("source", ["drive", "real"])
@@ -388,6 +402,15 @@ def camera_points(points, _):
     return points @ AXES[CAMERA]
 
 
+def spherical(unit):
+    def change(points, _):
+        flat = np.hypot(points[:, 0], points[:, 1])
+        azimuth, elevation = np.arctan2(points[:, 1], points[:, 0]), np.arctan2(points[:, 2], flat)
+        return np.column_stack([np.hypot(flat, points[:, 2]), azimuth / unit, elevation / unit])
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "found"),
     [
@@ -397,8 +420,15 @@ def camera_points(points, _):
         (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
         (lambda points, _: points @ AXES["down"], "data.read_as=points_upside_down"),
         (camera_points, "data.read_as=points_camera"),
+        (spherical(1.0), "data.read_as=points_spherical"),
+        (spherical(np.pi / 180), "data.read_as=points_spherical"),
+        (lambda points, _: points @ rotations_about(1, 0.5), "degrees (turn it by +30 about y)"),
+        (lambda points, _: points @ rotations_about(0, -0.4), "data.ego_T_lidar"),
     ],
-    ids=["millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera"],
+    ids=[
+        *("millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera"),
+        *("radians", "degrees", "pitch", "roll"),
+    ],
 )
 @pytest.mark.parametrize("source", ["drive", pytest.param("real", marks=pytest.mark.slow)])
 def test_wrong_units_and_axes_are_recognised(source, change, found, request):
@@ -415,6 +445,41 @@ def test_wrong_units_and_axes_are_recognised(source, change, found, request):
         again = read_as(Wrong(good, points=change, masks=False), reading)
         assert np.allclose(again.sweep(3).points, good.sweep(3).points, atol=1e-3)
         assert find_problems(again) == []
+
+
+def test_points_in_feet_are_told_by_the_motion(drive):
+    feet = Wrong(drive, lambda points, _: points / 0.3048)
+    (problem,) = find_problems(feet)
+    assert "give data.read_as=points_feet" in problem and find_problems(read_as(feet, "points_feet")) == []
+
+
+@pytest.mark.parametrize("first", [np.linalg.norm, lambda points, axis: np.arange(len(points)) % 32])
+def test_a_column_before_x_is_told_and_no_pose_is_blamed(thin, tmp_path, first):
+    write_array_log(thin, tmp_path)
+    for file in (tmp_path / thin.log_id / "points").iterdir():
+        points = np.load(file)
+        np.save(file, np.column_stack([first(points, axis=1), points]).astype(np.float32))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        open_log("arrays", tmp_path / thin.log_id, ground=None)
+    texts = [str(each.message) for each in caught]
+    assert any("first column does not seem to be x" in text for text in texts)
+    assert not any("the poses" in text or "world's frame" in text for text in texts)
+
+
+@pytest.mark.parametrize("has_poses", [True, False])
+def test_sweeps_that_measure_parts_of_a_turn_are_told(drive, has_poses):
+    """A cloud per packet, or two sensors in turns."""
+
+    class Part(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index // 3)
+            azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) % 1
+            keep = np.floor(3 * azimuth) == index % 3
+            return replace(sweep, points=sweep.points[keep], is_ground=sweep.is_ground[keep])
+
+    texts = find_problems(Part(drive, poses=None if has_poses else lambda _: None))
+    assert any("share 0 % of the directions" in text or "share 4 %" in text for text in texts), texts
 
 
 def test_points_in_the_world_without_poses_are_told_by_the_last_sweep(drive):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml  # type: ignore[import-untyped]
 
 from cflow_torch import CFlowError
 from cflow_torch.data.arrays import poses_text
@@ -185,6 +186,7 @@ def test_a_vehicle_that_stands_has_a_pose_in_every_line(tmp_path: Path) -> None:
 
 
 POSES = as_matrix(rotations_about(2, 3 + 0.1 * np.arange(12)) @ rotations_about(0, 0.02), np.arange(36).reshape(12, 3))
+QUATERNIONS = to_quaternions(POSES[:, :3, :3]).tolist()
 ANGLES = [(0.02, 0, (3 + 0.1 * k + np.pi) % (2 * np.pi) - np.pi) for k in range(12)]  # roll, pitch, yaw
 
 
@@ -199,6 +201,18 @@ LAYOUTS = {
     "13 numbers": rows([(k, *pose[:3].reshape(-1)) for k, pose in enumerate(POSES)]),
     "17 numbers": rows([(k, *pose.reshape(-1)) for k, pose in enumerate(POSES)]),
     "16 numbers": rows(POSES.reshape(12, 16), ","),
+    "by columns": rows(POSES.transpose(0, 2, 1).reshape(12, 16)),
+    "time, by columns": rows([(k, *pose.T.reshape(-1)) for k, pose in enumerate(POSES)]),
+    "trajectory of Open3D": [line for k, pose in enumerate(POSES) for line in (f"{k} {k} {k + 1}", *rows(pose))],
+    "time and angles": rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ","),
+    "angles": rows([(*POSES[k, :3, 3], *ANGLES[k]) for k in range(12)]),
+    "vertices of g2o": [
+        *(
+            f"VERTEX_SE3:QUAT {k} {rows([[*POSES[k, :3, 3], *QUATERNIONS[k][1:], QUATERNIONS[k][0]]])[0]}"
+            for k in range(12)
+        ),
+        "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 " + "1 " * 21,
+    ],
     "four lines": rows(POSES.reshape(48, 4)),
     "radians": ["t,x,y,z,roll,pitch,yaw", *rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ",")],
     "degrees": ["x y z roll_deg pitch_deg yaw_deg", *rows(DEGREES)],
@@ -211,7 +225,14 @@ def test_layouts_of_poses(tmp_path, layout) -> None:
     (tmp_path / "poses.csv").write_text("\n".join(LAYOUTS[layout]))
     read = poses_text.read_poses(tmp_path / "poses.csv")
     assert np.allclose(read.poses, POSES, atol=1e-12)
-    has_times = layout in ("13 numbers", "17 numbers", "radians")
+    has_times = layout in (
+        "13 numbers",
+        "17 numbers",
+        "radians",
+        "time, by columns",
+        "time and angles",
+        "vertices of g2o",
+    )
     assert (read.times_ns is not None) == has_times and (not has_times or read.times_ns[2] == 2 * 10**9)
 
 
@@ -224,7 +245,6 @@ def test_a_plane_pose_and_a_pose_without_a_time(tmp_path) -> None:
     assert np.allclose(untimed.poses[1, :2, 0], (1 - 2 * 0.36, 2 * 0.6 * 0.8))
 
 
-QUATERNIONS = to_quaternions(POSES[:, :3, :3]).tolist()
 FRAMES = [{"file_path": f"clouds/{name}.npy", "transform_matrix": POSES[name].tolist()} for name in range(12)]
 JSON: dict[str, Any] = {
     "nerfstudio": {"camera_model": "PINHOLE", "fl_x": 500.0, "frames": FRAMES[6:] + FRAMES[:6]},
@@ -266,6 +286,80 @@ def test_poses_in_json_are_found_and_read_in_the_order_of_the_clouds(tmp_path, l
     with pytest.warns(CFlowWarning, match="its poses are those of transforms.json"):
         log: Any = ArraysLog(tmp_path)
     assert np.allclose(log.poses, POSES, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["poses.npz", "odometry.yaml", "odometry.yml"])
+def test_poses_in_yaml_and_npz_are_read(tmp_path, name) -> None:
+    clouds(tmp_path, range(12))
+    if name.endswith(".npz"):
+        np.savez(tmp_path / name, T=POSES, stamps=np.arange(12) * 0.1, camera=np.eye(3))
+    elif name.endswith(".yml"):  # as messages that are printed
+        documents = [
+            {
+                "header": {"frame_id": "odom"},
+                "pose": {"position": dict(zip("xyz", pose[:3, 3].tolist())), "orientation": dict(zip("wxyz", q))},
+            }
+            for pose, q in zip(POSES, QUATERNIONS)
+        ]
+        (tmp_path / name).write_text(yaml.safe_dump_all(documents))
+    else:
+        rows_of = [{"stamp": 0.1 * k, "transform": pose.tolist()} for k, pose in enumerate(POSES)]
+        (tmp_path / name).write_text(yaml.safe_dump({"trajectory": rows_of}))
+    log: Any = ArraysLog(tmp_path)
+    assert np.allclose(log.poses, POSES, atol=1e-9)
+    assert name.endswith(".yml") or log.timestamps[3] == 300_000_000
+
+
+def test_poses_belong_to_the_numbers_of_sweeps(tmp_path) -> None:
+    """KITTI-360: a number and a matrix per line, and some sweeps have none. Argoverse 1: names with times."""
+    clouds(tmp_path, [f"{k:010d}" for k in range(12)])
+    lines = rows([(k, *pose[:3].reshape(-1)) for k, pose in enumerate(POSES)])
+    (tmp_path / "poses.txt").write_text("\n".join(lines[1:4] + lines[6:]))
+    with pytest.warns(CFlowWarning, match="3 of 12 sweeps have no pose"):
+        log: Any = ArraysLog(tmp_path)
+    assert np.allclose(log.poses, POSES[[1, 2, 3, *range(6, 12)]]) and log.gaps == {2}
+    named = clouds(tmp_path / "argoverse" / "lidar", [f"PC_{stamp}" for stamp in STAMPS]).parent
+    (named / "poses").mkdir()
+    for k in range(24):  # twice as many as sweeps
+        text = json.dumps({"translation": POSES[k // 2, :3, 3].tolist(), "rotation": QUATERNIONS[k // 2]})
+        (named / "poses" / f"city_{STAMPS[k // 2] + 50_000_000 * (k % 2)}.json").write_text(text)
+    assert np.allclose(ArraysLog(named).poses, POSES, atol=1e-9)
+
+
+def test_poses_near_a_folder_are_those_at_its_times(tmp_path) -> None:
+    """MulRan and Newer College: poses lie two levels above the clouds, or in a folder next to them."""
+    (tmp_path / "truth").mkdir()
+    folder = clouds(tmp_path / "sensor_data" / "Ouster")
+    (tmp_path / "truth" / "poses.csv").write_text("\n".join(EXACT))
+    (tmp_path / "other.csv").write_text("\n".join(line(k, f"{k / 10}") for k in range(12)))
+    with pytest.warns(CFlowWarning, match="its poses are those of .*truth.*poses.csv"):
+        assert ArraysLog(folder).poses[:, 0, 3].tolist() == list(range(12))
+    (tmp_path / "global.txt").write_text("\n".join(EXACT))
+    with pytest.warns(CFlowWarning, match="global.txt and .*poses.csv: choose one with data.poses"):
+        assert ArraysLog(folder).poses is None
+
+
+def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
+    for k, pose in enumerate(POSES):
+        np.savez(tmp_path / f"{k}.npz", points=np.ones((5, 3)), pose=pose, stamp=0.1 * k)
+    with pytest.warns(CFlowWarning, match="its poses come from the array pose"):
+        log: Any = ArraysLog(tmp_path)
+    assert np.array_equal(log.poses, POSES) and log.has_viewpoints
+
+
+def test_numbers_of_sweeps_are_no_times(tmp_path) -> None:
+    clouds(tmp_path)
+    (tmp_path / "poses.txt").write_text("\n".join(line(k, f"{k}") for k in range(12)))
+    assert ArraysLog(tmp_path).poses[:, 0, 3].tolist() == list(range(12))
+
+
+def test_rounded_poses_are_refused(tmp_path) -> None:
+    clouds(tmp_path, range(12))
+    far = POSES.copy()
+    far[:, :3, 3] += (690_000, 5_330_000, 500)
+    np.save(tmp_path / "poses.npy", far.astype(np.float32))
+    with pytest.raises(CFlowError, match="only holds multiples of 0.5 m"):
+        ArraysLog(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".json", ".npy"])
@@ -412,7 +506,7 @@ def test_tables_may_hold_texts_and_lines_of_nan(tmp_path) -> None:
     matrices[4, 3] = np.nan
     named = [f"{stamp}.npy {row}" for stamp, row in zip(STAMPS, rows(matrices))]
     (tmp_path / "poses.txt").write_text("\n".join(named))
-    with pytest.warns(CFlowWarning, match="1 of 12 sweeps have a pose of NaN .* left out"):
+    with pytest.warns(CFlowWarning, match="1 of 12 sweeps have no pose, or one of NaN, .* left out"):
         log = ArraysLog(tmp_path)
     assert np.allclose(log.poses, np.delete(POSES, 4, 0)) and log.gaps == {3}
 

@@ -36,7 +36,8 @@ class BinLayout(NamedTuple):
         return len(content) < _FEWEST * self.step or _explained(_numbers(start, self.kind), self.columns) >= _EXPLAINED
 
     def __str__(self) -> str:
-        return f"{self.columns} float{8 * np.dtype(self.kind).itemsize} per point"
+        order = "big-endian " if self.kind[0] == ">" else ""
+        return f"{self.columns} {order}float{8 * np.dtype(self.kind).itemsize} per point"
 
 
 def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
@@ -46,16 +47,18 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
         content: the whole file.
         columns: numbers per point; None = find out.
 
-    Convention: the type is the one, float32 or float64, in which numbers have sizes of coordinates. Columns differ in
-        size (z is smaller than x and y, intensities are larger). We choose the number of columns, 3 to 8, that explains
-        most of the variance of log sizes. Ties: the smallest. A file that is empty or too short to tell is KITTI's.
+    Convention: the type is the one, float32 or float64, little- or big-endian, in which numbers have sizes of
+        coordinates. Columns differ in size (z is smaller than x and y, intensities are larger). We choose the number of
+        columns, 3 to 8, that explains most of the variance of log sizes. Ties: the smallest. A file that is empty or
+        too short to tell is KITTI's.
 
     Raises:
         CFlowError: no layout fits. The message names `bin_columns`.
     """
     kind = _type_of(content)
     if columns is not None:
-        return BinLayout(columns, "<f8" if kind == "<f8" and len(content) % (8 * columns) == 0 else "<f4")
+        is_whole = kind != "" and len(content) % (np.dtype(kind).itemsize * columns) == 0
+        return BinLayout(columns, kind if is_whole else "<f4")
     fitting = [BinLayout(count, kind) for count in _COLUMNS if kind]
     fitting = [layout for layout in fitting if len(content) % layout.step == 0]
     explained = [_explained(_numbers(content, layout.kind), layout.columns) for layout in fitting]
@@ -74,14 +77,20 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
 
 
 def _type_of(content: bytes) -> str:
-    """Return "<f4", "<f8", or "" if the numbers fit neither. float32 can look like float64, but not the reverse."""
-    halves = _numbers(content, "<f4")
-    is_float64 = are_plausible(_numbers(content, "<f8"))
+    """Return the type of the numbers, "<f4", "<f8", ">f4" or ">f8"; "" = they fit none."""
+    return _type_in(content, "<") or _type_in(content, ">")
+
+
+def _type_in(content: bytes, order: str) -> str:
+    """Return the type of numbers of an order of bytes. float32 can look like float64, but not the reverse."""
+    halves = _numbers(content, f"{order}f4")
+    is_float64 = are_plausible(_numbers(content, f"{order}f8"))
     if not are_plausible(halves):
-        return "<f8" if is_float64 else ""
+        return f"{order}f8" if is_float64 else ""
     # The lower halves of float64 numbers with few digits are zeros, so they look like float32, too.
-    low, high = (float((half == 0).mean()) if len(half) else 0.0 for half in (halves[::2], halves[1::2]))
-    return "<f8" if is_float64 and low > 0.5 > high else "<f4"
+    shares = [float((half == 0).mean()) if len(half) else 0.0 for half in (halves[::2], halves[1::2])]
+    low, high = shares if order == "<" else shares[::-1]
+    return f"{order}f8" if is_float64 and low > 0.5 > high else f"{order}f4"
 
 
 def are_plausible(numbers: np.ndarray) -> bool:

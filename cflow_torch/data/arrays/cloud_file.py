@@ -88,6 +88,15 @@ def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return kept
 
 
+def matrices_in(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of an `.npz` file that may be poses: (4, 4) or (3, 4) numbers."""
+    with file_errors(path, _hint(path)):
+        arrays = _plain_arrays(read_bytes(path))
+    return {
+        name: array for name, array in arrays.items() if array.shape in ((4, 4), (3, 4)) and array.dtype.kind in "fiu"
+    }
+
+
 def in_single(points: np.ndarray) -> np.ndarray:
     """Return points as float32, unless this type holds them by millimetres only, as in a map's frame."""
     if points.dtype == np.float32:

@@ -9,20 +9,36 @@ from typing import Any, Callable, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.cloud_file import SUFFIXES
-from cflow_torch.data.arrays.poses_text import files_of_poses, parse_poses, parse_times, read_poses
+from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.folders import find_folders, natural_key, visible
 from cflow_torch.data.paths import PathLike, as_path, is_remote, read_start
+from cflow_torch.data.trajectory import Trajectory
 from cflow_torch.types import CFlowError
 
 POINT_FOLDERS = ("points", "lidar", "velodyne", "clouds", "pcd")  # where the clouds may lie below the log's folder
-POSE_FILES = ("poses.txt", "poses.npy", "poses.csv", "trajectory.txt", "trajectory.csv", "odometry.csv")
+POSE_FILES = (
+    *("poses.txt", "poses.npy", "poses.npz", "poses.csv", "trajectory.txt", "trajectory.csv", "trajectory.npz"),
+    "odometry.csv",
+)
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_TABLES = (".txt", ".csv", ".tum", ".json", ".jsonl")  # suffixes of files that we test for poses and times
+_TABLES = (
+    ".txt",
+    ".csv",
+    ".tum",
+    ".log",
+    ".g2o",
+    ".json",
+    ".jsonl",
+    ".yaml",
+    ".yml",
+)  # suffixes of files that we test for poses and times
+_NEAR_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test in other folders
+_FIRST_UNIX, _MOST = 10**17, 50  # nanoseconds in 1973; files or folders
 _TESTED = 8192  # bytes of a file that tell what it holds
-_LARGEST_JSON = 1 << 24  # bytes; JSON must be whole to be read, and poses take less
+_LARGEST = 1 << 24  # bytes; structured files must be whole to be read, and poses take less
 
 
 def find_array_logs(root: PathLike) -> list[Path]:
@@ -144,6 +160,24 @@ def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
     return poses, times
 
 
+def find_poses_near(folder: Path, times_ns: Sequence[int]) -> list[Trajectory]:
+    """Find files of text that have poses at the unix times of most sweeps: below a folder, and two levels above it.
+
+    Of folders next to the log or below it, we look only into those that hold nothing but tables, as others are logs. We
+    read the start of at most 50 files in each of at most 50 folders.
+    """
+    if is_remote(folder) or times_ns[0] < _FIRST_UNIX:
+        return []
+    top = folder.resolve()
+    levels = [top, *top.parents[:2]]
+    children = {child: sorted(visible(child))[:_MOST] for level in levels for child in sorted(visible(level))[:_MOST]}
+    plain = [files for files in children.values() if all(file.suffix in _TABLES for file in files)]
+    files = [file for files in (*map(visible, levels), *plain) for file in files if file.suffix in _NEAR_TABLES]
+    starts = ((file, _start_of(file, parse_poses)) for file in files)
+    timed = [read_poses(file) for file, start in starts if start is not None and start.times_ns is not None]
+    return [trajectory for trajectory in timed if trajectory.covers(times_ns)]
+
+
 def _has_one_pose(path: Path) -> bool:
     try:
         return len(read_start(path, _TESTED)) < _TESTED and len(read_poses(path).poses) == 1
@@ -154,11 +188,11 @@ def _has_one_pose(path: Path) -> bool:
 def _start_of(path: Path, parse: Callable[[bytes, Path], Any]) -> Any:
     """Parse the first lines of a file; None = this is not possible."""
     try:
-        is_json = path.suffix.lower() in (".json", ".jsonl")
-        start = read_start(path, _LARGEST_JSON if is_json else _TESTED)
-        if not is_json and len(start) == _TESTED:  # whole lines, and whole matrices of four
+        is_whole = path.suffix.lower() in STRUCTURED
+        start = read_start(path, _LARGEST if is_whole else _TESTED)
+        if not is_whole and len(start) == _TESTED:  # whole lines, and whole matrices of four or five
             lines = start.splitlines(keepends=True)[:-1]
-            start = b"".join(lines[: len(lines) // 4 * 4])
+            start = b"".join(lines[: len(lines) // 20 * 20] or lines[: len(lines) // 4 * 4])
         return parse(start, path)
     except (CFlowError, OSError):
         return None

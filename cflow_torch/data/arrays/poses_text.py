@@ -9,7 +9,7 @@ from typing import Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.stamps import nanoseconds_of_dates, nanoseconds_of_numbers
-from cflow_torch.data.arrays.tables import MATRIX, Table, parse_table, tables_of_json
+from cflow_torch.data.arrays.tables import MATRIX, Table, parse_table, tables_of_values
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
@@ -25,6 +25,9 @@ _TIMES = {"time", "sec", "nsec"}
 _TUM = ("time", *_POSITION, "qx", "qy", "qz", "qw")
 # What columns without names hold, by their number; the last row of a matrix is ignored.
 _UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX, 13: ("time", *MATRIX), 16: MATRIX, 17: ("time", *MATRIX)}
+_UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
+STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz")
+"""Suffixes of files whose values have names or nest, see `tables_of_values`."""
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
 
@@ -32,13 +35,14 @@ def read_poses(path: PathLike) -> Trajectory:
     """Read poses, whose rotations must be orthogonal up to rounding.
 
     Args:
-        path: a file of text, of JSON, or `.npy` with (K, 4, 4), (K, 3, 4) or the numbers of K lines; or a folder with a
-            file per pose. A line of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM: time in
-            seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows), or 13 or 17
-            (a time before the matrix), or four lines have a matrix. If a line before the numbers names the columns
-            (timestamp, x, qw, ...), they may have any order, and roll, pitch and yaw may replace the quaternion. Other
-            columns, empty lines and lines that begin with `#` are ignored. Times: `nanoseconds_of_numbers`. JSON:
-            `tables_of_json`.
+        path: a file of text, of `STRUCTURED`, or `.npy` with (K, 4, 4), (K, 3, 4) or the numbers of K lines; or a
+            folder with a file per pose. A line of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM:
+            time in seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows, or
+            by columns), or 13 or 17 (a time before the matrix). 7 numbers without a quaternion are a time, x y z, roll
+            pitch yaw; 6 have no time. Four lines may have a matrix, below a line of three numbers (Open3D). Of a g2o
+            graph, vertices are read. If a line before the numbers names the columns (timestamp, x, qw, ...), they may
+            have any order, and roll, pitch and yaw may replace the quaternion. Other columns, empty lines and lines
+            that begin with `#` are ignored. Times: `nanoseconds_of_numbers`.
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
         angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3 has w
@@ -70,11 +74,11 @@ def files_of_poses(folder: Path) -> list[Path]:
 
 
 def parse_poses(content: bytes, path: Path) -> Trajectory:
-    """Return the poses in the content of a text or JSON file."""
-    if path.suffix.lower() not in (".json", ".jsonl"):
+    """Return the poses in the content of a file of text or `STRUCTURED`."""
+    if path.suffix.lower() not in STRUCTURED:
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")
-    for table in tables_of_json(content, path):
+    for table in tables_of_values(content, path):
         if _roles(table.names):
             try:
                 return _poses_of_table(table, path)
@@ -89,6 +93,10 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
         words = words.reshape(-1, 16)
     roles = _roles(names)
     unnamed = _UNNAMED.get(words.shape[1], ())
+    if words.shape[1] in (6, 7) and not names and not _end_in_quaternions(words):
+        unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
+    if words.shape[1] in (16, 17) and not names:
+        words = _by_rows(words)
     if not roles and (not names or len(unnamed) > 8 or len(names) == len(_TUM)):
         roles = {role: column for column, role in enumerate(unnamed)}
     if not roles:
@@ -108,10 +116,24 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     return Trajectory(poses, _times_of_columns(roles, words, path), is_kitti, str(path), labels)
 
 
+def _end_in_quaternions(words: np.ndarray) -> bool:
+    norms = np.linalg.norm(words[:, -4:].astype(np.float64), axis=1)
+    return bool(np.nanmedian(np.abs(norms - 1)) < 0.1)
+
+
+def _by_rows(words: np.ndarray) -> np.ndarray:
+    """Return rows that end in matrices, (K, 16) or (K, 17), by rows, also if they are by columns."""
+    matrices = words[:, -16:].reshape(-1, 4, 4)
+    numbers = matrices.astype(np.float64)
+    if (numbers[:, :3, 3] != 0).any() or not (numbers[:, 3, :3] != 0).any():
+        return words
+    return np.concatenate([words[:, :-16], matrices.transpose(0, 2, 1).reshape(-1, 16)], axis=1)
+
+
 def _roles(names: Sequence[str]) -> dict[str, int]:
     """Return the columns of the position, rotation and time that names tell; {} = they do not tell a pose."""
     first: dict[str, int] = {}
-    for column, name in enumerate(names):
+    for column, name in sorted(enumerate(names), key=lambda named: "stamp" not in named[1].lower()):  # not of arrival
         last = name.rpartition(".")[2]
         role = last if last in MATRIX else role_of_name(name)
         if role is not None:
@@ -140,7 +162,7 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
         quaternions = np.stack([values[name] for name in _QUATERNION], axis=1)
         return poses_from_quaternions(positions, quaternions, lambda row: f"{path}: pose {row}")
     angles = np.stack([values.get(name, zeros) for name in _ANGLES])
-    if "deg" in names[roles["yaw"]].lower() or np.abs(angles).max() > 2 * np.pi:
+    if (names and "deg" in names[roles["yaw"]].lower()) or np.abs(angles).max() > 2 * np.pi:
         angles = np.radians(angles)
     return as_matrix(_rotations(angles), positions)
 
@@ -187,7 +209,7 @@ def _ascending(path: Path, words: Sequence[str]) -> np.ndarray:
     result = np.array(nanoseconds_of_numbers(words), dtype=np.int64)
     falls = np.diff(result) <= 0
     if falls.any():
-        raise CFlowError(f"{path}: times must ascend, line {int(falls.argmax()) + 2} does not")
+        raise CFlowError(f"{path}: times must ascend, line {int(falls.argmax()) + 2} does not: sort its lines by time")
     return result
 
 

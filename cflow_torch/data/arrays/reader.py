@@ -10,11 +10,12 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table
+from cflow_torch.data.arrays.cloud_file import in_single, matrices_in, read_columns, read_table
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
     POSE_FILES,
     find_clouds,
+    find_poses_near,
     find_tables,
     only_one,
     other_folders,
@@ -34,7 +35,8 @@ from cflow_torch.transforms import poses_from_quaternions, rigid_transform, tran
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 
-_VIEWPOINT = "VIEWPOINT"
+_VIEWPOINT, _ARRAY = "VIEWPOINT", "the array"  # sources of poses that come with the clouds
+_LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
 _LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
@@ -45,8 +47,9 @@ class ArraysLog(Log):
         folder: of a log, see `find_array_logs`. Clouds are sorted by the times in their names, else naturally: 2
             before 10.
         poses: "auto" = one of `POSE_FILES` in the folder, or KITTI's ../../poses/<name>.txt, or the only file or
-            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set; None = no poses; or a file
-            (see `read_poses`); or a (K, 4, 4) array.
+            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or the only matrix in each
+            `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
+            sweeps; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
             converts poses of KITTI's camera to poses of the LiDAR, and `poses_of` is then ignored.
@@ -65,7 +68,8 @@ class ArraysLog(Log):
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep, see `fit_to_sweeps`; None = unknown. Without times, there
             is one pose per sweep, or each sweep takes that of its name or number.
         bin_layout: numbers of a point of `.bin` files, None for files of another suffix.
-        has_viewpoints: whether the poses come from VIEWPOINT. Such clouds are often in the world's frame (`read_as`).
+        has_viewpoints: whether the poses come from VIEWPOINT or arrays of the clouds. Such clouds are often in the
+            world's frame (`read_as`).
 
     Convention:
         `missing_returns` stay, as NaN, so that results have a row for every row of the file. Sweeps are in the ego
@@ -103,15 +107,17 @@ class ArraysLog(Log):
         self.lidar_position = self.ego_T_lidar[:3, 3]
         trajectory, are_of_lidar = self._trajectory(poses, calibration)
         stamps = self._times(times, trajectory)
+        if trajectory is None and poses == "auto" and stamps is not None:
+            trajectory = self._poses_near(stamps)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.gaps = self._with_gaps_in_time() if self._has_times and trajectory is None else frozenset()
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
         if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
             self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
-        self.has_viewpoints = trajectory is not None and trajectory.source == _VIEWPOINT
-        if self.has_viewpoints:
-            self._note("its poses come from VIEWPOINT")
+        self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAY))
+        if trajectory is not None and self.has_viewpoints:
+            self._note(f"its poses come from {trajectory.source}")
 
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: (N, 3) float32 in the ego frame; pose, ground mask and times where they are known."""
@@ -156,7 +162,9 @@ class ArraysLog(Log):
         file = resolve(self.folder, poses, POSE_FILES, "poses", kitti)
         if file is None and poses == "auto":
             found = [
-                path for path in find_tables(self.folder)[0] if ".json" not in path.suffix.lower() or self._fits(path)
+                path
+                for path in find_tables(self.folder)[0]
+                if path.suffix.lower() not in poses_text.STRUCTURED or self._fits(path)
             ]
             file = only_one(found, self.folder, "poses")
             self._note(f"its poses are those of {file.name}" if file else "")
@@ -176,14 +184,26 @@ class ArraysLog(Log):
             return trajectory, True
         return trajectory._replace(poses=converted), True
 
+    def _poses_near(self, stamps: list[int]) -> Trajectory | None:
+        """Return the poses of the only file in other folders that has them at the times of the sweeps."""
+        found = find_poses_near(self.folder, stamps)
+        names = " and ".join(each.source for each in found)
+        if len(found) > 1:
+            self._note(f"there are poses at the times of its sweeps in {names}: choose one with data.poses=FILE")
+            return None
+        self._note(f"its poses are those of {names}, which has them at the times of its sweeps" if found else "")
+        return found[0] if found else None
+
     def _fits(self, path: Path) -> bool:
-        """Test whether a JSON file has poses of the sweeps, because such files often hold other poses."""
+        """Test whether a structured file has poses of the sweeps, because such files often hold other poses."""
         trajectory = poses_text.read_poses(path)
         rows = self._labelled_rows(trajectory.labels)
         return trajectory.times_ns is not None or len(trajectory.poses) == len(self.files) or rows is not None
 
     def _viewpoints(self) -> Trajectory | None:
-        """Read the poses in VIEWPOINT of `.pcd` files; None if no file has one."""
+        """Read the poses in VIEWPOINT of `.pcd` files, or in an array of `.npz` files; None if no file has one."""
+        if self.files[0].suffix.lower() == ".npz":
+            return self._poses_in_arrays()
         if self.files[0].suffix.lower() != ".pcd":
             return None
         numbers = np.tile(np.eye(7)[3], (len(self.files), 1))
@@ -195,6 +215,18 @@ class ArraysLog(Log):
             return None
         poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
         return Trajectory(poses, None, False, _VIEWPOINT)
+
+    def _poses_in_arrays(self) -> Trajectory | None:
+        """Read the only matrix, (4, 4) or (3, 4), of each `.npz` file."""
+        of_files = [matrices_in(file) for file in self.files[:1]]
+        if len(of_files[0]) != 1:
+            return None
+        (name,) = of_files[0]
+        of_files += [matrices_in(file) for file in self.files[1:]]
+        if any(name not in each for each in of_files):
+            return None
+        poses = checked_poses(np.stack([each[name] for each in of_files]), name)
+        return Trajectory(poses, None, False, f"{_ARRAY} {name} of its clouds")
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
@@ -217,10 +249,21 @@ class ArraysLog(Log):
         return None if file is None else poses_text.read_times(file).tolist()
 
     def _labelled_rows(self, labels: Sequence[str]) -> np.ndarray | None:
-        """Return the row of each file in a table whose rows have labels: by its name, or in the order of numbers."""
-        row_of = {Path(label).stem: row for row, label in enumerate(labels)}
+        """Return the row of each file in a table whose rows have labels: by its name, its number, or in their order.
+
+        If the numbers of more than half of the files are there, and there are fewer or more rows than files, the others
+        have none (-1).
+        """
+        stems = [Path(label).stem for label in labels]
+        row_of = dict(zip(stems, range(len(stems))))
         if row_of.keys() >= {path.stem for path in self.files}:
             return np.array([row_of[path.stem] for path in self.files])
+        numbers = [_number_of(path.stem) for path in self.files]
+        numbered = dict(zip(map(_number_of, stems), range(len(stems))))
+        rows = np.array([numbered.get(number, -1) for number in numbers])
+        is_enough = (rows >= 0).mean() > (_LEAST_NAMED if len(stems) != len(self.files) else 1 - 1e-9)
+        if len(numbered) == len(stems) > 0 and is_enough and max(numbers) >= _LEAST_REACH * max(numbered):
+            return rows
         if len(row_of) != len(self.files) or len({re.sub(r"\d+", "", label) for label in labels}) > 1:
             return None
         return np.array(sorted(range(len(labels)), key=lambda row: natural_key(labels[row])))
@@ -234,8 +277,7 @@ class ArraysLog(Log):
         labelled = self._labelled_rows(labels) if len(labels) == count else None
         if count == len(self.files) or labelled is not None:
             return np.arange(count) if labelled is None else labelled
-        digits = [re.findall(r"\d+", path.stem) for path in self.files]
-        numbers = np.array([int(runs[-1][-9:]) if runs else -1 for runs in digits])
+        numbers = np.array([_number_of(path.stem) % 10**9 for path in self.files])
         fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
         if len(fitting) != 1 or len(set(numbers)) < len(numbers) or fitting[0].max() < _LEAST_REACH * count:
             return None
@@ -243,6 +285,7 @@ class ArraysLog(Log):
         return fitting[0]
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
+        trajectory = trajectory.counted(stamps)
         source = trajectory.source
         rows = np.arange(len(self.files))
         if trajectory.times_ns is not None and stamps is not None:
@@ -257,9 +300,10 @@ class ArraysLog(Log):
                     "with times (TUM) and the times of the sweeps in times.txt, or no poses"
                 )
             rows = given
-            is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2))
+            is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2)) & (rows >= 0)
             if not is_known.all():
-                self._note(f"{(~is_known).sum()} of {len(rows)} sweeps have a pose of NaN in {source} and are left out")
+                count = f"{(~is_known).sum()} of {len(rows)} sweeps"
+                self._note(f"{count} have no pose, or one of NaN, in {source} and are left out")
             poses = trajectory.poses[rows][is_known]
         kept = np.flatnonzero(is_known)
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
@@ -268,6 +312,12 @@ class ArraysLog(Log):
         gaps = np.flatnonzero(is_gap).tolist()
         self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
         return poses
+
+
+def _number_of(stem: str) -> int:
+    """Return the last number in the name of a file; -1 = it has none."""
+    digits = re.findall(r"\d+", stem)
+    return int(digits[-1]) if digits else -1
 
 
 def _drives_along_x(poses: np.ndarray) -> bool:

@@ -1,7 +1,8 @@
-"""Tables of numbers in text files, with or without names of the columns, and in JSON files."""
+"""Tables of numbers in text files, with or without names of the columns, and in JSON, YAML and .npz files."""
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from decimal import Decimal
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any, Iterator, NamedTuple, Sequence
 
 import numpy as np
+import yaml  # type: ignore[import-untyped]
 
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
@@ -42,6 +44,7 @@ def parse_table(content: bytes, path: Path) -> Table:
     """
     with file_errors(path, "every line must have the same number of numbers"):
         lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
+        lines = _poses_only(lines)
         start = next((k for k, line in enumerate(lines) if _is_row(_split(line))), len(lines))
         names = re.split("[,;]", lines[start - 1].lstrip("#")) if start else []
         names = names if len(names) > 1 or not start else lines[start - 1].lstrip("#").split()
@@ -63,16 +66,20 @@ def read_numbers(path: Path) -> np.ndarray:
         return parse_table(read_bytes(path), path).words.astype(np.float64)
 
 
-def tables_of_json(content: bytes, path: Path) -> Iterator[Table]:
-    """Yield what may be a table in a JSON file, outer values first: lists, and objects whose members are alike.
+def _poses_only(lines: list[str]) -> list[str]:
+    """Leave out edges of a g2o graph, and the three numbers above each matrix of a trajectory of Open3D."""
+    vertices = [line for line in lines if line.startswith("VERTEX_SE3")]
+    counts = [len(_split(line)) for line in lines[:5]]
+    return vertices or ([line for k, line in enumerate(lines) if k % 5] if counts == [3, 4, 4, 4, 4] else lines)
+
+
+def tables_of_values(content: bytes, path: Path) -> Iterator[Table]:
+    """Yield what may be a table in a JSON, YAML or .npz file: lists, and objects whose members are alike, outer first.
 
     Numbers of a row are named by their keys, joined by dots. A list, nested or not, of 12 or 16 numbers is a matrix, by
     rows, or by columns if these end in 0, 0, 0, 1. A list of three or four is a vector if the name of the list says so.
     """
-    parse = partial(json.loads, parse_float=Decimal, parse_int=Decimal)
-    with file_errors(f"{path} as JSON"):
-        text = content.decode("utf-8-sig")
-        value = list(map(parse, text.splitlines())) if path.suffix.lower() == ".jsonl" else parse(text)
+    value = _value_of(content, path)
     for labels, members in (*_series(value), ([], [value])):
         rows = [dict(_numbers_of(member, "")) for member in members]
         names = max(rows, key=len, default={}).keys()
@@ -80,6 +87,29 @@ def tables_of_json(content: bytes, path: Path) -> Iterator[Table]:
             texts = labels or [_text_of(member) for member in members]
             words = [[row.get(name, "nan") for name in names] for row in rows]
             yield Table(list(names), np.array(words, str), texts if len({*texts, ""}) > len(texts) else [])
+
+
+def _value_of(content: bytes, path: Path) -> Any:
+    """Return the lists, dictionaries and Decimals in a file. Nothing is unpickled."""
+    kind = path.suffix.lower()
+    with file_errors(f"{path} as {kind[1:]}"):
+        if kind == ".npz":
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                return {name: _as_decimals(archive[name].tolist()) for name in archive.files}
+        text = content.decode("utf-8-sig")
+        if kind in (".yaml", ".yml"):
+            documents = list(yaml.load_all(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader)))
+            return _as_decimals(documents[0] if len(documents) == 1 else documents)
+        parse = partial(json.loads, parse_float=Decimal, parse_int=Decimal)
+        return list(map(parse, text.splitlines())) if kind == ".jsonl" else parse(text)
+
+
+def _as_decimals(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _as_decimals(member) for key, member in value.items()}
+    if isinstance(value, list):
+        return [_as_decimals(member) for member in value]
+    return Decimal(str(value)) if _is_number(str(value)) else value
 
 
 def _series(value: Any) -> Iterator[tuple[list[str], list[Any]]]:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from cflow_torch.data.arrays.folder import find_poses_near
+from cflow_torch.data.arrays.poses_text import read_poses
 from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import search
@@ -66,8 +68,9 @@ class BagLog(Log):
         path: a file, or the folder of a ROS 2 bag, on this machine.
         topic: topic of the clouds (sensor_msgs/PointCloud2, or Livox' CustomMsg); None = the only one of this type.
         poses: "tf" = from the transforms; a topic of nav_msgs/Odometry, geometry_msgs/PoseStamped or
-            PoseWithCovarianceStamped; None = no poses; "auto" = the first available of: transforms in which the ego
-            frame moves, the only topic of these types, none.
+            PoseWithCovarianceStamped; a file of poses of the ego frame with times (TUM); None = no poses; "auto" = the
+            first available of: transforms in which the ego frame moves, the only topic of these types, the only file in
+            a folder near the bag that has poses at the times of the clouds, none.
         frame: name of the ego frame; None = base_link if transforms connect it to the LiDAR, else the LiDAR's own.
         ego_T_lidar: (4, 4), maps the frame of the clouds to the ego frame; None = from the transforms.
 
@@ -117,9 +120,11 @@ class BagLog(Log):
             self.frame = frame or self._ego_frame()
             self.timestamps = sorted(self._arrival)
             self._check_count(f"{self.path}: {self.topic}")
-            source = self._pose_source(topics, poses, bool(tracks))
-            if source is not None:
-                self._use_poses(source, tracks)
+            trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
+            if trajectory is None and poses == "auto":
+                trajectory = self._poses_near()
+            if trajectory is not None:
+                self._use_poses(trajectory)
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
             self.gaps = self._with_gaps_in_time()
             self._period = float(np.median(np.diff(self.timestamps))) * 1e-9
@@ -141,11 +146,35 @@ class BagLog(Log):
         has_usual = not set(_POSE_TYPES).isdisjoint(topics.values())
         return self._chosen(topics, _POSE_TYPES if has_usual else _OTHER_POSES, None, "poses")
 
-    def _use_poses(self, source: str, tracks: dict[str, list[Any]]) -> None:
-        """Take the poses of "tf" or of a topic, and keep the sweeps that have one."""
-        self.trajectory = times, matrices = self._find_trajectory(source, tracks)
+    def _poses_of_bag(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
+        """Return the poses of transforms or of a topic; None = there are none. Clouds of another clock are shifted."""
+        source = self._pose_source(topics, poses, bool(tracks))
+        if source is None:
+            return None
+        times, matrices = self._find_trajectory(source, tracks)
         self._set_clock(times)
-        trajectory = Trajectory(matrices, times, False, f"{source} of {self.path}")
+        return Trajectory(matrices, times, False, f"{source} of {self.path}")
+
+    def _poses_of_file(self, poses: str | None) -> Trajectory | None:
+        """Return the poses of a file next to the bag, or of any other, see `read_poses`; None = this is not a file."""
+        files = [] if poses is None else [path for path in (as_path(poses), self.path.parent / poses) if path.is_file()]
+        trajectory = read_poses(files[0]) if files else None
+        if trajectory is not None and trajectory.times_ns is None:
+            raise CFlowError(f"{files[0]} has no times: give a bag poses with times (TUM)")
+        return trajectory
+
+    def _poses_near(self) -> Trajectory | None:
+        found = find_poses_near(self.path.parent, self.timestamps)
+        names = " and ".join(each.source for each in found)
+        if len(found) > 1:
+            self._note(f"it has no poses, but {names} have them at the times of its clouds: choose data.poses=FILE")
+        elif found:
+            self._note(f"it has no poses, so we take those of {names} for poses of {self.frame}")
+        return found[0] if len(found) == 1 else None
+
+    def _use_poses(self, trajectory: Trajectory) -> None:
+        """Take poses with times, and keep the sweeps that have one."""
+        self.trajectory = np.asarray(trajectory.times_ns), trajectory.poses
         self.poses, is_covered, note = fit_to_sweeps(trajectory, self.timestamps)
         self._note(note)
         self.has_sparse_poses = trajectory.is_sparse(self.timestamps)
