@@ -24,9 +24,10 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     """What an object's motion loses by being displaced by 0.4 m per interval, the best of four displacements, in
     standard deviations of what it finds; and whether it is dynamic. 0 for a static object.
 
-    An object that moves by 0.05 m and loses at least one standard deviation is dynamic, if it is within 35 m, moves by
-    two pixels or finds more than half as much where it moves to as in place. So is one that is not a line and is found
-    less in place than where it moves to, if it loses something or moves at least twice as far as it is displaced.
+    An object that moves by 0.05 m and loses at least one standard deviation is dynamic, if its window has history, or
+    it is within 35 m, moves by two pixels or finds more than half as much where it moves to as in place. So is one that
+    is not a line and is found less in place than where it moves to, if it loses something or moves at least twice as
+    far as it is displaced.
     """
     if not any(rigid.flow):
         return 0.0, False
@@ -39,7 +40,8 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     z = gain / math.sqrt(surplus + stays) if gain > 0 else 0.0
     is_line = principal_axis(sweeps, members[sweeps.pixels[members, 0] == 0]) is not None
     speed = math.hypot(*rigid.flow)
-    is_sure = z >= 1 and (speed >= 2 * sweeps.size or math.hypot(*rigid.centre) < 35 or 2 * surplus > stays)
+    is_told = sweeps.has_history or speed >= 2 * sweeps.size or math.hypot(*rigid.centre) < 35
+    is_sure = z >= 1 and (is_told or 2 * surplus > stays)
     leaves = (gain > 0 or speed >= 2 * DISPLACEMENT) and surplus > stays and not is_line
     return z, bool(speed >= 0.05 and (is_sure or leaves))
 
