@@ -22,7 +22,7 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3510, 129, 3539),
     "keypoints": (small("keypoints"), 868, 35, 898),
     "default": (small("default"), 3391, 105, 3428),
-    "offline": (small("offline"), 3650, 115, 3665),
+    "offline": (small("offline"), 3717, 115, 3732),
 }
 
 
