@@ -323,8 +323,9 @@ def track(
         `cluster_id`: of this sweep's flow, -1 while it is static or where its flow is missing; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;
         `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must
-        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much, if
-        the box shrinks, the centre must have moved by 0.3 m plus a twentieth of the length. Otherwise, and if it is
+        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much,
+        it is enough that one end has moved by its summed flow ± 25 %, at least 0.3 m plus a twentieth of the
+        length. Otherwise, and if it is
         narrower or lower than 0.12 m, its flow in at least three sweeps must add up to the larger of 1.5 m and its
         length, and the box must have moved by this sum ± 25 %. Tracks that are never confirmed are left out, and those
         that leave no free place: where they were, 0.3 times as many static points or more remain.

@@ -234,13 +234,15 @@ def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then
     assert np.array_equal(table["is_confirmed"], np.arange(13) >= 6)
 
 
-def test_a_slow_car_that_is_ever_more_hidden_is_confirmed_if_its_flow_is_confident() -> None:
+@pytest.mark.parametrize("is_shown", [True, False])
+def test_a_slow_car_of_which_ever_more_or_less_is_seen_is_confirmed_if_its_flow_is_confident(is_shown: bool) -> None:
     class Hidden(Staged):
-        """The car drives behind something that hides its front."""
+        """The car drives out of, or behind, something that hides a part of it."""
 
         def world(self, index: int) -> Any:
             points, flow, car = super().world(index)
-            kept = (car < 0) | (points[:, 0] < 5)
+            is_seen = points[:, 0] > 3 if is_shown else points[:, 0] < 5
+            kept = (car < 0) | is_seen
             return points[kept], flow[kept], car[kept]
 
     log = Hidden([straight((0, 0), (0.17, 0.0), 9)])
