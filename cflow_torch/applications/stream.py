@@ -105,8 +105,8 @@ class FlowStream:
 
         Args:
             points: (N, 3+) float, metres, ego frame of this sweep; copied. Or a `Sweep`, which has all of these.
-            pose: (4, 4) `T_world_ego`; None = estimate it by KISS-ICP (extra `odometry`). Give poses for all sweeps of
-                the stream, or for none.
+            pose: (4, 4) `T_world_ego`; None = estimate it from the points (extra `odometry`). Give poses for all sweeps
+                of the stream, or for none.
             time: nanoseconds (int) or seconds (float); None = unknown. Give times for all sweeps, or for none.
             is_ground: (N,) bool ground mask; None = unknown.
             point_times: (N,) float, seconds of each point after the time stamp; None = unknown.

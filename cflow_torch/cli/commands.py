@@ -19,7 +19,7 @@ PAIR_SETTINGS = ("data.first", "data.step")
 DATA_SETTINGS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("first", "seed", "first_seed"), bounds(int, low=0)),
     **dict.fromkeys(("step", "num_sweeps", "num_drives", "sweep_step"), bounds(int, low=1)),
-    **dict.fromkeys(("odometry", "check", "both_returns"), bounds(bool)),
+    **dict.fromkeys(("check", "both_returns"), bounds(bool)),
 }
 
 
@@ -485,7 +485,7 @@ class Stream(Command):
     """Replays the first log of the data in real time and measures the latency: a summary and OUTPUT/stream.json.
 
     Latency is the time from the arrival of sweep t+1 to the flow of sweep t. A late result delays the next one. If
-    sweeps have no poses, KISS-ICP (extra odometry) estimates them, and the latency includes this time.
+    sweeps have no poses, generalised ICP (extra odometry) estimates them, and the latency includes this time.
 
     examples:
       cflow stream drive.bag                          at the speed of the recording

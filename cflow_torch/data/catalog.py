@@ -229,7 +229,7 @@ def open_log(
     name: str,
     source: Any,
     find_ground: Any = "auto",
-    odometry: bool = False,
+    odometry: bool | str = False,
     check: bool = True,
     deskew: Any = "auto",
     read_as: str | None | Sequence[str] = "auto",
@@ -243,7 +243,7 @@ def open_log(
         source: from `find_sources` or `find_user_sources`.
         find_ground: method of `cflow_torch.ground.find_ground` for sweeps without a ground mask, "grid" or
             "patchwork"; "auto" = "grid", and `check` warns if it found ground; None = they stay without a mask.
-        odometry: estimate poses with kiss-icp if the log has none.
+        odometry: True = estimate poses from the points if the log has none; "refine" = also correct given poses.
         check: warn of likely mistakes, see `check_log`.
         read_as: how to read poses and points that have another convention, see `cflow_torch.data.read_as.read_as`; or a
             value of `deskew`: "times", "clockwise", ...
@@ -262,12 +262,14 @@ def open_log(
         deskew, read_as = read_as, "auto"
     given = {
         "find_ground": (find_ground, CHOICES),
+        "odometry": (odometry, (False, True, "refine")),
         "deskew": (deskew, DESKEW_CHOICES),
         "own_vehicle": (own_vehicle, ("auto", None)),
     }
     for setting, (value, choices) in given.items():
         if value not in choices:
-            raise CFlowError(f"{setting}={value!r}: choose one of {', '.join(str(each or 'null') for each in choices)}")
+            words = ("null" if each is None else str(each).lower() for each in choices)
+            raise CFlowError(f"{setting}={value!r}: choose one of {', '.join(words)}")
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
     if isinstance(source, UserSource):
@@ -281,7 +283,7 @@ def open_log(
     if odometry:
         from cflow_torch.data.odometry import with_poses
 
-        log = with_poses(log)
+        log = with_poses(log, refine=odometry == "refine")
     log = read_log_as(log, read_as)
     if own_vehicle is not None:
         log = OwnVehicleLog(log)

@@ -1,4 +1,4 @@
-"""Experimental: data sets that KISS-ICP's own loaders read (extra `odometry`), such as HeLiPR, MulRan, NCLT, Boreas."""
+"""Experimental: data sets that KISS-ICP's own loaders read (extra `kiss-icp`), such as HeLiPR, MulRan, NCLT, Boreas."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class KissICPLog(Log):
     def __init__(self, root: PathLike, loader: str, sequence: str | None = None) -> None:
         self.root = as_path(root)
         datasets = import_optional(
-            "kiss_icp.datasets", "KISS-ICP's loaders need it (extra odometry): pip install kiss-icp"
+            "kiss_icp.datasets", "KISS-ICP's loaders need it (extra kiss-icp): pip install kiss-icp"
         )
         names = sorted(set(datasets.available_dataloaders()) - set(_OTHERS))
         if loader not in names:

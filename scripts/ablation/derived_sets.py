@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.log import FlowLabels
+from cflow_torch.data.odometry import Odometry
 from cflow_torch.evaluation.frame import EvalFrame, ego_motion_flow
-from cflow_torch.transforms import transform_points
+from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Sweep, Window
 
 # Points (N, 3), instance (N,) with 0 = background, total flow (N, 3), usable (N,) bool; all of one sweep.
@@ -124,3 +125,29 @@ def _append(sweep: Sweep, points: np.ndarray) -> Sweep:
     """Append points that are not ground."""
     is_ground = np.concatenate([sweep.is_ground, np.zeros(len(points), bool)])
     return replace(sweep, points=np.concatenate([sweep.points, points.astype(np.float32)]), is_ground=is_ground)
+
+
+def with_noisy_poses(given: Window, seed: int) -> Window:
+    """Return a window without later sweeps, whose poses have noise: 2 cm in x and y, and 0.1 degrees of turn."""
+    rng = np.random.default_rng(seed)
+
+    def noisy(sweep: Sweep) -> Sweep:
+        error = np.eye(4)
+        error[:3, :3] = Rotation.from_euler("z", rng.normal(0, 0.1), degrees=True).as_matrix()
+        error[:2, 3] = rng.normal(0, 0.02, 2)
+        return replace(sweep, pose=sweep.pose @ error)
+
+    return Window(noisy(given.pc0), noisy(given.pc1), tuple(noisy(sweep) for sweep in given.pch))
+
+
+def with_refined_poses(given: Window) -> Window:
+    """Refine the poses of a window without later sweeps, oldest sweep first, as `estimate_poses` does."""
+    odometry = Odometry()
+    refined = []
+    before = None
+    for sweep in (*reversed(given.pch), given.pc0, given.pc1):
+        start = None if before is None else relative_transform(sweep.pose, before.pose)
+        refined.append(replace(sweep, pose=odometry.next_pose(np.asarray(sweep.points), "a sweep", start)))
+        before = sweep
+    *history, pc0, pc1 = refined
+    return Window(pc0, pc1, tuple(reversed(history)))

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Callable, NamedTuple, Sequence
 
 import numpy as np
-from derived_sets import chain_flow, paste_static
+from derived_sets import chain_flow, paste_static, with_noisy_poses, with_refined_poses
 
 from cflow_torch.applications.moving_groups import MOVING
 from cflow_torch.data.av2 import AV2Log
@@ -41,7 +41,7 @@ SCENES = ("street", "highway", "crossing", "narrow")
 SIMULATED_SWEEPS, SIMULATED_WINDOWS = 15, (9, 12)  # per drive
 MOTORWAY_SWEEPS = 8
 SCENE_SEEDS = (0, 1, 2, 3, 4)  # of the small drives
-GROUPS = ("real", "odd", "merged", "pandaset", "scenes", "sim", "motorway")
+GROUPS = ("real", "odd", "merged", "pandaset", "poses", "scenes", "sim", "motorway")
 AV2 = DATA / "av2-7fab2350" / "val" / "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 KITTI, KITTI_LATER = (DATA / "kitti-0000" / f"kitti-0000-{part}.h5" for part in ("a", "c2"))
 CROWN = DATA / "av2-crown" / "av2-crown.h5"
@@ -94,6 +94,10 @@ def make_sets(names: Sequence[str], seeds: Sequence[range]) -> list[ScoredSet]:
         ScoredSet("pandaset a1 h=4", "pandaset", lambda: kitti(PANDASET["a1"])[4:]),
         ScoredSet("pandaset c h=4", "pandaset", lambda: kitti(PANDASET["c"])[4:]),
     ]
+    for history in (0, HISTORY):
+        noisy = ScoredSet(f"noisy poses h={history}", "poses", noisy_poses, history)
+        refined = replace(noisy, name=f"refined poses h={history}", load=partial(noisy_poses, refine=True))
+        sets.extend((noisy, refined))
     for name, stage in _SCENES.items():
         reach = drives.BORDERS[-1] if name == "border" else NEAR
         sets.append(ScoredSet(name, "scenes", partial(staged, stage), half_side=None, reach=reach))
@@ -134,6 +138,15 @@ def av2_pair() -> list[Item]:
     with np.load(AV2 / "ego_motion.npz") as stored:
         T_ego1_ego0 = stored["ego_motion"][0].astype(np.float64)
     return [make_item(pair, log.labels(0), pose_flow=ego_motion_flow(pair.pc0.points, T_ego1_ego0))]
+
+
+def noisy_poses(refine: bool = False) -> list[Item]:
+    """Every other window of PandaSet a1 with noise in its poses; `refine` = corrected as by `data.odometry=refine`."""
+    items = []
+    for number, (given, frame) in enumerate(kitti(PANDASET["a1"])[HISTORY::2]):
+        noisy = with_noisy_poses(given, number)
+        items.append(Item(with_refined_poses(noisy) if refine else noisy, frame))
+    return items
 
 
 def scene(path: Path) -> CachedLog:

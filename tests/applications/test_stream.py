@@ -136,8 +136,8 @@ def test_settings_that_a_stream_cannot_have_are_refused(sweeps):
 def test_missing_ground_and_poses_are_estimated():
     drive = make_drive(seed=2, num_sweeps=4, profile="demo")
     stream = FlowStream("default", num_history=0)
-    if find_spec("kiss_icp") is None:
-        with pytest.raises(CFlowError, match="pip install kiss-icp"):
+    if find_spec("small_gicp") is None:
+        with pytest.raises(CFlowError, match="pip install small-gicp"):
             stream.push(drive.sweep(0).points)
         return
     for index in range(4):
