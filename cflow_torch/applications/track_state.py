@@ -116,8 +116,8 @@ class TrackStates(NamedTuple):
         """(K,) bool: the track moves, and its box has moved roughly as its flow predicts.
 
         If `evidence` is high, both ends of the box must have moved at least a little: a piece of a wall may have flow,
-        but its box then grows, shrinks or jumps. If it is very high, one end must have moved nearly as predicted. Otherwise,
-        the box must have moved far, and nearly as predicted.
+        but its box then grows, shrinks or jumps. If it is very high, one end must have moved nearly as predicted.
+        Otherwise, the box must have moved far, and nearly as predicted.
         """
         predicted = self.travel.norm(dim=1)
         length = self.size[:, 0]
