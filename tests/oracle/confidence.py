@@ -24,8 +24,9 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     """What an object's motion loses by being displaced by 0.4 m per interval, the best of four displacements, in
     standard deviations of what it finds; and whether it is dynamic. 0 for a static object.
 
-    An object that loses at least one standard deviation is dynamic. So is one that is not a line and is found less in
-    place than where it moves to, if it loses something or moves at least twice as far as it is displaced.
+    An object that moves by 0.05 m and loses at least one standard deviation is dynamic, if it is within 35 m, moves by
+    two pixels or finds more than half as much where it moves to as in place. So is one that is not a line and is found
+    less in place than where it moves to, if it loses something or moves at least twice as far as it is displaced.
     """
     if not any(rigid.flow):
         return 0.0, False
@@ -37,8 +38,10 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     gain, stays = surplus - max(others), found_in_place(sweeps, members, sweeps.image)[:, 0].sum()
     z = gain / math.sqrt(surplus + stays) if gain > 0 else 0.0
     is_line = principal_axis(sweeps, members[sweeps.pixels[members, 0] == 0]) is not None
-    is_fast = rigid.flow[0] * rigid.flow[0] + rigid.flow[1] * rigid.flow[1] >= (2 * DISPLACEMENT) ** 2
-    return z, bool(z >= 1 or ((gain > 0 or is_fast) and surplus > stays and not is_line))
+    speed = math.hypot(*rigid.flow)
+    is_sure = z >= 1 and (speed >= 2 * sweeps.size or math.hypot(*rigid.centre) < 35 or 2 * surplus > stays)
+    leaves = (gain > 0 or speed >= 2 * DISPLACEMENT) and surplus > stays and not is_line
+    return z, bool(speed >= 0.05 and (is_sure or leaves))
 
 
 def surplus_of(sweeps: SlicedSweeps, members: np.ndarray, motion: np.ndarray, is_wide: np.ndarray) -> int:

@@ -141,6 +141,28 @@ def test_without_a_margin_only_fast_objects_move(speed, moves):
     assert bool(result.residual_flow.any()) == moves
 
 
+@pytest.mark.parametrize(("x", "speed", "moves"), [(30.0, 0.1, True), (50.0, 0.1, False), (50.0, 0.3, True)])
+def test_far_away_a_slow_motion_must_leave_half_of_what_stays(x, speed, moves):
+    """The sides of the truck match themselves in place, and only its ends move."""
+    side, front = torch.arange(0, 6.01, 0.05), torch.arange(0, 2.01, 0.05)
+    height = torch.tensor([0.3, 0.8, 1.3, 1.8])
+    sides = torch.cartesian_prod(side, torch.tensor([0.0, 2.0]), height)
+    ends = torch.cartesian_prod(torch.tensor([0.0, 6.0]), front, height)
+    truck = torch.cat((sides, ends)) + torch.tensor([x + 0.013, 0.013, 0.0])
+    sweeps = [Sweep(truck - torch.tensor([number * speed, 0.0, 0.0])) for number in range(6)]
+    (result,) = make_model("default")([Window(sweeps[1], sweeps[0], tuple(sweeps[2:]))])
+    assert torch.allclose(result.residual_flow[:, 0], torch.tensor(speed * moves), atol=0.01)
+
+
+def test_a_motion_below_the_least_one_is_static(monkeypatch):
+    monkeypatch.setattr(confidence, "MOVING", 0.2)
+    car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
+    for speed in (0.15, 0.25):
+        window = Window(Sweep(car), Sweep(car + torch.tensor([speed, 0.0, 0.0])))
+        (result,) = make_model("default")([window])
+        assert bool(result.residual_flow.any()) == (speed > 0.2)
+
+
 def test_the_margin_follows_the_rotation_of_a_bus():
     # 5 m from the centre, 5 degrees are 0.44 m: more than a pixel, and than the displacement of the margin.
     x = np.arange(-5.5, 5.5, 0.1)
