@@ -10,7 +10,7 @@ import numpy as np
 from cflow_torch.config import Config, make_config
 from cflow_torch.dense.method import CorrelationFlow
 from cflow_torch.errors import warn
-from cflow_torch.ground.segmentation import CHOICES, find_ground_batch
+from cflow_torch.ground.segmentation import GROUND_METHODS, find_ground_batch
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.tensors import choose_device
@@ -80,8 +80,8 @@ def estimate_flow(
 
     Source: Alg. general_correlation_flow; Sec. CorrelationFlow-Keypoints.
     """
-    if ground not in CHOICES:
-        raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
+    if ground not in GROUND_METHODS:
+        raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND_METHODS))}")
     moved = sorted(_IN_SWEEPS & settings.keys())
     if moved:
         raise CFlowError(

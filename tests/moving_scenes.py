@@ -12,10 +12,9 @@ from scenes import pose
 
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.ops.groups import Groups
-from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.refinement import MOST_TIME
-from cflow_torch.verified.selection import number_objects
+from cflow_torch.verified.selection import Objects, number_objects
 from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch

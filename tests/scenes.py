@@ -15,10 +15,10 @@ from oracle import reference_flow
 from cflow_torch.config import METHODS, Config, VerifiedConfig
 from cflow_torch.estimate import make_model
 from cflow_torch.types import FlowResult, Sweep, Window
-from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.verified.refinement import refine
+from cflow_torch.verified.selection import Objects
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import make_batch
 

@@ -40,7 +40,6 @@ def run(
     layout: Layout = ONE,
     shard: Shard = Shard(),  # noqa: B008 (immutable)
     engine: str = "local",
-    resume: bool = True,
     overwrite: bool = False,
     settings: dict[str, Any] = {},  # noqa: B006 (read only)
     **engine_settings: Any,
@@ -49,7 +48,7 @@ def run(
     job = make_job(output, batch=layout.batch, redo=overwrite, **settings)
     sources = find_sources("av2", root)
     names = [source.name for source in sources]
-    check_logs(output, names, job.identity, resume, overwrite, shard.count == 1)
+    check_logs(output, names, job.identity, overwrite, shard.count == 1)
     for name in names if overwrite and shard.count == 1 else ():
         clear_log(output / name)
     with ENGINES[engine](job, layout, **engine_settings) as executors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,12 @@ from cflow_torch.simulator.writers.av2 import write_av2_log
 SMALL_LOGS = ("av2", "aevascenes", "arrays", "bags", "hdf5", "nuscenes", "truckscenes", "waymo")
 
 
-make_small_drive = lru_cache(maxsize=None)(partial(make_drive, seed=3, profile="demo"))  # many tests write this drive
+@lru_cache(maxsize=None)
+def make_small_drive(num_sweeps: int, seed: int = 3) -> Drive:
+    """A street that many tests write, with half of the columns of the profile demo."""
+    (unit,) = PROFILES["demo"].units
+    profile = replace(PROFILES["demo"], units=(replace(unit, num_columns=unit.num_columns // 2),))
+    return Drive(make_drive(seed, 1, "demo").scene, profile, seed, num_sweeps, f"synthetic-demo-{seed:04d}")
 
 
 def write_small_log(name: str, folder: Path) -> Path:

@@ -21,8 +21,8 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper": (small("paper", num_history=0), 608, 32, 637),
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3510, 129, 3539),
     "keypoints": (small("keypoints"), 868, 35, 898),
-    "default": (small("default"), 3390, 105, 3428),
-    "offline": (small("offline"), 3683, 115, 3698),
+    "default": (small("default"), 3350, 105, 3388),
+    "offline": (small("offline"), 3650, 115, 3665),
 }
 
 

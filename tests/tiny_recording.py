@@ -6,7 +6,9 @@ from typing import Sequence
 
 import numpy as np
 
-from cflow_torch.simulator.recording import AnnotationBoxes, UnitReturns
+from cflow_torch.data.boxes import Boxes
+from cflow_torch.data.categories import CATEGORY_INDEX
+from cflow_torch.simulator.recording import UnitReturns
 from cflow_torch.types import Sweep
 
 START_NS = 1_533_279_682_000_000_000
@@ -115,11 +117,11 @@ class TinyRecording:
     def elevations(self, unit: str) -> np.ndarray:
         return np.linspace(-0.5, 0.2, 32)
 
-    def boxes(self, index: int) -> AnnotationBoxes:
+    def boxes(self, index: int) -> Boxes:
         world = np.stack([self.car_at(self.timestamps[index]), self.parked()])
-        return AnnotationBoxes(
+        return Boxes(
             track_id=TRACKS,
-            category=("REGULAR_VEHICLE", "TRUCK_CAB"),
+            category=[CATEGORY_INDEX[name] for name in ("REGULAR_VEHICLE", "TRUCK_CAB")],
             size=np.tile(CAR_SIZE, (2, 1)),
             pose=np.linalg.inv(self.poses[index]) @ world,
             num_points=np.array([NUM_ON_CAR * len(self.mounts), 0]),

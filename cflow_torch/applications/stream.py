@@ -15,7 +15,7 @@ from cflow_torch.config import Config, make_config
 from cflow_torch.data.odometry import Odometry
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
-from cflow_torch.ground.segmentation import CHOICES, find_ground
+from cflow_torch.ground.segmentation import GROUND_METHODS, find_ground
 from cflow_torch.tensors import choose_device, read_ground, read_positions
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.collation import make_batch
@@ -70,8 +70,8 @@ class FlowStream:
         max_gap: float = 0.5,
         **settings: Any,
     ) -> None:
-        if ground not in CHOICES:
-            raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, CHOICES))}")
+        if ground not in GROUND_METHODS:
+            raise CFlowError(f"ground={ground!r}: give one of {', '.join(map(repr, GROUND_METHODS))}")
         if not (isinstance(max_gap, (int, float)) and max_gap > 0):
             raise CFlowError(f"max_gap={max_gap!r}: give seconds above 0")
         config = make_config(preset, **settings)

@@ -29,7 +29,7 @@ def task(cfg: Bench) -> None:
     ensure_writable(output)
     report = {"log": log.log_id, **measure(model, windows, cfg.repeats, cfg.batches), "machine": machine()}
     report.update(versions=versions(), model=model.config.as_dict())
-    print(format_report(report))
+    print(_table(report))
     write_json(output / "bench.json", report)
     print(f"written to {output / 'bench.json'}")
 
@@ -72,7 +72,7 @@ def measure(
     }
 
 
-def format_report(report: dict[str, Any]) -> str:
+def _table(report: dict[str, Any]) -> str:
     seconds, model = report["seconds"], report["model"]
     peak = "unknown" if report["peak_bytes"] is None else f"{report['peak_bytes'] / 1e6:.0f} MB"
     times = {"total, median": seconds["median"], "min": seconds["min"], "max": seconds["max"], **seconds["stages"]}

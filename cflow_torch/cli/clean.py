@@ -30,7 +30,7 @@ from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
 # Settings that do not change the points of a log.
-_FREE = ("output", "overwrite", "resume", "device", "map", "data.root", "data.label", "data.check", "model.max_memory")
+_FREE = ("output", "overwrite", "device", "map", "data.root", "data.label", "data.check", "model.max_memory")
 _NEEDED = ("residual_flow", "cluster_id", "is_valid")  # of flow files
 
 
@@ -68,8 +68,6 @@ def _is_new(cfg: Clean, log: Log, output: Path) -> bool:
     file = _record_file(folder)
     before: dict[str, Any] = read_json(file) if file.exists() else {}
     check_same_run(folder, before, json_ready(_record(cfg, log)), _FREE)
-    if not cfg.resume:
-        raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
     return False
 
 

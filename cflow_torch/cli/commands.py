@@ -186,10 +186,8 @@ class FlowFiles(Command):
     """Settings of the commands that write flow files."""
 
     device: str = _device()
-    resume: bool = setting(True, "continue an earlier run with the same settings; false = reject its results")
     overwrite: bool = setting(False, "true = compute these logs again and replace their older results")
     dry_run: bool = setting(False, "true = only count the frames of each log, and those left to do")
-    verbose: bool = setting(False, "true = print the time of each stage")
     shard: ShardSettings = setting(ShardSettings(), "share of the work for this process", kind=ShardSettings)
     engine: Engine = group("local", kind=Engine)
 
@@ -525,7 +523,6 @@ class Clean(Command):
     output: str = setting("outputs/clean", "local folder; each log gets <log id>/points, poses.txt, ...")
     model: Config = group("offline", kind=Config)
     device: str = _device()
-    resume: bool = setting(True, "skip logs that were written with the same settings; false = reject them")
     overwrite: bool = setting(False, "true = write these logs again and replace their older results")
     flow: str | None = _path("output folder of `cflow flow` whose flow is used; null = estimate the flow")
     remove_stopped: bool = setting(False, "also remove objects that move at another time, such as a waiting car")
@@ -568,16 +565,12 @@ class ListSettings(Words):
 
     With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
 
-    --opensceneflow FOLDER writes the model files of OpenSceneFlow's configuration instead: cflow.yaml (preset default),
-    cflow_live.yaml, cflow_paper.yaml, ... The package contains the same files.
-
     examples:
       cflow settings max_speed          default, allowed values and meaning of a setting
       cflow settings data.find_ground   a setting of several data sets
       cflow settings data               the choices of a group
       cflow settings data=hdf5 eval     all settings of a data set and of a command
       cflow settings > settings.md
-      cflow settings --opensceneflow conf/model
     """
 
     SUMMARY: ClassVar[str] = "list all settings with defaults and explanations"

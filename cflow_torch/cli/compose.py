@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 import traceback
 from contextlib import contextmanager
@@ -19,7 +18,6 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from cflow_torch.cli.choices import known_settings
 from cflow_torch.cli.commands import ENGINES, NOT_GIVEN, PICTURES, WITH_SETTINGS, Check, Command, Plot, own_fields
 from cflow_torch.cli.failures import UnfinishedJob, exit_if_refused, exit_wrong
 from cflow_torch.cli.words import Call, check_exists
@@ -29,11 +27,6 @@ from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.setting import Settings
 
 _PARSER = OverridesParser.create()
-_PATHS = {"data.root", "data.cache"}  # text, even if they look like numbers
-# Values that Hydra must read by itself: null, a list, a reference, a function, a quoted text.
-_SYNTAX = re.compile(
-    r"null|\[.*\]|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
-)
 _PLUGINS = "hydra-joblib-launcher hydra-submitit-launcher hydra-optuna-sweeper"
 
 
@@ -79,14 +72,13 @@ _register()
 def run_with_hydra(name: str, call: Call) -> None:
     """Let Hydra compose the settings of a command and run it with them, or with those of each job of a sweep."""
     with errors_told(name):
-        overrides = hydra_overrides(WITH_SETTINGS[name], call)
         # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
-        parsed = _PARSER.parse_overrides(overrides)
+        parsed = _PARSER.parse_overrides(call.overrides)
         fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
         unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}
         names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
-        sys.argv = [f"cflow {name}", *overrides, names, *call.options]
+        sys.argv = [f"cflow {name}", *call.overrides, names, *call.options]
 
         @hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
         def job(composed: Any) -> Any:
@@ -110,29 +102,6 @@ def run_job(name: str, composed: Any) -> Any:
 
         keep_freed_memory()
         return import_module(f"cflow_torch.cli.{name}").task(settings)
-
-
-def hydra_overrides(command: type[Command], call: Call) -> list[str]:
-    """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
-    known = known_settings(command).items()
-    texts = {name for name, owners in known if any(limits and limits["kind"] is str for limits in owners.values())}
-    overrides = []
-    for word in call.settings:
-        key, _, value = word.partition("=")
-        overrides.append(f"{key}={_as_text(value)}" if key.lstrip("+") in {*texts, *_PATHS} else word)
-    paths = [_quoted(path) for path in call.paths]
-    if paths:
-        overrides.append(f"data.root={paths[0] if len(paths) == 1 else '[' + ','.join(paths) + ']'}")
-    return overrides
-
-
-def _as_text(value: str) -> str:
-    """Quote text, or each text of a sweep (a,b), so that Hydra reads no other type: the name 1e5 is not a number."""
-    return value if _SYNTAX.fullmatch(value) else ",".join(map(_quoted, value.split(",")))
-
-
-def _quoted(value: str) -> str:
-    return '"' + value.replace('"', r"\"") + '"'
 
 
 def _complete(settings: Command) -> dict[str, Any]:

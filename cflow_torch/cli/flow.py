@@ -147,7 +147,7 @@ def _check_output(cfg: FlowFiles, flow: FlowRun, check: Callable[[Any, FlowRun],
         check(cfg, flow)
         ensure_writable(output)
     names = [source_name(part.source) for part in flow.parts]
-    check_logs(output, names, flow.job.identity, cfg.resume, cfg.overwrite, is_alone)
+    check_logs(output, names, flow.job.identity, cfg.overwrite, is_alone)
     if cfg.overwrite and is_alone and not cfg.dry_run:
         for log in flow.open_logs():
             clear_log(output / log.log_id)
@@ -178,7 +178,7 @@ def _finish(
         report["seconds"] += perf_counter() - begin
         with suppress(OSError):  # the run has reported it
             write_json(file, report)
-    print(f"{format_report(report, cfg.verbose)}\nflow files in {flow.job.output}, report in {file}")
+    print(f"{format_report(report)}\nflow files in {flow.job.output}, report in {file}")
     status = report["exit_status"] or int(bool(failures))
     if status:
         missing = format_missing(report) + "".join(f"\n  {scene}: {message}" for scene, message in failures)

@@ -25,7 +25,7 @@ def task(cfg: Stream) -> None:
     ensure_writable(output)
     report = {"log": log.log_id, **play(stream, log, cfg.pace, cfg.count)}
     report.update(machine=machine(), versions=versions())
-    print(format_report(report))
+    print(_summary(report))
     write_json(output / "stream.json", report)
     print(f"written to {output / 'stream.json'}")
 
@@ -67,7 +67,7 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
     }
 
 
-def format_report(report: dict[str, Any]) -> str:
+def _summary(report: dict[str, Any]) -> str:
     p50, p99 = (1000 * report["latency"][name] for name in ("p50", "p99"))
     lines = [
         f"log {report['log']}: {report['sweeps']} sweeps, {report['results']} results, {report['rate']:.1f} sweeps/s",

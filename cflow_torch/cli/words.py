@@ -8,10 +8,11 @@ from __future__ import annotations
 import glob
 import math
 import os
+import re
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any, Iterable, Mapping, NamedTuple
 
-from cflow_torch.cli.choices import choices, known_settings
+from cflow_torch.cli.choices import Limits, choices, known_settings
 from cflow_torch.cli.commands import PAIR_SETTINGS, PICTURES, WITH_SETTINGS, Command
 from cflow_torch.errors import CFlowError, near
 from cflow_torch.setting import checked
@@ -22,13 +23,25 @@ _WITH_VALUE = (*_OWN_CONFIGS, "-c", "--cfg", "-p", "--package", "-i", "--info")
 _FLAGS = ("-m", "--multirun", "-r", "--run", "--resolve", "--hydra-help", "--version", "-sc", "--shell-completion")
 _LITERALS = {"null": None, "true": True, "false": False, "inf": math.inf, "nan": math.nan}
 _NOT_PLAIN = "'\"[{(*$"  # characters by which a value is a list, a text, a function or a reference of Hydra's
+_PATHS = {"data.root", "data.cache"}  # text, even if they look like numbers
+# Values that Hydra must read by itself: null, a list, a reference, a function, a quoted text.
+_SYNTAX = re.compile(
+    r"null|\[.*\]|.*\$\{.*\}.*|(choice|range|interval|glob|shuffle|sort|str)\(.*\)|'.*'|\".*\"", re.IGNORECASE
+)
 
 
-class Call(NamedTuple):
+class Words(NamedTuple):
     """The words of a call. A word without "=" is a path."""
 
     settings: list[str]
     paths: list[str]
+    options: list[str]
+
+
+class Call(NamedTuple):
+    """A call as Hydra reads it."""
+
+    overrides: list[str]
     options: list[str]
 
 
@@ -37,6 +50,7 @@ def read_call(words: list[str], command: str) -> Call:
 
     With `--config-dir`, your own configurations may have other choices and settings of groups; Hydra knows them.
     """
+    kind = WITH_SETTINGS[command]
     call = split(words)
     given = {option.partition("=")[0] for option in call.options if option.startswith("-")}
     for option in given - {*_FLAGS, *_WITH_VALUE}:
@@ -44,12 +58,12 @@ def read_call(words: list[str], command: str) -> Call:
     for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
         check_exists(path)
     _check_settings(call.settings, command, bool(given & set(_OWN_CONFIGS)))
-    return call
+    return Call(hydra_overrides(kind, call), call.options)
 
 
-def split(words: list[str]) -> Call:
+def split(words: list[str]) -> Words:
     """Split the words of a call. Hydra accepts no option, such as `-m`, between two settings."""
-    call = Call([], [], [])
+    call = Words([], [], [])
     for before, word in zip(["", *words], words):
         if word.startswith("-") or before in _WITH_VALUE:
             call.options.append(word)
@@ -68,29 +82,36 @@ def _is_path(word: str) -> bool:
 def _check_settings(settings: list[str], command: str, has_own: bool) -> None:
     """Reject names that do not exist and plain values that are not allowed."""
     kind = WITH_SETTINGS[command]
-    chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
     known = known_settings(kind)
+    chosen = dict.fromkeys(kind.groups(), []) if has_own else _chosen(settings, kind)
     for word in settings:
         key, _, value = word.partition("=")
         is_group = key in chosen or any(name.startswith(f"{key}.") for name in known)
         if is_group or _is_for_hydra(key) or (has_own and key.partition(".")[0] in chosen):
             continue
         if key not in known:
-            of_value = [group for group in chosen if value in choices(group)]  # preset=live
-            hint = f" (did you mean {of_value[0]}={value}?)" if of_value else near(key, [*chosen, *known])
+            hint = _group_of(value, chosen) or near(key, [*chosen, *known])
             raise CFlowError(f"unknown setting {key!r}{hint}: `cflow {command} --cfg job` prints all settings")
-        owners = [choice for choice in known[key] if _is_chosen(choice, chosen)]
-        if not owners:
-            raise CFlowError(
-                f"setting {key!r} belongs to {' or '.join(known[key])}: give that as well, or leave it out"
-            )
         if key in PAIR_SETTINGS and not kind.CHOOSES_PAIRS:
             choosing = [name for name, other in WITH_SETTINGS.items() if other.CHOOSES_PAIRS]
             raise CFlowError(f"{key} is for cflow {' and cflow '.join(choosing)}: cflow {command} takes every pair")
-        limits = known[key][owners[0]]
-        if len(owners) == 1 and limits is not None:
-            for plain in plain_values(value, limits["kind"] is str):
-                checked(key, plain, limits)
+        _check_value(key, value, known[key], chosen)
+
+
+def _group_of(value: str, groups: Iterable[str]) -> str:
+    """Return the hint that a value is a choice of a group, as in preset=live; "" if it is not."""
+    of_value = [group for group in groups if value in choices(group)]
+    return f" (did you mean {of_value[0]}={value}?)" if of_value else ""
+
+
+def _check_value(key: str, value: str, owners: Mapping[str, Limits], chosen: dict[str, list[str]]) -> None:
+    """Reject a setting of a choice that is not in effect, and plain values that are not allowed."""
+    limits = [limits for choice, limits in owners.items() if _is_chosen(choice, chosen)]
+    if not limits:
+        raise CFlowError(f"setting {key!r} belongs to {' or '.join(owners)}: give that as well, or leave it out")
+    if len(limits) == 1 and limits[0] is not None:
+        for plain in plain_values(value, limits[0]["kind"] is str):
+            checked(key, plain, limits[0])
 
 
 def _is_chosen(choice: str, chosen: dict[str, list[str]]) -> bool:
@@ -144,6 +165,34 @@ def _chosen(settings: list[str], kind: type[Command]) -> dict[str, list[str]]:
 def _is_for_hydra(key: str) -> bool:
     """Test whether a key adds or removes a setting, moves a group, or is a setting of Hydra itself."""
     return key.startswith(("+", "~", "hydra")) or "@" in key
+
+
+def hydra_overrides(command: type[Command], call: Words) -> list[str]:
+    """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
+    texts = set(_PATHS)
+    for name, owners in known_settings(command).items():
+        if any(limits and limits["kind"] is str for limits in owners.values()):
+            texts.add(name)
+    overrides = [_override(word, texts) for word in call.settings]
+    if len(call.paths) == 1:
+        overrides.append(f"data.root={_quoted(call.paths[0])}")
+    elif call.paths:
+        overrides.append(f"data.root=[{','.join(map(_quoted, call.paths))}]")
+    return overrides
+
+
+def _override(word: str, texts: set[str]) -> str:
+    key, _, value = word.partition("=")
+    return f"{key}={_as_text(value)}" if key.lstrip("+") in texts else word
+
+
+def _as_text(value: str) -> str:
+    """Quote text, or each text of a sweep (a,b), so that Hydra reads no other type: the name 1e5 is not a number."""
+    return value if _SYNTAX.fullmatch(value) else ",".join(map(_quoted, value.split(",")))
+
+
+def _quoted(value: str) -> str:
+    return '"' + value.replace('"', r"\"") + '"'
 
 
 def check_exists(path: str) -> None:

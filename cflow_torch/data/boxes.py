@@ -7,7 +7,7 @@ from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.data.categories import CATEGORY_INDEX
+from cflow_torch.data.categories import CATEGORIES, CATEGORY_INDEX
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.transforms import transform_points
@@ -26,18 +26,25 @@ class Boxes:
         category: (K,) uint8, Argoverse 2 index.
         size: (K, 3) float64, metres: length (x), width (y), height (z).
         pose: (K, 4, 4) float64 `T_ego_box`, box coordinates (origin at the centre) to the ego frame of the sweep.
+        num_points: (K,) int64, LiDAR points on each object; None = not counted.
     """
 
-    def __init__(self, track_id: Sequence[str], category: Any, size: Any, pose: Any) -> None:
+    def __init__(self, track_id: Sequence[str], category: Any, size: Any, pose: Any, num_points: Any = None) -> None:
         self.track_id = track_id
         self.category = np.array(category, dtype=np.uint8)
         self.size = np.array(size, dtype=np.float64).reshape(-1, 3)
         self.pose = np.array(pose, dtype=np.float64).reshape(-1, 4, 4)
+        self.num_points = num_points
         if not (np.isfinite(self.size).all() and np.isfinite(self.pose).all()):
             raise CFlowError("a box has numbers that are not finite; copy the annotations again")
         twice = sorted(name for name, times in Counter(track_id).items() if times > 1)
         if twice:
             raise CFlowError(f"a track may have only one box per sweep; these have more: {twice[:_LISTED]}")
+
+    @property
+    def names(self) -> list[str]:
+        """The Argoverse 2 category of each box."""
+        return [CATEGORIES[index] for index in self.category]
 
 
 def category_indices(names: Sequence[Any], known: Mapping[Any, str]) -> list[int]:

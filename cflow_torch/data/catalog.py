@@ -11,8 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 
-from cflow_torch.data.deskewing import CHOICES as DESKEW_CHOICES
-from cflow_torch.data.deskewing import DeskewedLog
+from cflow_torch.data.deskewing import DESKEW_CHOICES, DeskewedLog
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.folders import find_folders, visible
@@ -21,7 +20,7 @@ from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name
 from cflow_torch.data.read_as import read_as as read_log_as
-from cflow_torch.ground.segmentation import CHOICES, has_ground
+from cflow_torch.ground.segmentation import GROUND_METHODS, has_ground
 from cflow_torch.ground.segmentation import find_ground as ground_of
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError, Sweep, Window
@@ -261,7 +260,7 @@ def open_log(
     if read_as in ("times", *SCANS) and deskew == "auto":  # how sweeps are scanned is a reading of the log, too
         deskew, read_as = read_as, "auto"
     given = {
-        "find_ground": (find_ground, CHOICES),
+        "find_ground": (find_ground, GROUND_METHODS),
         "odometry": (odometry, (False, True, "refine")),
         "deskew": (deskew, DESKEW_CHOICES),
         "own_vehicle": (own_vehicle, ("auto", None)),

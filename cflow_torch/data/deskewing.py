@@ -16,7 +16,7 @@ from cflow_torch.types import CFlowError, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, deskew_points, scan_fractions
 from cflow_torch.windows.readings import Judgement
 
-CHOICES = ("auto", "times", "off", *SCANS)
+DESKEW_CHOICES = ("auto", "times", "off", *SCANS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
 _SLICE = 1e-4  # seconds during which we use one pose of a trajectory: 3 mm at 30 m/s
 _INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
@@ -33,7 +33,7 @@ class DeskewedLog(LogWrapper):
             of raw points are moved by these, and others stay.
 
     Attributes:
-        scan: how the sweeps are read, one of `CHOICES` but "auto". It is decided at first use, from the log alone.
+        scan: how the sweeps are read, one of `DESKEW_CHOICES` but "auto". It is decided at first use, by the log alone.
 
     Convention:
         - The motion between neighbouring poses has a constant velocity and rotation rate. Before the first and after
@@ -46,8 +46,8 @@ class DeskewedLog(LogWrapper):
     """
 
     def __init__(self, log: Log, deskew: str = "auto") -> None:
-        if deskew not in CHOICES:
-            raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(CHOICES)}")
+        if deskew not in DESKEW_CHOICES:
+            raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
         super().__init__(log)
         self._deskew = deskew
         self._recent = CachedLog(log, 2)
@@ -124,7 +124,7 @@ class DeskewedLog(LogWrapper):
         if reading != "times":
             return self._seconds_by_azimuth(as_numpy(sweep.points)[rows], reading)
         if sweep.point_times is None:
-            others = ", ".join(name for name in CHOICES if name != "times")
+            others = ", ".join(name for name in DESKEW_CHOICES if name != "times")
             raise CFlowError(f"log {self.log_id} has no times of points for deskew=times: choose one of {others}")
         return as_numpy(sweep.point_times)[rows].astype(np.float64)
 

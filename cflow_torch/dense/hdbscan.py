@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import DenseConfig
-from cflow_torch.dense.clustering import ClusterPixels, Clusters, bounding_boxes
+from cflow_torch.dense.clustering import ClusterPixels, Clusters, cluster_boxes
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.errors import import_optional
 from cflow_torch.ops.groups import FAR, Groups
@@ -32,7 +32,7 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
     pixels = _occupied_pixels(sweeps, labels)
     kept = _linked(pixels)
     clusters = pixels.labels.select(kept)
-    top_left, size = bounding_boxes(clusters, pixels.row, pixels.col)
+    top_left, size = cluster_boxes(clusters, pixels.row, pixels.col)
     is_kept = clusters.is_member
     result = Clusters(
         window=pixels.window[clusters.first()],

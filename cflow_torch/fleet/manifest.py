@@ -60,17 +60,15 @@ def make_identity(
     return {**identity, "hash": hashlib.sha256(text.encode()).hexdigest()}
 
 
-def check_logs(
-    output: Path, names: Iterable[str], identity: Mapping[str, Any], resume: bool, overwrite: bool, alone: bool
-) -> None:
+def check_logs(output: Path, names: Iterable[str], identity: Mapping[str, Any], overwrite: bool, alone: bool) -> None:
     """Raise a `CFlowError` if results of a run must not be added to the folders of logs in `output`.
 
-    `resume` continues an earlier run of the same identity. `overwrite` replaces the results of other runs. It is
-    allowed only if you are `alone`, that is, if no other shard works on these logs. A worker checks a log again when it
+    A run continues an earlier one of the same identity. `overwrite` replaces the results of other runs. It is allowed
+    only if you are `alone`, that is, if no other shard works on these logs. A worker checks a log again when it
     has opened it (`checked_manifest`). An object store takes a while for each log, so there we leave it to the workers.
     """
     forget_listings(output)
-    if (overwrite and alone) or (resume and is_remote(output)):
+    if (overwrite and alone) or is_remote(output):
         return
     for folder in (output / name for name in names):
         before = _read(folder / MANIFEST)
@@ -78,8 +76,6 @@ def check_logs(
             continue
         remedy = "remove that folder" if overwrite else OVERWRITE
         check_same_run(folder, before.get("run", {}), identity, ["hash"], remedy)
-        if not (resume or overwrite):
-            raise CFlowError(f"{folder} has results with the same settings: give resume=true or overwrite=true")
 
 
 def checked_manifest(folder: Path, log: Log, identity: Mapping[str, Any]) -> dict[str, Any]:

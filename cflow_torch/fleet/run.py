@@ -193,8 +193,8 @@ class Counters:
         }
 
 
-def format_report(report: dict[str, Any], verbose: bool = False) -> str:
-    """Return the report as a table. With `verbose`, the table has the times of the stages, too."""
+def format_report(report: dict[str, Any]) -> str:
+    """Return the report as a table, without the times of the stages."""
     frames, shard, devices = report["frames"], report["shard"], report["devices"]
     workers = f"workers: {len(devices)} on {', '.join(sorted(set(devices)))}"
     rows = {
@@ -213,9 +213,6 @@ def format_report(report: dict[str, Any], verbose: bool = False) -> str:
     }
     rows.update({name: count for name, count in seldom.items() if count})
     rows.update({"seconds": f"{report['seconds']:.1f}", "frames/s": f"{report['frames_per_s']:.2f}"})
-    if verbose and report["stages"]:
-        rows["ms per frame and worker (stages overlap)"] = ""
-        rows.update({f"  {name}": f"{1e3 * seconds:.1f}" for name, seconds in report["stages"].items()})
     width = max(map(len, rows))
     return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows.items())
 

@@ -17,13 +17,15 @@ import torch
 from torch import Tensor
 
 from cflow_torch.errors import import_optional
-from cflow_torch.ground.plane import FARTHEST, millimetres, near_plane, order_statistics
-from cflow_torch.ops.lower_surface import UNKNOWN, lower_surface
+from cflow_torch.ground.plane import FARTHEST, CellHeights, Points, near_plane
+from cflow_torch.ops.indices import lookup
+from cflow_torch.ops.lower_surface import NO_HEIGHT, lower_surface
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.tensors import choose_device, read_positions
 from cflow_torch.types import Array, CFlowError, Sweep, Window, check_points
 
-CHOICES = (None, "auto", "grid", "patchwork")  # None = do not look for ground; "auto" = "grid" where there is no mask
+# None = do not look for ground; "auto" = "grid" where there is no mask.
+GROUND_METHODS = (None, "auto", "grid", "patchwork")
 THRESHOLD = 0.3  # metres above the surface; the rule of the Argoverse 2 raster
 
 # Cells are powers of two of a millimetre, so floor division is a shift, also for negative numbers.
@@ -73,17 +75,15 @@ def find_ground_batch(
     Cost: two sorts of all points, and some 60 passes over 256 x 256 cells per sweep. 100,000 points take 20 ms on one
     CPU thread (docs/data.md).
     """
-    if method not in CHOICES[1:]:
-        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, CHOICES[1:]))}")
+    if method not in GROUND_METHODS[1:]:
+        raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, GROUND_METHODS[1:]))}")
     if isinstance(threshold, bool) or not isinstance(threshold, (int, float)) or not 0 <= threshold < FARTHEST:
         raise CFlowError(f"threshold={threshold!r}: give metres above the ground, for example 0.3")
     if not clouds:
         return []
     positions, sweep = _stack(clouds, device)
-    if method == "patchwork":
-        is_ground = _patchwork(positions, sweep, len(clouds))
-    else:
-        is_ground = _grid(positions, sweep, len(clouds), round(threshold * 1000))
+    points = Points.of(positions, sweep, len(clouds))
+    is_ground = _patchwork(points, positions) if method == "patchwork" else _grid(points, round(threshold * 1000))
     masks = is_ground.split([cloud.shape[0] for cloud in clouds])
     return [
         mask.to(cloud.device) if isinstance(cloud, Tensor) else mask.cpu().numpy() for mask, cloud in zip(masks, clouds)
@@ -93,42 +93,37 @@ def find_ground_batch(
 @one_thread()
 def has_ground(cloud: Array) -> bool:
     """Test whether a sweep contains ground, in a third of the time of `find_ground`, from at most 30,000 points."""
-    return bool(near_plane(*_thinned(cloud), 1).is_there)
+    return bool(near_plane(_thinned(cloud)).is_there)
 
 
 @one_thread()
 def is_upside_down(cloud: Array) -> bool:
     """Test whether z points down: nearly all points more than half a metre from the ground are below it."""
-    points, sweep, inside = _thinned(cloud)
-    plane = near_plane(points, sweep, inside, 1)
-    above = points[2] - plane.at(points[0], points[1], sweep)
-    is_far = inside & (above.abs() > _FAR) & (points[:2].abs() < _NEAR).all(0)
-    num_far = int(is_far.sum())
-    num_below = int((is_far & (above < 0)).sum())
-    return bool(plane.is_there) and num_below >= max(_FEWEST_BELOW, _SHARE_BELOW * num_far)
+    points = _thinned(cloud)
+    plane = near_plane(points)
+    height = plane.heights(points)
+    is_near = points.is_active & (points.position[:2].abs() < _NEAR).all(0)
+    num_below = int((is_near & (height < -_FAR)).sum())
+    num_above = int((is_near & (height > _FAR)).sum())
+    return bool(plane.is_there) and num_below >= max(_FEWEST_BELOW, _SHARE_BELOW * (num_below + num_above))
 
 
-def _thinned(cloud: Array) -> tuple[Tensor, Tensor, Tensor]:
-    """Return every k-th point of a cloud: (3, N) int64 mm, the sweep (0), and `inside` as from `millimetres`."""
+def _thinned(cloud: Array) -> Points:
+    """Return every k-th point of a sweep."""
     check_points(cloud, "points")
-    positions, sweep = _stack([cloud[:: max(1, -(-cloud.shape[0] // _MOST_POINTS))]], "auto")
-    points, inside = millimetres(positions)
-    return points, sweep, inside
+    step = max(1, -(-cloud.shape[0] // _MOST_POINTS))
+    return Points.of(*_stack([cloud[::step]], "auto"), 1)
 
 
-def _grid(positions: Tensor, sweep: Tensor, num_sweeps: int, threshold: int) -> Tensor:
-    """Segment the ground by the method "grid", (N,) bool, from (3, N) float64 metres. The threshold is in mm."""
-    points, inside = millimetres(positions)
-    plane = near_plane(points, sweep, inside, num_sweeps)
-    above = (points[2] - plane.at(points[0], points[1], sweep)).clamp_(-_HIGHEST, _HIGHEST)
-    col, row = (points[:2] >> _CELL_BITS).add_(_CELLS // 2)
-    cell = (sweep * _CELLS).add_(row).mul_(_CELLS).add_(col)
-    num_cells = num_sweeps * _CELLS * _CELLS
-    low, _, count = order_statistics(cell.masked_fill(~inside, num_cells), above, num_cells)
-    low = low.masked_fill_(count == 0, UNKNOWN).int().view(num_sweeps, _CELLS, _CELLS)
-
-    surface = lower_surface(low).flatten().index_select(0, cell)
-    return (above <= surface + threshold).logical_and_(inside).logical_and_(plane.is_there.index_select(0, sweep))
+def _grid(points: Points, threshold: int) -> Tensor:
+    """Segment the ground by the method "grid", (N,) bool. The threshold is in mm."""
+    plane = near_plane(points)
+    height = plane.heights(points).clamp_(-_HIGHEST, _HIGHEST)
+    cell = points.cell(_CELL_BITS, _CELLS)
+    cells = CellHeights.of(points, height, cell, _CELLS)
+    surface = lower_surface(cells.low.masked_fill(cells.count == 0, NO_HEIGHT).int())
+    is_low = height <= lookup(surface.flatten(), cell) + threshold
+    return is_low.logical_and_(points.is_active).logical_and_(plane.is_there.index_select(0, points.sweep))
 
 
 def _stack(clouds: Sequence[Array], device: Any) -> tuple[Tensor, Tensor]:
@@ -143,25 +138,25 @@ def _stack(clouds: Sequence[Array], device: Any) -> tuple[Tensor, Tensor]:
     return positions, of_point
 
 
-def _patchwork(positions: Tensor, sweep: Tensor, num_sweeps: int) -> Tensor:
+def _patchwork(points: Points, positions: Tensor) -> Tensor:
     """Segment by Patchwork++, (N,) bool. We shift each cloud in z to the sensor height of its default settings."""
-    need = "method='patchwork' needs Patchwork++ (extra ground): pip install pypatchworkpp, or method='grid'"
-    pypatchworkpp = import_optional("pypatchworkpp", need)
-    points, inside = millimetres(positions)
-    plane = near_plane(points, sweep, inside, num_sweeps)
-    result = np.zeros(positions.shape[1], dtype=bool)
-    for number in range(num_sweeps):  # the library takes one cloud at a time
-        mine = (inside & (sweep == number)).cpu().numpy().nonzero()[0]
-        if not bool(plane.is_there[number]):
-            continue
-        settings = pypatchworkpp.Parameters()
-        settings.sensor_height = _PATCHWORK_HEIGHT
-        settings.enable_RNR = False  # needs intensities
-        settings.verbose = False
-        cloud = np.zeros((len(mine), 4), np.float32)
-        cloud[:, :3] = positions.cpu().numpy()[:, mine].T
+    pypatchworkpp = import_optional(
+        "pypatchworkpp",
+        "method='patchwork' needs Patchwork++ (extra ground): pip install pypatchworkpp, or method='grid'",
+    )
+    settings = pypatchworkpp.Parameters()
+    settings.sensor_height = _PATCHWORK_HEIGHT
+    settings.enable_RNR = False  # needs intensities
+    settings.verbose = False
+    plane = near_plane(points)
+    is_ground = torch.zeros_like(points.is_active)
+    for number in plane.is_there.nonzero()[:, 0]:  # the library takes one cloud at a time
+        member = (points.is_active & (points.sweep == number)).nonzero()[:, 0]
+        cloud = np.zeros((len(member), 4), np.float32)
+        cloud[:, :3] = positions[:, member].cpu().numpy().T
         cloud[:, 2] -= int(plane.height[number]) / 1000 + _PATCHWORK_HEIGHT
         segmenter = pypatchworkpp.patchworkpp(settings)
         segmenter.estimateGround(cloud)
-        result[mine[np.asarray(segmenter.getGroundIndices(), dtype=np.int64)]] = True
-    return torch.from_numpy(result).to(positions.device)
+        found = torch.from_numpy(np.asarray(segmenter.getGroundIndices(), dtype=np.int64))
+        is_ground[member[found.to(member.device)]] = True
+    return is_ground

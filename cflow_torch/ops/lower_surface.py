@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-UNKNOWN = 1 << 29  # height of an empty cell; sums with it still fit an int32
+NO_HEIGHT = 1 << 29  # height of an empty cell; sums with it still fit an int32
 _SUPPORT = 300  # height difference of similar neighbours, mm; low points without such neighbours are multipath
 _STEEP, _GENTLE = 164, 51  # mm per cell: 16 % for hills, 5 % about the smoothed hills (cells of a metre)
 _ROUGH = 70  # mm; cells up to this height above the surface belong to it
@@ -19,7 +19,7 @@ def lower_surface(low: Tensor) -> Tensor:
     """Fit the highest surface of limited slope below the heights, apart from low outliers. Objects rise more steeply.
 
     Args:
-        low: (B, H, W) int32, mm, a low height of each cell, such as its tenth percentile; `UNKNOWN` = empty.
+        low: (B, H, W) int32, mm, a low height of each cell, such as its tenth percentile; `NO_HEIGHT` = empty.
 
     Returns:
         (B, H, W) int32, mm, defined everywhere.
@@ -30,25 +30,25 @@ def lower_surface(low: Tensor) -> Tensor:
     Cost: about sixty passes over the maps.
     """
     is_supported = _is_supported(low)
-    hills = _box_mean(_gentlest(low.masked_fill(~is_supported, UNKNOWN), _STEEP))
+    hills = _box_mean(_gentlest(low.masked_fill(~is_supported, NO_HEIGHT), _STEEP))
     rest = low - hills
     # Far rings have many cells without similar neighbours. Such a cell counts unless it is far below the hills.
-    is_trusted = (is_supported | (rest >= -_SUPPORT)).logical_and_(low < UNKNOWN)
-    return _gentlest(rest.masked_fill_(~is_trusted, UNKNOWN), _GENTLE).add_(hills)
+    is_trusted = (is_supported | (rest >= -_SUPPORT)).logical_and_(low < NO_HEIGHT)
+    return _gentlest(rest.masked_fill_(~is_trusted, NO_HEIGHT), _GENTLE).add_(hills)
 
 
 def _is_supported(low: Tensor) -> Tensor:
     """(B, H, W) bool: three of the eight neighbours, or half of the occupied ones, have a similar height."""
     height, width = low.shape[1:]
-    padded = F.pad(low, (1, 1, 1, 1), value=UNKNOWN)
+    padded = F.pad(low, (1, 1, 1, 1), value=NO_HEIGHT)
     num_similar = torch.zeros_like(low, dtype=torch.uint8)
     num_occupied = torch.zeros_like(low, dtype=torch.uint8)
     for down, right in _NEIGHBOURS:
         neighbour = padded[:, down : down + height, right : right + width]
         num_similar += (neighbour - low).abs_() <= _SUPPORT
-        num_occupied += neighbour < UNKNOWN
+        num_occupied += neighbour < NO_HEIGHT
     is_similar = num_similar * 2 >= num_occupied.clamp(max=6)
-    return is_similar & (num_occupied > 0) & (low < UNKNOWN)
+    return is_similar & (num_occupied > 0) & (low < NO_HEIGHT)
 
 
 def _gentlest(heights: Tensor, slope: int) -> Tensor:
@@ -56,8 +56,8 @@ def _gentlest(heights: Tensor, slope: int) -> Tensor:
 
     Between known cells, it is the mean of the highest and the lowest possible surface. The slope is in mm per cell.
     """
-    is_ground = (heights - _cone(heights, slope) <= _ROUGH).logical_and_(heights < UNKNOWN)
-    both = torch.cat([heights, -heights]).masked_fill_(~is_ground.repeat(2, 1, 1), UNKNOWN)
+    is_ground = (heights - _cone(heights, slope) <= _ROUGH).logical_and_(heights < NO_HEIGHT)
+    both = torch.cat([heights, -heights]).masked_fill_(~is_ground.repeat(2, 1, 1), NO_HEIGHT)
     highest, lowest = _cone(both, slope).split(len(heights))
     return (highest - lowest) >> 1
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from cflow_torch.data.av2 import GroundRaster
+from cflow_torch.data.boxes import Boxes
 from cflow_torch.data.categories import CATEGORY_INDEX
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.simulator.car_park import build_car_park
@@ -21,7 +22,7 @@ from cflow_torch.simulator.motion import SceneMotion
 from cflow_torch.simulator.narrow import build_narrow
 from cflow_torch.simulator.objects import own_truck
 from cflow_torch.simulator.profiles import PROFILES, WEATHER, in_weather
-from cflow_torch.simulator.recording import AnnotationBoxes, UnitReturns
+from cflow_torch.simulator.recording import UnitReturns
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.sensors import LidarProfile
 from cflow_torch.simulator.street import build_street
@@ -128,19 +129,18 @@ class Drive(Log):
         category = np.where(now, np.append(self._category, 0), 0).astype(np.uint8)
         return FlowLabels(flow.astype(np.float32), category[body], (now & then)[body])
 
-    def boxes(self, index: int) -> AnnotationBoxes:
+    def boxes(self, index: int) -> Boxes:
         """Annotation boxes of sweep `index`, in its ego frame."""
         returns = self.returns(index)
         chosen = np.flatnonzero(self._is_annotated[index] & (self._category > 0))
-        bodies = [self.scene.bodies[i] for i in chosen]
-        size = np.array([body.size for body in bodies]).reshape(-1, 3) + _BOX_SLACK
+        size = np.array([self.scene.bodies[i].size for i in chosen]).reshape(-1, 3) + _BOX_SLACK
         pose = np.linalg.inv(self.poses[index]) @ self._body_poses[index, chosen]
         if self._profile.is_rolling:
             size = np.maximum(size, self._extent(index, returns)[chosen])
         pose[:, :3, 3] += pose[:, :3, 2] * size[:, 2:] / 2
-        return AnnotationBoxes(
+        return Boxes(
             track_id=tuple(self.track_ids[i] for i in chosen),
-            category=tuple(str(body.category) for body in bodies),
+            category=self._category[chosen],
             size=size,
             pose=pose,
             num_points=np.bincount(self._body_of(returns), minlength=len(self.scene.bodies) + 1)[chosen],

@@ -1,29 +1,10 @@
-"""What a simulated drive has for writers, besides sweeps and labels: boxes, returns of each LiDAR."""
+"""What a simulated drive has for writers, besides sweeps, labels and boxes: the returns of each LiDAR."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-
-
-@dataclass(frozen=True)
-class AnnotationBoxes:
-    """Annotation boxes of one sweep.
-
-    Args:
-        track_id: (M,) UUIDs, the same in every sweep.
-        category: (M,) Argoverse 2 names.
-        size: (M, 3) float64 length, width, height, metres.
-        pose: (M, 4, 4) float64 `T_ego_box`, origin in the middle of the box.
-        num_points: (M,) int64, number of LiDAR points on the object.
-    """
-
-    track_id: tuple[str, ...]
-    category: tuple[str, ...]
-    size: np.ndarray
-    pose: np.ndarray
-    num_points: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,8 @@
 """The aperture problem: static lines seem to slide along themselves, and long vehicles really do.
 
 A moving sensor samples walls, hedges and guard rails at positions that move with it, so they seem to slide along
-themselves. Such a line is static if t+1 has most of it at the old position, or if the older sweeps have most of it at
-the new one. One of the two suffices, because one end of the line may enter or leave the view. The side of a car is a
-line as well, but its rear leaves the old position and its front reaches a new one. A low line of 7 m or more is a guard
-rail, which is always static.
+themselves. Such a line is static if the other sweeps have most of it at its position in t+1. The side of a car is a
+line as well, but its front reaches a new position. A low line of 7 m or more is a guard rail, which is always static.
 
 Both ends of a bus or a tram move, although most of it is covered. If a wall seems to move, one of its ends stays, or
 its ends are only the limits of the view. The ends of a guard rail or a noise barrier may keep pace with the ego
@@ -30,7 +28,7 @@ from cflow_torch.verified.in_place import are_covered
 _THIN = 0.3  # metres, largest standard deviation of a line across it
 _LONG = 1.0  # metres, smallest standard deviation along it
 _ALONG = 0.04  # squared sine of the largest angle between a line and a motion along it
-_LEAST_TRAVEL = 1.2  # metres; shorter displacements over the window are ignored
+_LEAST_TRAVEL = 1.2  # metres, of the ends of a long vehicle
 _ALIKE = 0.1  # the displacements of two ends that move together differ by at most this share of their sum
 _LONGEST = 60.0  # metres; no road vehicle is longer. The ends of a longer noise barrier are only the limits of the view
 # A guard rail has fewer than 2 height slices per pixel at t+1 on average, and a standard deviation of at least 2 m
@@ -48,14 +46,13 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, pixels: Pixels, groups: Grou
         candidates: (A, C, 2) float64 (y, x), fine pixels per sweep interval.
 
     Returns:
-        (A, C) bool. True if the pixels of the component at t+1 form a line, the motion points along it, its
-        displacement over the window is at least 1.2 m, and the line is a rail or is covered. With history, a covered
-        line does not slide if both of its ends move.
+        (A, C) bool. True if the pixels of the component at t+1 form a line, the motion points along it, and the line is
+        a rail or is covered. With history, a covered line does not slide if both of its ends move.
 
     Convention:
         Moments are sums of integers; all else is elementwise float64 in the written order. The pixels of a line have a
         standard deviation of at most 0.3 m across it and at least 1 m along it. A rail is a line with at least 2 m
-        along it, and fewer than two slices per pixel on average. Zero motion never slides.
+        along it, and fewer than two slices per pixel on average.
 
     Cost: some passes over the pixels.
     """
@@ -74,10 +71,7 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, pixels: Pixels, groups: Grou
     num_more = at_newest.sum(count_slices(newest_pixels.slices) - _TALL)
     is_rail = (num_more < 0) & (lines.variance >= (_RAIL / pixel_size) ** 2)
     slides = lines.is_line & (is_rail | is_covered & ~travels)
-
-    intervals = sweeps.elapsed.amax(1) - sweeps.elapsed.amin(1)  # [B]
-    travel = candidates.square().sum(2) * intervals.square().index_select(0, window)[:, None]  # [A, C], square pixels
-    return slides[:, None] & lines.are_along(candidates) & (travel >= (_LEAST_TRAVEL / pixel_size) ** 2)
+    return slides[:, None] & lines.are_along(candidates)
 
 
 class Lines(NamedTuple):

@@ -1,6 +1,6 @@
 """Motion candidates of the nodes of the component tree.
 
-The candidates of a node are its correlation peaks with each sweep, their median, and the median of its parent.
+The candidates of a node are its correlation peaks with each sweep, and its velocity if it is a linked fast object.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_empty, lazy_zeros
-from cflow_torch.ops.segments import masked_median
 from cflow_torch.verified.columns import OWN, Pixels, count_slices
 from cflow_torch.verified.component_tree import Tree
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
@@ -37,10 +36,8 @@ def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, conf
     """Return the candidates of all nodes, each correlated at its own pixel size.
 
     Convention: a peak at shift 0 is not refined. The parabola is fitted to counts of slices of the node's own pixels.
-        We take the median of y and the median of x if any window has at least two sweeps besides t+1. The median of a
-        single estimate is that estimate, so a pair gets the same motion in any batch.
 
-    Source: adapted from Sec. leverage_past_pcs, which takes the medians of magnitude and of orientation.
+    Source: adapted from Sec. leverage_past_pcs, which takes medians over the sweeps instead.
     """
     images = _NodeImages.of(nodes, blocks, sweeps)
     boxes = images.boxes
@@ -51,12 +48,9 @@ def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, conf
     peak *= boxes.block.index_select(0, pairs.cluster)[:, None]
     estimates = Estimates.of(pairs, peak, score, sweeps.elapsed.index_select(0, nodes.window)[:, 1:])
 
-    own = estimates.per_interval().masked_fill_(~estimates.available[:, :, None], 0.0)
-    if sweeps.num_steps > 2:
-        own = torch.cat((masked_median(own, estimates.available)[:, None], own), 1)
-    own = own + 0.0  # turns -0.0 into 0.0
-    of_parent = nodes.by_parent.spread(own[:, 0]) + nodes.motion
-    return Candidates(torch.cat((own, of_parent[:, None]), 1), estimates.newest_score())
+    peaks = estimates.per_interval().masked_fill_(~estimates.available[:, :, None], 0.0)  # [N, S - 1, 2]
+    motion = torch.cat((peaks, nodes.motion[:, None]), 1) + 0.0  # turns -0.0 into 0.0
+    return Candidates(motion, estimates.newest_score())
 
 
 @dataclass(frozen=True)

@@ -366,6 +366,11 @@ class Columns:
         filled = self.slices[1:, : is_unknown.shape[1]]
         filled |= is_unknown[1:].view(torch.uint8) * 255
 
+    def are_filled(self, pixels: Pixels, step: int) -> Tensor:
+        """Tell at which of K pixels another sweep has slices, but no pixel: (K,) bool, see `fill`."""
+        is_empty = self.rank[step].index_select(0, self.column_of(pixels)) == _EMPTY
+        return is_empty & (self.look_up(pixels, step) & OWN > 0)
+
 
 def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:
     """Return the positions of pixels in the images of the windows, (K,) in the dtype of row and column, never 0."""

@@ -33,9 +33,9 @@ from cflow_torch.ops.chunks import chunks
 from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, take_columns
 from cflow_torch.ops.linear import full, inverse, matvec, upper
-from cflow_torch.verified.component_tree import Objects
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
+from cflow_torch.verified.selection import Objects
 from cflow_torch.verified.subpixel_motion import with_slow_objects
 from cflow_torch.verified.voxel_centroids import (
     ObjectPoints,

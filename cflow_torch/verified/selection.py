@@ -8,10 +8,13 @@ the motion of the winner in its own pixels. Two sweeps are too few to tell:
     winner     [   A     A  c  p ]     a car A, a cyclist c behind it and a parked car p: all move as A
     dissent              [c][p]        c moves by itself, p is static
 
-The pixels of copies follow the drawn ones, and P' counts both.
+P is the number of drawn pixels. The pixels of copies follow, and P' counts both.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Callable
 
 import torch
 import torch.nn.functional as F
@@ -19,14 +22,33 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.verified.component_tree import PER_SLICE, Components, NodeKind, Objects, Tree
+from cflow_torch.verified.component_tree import Components, Tree, corners_at_newest, longer_side
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.paired_test import NEAR_Z, Counts, Verdict, count_wins
+from cflow_torch.verified.paired_test import NEAR_Z, PER_SLICE, Counts, Verdict, count_wins
 
 # The price of an object on each level. Children move separately only if that gains more evidence.
 PRICE = 4 * PER_SLICE
 _DISSENT_Z = 2.0  # factor of z for nodes that dissent
 _LEAST_DIFFERENCE = 1.0  # finest pixels per sweep interval, between the motions of a winner and of a node that dissents
+
+
+@dataclass(frozen=True)
+class Objects:
+    """The selected objects, in order of their first pixel in the list: those of copies come last."""
+
+    pixels: Groups  # the P' pixels, grouped by object
+    # The G objects, grouped by their node. Static objects whose component is not a node are in no group.
+    by_node: Groups
+    first: Tensor  # (G,) int64, position of the first pixel of each object in the list
+
+    @property
+    def count(self) -> int:
+        """Number of objects, G."""
+        return self.pixels.count
+
+    def length_at_newest(self, sweeps: HeightSlicedSweeps) -> Tensor:
+        """(G,) float64, metres, longer side of the bounding box of the pixels at t+1; 0 without any."""
+        return longer_side(corners_at_newest(sweeps.pixels, self.pixels), sweeps.grid.pixel_size)
 
 
 def select_objects(
@@ -36,6 +58,7 @@ def select_objects(
     verdict: Verdict,
     significance: float,
     price: int = PRICE,
+    dissent: Callable[..., Tensor] | None = None,
 ) -> Objects:
     """Select objects from the leaves up, then let nodes inside the winners dissent.
 
@@ -44,27 +67,27 @@ def select_objects(
         verdict: the best motion of each node, and its evidence; 0 = none is significant.
         significance: z of the paired test. For a node against the winner around it, z is twice as large.
         price: of an object, in units of `PER_SLICE`.
+        dissent: `with_dissent`, or what an ablation puts in its place.
 
     Returns:
         The objects. A pixel belongs to the first of these that exists:
-        1. its node of a fast object, if that has evidence, and more than 2 has;
-        2. the node whose motion the finest of its nodes of the levels takes, else its node of changed pixels or of
-           copies with evidence;
-        3. its plain component, if that is linked. Then it is static.
+        1. the node whose motion the finest of its nodes of the levels takes, or its node of another kind with the most
+           evidence, if that has more;
+        2. its plain component, if that is linked. Then it is static.
         Otherwise it is static and belongs to no object.
 
     Convention:
         The value of a child is its own evidence or the sum of its children's values, whichever is more, minus `price`,
         but at least 0. The coarsest node with more evidence than its children wins. Ties: the children win.
-        With history, a node inside a winner dissents if its motion differs from that of the winner, and from the one it
-        would take from its parent, by a pixel per sweep interval in y or in x, and gains more than `price`.
+        With history, a node inside a winner dissents if its motion differs from that of the winner by a pixel per sweep
+        interval in y or in x, and gains more than `price`. Otherwise, it takes the motion that its parent takes.
 
     Cost: a few passes over the nodes for each level, and over the members; the paired test of nodes that may dissent.
     """
     none = tree.count
     node = torch.arange(none, device=verdict.evidence.device)
     winner = _winners(tree, node, verdict.evidence, price)
-    taken = _with_dissent(sweeps, tree, verdict, winner, significance, price)
+    taken = (dissent or with_dissent)(sweeps, tree, verdict, winner, significance, price)
     by_pixel = Groups(tree.pixel, sweeps.num_pixels)  # the members
     moving = _moving_nodes(tree, by_pixel, taken, verdict.evidence)
 
@@ -95,7 +118,7 @@ def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
     return winner
 
 
-def _with_dissent(
+def with_dissent(
     sweeps: HeightSlicedSweeps, tree: Tree, verdict: Verdict, winner: Tensor, significance: float, price: int
 ) -> Tensor:
     """Return the node whose motion each node takes, (N,) int64; N = it is static.
@@ -108,7 +131,8 @@ def _with_dissent(
     motion_around = Groups(winner, none).spread(motion)  # [N, 2]
     has_history = sweeps.has_history.index_select(0, tree.window)
     is_inside = (tree.kind < tree.num_levels) & (winner < none) & (winner != node) & has_history
-    inside = flat_nonzero(is_inside & _differ(motion, motion_around))
+    differs = ((motion - motion_around).abs() >= _LEAST_DIFFERENCE).any(1)
+    inside = flat_nonzero(is_inside & differs)
     if len(inside) == 0:
         return winner
     dissents = torch.zeros_like(is_inside)
@@ -116,16 +140,9 @@ def _with_dissent(
     own = torch.where(motion.any(1), node, none)
     taken = winner
     for level in range(1, tree.num_levels):
-        of_parent = tree.by_parent.spread(taken, none=none)
-        takes_own = dissents & _differ(motion, Groups(of_parent, none).spread(motion))
-        of_level = torch.where(takes_own, own, of_parent)
+        of_level = torch.where(dissents, own, tree.by_parent.spread(taken, none=none))
         taken = torch.where(is_inside & (tree.kind == level), of_level, taken)
     return taken
-
-
-def _differ(motion: Tensor, other: Tensor) -> Tensor:
-    """Tell which motions differ by a pixel in y or in x, (N,) bool, from (N, 2) each, pixels per sweep interval."""
-    return ((motion - other).abs() >= _LEAST_DIFFERENCE).any(1)
 
 
 def _gain(sweeps: HeightSlicedSweeps, tree: Tree, node: Tensor, motion: Tensor, other: Tensor, z: float) -> Tensor:
@@ -143,21 +160,21 @@ def _gain(sweeps: HeightSlicedSweeps, tree: Tree, node: Tensor, motion: Tensor, 
 def _moving_nodes(tree: Tree, by_pixel: Groups, taken: Tensor, evidence: Tensor) -> Tensor:
     """Return the moving node of each pixel, (P',) int64, N = none; see `select_objects`.
 
-    `by_pixel` groups the members by pixel, `taken` is the result of `_with_dissent`.
+    `by_pixel` groups the members by pixel, `taken` is the result of `with_dissent`.
     """
     none = tree.count
     node = torch.arange(none, device=taken.device)
     is_of_level = tree.kind < tree.num_levels
-    is_fast = tree.kind == NodeKind.UNLINKED
     # Nodes are listed level by level, so the finest node of a pixel has the largest number.
     finest = by_pixel.max(tree.members.spread(torch.where(is_of_level, node, -1), none=-1), empty=-1)  # [P']
-    slow = torch.where(finest >= 0, F.pad(taken, (0, 1), value=none).index_select(0, finest.clamp(min=0)), none)
-    fast = by_pixel.min(tree.members.spread(taken.masked_fill(~is_fast, none), none=none), empty=none)  # [P']
-    other = by_pixel.min(tree.members.spread(taken.masked_fill(is_of_level | is_fast, none), none=none), empty=none)
-    slow = torch.where(slow < none, slow, other)
+    of_level = torch.where(finest >= 0, F.pad(taken, (0, 1), value=none).index_select(0, finest.clamp(min=0)), none)
+    # The largest key is that of the node with the most evidence. Ties: the first.
+    key = torch.where(is_of_level | (taken == none), -1, (evidence + 1) * none - 1 - node)
+    key = by_pixel.max(tree.members.spread(key, none=-1), empty=-1)  # [P']
+    other = torch.where(key >= 0, none - 1 - key % max(none, 1), none)
     evidence_of = F.pad(evidence, (0, 1))  # of none, 0
-    is_faster = evidence_of.index_select(0, fast) > evidence_of.index_select(0, slow)
-    return torch.where(is_faster, fast, slow)
+    is_more = evidence_of.index_select(0, other) > evidence_of.index_select(0, of_level)
+    return torch.where(is_more, other, of_level)
 
 
 def _keys_of_components(components: Components, first: int, num_pixels: int) -> Tensor:

@@ -20,7 +20,7 @@ from cflow_torch.viz.packing import PackedDrive, packed
 from cflow_torch.viz.scene import MAX_FLOW, ViewedPair
 from cflow_torch.viz.style import checked_path
 
-VOXEL = 0.1  # metres
+STATIC_VOXEL = 0.1  # metres
 _TEMPLATE = Path(__file__).parent / "page.html"
 
 TrackTable = Mapping[str, np.ndarray]
@@ -53,7 +53,7 @@ def show(
     title: str = "CorrelationFlow",
     preset: str | None = None,
     max_flow: float = MAX_FLOW,
-    voxel: float = VOXEL,
+    voxel: float = STATIC_VOXEL,
 ) -> Page:
     """Show one pair or several consecutive ones in 3-D: in a notebook inline, elsewhere with `show(...).save(path)`.
 
@@ -86,7 +86,7 @@ def save_page(
     tracks: Callable[[], TrackTable | None] = lambda: None,
     preset: str | None = None,
     max_flow: float = MAX_FLOW,
-    voxel: float = VOXEL,
+    voxel: float = STATIC_VOXEL,
 ) -> int:
     """Save a drive as one .html that any browser opens without a network.
 

@@ -9,6 +9,7 @@ The columns are those of run.py.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,6 +21,8 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.verified import changed_pixels, component_tree, confidence, paired_test, refinement, selection
+from cflow_torch.verified.height_slices import HeightSlicedSweeps
+from cflow_torch.verified.spacing import Spacing
 
 
 def _without_changed(sweeps: Any) -> changed_pixels.ChangedPixels:
@@ -49,16 +52,32 @@ def _no_ends_move(sweeps: Any, pixels: Any, groups: Groups) -> Tensor:
     return torch.zeros(groups.count, dtype=torch.bool, device=groups.of_item.device)
 
 
+def _points_are_dense(*given: Any) -> Spacing:
+    return Spacing.of(*given)._replace(most=1, has_tall=False)
+
+
+def _without_coverage(batch: Any, *given: Any) -> HeightSlicedSweeps:
+    return HeightSlicedSweeps.of(replace(batch, coverage=None), *given)
+
+
+def _no_dissent(sweeps: Any, tree: Any, verdict: Any, winner: Tensor, significance: float, price: int) -> Tensor:
+    return winner
+
+
 # For each row of the table, the steps of `VerifiedFlow` that it replaces.
 STEPS: dict[str, dict[str, Any]] = {
     "all steps": {},
+    "no spacing": {"draw": partial(HeightSlicedSweeps.of, measure_spacing=_points_are_dense)},
+    "no coverage": {"draw": _without_coverage},
     "no changed pixels": {"find_changed": _without_changed},
     "no unchanged pixels": {"add_unchanged": lambda sweeps, tree, motion: tree},
     "no static test": {"find_components": _linked_may_move},
+    "no links of fast objects": {"link_unlinked": lambda sweeps, components, tree, max_speed: tree},
     "no objects under overhangs": {"add_overhung": lambda sweeps, components, tree: (sweeps, tree)},
     "no aperture test": {"verify": partial(paired_test.verify, slides=_nothing_slides)},
-    "no least gain": {"verify": partial(paired_test.verify, least_gain=0)},
+    "no least gain": {"verify": partial(paired_test.verify, least_share=math.inf)},
     "no price of an object": {"select_objects": partial(selection.select_objects, price=0)},
+    "no dissent": {"select_objects": partial(selection.select_objects, dissent=_no_dissent)},
     "no margin": {"motion_margin": _without_margin},
     "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
     "no slow objects of pairs": {"refine": partial(refinement.refine, add_slow=_nothing_is_slow)},

@@ -94,7 +94,7 @@ def moving(
             rows.append(row)
             velocities.append(velocity)
             is_scored.append(np.linalg.norm(velocity) >= SPEED and num_points >= POINTS and is_near)
-    names = [CATEGORIES[boxes.category[row]] for row in rows]
+    names = [boxes.names[row] for row in rows]
     kinds = [CLASS_OF.get(name, "car") for name in names]
     ids = [boxes.track_id[row] for row in rows]
     return TrueBoxes(
@@ -128,8 +128,7 @@ class SimulatedBoxes(SimulatedLog):
         boxes = self.drive.boxes(index * self.step)
         row = {name: number for number, name in enumerate(self.drive.track_ids)}
         size = np.array([self.drive.scene.bodies[row[name]].size for name in boxes.track_id]).reshape(-1, 3)
-        category = [CATEGORIES.index(name) for name in boxes.category]
-        return Boxes(boxes.track_id, category, size, boxes.pose)
+        return Boxes(boxes.track_id, boxes.category, size, boxes.pose)
 
 
 class PandaSetBoxes(PandaSetLog):

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import cflow
+from small_logs import make_small_drive
 
 from cflow_torch import CFlowError, make_config, make_model
 from cflow_torch.applications import labels
 from cflow_torch.applications.labels import find_labels, label_scene
 from cflow_torch.data.hdf5 import HDF5Log, write_hdf5_results, write_hdf5_scene
 from cflow_torch.data.log import windows
-from cflow_torch.simulator import make_drive
 
 h5py = pytest.importorskip("h5py")
 spatial = pytest.importorskip("scipy.spatial")
@@ -38,7 +38,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes."""
     folder = tmp_path_factory.mktemp("drives")
     for seed in (1, 2):
-        write_hdf5_scene(make_drive(seed, NUM_SWEEPS, "demo"), folder / f"scene-{seed}.h5")
+        write_hdf5_scene(make_small_drive(NUM_SWEEPS, seed), folder / f"scene-{seed}.h5")
     return folder
 
 

@@ -16,10 +16,10 @@ import torch
 from command_line import cflow
 from preset_windows import small
 from scenes import assert_same_bits, scene
+from small_logs import make_small_drive
 
 from cflow_torch import CFlowError, FlowResult, FlowStream, Sweep, Window, make_config, make_model
 from cflow_torch.errors import CFlowWarning
-from cflow_torch.simulator import make_drive
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_settings_that_a_stream_cannot_have_are_refused(sweeps):
 
 
 def test_missing_ground_and_poses_are_estimated():
-    drive = make_drive(seed=2, num_sweeps=4, profile="demo")
+    drive = make_small_drive(4, seed=2)
     stream = FlowStream("default", num_history=0)
     if find_spec("small_gicp") is None:
         with pytest.raises(CFlowError, match="pip install small-gicp"):
@@ -150,7 +150,7 @@ def test_missing_ground_and_poses_are_estimated():
 
 
 def test_ground_is_found_by_default_but_a_given_mask_wins():
-    drive = make_drive(seed=2, num_sweeps=2, profile="demo")
+    drive = make_small_drive(2, seed=2)
     settings = make_config(num_history=0, point_cloud_range=(-20, -20, -9, 20, 20, 9))
     given = [drive.sweep(index) for index in range(2)]
     bare = [replace(sweep, is_ground=None) for sweep in given]

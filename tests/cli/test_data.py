@@ -11,8 +11,7 @@ import pytest
 from small_logs import SMALL_LOGS, write_small_log
 
 from cflow_torch.cli.commands import Flow
-from cflow_torch.cli.compose import hydra_overrides
-from cflow_torch.cli.words import split
+from cflow_torch.cli.words import hydra_overrides, split
 from cflow_torch.data.catalog import DATA_SETS, recognise
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.types import CFlowError

@@ -79,8 +79,6 @@ def test_clean_resumes_and_overwrites_as_flow_does(drives, tmp_path, cflow, caps
     assert cflow(*call, drives[0], "remove_stopped=true") == 2
     error = capsys.readouterr().err
     assert "remove_stopped was False, is True" in error and "overwrite=true" in error
-    assert cflow(*call, drives[0], "voxel_size=0.2", "resume=false") == 2
-    assert times(out / "drive_1") == first
     assert cflow(*call, drives[0], "remove_stopped=true", "overwrite=true") == 0
     assert times(out / "drive_1").values() != first.values() and not (out / "drive_1.ply").exists()
     assert times(out / "drive_2") == second

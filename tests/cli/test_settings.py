@@ -14,9 +14,8 @@ from omegaconf import OmegaConf
 from cflow_torch import make_config
 from cflow_torch.cli.choices import FOLDER, choices, help_of, names_in, read_settings
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
-from cflow_torch.cli.compose import hydra_overrides
 from cflow_torch.cli.main import HELP
-from cflow_torch.cli.words import read_call, split
+from cflow_torch.cli.words import hydra_overrides, read_call, split
 from cflow_torch.config import METHODS, PRESETS, Config
 from cflow_torch.data.catalog import DATA_SETS
 
@@ -183,9 +182,3 @@ def test_settings_explains_one_name(name, expected, cflow, capsys):
     assert all(part in text for part in expected) and len(text) < 4500
     assert cflow("settings", "max_sped") == 2
     assert "nothing has this name (did you mean model.max_speed?)" in capsys.readouterr().err
-
-
-def test_the_harness_models_are_those_in_the_package(tmp_path: Path, cflow) -> None:
-    assert cflow("settings", "--opensceneflow", tmp_path / "model") == 0
-    committed = {file.name: file.read_text() for file in (FOLDER / "opensceneflow" / "model").glob("*.yaml")}
-    assert committed == {file.name: file.read_text() for file in (tmp_path / "model").iterdir()}

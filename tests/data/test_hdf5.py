@@ -7,12 +7,12 @@ import pickle
 import numpy as np
 import pytest
 from hdf5_scene import STAMPS, move_to_sensor, write_scene
+from small_logs import make_small_drive
 
 from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.writer import write_hdf5_scene
 from cflow_torch.data.log import window
-from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import transform_points
 
 h5py = pytest.importorskip("h5py")
@@ -123,7 +123,7 @@ def test_every_key_is_read_in_its_own_type(tmp_path):
 
 @pytest.fixture(scope="module")
 def drive():
-    return make_drive(seed=1, num_sweeps=3, profile="demo")
+    return make_small_drive(3, seed=1)
 
 
 @pytest.mark.parametrize("points_frame", ["ego", "sensor"])

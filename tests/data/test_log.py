@@ -163,7 +163,7 @@ def test_objects_are_the_moving_objects_of_the_simulator(drive, result):
     assert (np.linalg.norm(objects["velocity"], axis=1) >= 0.5).all()
     T, before, after = np.linalg.inv(drive.poses[4]) @ drive.poses[3], drive.boxes(3), drive.boxes(4)
     num_moving, num_missed, is_found = 0, 0, np.zeros(len(objects), bool)
-    for track, pose0, count, category in zip(before.track_id, before.pose, before.num_points, before.category):
+    for track, pose0, count, category in zip(before.track_id, before.pose, before.num_points, before.names):
         number = after.track_id.index(track)
         pose, size = after.pose[number], after.size[number]
         velocity = (pose - T @ pose0)[:3, 3] / 0.1

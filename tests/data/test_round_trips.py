@@ -93,7 +93,7 @@ def test_drives_and_the_truth_of_their_boxes_come_back(name: str, drives: dict[s
         return
     tracks = []
     for boxes in (drive.boxes(0), drive.boxes(1)):
-        category = [CATEGORY_INDEX[form.category(each)] for each in boxes.category]
+        category = [CATEGORY_INDEX[form.category(each)] for each in boxes.names]
         pose = boxes.pose
         if name == "waymo":  # stores headings only
             heading = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])

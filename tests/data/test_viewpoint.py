@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from small_logs import make_small_drive
 
 from cflow_torch import CFlowError
 from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import read_cloud, write_cloud
 from cflow_torch.data.catalog import open_log
-from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import to_quaternions, transform_points
 from cflow_torch.types import CFlowWarning
 
@@ -21,7 +21,7 @@ THIN = slice(None, None, 3)  # rows of a sweep that are written
 
 def write_drive(root, frame: str, origin: float):
     """Write a third of the demo drive, and return it with its poses, of which the first is at x = `origin`."""
-    drive = make_drive(seed=1, num_sweeps=4, profile="demo")
+    drive = make_small_drive(4, seed=1)
     to_start = np.linalg.inv(drive.poses[0])
     to_start[0, 3] += origin
     poses = to_start @ drive.poses
@@ -70,7 +70,7 @@ def test_cleaned_clouds_have_the_same_form(tmp_path, frame: str) -> None:
 
 
 def test_viewpoints_need_poses_and_pcd(tmp_path) -> None:
-    drive = make_drive(seed=1, num_sweeps=2, profile="demo")
+    drive = make_small_drive(2, seed=1)
     with pytest.raises(CFlowError, match="viewpoint='world' with suffix='.npy'"):
         write_array_log(drive, tmp_path, ".npy", "world")
 

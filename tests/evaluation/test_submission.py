@@ -16,6 +16,7 @@ from command_line import cflow
 from hdf5_scene import write_scene
 from public_evaluators import FLOW, LOG, TIME, official_mask, read_pair
 from pyarrow import feather
+from small_logs import make_small_drive
 
 from cflow_torch import CFlowError, CorrelationFlow
 from cflow_torch.data.av2 import AV2Log
@@ -23,7 +24,6 @@ from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window
 from cflow_torch.evaluation.submission.archive import check_submission, encode, get_version, write_frame, write_zip
 from cflow_torch.evaluation.submission.frames import MaskArchive, plan_log, point_mask, read_frame_list, require_logs
-from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 Files = Dict[str, bytes]
@@ -32,7 +32,7 @@ Files = Dict[str, bytes]
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> AV2Log:
     """Seven simulated sweeps: pairs 0 and 5 are submitted."""
-    return AV2Log(write_av2_log(make_drive(seed=3, num_sweeps=7, profile="demo"), tmp_path_factory.mktemp("drive")))
+    return AV2Log(write_av2_log(make_small_drive(7), tmp_path_factory.mktemp("drive")))
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from small_fleet import SWEEPS, run, tree
+from small_logs import make_small_drive
 
 from cflow_torch.fleet.machine import Layout
-from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 
@@ -17,7 +17,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of three logs, of 3, 5 and 2 pairs."""
     root = tmp_path_factory.mktemp("fleet")
     for seed, sweeps in enumerate(SWEEPS):
-        write_av2_log(make_drive(seed=seed, num_sweeps=sweeps, profile="demo"), root)
+        write_av2_log(make_small_drive(sweeps, seed), root)
     return root
 
 

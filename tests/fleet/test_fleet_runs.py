@@ -90,8 +90,6 @@ def test_other_settings_are_rejected_by_name(fleet, single, out):
         run(fleet, out, settings=OTHER)
     with pytest.raises(CFlowError, match="find_ground was None, is grid"):
         run(fleet, out, settings={"settings": {"find_ground": "grid"}})
-    with pytest.raises(CFlowError, match="resume=true"):
-        run(fleet, out, resume=False)
     with pytest.raises(CFlowError, match="remove that folder"):
         run(fleet, out, shard=Shard(0, 2), overwrite=True, settings=OTHER)
     manifest = frames(out)[0].with_name("manifest.json")

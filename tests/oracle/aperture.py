@@ -16,15 +16,15 @@ COVERED = 65  # per cent
 def slides_along_itself(sweeps: SlicedSweeps, members: np.ndarray, motion: Vector) -> bool:
     """Whether a line that stays where it is explains a motion of a component: it is a line at t+1 that is low and of a
     standard deviation of 2 m or more, or covered without both of its ends moving (in pairs, whatever they do); and the
-    motion points along it (the sine of the angle is at most 0.2) and leads at least 1.2 m over the window."""
+    motion points along it (the sine of the angle is at most 0.2)."""
     newest = members[sweeps.pixels[members, 0] == 0]
-    axis, speed = principal_axis(sweeps, newest), math.hypot(*motion)
-    if axis is None or speed * np.ptp(sweeps.elapsed) < LEAST_TRAVEL / sweeps.size:
+    axis = principal_axis(sweeps, newest)
+    if axis is None:
         return False
     is_long = np.var(sweeps.pixels[newest, 1:] @ axis) >= (2.0 / sweeps.size) ** 2
     is_rail = is_long and COUNT[sweeps.slices[newest]].sum() < 2 * len(newest)
-    along = abs(axis[0] * motion[1] - axis[1] * motion[0]) <= 0.2 * speed
-    is_static = is_covered(sweeps, members) and not (sweeps.has_history and both_ends_move(sweeps, members))
+    along = abs(axis[0] * motion[1] - axis[1] * motion[0]) <= 0.2 * math.hypot(*motion)
+    is_static = is_covered(sweeps, newest) and not (sweeps.has_history and both_ends_move(sweeps, members))
     return bool(along and (is_rail or is_static))
 
 
@@ -37,11 +37,11 @@ def principal_axis(sweeps: SlicedSweeps, members: np.ndarray) -> np.ndarray | No
     return axes[:, 1] if small <= (0.3 / sweeps.size) ** 2 and large >= (1.0 / sweeps.size) ** 2 else None
 
 
-def is_covered(sweeps: SlicedSweeps, members: np.ndarray) -> bool:
-    """Whether slices are in the 3 x 3 pixels where they are, at least `COVERED` per cent: of those of t+1 in all other
-    sweeps, or of those of the other sweeps in t+1."""
-    counts = found_in_place(sweeps, members, sweeps.around)
-    return any(total > 0 and near * 100 >= total * COVERED for near, total in counts)
+def is_covered(sweeps: SlicedSweeps, newest: np.ndarray) -> bool:
+    """Whether the other sweeps have at least `COVERED` per cent of the slices of some pixels of t+1 in the 3 x 3 pixels
+    where they are."""
+    _, (near, total) = found_in_place(sweeps, newest, sweeps.around)
+    return bool(total > 0 and near * 100 >= total * COVERED)
 
 
 def both_ends_move(sweeps: SlicedSweeps, members: np.ndarray) -> bool:

@@ -1,8 +1,7 @@
-"""Motion candidates of nodes: peaks of the correlation with each sweep, their median, that of the parent."""
+"""Motion candidates of nodes: peaks of the correlation with each sweep, and the velocity of a fast object."""
 
 from __future__ import annotations
 
-from statistics import median
 from typing import Sequence
 
 import numpy as np
@@ -19,22 +18,14 @@ def propose(sweeps: SlicedSweeps, nodes: Sequence[Node]) -> tuple[list[list[Vect
     """What each node may have done, (y, x) finest pixels per interval, in the order in which ties are decided; and the
     NCC of each with the nearest sweep that has it.
 
-    The median of the peaks of all sweeps in y and in x, if there is more than one other sweep; the peak of each; and
-    the first candidate of the parent. (0, 0), which never wins, stands for a sweep that lacks the node.
+    The peak of each sweep, then the velocity. (0, 0), which never wins, stands for a sweep that lacks the node.
     """
     candidates: list[list[Vector]] = []
     scores = []
     for node in nodes:
         images, block = draw(sweeps, node)
         peaks = [find_peak(sweeps, images, block, m) for m in range(1, len(images))]
-        found = [motion for motion, score in peaks if score is not None]
-        own = [motion for motion, _ in peaks]
-        if len(own) > 1:
-            own.insert(0, (median([y for y, _ in found]), median([x for _, x in found])))
-        if node.parent >= 0:
-            own.append(candidates[node.parent][0])
-        own.append(node.velocity)
-        candidates.append(own)
+        candidates.append([*(motion for motion, _ in peaks), node.velocity])
         scores.append(next(score for _, score in peaks if score is not None))
     return candidates, scores
 

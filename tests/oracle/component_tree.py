@@ -106,23 +106,17 @@ def dissent(sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], winner:
     """The node whose motion each node takes, -1 = none, from the winners of the cut.
 
     With history, a node inside a winner takes its own motion, or is static, if that differs from the motion of the
-    winner, and from what its parent takes, by a pixel in y or in x, and gains more than `PRICE` against the winner in
-    its own pixels.
+    winner by a pixel in y or in x, and gains more than `PRICE` against the winner in its own pixels.
     """
     taken = list(winner)
     for i, node in enumerate(tree.nodes):
         if node.level >= len(tree.levels) or winner[i] in (-1, i) or not sweeps.has_history:
             continue
         taken[i] = taken[node.parent]
-        around = motions[taken[i]] if taken[i] >= 0 else (0.0, 0.0)
-        differs = differ(motions[i], motions[winner[i]]) and differ(motions[i], around)
+        differs = max(abs(a - b) for a, b in zip(motions[i], motions[winner[i]])) >= 1
         if differs and gain(sweeps, node.members, motions[i], motions[winner[i]], z) > PRICE:
             taken[i] = i if any(motions[i]) else -1
     return taken
-
-
-def differ(motion: Vector, other: Vector) -> bool:
-    return max(abs(a - b) for a, b in zip(motion, other)) >= 1
 
 
 def gain(sweeps: SlicedSweeps, members: np.ndarray, motion: Vector, other: Vector, z: float) -> int:
@@ -142,12 +136,12 @@ def select_objects(
     """Objects, which move or are static as a whole: (P,) object of each pixel, numbered by their first pixels, and node
     of each object; -1 = none.
 
-    A pixel moves with the node whose motion its finest node in the tree takes; else with its node of changed pixels, if
-    that has any evidence; but with its node of a fast object, if that has more evidence. Else it is static with its
-    plain component, if that is linked.
+    A pixel moves with the node whose motion its finest node in the tree takes; but with its first node of changed
+    pixels or of a fast object, if that has more evidence. Else it is static with its plain component, if that is
+    linked.
     """
     nodes, num_levels, plain = tree.nodes, len(tree.levels), tree.levels[-1]
-    name, moving, changed = np.full((3, len(plain)), -1)
+    name, moving = np.full((2, len(plain)), -1)
     for label in np.unique(plain):
         if is_linked(sweeps, np.flatnonzero(plain == label)):
             name[plain == label] = len(nodes) + label
@@ -157,12 +151,9 @@ def select_objects(
             moving[node.members] = winner
         if node.level == num_levels - 1:
             name[node.members] = i
-        if node.level == num_levels and evidence[i] > 0:
-            changed[node.members] = i
-    moving = np.where(moving >= 0, moving, changed)
     name = np.where(moving >= 0, moving, name)
     for i, node in enumerate(nodes):
-        if node.level == num_levels + 1:
+        if node.level >= num_levels:
             rivals = [evidence[number] if number >= 0 else 0 for number in moving[node.members].tolist()]
             gained = node.members[np.array(rivals) < evidence[i]]
             moving[gained] = name[gained] = i

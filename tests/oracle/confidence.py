@@ -45,9 +45,8 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
 
 
 def surplus_of(sweeps: SlicedSweeps, members: np.ndarray, motion: np.ndarray, is_wide: np.ndarray) -> int:
-    """Slices won minus those lost; of wide pixels by the near counts, of others by the exact ones."""
-    exact, near = (np.subtract(*count_wins(sweeps, members, motion, is_near, is_wide)) for is_near in (False, True))
-    return int(np.where(is_wide, near, exact).sum())
+    """Slices won minus those lost, by the near counts."""
+    return int(np.subtract(*count_wins(sweeps, members, motion, True, is_wide)).sum())
 
 
 def motion_of_pixels(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> np.ndarray:

@@ -26,7 +26,7 @@ from oracle.spacing import are_tall, reach_of_pixels, spacing_of
 from oracle.sweeps import Cloud, PointMotion
 from oracle.unlinked import link_unlinked
 
-CHANGED_Z, FAST_Z = 4.0, 2.5  # standard deviations for nodes of changed pixels, and of fast objects
+CHANGED_Z = 4.0  # standard deviations for nodes of changed pixels
 LEAVES = 20  # slices that a fast object must win for each one that it loses
 
 
@@ -87,12 +87,12 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
 
 def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_levels: int) -> tuple[Vector, int]:
     """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations
-    (as many for wide fast objects), that of the near counts. Nodes of changed pixels and fast objects need more of
-    them. All must gain three slices for each sweep besides t and t+1, or one for eight pixels."""
-    z = {num_levels: CHANGED_Z, num_levels + 1: FAST_Z}.get(node.level, sweeps.config.significance)
+    (as many for fast objects), that of the near counts. Nodes of changed pixels need more of them. With history, all
+    must gain a slice for eight pixels."""
+    z = CHANGED_Z if node.level == num_levels else sweeps.config.significance
     is_fast = node.level > num_levels
-    near_z = z if is_fast and are_wide(sweeps, node.members).any() else 2 * z
-    least = min(16 * 3 * (len(sweeps.elapsed) - 2), 16 * len(node.members) // 8)
+    near_z = z if is_fast else 2 * z
+    least = 16 * len(node.members) / 8 * sweeps.has_history
     evidence = []
     for motion in candidates:
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))

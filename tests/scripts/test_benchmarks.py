@@ -13,11 +13,11 @@ import torch
 from preset_windows import small
 from scenes import RANGE, assert_same
 from scipy.spatial.transform import Rotation
+from small_logs import make_small_drive
 
 from cflow_torch import CorrelationFlow, Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
-from cflow_torch.simulator import make_drive
 
 S = 0.25  # pixel of the small scenes
 # (row, col, height, width) and the shift per sweep (rows, cols); objects do not touch within three sweeps.
@@ -153,7 +153,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from cflow_torch.data.hdf5 import write_hdf5_scene
 
     file = tmp_path_factory.mktemp("peers") / "drive.h5"
-    write_hdf5_scene(make_drive(1, 5, "demo"), file)
+    write_hdf5_scene(make_small_drive(5, seed=1), file)
     return file
 
 

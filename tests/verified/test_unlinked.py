@@ -71,7 +71,7 @@ def test_a_far_car_of_few_points_is_found(step, num_points):
 
 
 @pytest.mark.parametrize("step", [-2.2, 3.5])
-def test_in_a_pair_an_unmatched_component_goes_with_the_nearest_one_of_like_size(step):
+def test_in_a_pair_an_unmatched_component_goes_with_the_nearest_one(step):
     shape = np.concatenate((front(1, 40), front(2, 40) + (14.0, 4.0, 0.0)))  # two cars
     pair = replace(window(shape, step), pch=())
     result = flow_as_oracle(pair, MODEL.config)

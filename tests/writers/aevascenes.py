@@ -11,10 +11,10 @@ import numpy as np
 
 from cflow_torch.data.aevascenes import CATEGORY_NAME, GROUND
 from cflow_torch.data.atomic import new_folder
-from cflow_torch.data.boxes import points_in_box
+from cflow_torch.data.boxes import Boxes, points_in_box
 from cflow_torch.data.paths import safe_name
 from cflow_torch.simulator.drive import Drive
-from cflow_torch.simulator.recording import AnnotationBoxes, UnitReturns
+from cflow_torch.simulator.recording import UnitReturns
 from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import CFlowError
 
@@ -55,7 +55,7 @@ def write_aevascenes_sequence(log: Drive, root: str | Path, layout: str = "v2") 
         - We write only motion-compensated clouds, because a recording has no others.
         - Every point has a class name: "road" on the ground, the class of the box that holds it, or "other_structure".
           `semantic_labels_idx` is the position of the name in `CATEGORY_NAME`. Aeva's own numbers may differ.
-        - AnnotationBoxes have no velocities, because the reader does not use them.
+        - Boxes have no velocities, because the reader does not use them.
 
     Raises:
         CFlowError: the sequence exists already, the folder name or the layout is not valid, a shot is before its
@@ -129,12 +129,12 @@ def _write_cloud(path: Path, unit: UnitReturns, classes: np.ndarray, where: str)
     )
 
 
-def _classes(log: Drive, index: int, boxes: AnnotationBoxes) -> np.ndarray:
+def _classes(log: Drive, index: int, boxes: Boxes) -> np.ndarray:
     """(N,) int64, class of every point of a sweep, as an index of `_CLASSES`."""
     sweep = log.sweep(index)
     points = np.asarray(sweep.points)[:, :3]
     classes = np.full(len(points), _CLASSES.index(_BACKGROUND), np.int64)
-    for category, size, pose in zip(boxes.category, boxes.size, boxes.pose):
+    for category, size, pose in zip(boxes.names, boxes.size, boxes.pose):
         near = np.flatnonzero(np.abs(points[:, 0] - np.float32(pose[0, 3])) <= np.linalg.norm(size))
         near = near[points_in_box(points[near], size, pose)]
         classes[near] = _CLASSES.index(_class_of(category))
@@ -149,7 +149,7 @@ def _class_of(category: str) -> str:
     return CLASS_OF[category]
 
 
-def _boxes(boxes: AnnotationBoxes) -> list[dict[str, Any]]:
+def _boxes(boxes: Boxes) -> list[dict[str, Any]]:
     """The boxes of a frame."""
     return [
         {
@@ -160,7 +160,7 @@ def _boxes(boxes: AnnotationBoxes) -> list[dict[str, Any]]:
             "dimensions": dict(zip(_XYZ, size.tolist())),
             "pose": _pose(pose),
         }
-        for track, category, size, pose in zip(boxes.track_id, boxes.category, boxes.size, boxes.pose)
+        for track, category, size, pose in zip(boxes.track_id, boxes.names, boxes.size, boxes.pose)
     ]
 
 

@@ -211,7 +211,7 @@ class SceneWriter:
         for key in keys:
             boxes = self.recording.boxes(key)
             poses = np.asarray(self.recording.poses[key]) @ boxes.pose
-            for row, (track, name) in enumerate(zip(boxes.track_id, boxes.category)):
+            for row, (track, name) in enumerate(zip(boxes.track_id, boxes.names)):
                 if name not in self._names:
                     raise CFlowError(
                         f"log {self.recording.log_id} has a box of category {name!r}, which the format does not have; "

@@ -204,7 +204,7 @@ def _box_rows(log: Drive, index: int, key: dict[str, Any]) -> list[dict[str, Any
     boxes = log.boxes(index)
     rows = []
     for track, category, size, pose, count in zip(
-        boxes.track_id, boxes.category, boxes.size, boxes.pose, boxes.num_points
+        boxes.track_id, boxes.names, boxes.size, boxes.pose, boxes.num_points
     ):
         if category in BOX_TYPE:
             numbers = {f"{BOX}box.center.{axis}": pose[k, 3] for k, axis in enumerate(_XYZ)}

@@ -96,7 +96,7 @@ def find_scenes(root: PathLike, foreign: Collection[str], data_set: str) -> list
     return found
 
 
-def read_table(
+def read_json_table(
     folder: Path, table: str, key: str = "", values: Collection[str] = (), more: Mapping[str, Sequence[str]] = {}
 ) -> list[Row]:
     """Read the rows of a table with the fields of `FIELDS`, and `more` of some tables.
@@ -140,7 +140,7 @@ class Tables:
     @cached_property
     def scenes(self) -> dict[str, str]:
         """Name of each scene -> its token."""
-        rows = read_table(self.folder, "scene")
+        rows = read_json_table(self.folder, "scene")
         file = self.folder / "scene.json"
         scenes = {safe_name(row["name"], f"{file}: the scene"): row["token"] for row in rows}
         if len(scenes) < len(rows):
@@ -176,11 +176,11 @@ class Tables:
     @cached_property
     def _by_token(self) -> dict[str, dict[str, Row]]:
         tables = ("sensor", "category", "instance", "sample")
-        return {table: _by_token(read_table(self.folder, table)) for table in tables}
+        return {table: _by_token(read_json_table(self.folder, table)) for table in tables}
 
     @cached_property
     def _boxes_of_scene(self) -> dict[str, list[Row]]:
-        return self._by_scene(read_table(self.folder, "sample_annotation"))
+        return self._by_scene(read_json_table(self.folder, "sample_annotation"))
 
     def _by_scene(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
         grouped: dict[str, list[Row]] = defaultdict(list)
@@ -191,7 +191,7 @@ class Tables:
     def _read_measured(self, modality: str) -> _Measured:
         sensors = [token for token, row in self._by_token["sensor"].items() if row["modality"] == modality]
         more = _CAMERA_FIELDS if modality == "camera" else {}
-        read = partial(read_table, self.folder, more=more)
+        read = partial(read_json_table, self.folder, more=more)
         mounts = _by_token(read("calibrated_sensor", "sensor_token", sensors))
         rows = read("sample_data", "calibrated_sensor_token", mounts)
         poses = _by_token(read("ego_pose", "token", {row["ego_pose_token"] for row in rows}))

@@ -94,7 +94,7 @@ class WaymoLog(BoxLog):
         self.timestamps = [time * 1000 for time in times]
         self._check_count(self.file)
         self._lasers = self._choose(lasers)
-        self._calibration = self._read_calibration()
+        self._calibration = self._read_lasers()
         component = Component(self.file, "vehicle_pose")
         poses = component.rows_by(TIME, times, (VEHICLE_POSE,))
         where = f"{component.file}: the pose of frame"
@@ -151,7 +151,7 @@ class WaymoLog(BoxLog):
             raise CFlowError(f"{self._pixel_poses.file} has no pixel poses of frame {time}; copy it again")
         return poses
 
-    def _read_calibration(self) -> dict[int, LaserCalibration]:
+    def _read_lasers(self) -> dict[int, LaserCalibration]:
         component = Component(self.file, "lidar_calibration")
         inclinations = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
         columns = [f"{CALIBRATION}{name}" for name in ("extrinsic.transform", *inclinations)]

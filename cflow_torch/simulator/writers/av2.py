@@ -12,9 +12,9 @@ from pyarrow import feather
 
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.av2 import GroundRaster
+from cflow_torch.data.boxes import Boxes
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.simulator.drive import Drive
-from cflow_torch.simulator.recording import AnnotationBoxes
 from cflow_torch.transforms import to_quaternions
 from cflow_torch.types import Sweep
 
@@ -90,11 +90,11 @@ def _label_columns(sweep: Sweep, labels: FlowLabels, T_ego1_ego0: np.ndarray) ->
     }
 
 
-def _annotations(stamp: int, boxes: AnnotationBoxes) -> Mapping[str, np.ndarray]:
+def _annotations(stamp: int, boxes: Boxes) -> Mapping[str, np.ndarray]:
     return {
         "timestamp_ns": np.full(len(boxes.track_id), stamp, np.int64),
         "track_uuid": np.array(boxes.track_id, dtype=object),
-        "category": np.array(boxes.category, dtype=object),
+        "category": np.array(boxes.names, dtype=object),
         **{name: boxes.size[:, k] for k, name in enumerate(("length_m", "width_m", "height_m"))},
         **_pose_columns(boxes.pose),
         "num_interior_pts": boxes.num_points.astype(np.int64),
