@@ -8,7 +8,8 @@ python scripts/benchmarks/boxes.py --simulated av2 waymo                   a str
 
 The simulated drives have the seeds 340 and 341. We chose settings on PandaSet 002, sweeps 72-79, and on simulated
 drives of the seeds 320, 321, 400 and 401. An object is scored in a sweep if it moves at 0.5 m/s or more, has at least
-20 points, and is within 50 m. Its box is the box of the sweep with the largest intersection over union (IoU), seen from above.
+20 points, and is within 50 m. Its box is the box of the sweep with the largest intersection over union (IoU), seen
+from above.
 
 AP is the average precision of moving boxes, by their confidence: a box is right if its IoU with an object that is
 scored, and has no better box, is above the threshold. Boxes on objects that move without being scored are left out.
