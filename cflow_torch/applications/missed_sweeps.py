@@ -11,12 +11,12 @@ from torch import Tensor
 from cflow_torch.applications.association import MIN_STOPPED_SHARE, box_of_point, enclosing_boxes
 from cflow_torch.applications.completion import TrackedPoints
 from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of
+from cflow_torch.applications.static_places import cells_of
 from cflow_torch.applications.track_table import Table
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import FlowResult, Window, as_numpy
 
 _MARGIN = 0.2  # metres, added to length, width and height of a box
-_APART = 0.1  # metres between a box and the place that it has left
 
 
 class FreePoints(NamedTuple):
@@ -57,11 +57,15 @@ class SweepTracks:
         points: the points of the tracks.
         timestamp_ns: time stamp of the sweep in its log.
         free: the other points; None = no track is looked for.
+
+    Attributes:
+        static: cells of the points without a track, ascending.
     """
 
     def __init__(self, table: Table, points: TrackedPoints, timestamp_ns: int, free: FreePoints | None) -> None:
         self.points = points
         self.free = free
+        self.static = np.zeros(0, np.int64) if free is None else np.unique(cells_of(free.position))
         self._where = {"sweep": points.sweep, "timestamp_ns": timestamp_ns}
         self.table = {**table, **{name: np.full(len(table["id"]), value) for name, value in self._where.items()}}
 
@@ -116,30 +120,3 @@ class SweepTracks:
         id_of_point = self.points.id.copy()
         id_of_point[self.points.id == number] = np.where(np.isin(ids, parts), ids, -1)
         self.points = self.points.renumber(id_of_point)
-
-
-class LeftPlaces:
-    """The places that tracks have left. Objects leave free places, pieces of a wall that seem to move do not."""
-
-    def __init__(self) -> None:
-        self._boxes: dict[int, list[tuple[Tensor, Tensor, Tensor, int]]] = {}  # of each track, and its points inside
-        self._shares: dict[int, list[float]] = {}  # points that remain, as a share of those of the track
-
-    def add(self, now: SweepTracks) -> None:
-        """Count the points at the last place of each moving track that its box does not touch any more."""
-        for row in np.flatnonzero(now.table["is_moving"]).tolist():
-            number = int(now.table["id"][row])
-            centre, size, heading = now.box(row)
-            boxes = self._boxes.setdefault(number, [])
-            for before, size_before, heading_before, count in reversed(boxes):
-                sides = size[0, :2].max() + size_before[0, :2].max()
-                if now.free is not None and (centre - before)[0, :2].norm() > sides / 2 + _APART:
-                    remaining = len(now.free.inside(before, size_before, heading_before))
-                    self._shares.setdefault(number, []).append(remaining / count)
-                    break
-            boxes.append((centre, size, heading, int(now.table["num_points"][row])))
-
-    def occupied(self) -> list[int]:
-        """Return the tracks whose places are not free, in the median of at least two sweeps."""
-        shares = {number: each for number, each in self._shares.items() if len(each) > 1}
-        return [number for number, each in shares.items() if np.median(each) >= MIN_STOPPED_SHARE]

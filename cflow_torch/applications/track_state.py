@@ -18,8 +18,8 @@ _NO_CONFIDENCE = 0.7  # log-odds per sweep if the method has no confidence
 _THIN = 0.12
 _MIN_TRAVEL, _MIN_TRAVEL_OF_LENGTH = 0.3, 0.1  # least net displacement of the box: metres, plus a share of its length
 _TRAVEL_FACTOR = 2.0  # largest ratio between the displacement of the box and the sum of its flow, either way
-# The box of an object that is ever more hidden shrinks: one end stays. With much evidence, it is enough that the centre
-# has moved. A change of length moves the centre half as far as the end, so we ask for half the share of the length.
+# Where an object is ever more or ever less hidden, one end of its box stays. With much evidence, it is enough that the
+# other end has moved as the flow predicts.
 _MUCH_EVIDENCE = 4.0
 # With less evidence, the box must move farther and follow the flow more closely.
 _LONG_TRAVEL, _TRAVEL_ERROR, _MIN_SWEEPS = 1.5, 0.25, 3  # metres (or the box's length if longer); share; sweeps
@@ -116,21 +116,21 @@ class TrackStates(NamedTuple):
         """(K,) bool: the track moves, and its box has moved roughly as its flow predicts.
 
         If `evidence` is high, both ends of the box must have moved at least a little: a piece of a wall may have flow,
-        but its box then grows, shrinks or jumps. If it is very high and the box shrinks, the centre must have moved.
-        Otherwise, the box must have moved far, and very nearly as predicted.
+        but its box then grows, shrinks or jumps. If it is very high, one end must have moved nearly as predicted.
+        Otherwise, the box must have moved far, and nearly as predicted.
         """
         predicted = self.travel.norm(dim=1)
         length = self.size[:, 0]
         moved = self.box - self.start
         centre = (moved * self.travel).sum(1) / predicted.clamp(min=1e-9)
-        slower_end = centre - (length - self.start_length).abs() / 2
-        least = predicted / _TRAVEL_FACTOR
-        ends_moved = slower_end >= torch.maximum(least, _MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH * length)
-        centre_moved = (length <= self.start_length) & (
-            centre >= torch.maximum(least, _MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH / 2 * length)
-        )
-        is_evident = ends_moved & (self.evidence >= _MIN_EVIDENCE) | centre_moved & (self.evidence >= _MUCH_EVIDENCE)
-        is_evident &= centre <= predicted * _TRAVEL_FACTOR
+        growth = (length - self.start_length) / 2
+        ends = centre + torch.stack([-growth, growth])
+        least = _MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH * length
+        least_of_one = _MIN_TRAVEL + _MIN_TRAVEL_OF_LENGTH / 2 * length
+        ends_moved = ends.amin(0) >= torch.maximum(least, predicted / _TRAVEL_FACTOR)
+        ends_moved &= centre <= predicted * _TRAVEL_FACTOR
+        one_end_moved = ((ends - predicted).abs() <= _TRAVEL_ERROR * predicted).any(0) & (predicted >= least_of_one)
+        is_evident = ends_moved & (self.evidence >= _MIN_EVIDENCE) | one_end_moved & (self.evidence >= _MUCH_EVIDENCE)
         has_gone_far = predicted >= torch.maximum(length, self.start_length).clamp(min=_LONG_TRAVEL)
         is_exact = (moved - self.travel)[:, :2].norm(dim=1) <= _TRAVEL_ERROR * predicted
         return self.is_moving & (is_evident | (has_gone_far & is_exact & (self.num_moving >= _MIN_SWEEPS)))

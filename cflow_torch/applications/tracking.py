@@ -11,9 +11,10 @@ from torch import Tensor
 
 from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, regroup
 from cflow_torch.applications.completion import TrackedPoints, complete
-from cflow_torch.applications.missed_sweeps import FreePoints, LeftPlaces, SweepTracks
+from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
 from cflow_torch.applications.people import divide_people
+from cflow_torch.applications.static_places import Sighting, static_points
 from cflow_torch.applications.track_state import Times, TrackStates
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds_and_sizes, turned
@@ -25,6 +26,7 @@ from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
 _MAX_MISSED = 3  # sweeps that a track survives unseen
 _REST_NOISE = 0.1  # metres, standard deviation of the place of a stopped object
 _UNKNOWN = 1e6  # variance of a new track, before its first measurement
+_MOST_STATIC = 0.5  # share of the points of a track in one sweep; pieces of walls have more
 _RECENT = 16  # sweeps whose visible edges decide the size of a track
 
 
@@ -323,11 +325,13 @@ def track(
         `cluster_id`: of this sweep's flow, -1 while it is static or where its flow is missing; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;
         `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must
-        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much, if
-        the box shrinks, the centre must have moved by 0.3 m plus a twentieth of the length. Otherwise, and if it is
+        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much,
+        it is enough that one end has moved by its summed flow ± 25 %, at least 0.3 m plus a twentieth of the
+        length. Otherwise, and if it is
         narrower or lower than 0.12 m, its flow in at least three sweeps must add up to the larger of 1.5 m and its
-        length, and the box must have moved by this sum ± 25 %. Tracks that are never confirmed are left out, and those
-        that leave no free place: where they were, 0.3 times as many static points or more remain.
+        length, and the box must have moved by this sum ± 25 %. Tracks that are never confirmed are left out. Points
+        whose place also holds static points before the track comes and after it has left are not of the track. A track
+        of which this holds for most of its points, in most of the sweeps in which it moves, is left out.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
@@ -364,7 +368,6 @@ class LogTracker:
         self._log = log
         self._tracker = Tracker(sweep_interval)
         self._sweeps: list[SweepTracks] = []
-        self._left = LeftPlaces()
         self._last: dict[int, int] = {}  # id -> number of the last sweep in which the track is seen
 
     def push(self, index: int, result: FlowResult) -> None:
@@ -375,7 +378,6 @@ class LogTracker:
         free = FreePoints.of(sweeps, result, points)
         now = SweepTracks(table, points, int(self._log.timestamps[index]), free)
         self._find_before(now)
-        self._left.add(now)
         self._sweeps.append(now)
         if len(self._sweeps) > _MAX_MISSED:
             self._sweeps[-_MAX_MISSED - 1].free = None  # to save memory
@@ -398,10 +400,29 @@ class LogTracker:
 
     def table(self) -> dict[str, np.ndarray]:
         """Return the table of `track`."""
+        self._take_out_static_points()
         table = self._whole()
         return self._whole() if divide_people(self._sweeps, table) else table
 
+    def _take_out_static_points(self) -> None:
+        """Take static points out of confirmed tracks.
+
+        A track is not seen in a sweep where most of its points are static. If this is so in most of the sweeps in which
+        it moves, it is not a track.
+        """
+        for number in np.unique(self._confirmed()["id"]).tolist():
+            sweeps = [each for each in self._sweeps if number in each.points.id]
+            seen = [Sighting(each.points.of_track(number)[0], each.static) for each in sweeps]
+            is_static = static_points(seen)
+            share = np.array([each.mean() for each in is_static])
+            moves = np.array([each.table["is_moving"][each.table["id"] == number][0] for each in sweeps])
+            is_wall = np.median(share[moves]) > _MOST_STATIC
+            for each, points, is_lost in zip(sweeps, is_static, is_wall | (share > _MOST_STATIC)):
+                if points.any() or is_lost:
+                    each.divide(number, np.where(points | is_lost, -1, number))
+
+    def _confirmed(self) -> dict[str, np.ndarray]:
+        return confirmed(join_tables([each.table for each in self._sweeps]))
+
     def _whole(self) -> dict[str, np.ndarray]:
-        table = confirmed(join_tables([each.table for each in self._sweeps]))
-        has_left = ~np.isin(table["id"], self._left.occupied())
-        return complete({name: values[has_left] for name, values in table.items()}, self.points)
+        return complete(self._confirmed(), self.points)

@@ -156,25 +156,63 @@ def test_a_strip_that_one_beam_draws_is_not_a_track_unless_it_goes_far() -> None
     assert len(set(table["id"])) == 1 and np.all(table["y"] > 4), "the one that moves by more than its length"
 
 
-@pytest.mark.parametrize("is_free", [True, False])
-def test_what_leaves_no_free_place_is_not_a_track(is_free: bool) -> None:
-    """A piece of a fence seems to move along it: the fence is there again where the piece was."""
+class Fence(Staged):
+    """A piece of a fence seems to move along it, beside a car or alone: the fence is there again where the piece was.
 
-    class Fence(Staged):
-        def world(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            points, flow, car = super().world(index)
-            x, y = self.paths[0, index]
-            fence = np.stack(np.meshgrid(np.arange(-5, 25, 0.05), [y + 0.5], np.arange(0, 1.2, 0.2)), -1).reshape(-1, 3)
-            fence = fence[(fence[:, 0] < x) | (fence[:, 0] > x + SIZE[0])]
-            count = 0 if is_free else len(fence)
-            return (
-                np.concatenate([points, fence[:count]]),
-                np.concatenate([flow, np.zeros((count, 3))]),
-                np.concatenate([car, np.full(count, -1)]),
-            )
+    Args:
+        path: of the corner of the car.
+        has_car: False = the piece alone.
+        has_fence: False = the fence is not there where the piece is not.
+    """
 
-    log = Fence([straight((0, 0), (0.9, 0.0), 16)])
-    assert len(set(track(log, log.results())["id"])) == is_free
+    def __init__(self, path: np.ndarray, has_car: bool, has_fence: bool) -> None:
+        super().__init__([path])
+        self._has_car = has_car
+        self._has_fence = has_fence
+
+    def world(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        points, flow, car = super().world(index)
+        x, y = self.paths[0, index]
+        fence = np.stack(np.meshgrid(np.arange(-5, 25, 0.05), [y - 0.6], np.arange(0, 1.2, 0.2)), -1).reshape(-1, 3)
+        is_piece = (fence[:, 0] >= x) & (fence[:, 0] <= x + SIZE[0])
+        is_seen = is_piece | self._has_fence
+        kept = (car < 0) | self._has_car
+        flows = is_piece[:, None] * flow[car == 0][:1]
+        return (
+            np.concatenate([points[kept], fence[is_seen]]),
+            np.concatenate([flow[kept], flows[is_seen]]),
+            np.concatenate([car[kept], np.where(is_piece, 0, -1)[is_seen]]),
+        )
+
+
+@pytest.mark.parametrize("has_fence", [True, False])
+def test_what_leaves_no_free_place_is_not_a_track(has_fence: bool) -> None:
+    log = Fence(straight((0, 0), (0.9, 0.0), 16), has_car=False, has_fence=has_fence)
+    assert len(set(track(log, log.results())["id"])) == (not has_fence)
+
+
+@pytest.mark.parametrize("has_fence", [True, False])
+def test_a_fence_beside_a_car_is_taken_out_of_its_track(has_fence: bool) -> None:
+    log = Fence(straight((0, 0), (0.9, 0.0), 16), has_car=True, has_fence=has_fence)
+    table, points = track_points(log, log.results())
+    assert len(set(table["id"])) == 1
+    track_id = points[8].track_id(table["id"])
+    is_fence = log.world(8)[0][:, 1] == -0.6
+    is_tracked = track_id >= 0
+    assert is_tracked[~is_fence].sum() == (log.world(8)[2] == 0)[~is_fence].sum(), "the car keeps its points"
+    assert is_tracked[is_fence].any() == (not has_fence)
+
+
+def test_a_car_that_starts_and_one_that_stops_keep_their_points() -> None:
+    """Cars that wait are static: another one left the place where one stops, and one starts where it has waited."""
+    rest = straight((0, 0), (0.0, 0.0), 12)
+    starts = np.concatenate([rest, straight((0.9, 0), (0.9, 0.0), 12)])
+    comes = np.concatenate([straight((-18, 0), (0.9, 0.0), 20), straight((0, 0), (0.0, 0.0), 4)])
+    log = Staged([starts, comes])
+    table, points = track_points(log, log.results())
+    assert len(set(table["id"])) == 2
+    for sweep in range(12, 21):
+        assert (points[sweep].track_id(table["id"]) >= 0).sum() == (log.world(sweep)[2] >= 0).sum()
 
 
 def test_two_cars_in_one_cluster_keep_their_ids() -> None:
@@ -234,13 +272,15 @@ def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then
     assert np.array_equal(table["is_confirmed"], np.arange(13) >= 6)
 
 
-def test_a_slow_car_that_is_ever_more_hidden_is_confirmed_if_its_flow_is_confident() -> None:
+@pytest.mark.parametrize("is_shown", [True, False])
+def test_a_slow_car_of_which_ever_more_or_less_is_seen_is_confirmed_if_its_flow_is_confident(is_shown: bool) -> None:
     class Hidden(Staged):
-        """The car drives behind something that hides its front."""
+        """The car drives out of, or behind, something that hides a part of it."""
 
         def world(self, index: int) -> Any:
             points, flow, car = super().world(index)
-            kept = (car < 0) | (points[:, 0] < 5)
+            is_seen = points[:, 0] > 3 if is_shown else points[:, 0] < 5
+            kept = (car < 0) | is_seen
             return points[kept], flow[kept], car[kept]
 
     log = Hidden([straight((0, 0), (0.17, 0.0), 9)])
