@@ -68,6 +68,9 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
     class Odd(LogWrapper):
         """Its second sweep is in millimetres, its last one repeats the fourth."""
 
+        poses = np.tile(np.eye(4), (5, 1, 1))
+        trajectory = None
+
         def sweep(self, index: int) -> Any:
             sweep = self.log.sweep(min(index, 3))
             points = sweep.points * np.float32(1000 if index == 1 else 1)
