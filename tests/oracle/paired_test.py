@@ -15,7 +15,6 @@ def count_wins(
     motion: Vector | np.ndarray,
     is_near: bool = False,
     is_wide: np.ndarray | None = None,
-    sweep: int | None = None,
 ) -> np.ndarray:
     """Paired counts of a component's motion against "static", over all sweeps and in both directions.
 
@@ -23,7 +22,6 @@ def count_wins(
         members: (K,) pixels of the component.
         motion: (y, x) pixels per interval, of all or (K, 2) of each.
         is_wide: (K,) bool; None = all are if any of them has a reach of more than one pixel.
-        sweep: compare only this one with t+1; None = all.
 
     Returns:
         (2, K) of each pixel. Won: slices that another sweep has where the motion takes them, and not where they are.
@@ -39,8 +37,7 @@ def count_wins(
     if is_wide is None:
         is_wide = are_wide(sweeps, members).any()
     for other, elapsed in enumerate(sweeps.elapsed):
-        is_compared = ((step == 0) != (other == 0)) & ((sweep is None) | (step + other == sweep))
-        own = np.where(is_compared, sweeps.slices[members], 0)
+        own = np.where((step == 0) != (other == 0), sweeps.slices[members], 0)
         intervals = (sweeps.elapsed[step] - elapsed)[:, None]
         dy, dx = np.floor(np.array(motion) * intervals + 0.5).astype(int).T
         here, there = sweeps.both[other, row, col], value_at(sweeps.both[other], row + dy, col + dx)
@@ -51,13 +48,6 @@ def count_wins(
         won += COUNT[own & there & ~near_here]
         lost += COUNT[own & here & ~near_there]
     return np.stack((won, lost))
-
-
-def balance_of(sweeps: SlicedSweeps, members: np.ndarray, motion: Vector) -> int:
-    """The sweeps other than t+1 that confirm a motion, minus those that contradict it, by near counts."""
-    others = range(1, len(sweeps.elapsed))
-    every = [count_wins(sweeps, members, motion, is_near=True, sweep=other).sum(1) for other in others]
-    return sum(int(np.sign(won - lost)) for won, lost in every)
 
 
 def are_wide(sweeps: SlicedSweeps, members: np.ndarray) -> np.ndarray:

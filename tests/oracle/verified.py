@@ -19,7 +19,7 @@ from oracle.changed_pixels import find_changed
 from oracle.component_tree import Node, grow, select_objects
 from oracle.confidence import TABLE, margin, probabilities
 from oracle.height_slices import SlicedSweeps, Vector, ground_slope, is_residue, over_squares
-from oracle.paired_test import are_wide, balance_of, count_wins, evidence_of
+from oracle.paired_test import are_wide, count_wins, evidence_of
 from oracle.pixels import in_range
 from oracle.registration import register
 from oracle.spacing import are_tall, reach_of_pixels, spacing_of
@@ -86,17 +86,20 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
 
 
 def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_levels: int) -> tuple[Vector, int]:
-    """The candidate of most evidence, and its evidence: that of the counts plus that of the near counts. In pairs, the
-    near counts need twice as many standard deviations. Nodes of changed pixels need more of them. Each other sweep that
-    does not confirm the motion asks for half as many more, and twice that if it contradicts the motion."""
+    """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations
+    (as many for fast objects), that of the near counts. Nodes of changed pixels need more of them. With history, all
+    must gain a slice for eight pixels."""
+    z = CHANGED_Z if node.level == num_levels else sweeps.config.significance
+    is_fast = node.level > num_levels
+    near_z = z if is_fast else 2 * z
+    least = 16 * len(node.members) / 8 * sweeps.has_history
     evidence = []
     for motion in candidates:
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))
-        z = CHANGED_Z if node.level == num_levels else sweeps.config.significance
-        z *= 1 + (len(sweeps.elapsed) - 1 - balance_of(sweeps, node.members, motion)) / 2
-        own = evidence_of(*exact, z) + evidence_of(*near, z if sweeps.has_history else 2 * z)
-        stays = node.level > num_levels and LEAVES * exact[1] > exact[0]
-        evidence.append(0 if stays or slides_along_itself(sweeps, node.members, motion) else own)
+        own = evidence_of(*exact, z) + evidence_of(*near, near_z)
+        stays = is_fast and LEAVES * exact[1] > exact[0]
+        counts = own > least and not stays and not slides_along_itself(sweeps, node.members, motion)
+        evidence.append(own if counts else 0)
     best = evidence.index(max(evidence))  # ties: the first
     return (candidates[best] if evidence[best] > 0 else (0.0, 0.0)), evidence[best]
 

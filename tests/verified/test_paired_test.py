@@ -50,7 +50,6 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
             for is_near, counts in ((False, wins.exact), (True, wins.near)):
                 expected = [oracle.count_wins(window, members, each, is_near).sum(1) for each in motions]
                 assert np.array_equal(torch.stack((counts.won[number], counts.lost[number]), 1), expected)
-            assert wins.balance[number].tolist() == [oracle.balance_of(window, members, each) for each in motions]
             assert in_place[number] == oracle.found_in_place(window, members, window.image)[:, 0].sum()
             assert covered[number] == aperture.is_covered(window, members)
             num_covered += int(covered[number])
@@ -101,24 +100,6 @@ def test_nodes_of_changed_pixels_need_4_standard_deviations(level, num_pixels, m
     every = torch.arange(sweeps.num_pixels)
     one = Groups(torch.zeros_like(every), 1)
     tree = Tree(every, one, Groups(zero + 1, 1), zero + level, zero, torch.zeros(1, 2), 2)
-    motion, _ = fast.verify(sweeps, tree, torch.tensor([[[0.0, 5.0]]], dtype=torch.float64), 1.5)
-    assert motion.tolist() == [[0.0, 5.0 * moves]]
-
-
-@pytest.mark.parametrize("num_moving, moves", [(1, False), (2, True)])
-def test_a_motion_that_few_sweeps_confirm_needs_more_evidence(num_moving, moves):
-    """Ten pixels move, and win 20 slices in each sweep that has them.
-
-    One of five sweeps adds z = 1.5 four times half: 20 < 4.5 * 4.47. With two, 40 > 3.75 * 6.32.
-    """
-    images = np.zeros((1, 6, 40, 40), dtype=np.uint8)
-    images[0, 0, 2:40:4, 30] = 1
-    for step in range(1, 1 + num_moving):
-        images[0, step, 2:40:4, 30 - 5 * step] = 1
-    sweeps, zero = from_images(images), torch.zeros(1, dtype=torch.int64)
-    every = torch.arange(sweeps.num_pixels)
-    one = Groups(torch.zeros_like(every), 1)
-    tree = Tree(every, one, Groups(zero + 1, 1), zero, zero, torch.zeros(1, 2), 2)
     motion, _ = fast.verify(sweeps, tree, torch.tensor([[[0.0, 5.0]]], dtype=torch.float64), 1.5)
     assert motion.tolist() == [[0.0, 5.0 * moves]]
 
