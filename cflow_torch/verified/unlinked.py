@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.groups import FAR, Groups
+from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
 from cflow_torch.ops.segments import masked_median
 from cflow_torch.verified.columns import Pixels
@@ -36,9 +36,7 @@ _REACH = 8  # cells; objects that move farther from sweep to sweep are not linke
 _ERROR = 0.7  # metres from that place to a part that confirms the velocity, at most, ...
 _ERROR_SHARE = 0.05  # ... and further for each metre that the object has moved
 _FASTEST = 60.0  # m/s, if the settings have no bound
-_LENGTHS = 2  # objects that move less than a half of the length of their part are linked by their pixels
 _LACKING = float(1 << 20)  # finest pixels, for a sweep without a part; longer than any sum of errors
-_LEAST_SIZE = 16  # of an unmatched component in a pair; smaller ones are mostly static (`confidence.json`)
 _NARROWEST = 0.4  # metres; a thin line that moves along itself may be a part of a longer line
 
 
@@ -84,7 +82,6 @@ class _Parts(NamedTuple):
     window: Tensor  # (Q,) int64
     step: Tensor  # (Q,) int64
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
-    length: Tensor  # (Q,) int64, finest pixels, longer side of the bounding box
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
@@ -100,23 +97,22 @@ class _Parts(NamedTuple):
         image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
         window, step = split_index(image, sweeps.num_steps)
         centre = parts.sum(pixels.row_col).double() / parts.size()
-        extent = parts.max(pixels.row_col, empty=0) - parts.min(pixels.row_col, empty=FAR)  # [2, Q]
-        return cls(pixel, parts, window, step, centre, extent.amax(0) + 1)
+        return cls(pixel, parts, window, step, centre)
 
     def __len__(self) -> int:
         return len(self.step)
 
 
 def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> tuple[Tensor, Groups]:
-    """Return the pixels of large unmatched components of pairs, (K,) int64, and group them by component and sweep."""
+    """Return the pixels of unmatched components of pairs, (K,) int64, and group them by component and sweep."""
     is_of_pair = ~sweeps.has_history.index_select(0, sweeps.pixels.window)
     index = flat_nonzero(is_of_pair)
     pixels = sweeps.pixels[index]  # all of t+1 or t
     is_unmatched = are_unmatched(sweeps, pixels, 1 - pixels.step)
-    found = find_unmatched(sweeps, components, index, pixels, is_unmatched, 1)
-    large = flat_nonzero(found.size >= _LEAST_SIZE)
-    component = found.component[large]
-    return index.index_select(0, large), component.select(component.nonempty())
+    component = find_unmatched(sweeps, components, index, pixels, is_unmatched, 1).component
+    member = flat_nonzero(component.is_member)
+    component = component[member]
+    return index.index_select(0, member), component.select(component.nonempty())
 
 
 class _Map:
@@ -226,15 +222,14 @@ def _centres(parts: _Parts, part: Tensor) -> Tensor:
 
 
 def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: float) -> tuple[Tensor, Tensor]:
-    """Pair each part of t with the parts of t+1 that are neither too near nor too far: (H,) int64 each."""
+    """Pair each part of t with the parts of t+1 that are not too far away: (H,) int64 each."""
     of_t = flat_nonzero(parts.step == 1)
     window = parts.window.index_select(0, of_t)
     centre = take_columns(parts.centre, of_t)
     other, is_part = cells.around(window, torch.zeros_like(window), centre, _REACH)  # [of t, 289]
     distance = (_centres(parts, other) - centre[..., None]).square_().sum(0).sqrt_()
     farthest = max_speed * sweeps.batch.seconds[:, 1].index_select(0, window).abs() / sweeps.grid.pixel_size + 1
-    nearest = parts.length.index_select(0, of_t) / _LENGTHS
-    pair = flat_nonzero(is_part & (distance <= farthest[:, None]) & (distance >= nearest[:, None]))
+    pair = flat_nonzero(is_part & (distance <= farthest[:, None]))
     at, _ = split_index(pair, other.shape[1])
     return of_t.index_select(0, at), other.view(-1).index_select(0, pair)
 

@@ -17,7 +17,6 @@ GAP, CELL = 0.4, 0.8  # metres: pixels of a part, cells of the map
 NEAR, REACH = 2, 8  # cells
 ERROR, SHARE = 0.7, 0.05  # metres, and metres for each metre
 NARROWEST = 0.4  # metres
-LEAST_SIZE = 16  # in a pair: pixels times their reach of an unmatched component
 
 
 def parts_of(sweeps: SlicedSweeps, may_be_fast: np.ndarray) -> list[np.ndarray]:
@@ -49,7 +48,7 @@ def parts_of_pair(sweeps: SlicedSweeps, component: np.ndarray) -> list[np.ndarra
         found = [np.flatnonzero((step == own) & (component == name)) for name in np.unique(component[step == own])]
         for part in found:
             size = reach[part].sum()
-            if 8 * reach[part[is_matched[part]]].sum() < size >= LEAST_SIZE and len(part) >= 2:
+            if 8 * reach[part[is_matched[part]]].sum() < size and len(part) >= 2:
                 parts.append(part)
     return parts
 
@@ -76,8 +75,7 @@ def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> 
     for i in np.flatnonzero(np.array(step_of) == 1).tolist():
         for other in around(0, centres[i], REACH):
             distance = np.linalg.norm(centres[other] - centres[i])
-            length = np.ptp(sweeps.pixels[parts[i], 1:], axis=0).max() + 1
-            if length / 2 <= distance <= farthest:
+            if distance <= farthest:
                 rank, track = follow(sweeps, i, (centres[i] - centres[other]) / since[0], centres, since, around)
                 # In a pair, all errors are 0, and the shortest way has the lowest rank.
                 tracks.append((rank + is_pair * distance, track))
