@@ -4,10 +4,10 @@ An object that moves farther than its own size has other pixels in every sweep, 
 link them. Here its pixels of one sweep are a part:
 
     sweep      t-2      t-1       t       t+1
-    parts      [a]      [b]      [c]      [d]       c and d give a velocity; the other parts confirm it
+    parts      [a]      [b]      [c]      [d]       c and d, or c and b, give a velocity; the other parts confirm it
 
 In a pair, a part is an unmatched component of t or of t+1, and no sweep confirms its velocity. So it goes with the
-nearest part. The linked parts are a node of the tree, like any other. Its velocity is one of its motion
+nearest part of like size. The linked parts are a node of the tree, like any other. Its velocity is one of its motion
 candidates.
 """
 
@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
 from cflow_torch.ops.segments import masked_median
 from cflow_torch.verified.columns import Pixels
@@ -30,13 +30,17 @@ from cflow_torch.verified.paired_test import count_wins
 from cflow_torch.verified.unmatched import are_unmatched, find_unmatched
 
 # We chose these values on simulated highways, seeds 820 and 821.
+_LONGEST = 8.0  # metres, of a part
 _CELL = 0.8  # metres, of the map of the parts; a cell holds one part
 _NEAR = 2  # cells, around the place where a velocity puts a part
 _REACH = 8  # cells; objects that move farther from sweep to sweep are not linked
 _ERROR = 0.7  # metres from that place to a part that confirms the velocity, at most, ...
 _ERROR_SHARE = 0.05  # ... and further for each metre that the object has moved
 _FASTEST = 60.0  # m/s, if the settings have no bound
+_LENGTHS = 2  # objects that move less than a half of the length of their part are linked by their pixels
 _LACKING = float(1 << 20)  # finest pixels, for a sweep without a part; longer than any sum of errors
+_LEAST_SIZE = 16  # of an unmatched component in a pair; smaller ones are mostly static (`confidence.json`)
+_LIKE = 2  # in a pair, the larger of two parts has at most this many times as many pixels as the other
 _NARROWEST = 0.4  # metres; a thin line that moves along itself may be a part of a longer line
 
 
@@ -47,11 +51,11 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         max_speed: m/s; None = 60.
 
     Convention:
-        Parts have the pixels of a sweep that are missing, or that every other sweep lacks. A part of t takes a velocity
-        from each part of t+1. In the other sweeps, we take the parts where it puts them. Of the velocities of a part of
-        t, or of t+1, the one with parts in the most sweeps wins, then the one with the smallest errors. In a pair,
-        parts are unmatched components, and the lowest velocity wins. A part belongs to its first node. The velocity of
-        a node must win more slices near its targets than it loses.
+        Parts have the pixels of a sweep that are missing, or that every other sweep lacks. A part of t takes its
+        velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least half of
+        the older sweeps. Of the velocities of a part of t, or of t+1, the one with the most sweeps wins, then the one
+        with the smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part
+        belongs to its first node. The velocity of a node must win more slices near its targets than it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
@@ -82,10 +86,11 @@ class _Parts(NamedTuple):
     window: Tensor  # (Q,) int64
     step: Tensor  # (Q,) int64
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
+    length: Tensor  # (Q,) int64, finest pixels, longer side of the bounding box
 
     @classmethod
     def of(cls, sweeps: HeightSlicedSweeps, components: Components) -> _Parts:
-        """Select the parts of at least two pixels."""
+        """Select the parts of at least two pixels that are at most `_LONGEST` long."""
         pixel = components.fast
         parts = components.parts
         if sweeps.batch.has_pairs:
@@ -93,26 +98,29 @@ class _Parts(NamedTuple):
             pixel = torch.cat((pixel, unmatched))
             parts = parts.followed_by(of_pairs)
         pixels = sweeps.pixels[pixel]
-        parts = parts.select(flat_nonzero(parts.size() >= 2))
+        extent = parts.max(pixels.row_col, empty=0) - parts.min(pixels.row_col, empty=FAR)  # [2, count]
+        length = extent.amax(0) + 1
+        kept = flat_nonzero((length * sweeps.grid.pixel_size <= _LONGEST) & (parts.size() >= 2))
+        parts = parts.select(kept)
         image = parts.max(pixels.window * sweeps.num_steps + pixels.step, empty=0)
         window, step = split_index(image, sweeps.num_steps)
         centre = parts.sum(pixels.row_col).double() / parts.size()
-        return cls(pixel, parts, window, step, centre)
+        return cls(pixel, parts, window, step, centre, length.index_select(0, kept))
 
     def __len__(self) -> int:
         return len(self.step)
 
 
 def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> tuple[Tensor, Groups]:
-    """Return the pixels of unmatched components of pairs, (K,) int64, and group them by component and sweep."""
+    """Return the pixels of large unmatched components of pairs, (K,) int64, and group them by component and sweep."""
     is_of_pair = ~sweeps.has_history.index_select(0, sweeps.pixels.window)
     index = flat_nonzero(is_of_pair)
     pixels = sweeps.pixels[index]  # all of t+1 or t
     is_unmatched = are_unmatched(sweeps, pixels, 1 - pixels.step)
-    component = find_unmatched(sweeps, components, index, pixels, is_unmatched, 1).component
-    member = flat_nonzero(component.is_member)
-    component = component[member]
-    return index.index_select(0, member), component.select(component.nonempty())
+    found = find_unmatched(sweeps, components, index, pixels, is_unmatched, 1)
+    large = flat_nonzero(found.size >= _LEAST_SIZE)
+    component = found.component[large]
+    return index.index_select(0, large), component.select(component.nonempty())
 
 
 class _Map:
@@ -160,13 +168,14 @@ class _Tracks:
 
 
 def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tracks:
-    """Follow the velocity from each part of t to each near part of t+1, and keep the best velocities."""
+    """Follow the velocity from each part of t to each near part of t+1 and of t-1, and keep the best velocities."""
     cells = _Map(sweeps, parts)
     of_t, other = _pairs(sweeps, parts, cells, max_speed)  # [H] each
     window = parts.window.index_select(0, of_t)
     elapsed = sweeps.elapsed.index_select(0, window)  # [H, S]
     before_t = elapsed - elapsed[:, 1:2]
-    velocity = (take_columns(parts.centre, of_t) - take_columns(parts.centre, other)) / before_t[:, 0]  # [2, H]
+    interval = before_t.gather(1, parts.step.index_select(0, other)[:, None])[:, 0]
+    velocity = (take_columns(parts.centre, of_t) - take_columns(parts.centre, other)) / interval  # [2, H]
     part, error = _follow(parts, cells, of_t, velocity, before_t)  # [H, S] each
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
     is_given = sweeps.is_given.index_select(0, window)
@@ -201,11 +210,13 @@ def _follow(parts: _Parts, cells: _Map, of_t: Tensor, velocity: Tensor, before_t
 def _ranks(error: Tensor, is_found: Tensor, is_given: Tensor) -> Tensor:
     """Rank velocities by the sweeps that confirm them, then by their errors, (H,) float64: the lowest is the best.
 
-    The arguments are (H, S). The rank is infinite without a part at t+1.
+    The arguments are (H, S). The rank is infinite without a part at t+1, or with parts in less than half of the older
+    sweeps.
     """
+    is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_given[:, 2:].sum(1))
     num_lacking = (is_given & ~is_found).sum(1)
     rank = error.masked_fill(~is_found, 0.0).sum(1) + num_lacking * _LACKING
-    return rank.masked_fill(~is_found[:, 0], math.inf)
+    return rank.masked_fill(~is_confirmed, math.inf)
 
 
 def _median_velocity(parts: _Parts, part: Tensor, is_found: Tensor, before_t: Tensor) -> Tensor:
@@ -222,16 +233,32 @@ def _centres(parts: _Parts, part: Tensor) -> Tensor:
 
 
 def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: float) -> tuple[Tensor, Tensor]:
-    """Pair each part of t with the parts of t+1 that are not too far away: (H,) int64 each."""
+    """Pair each part of t with the parts of t+1 and of t-1 that are neither too near nor too far: (H,) int64 each."""
     of_t = flat_nonzero(parts.step == 1)
-    window = parts.window.index_select(0, of_t)
+    steps = ((0,), (2,)) if sweeps.num_steps > 2 else ((0,),)
+    step = constant(steps, torch.int64, of_t.device).expand(-1, len(of_t))
+    window = parts.window.index_select(0, of_t).expand_as(step)
     centre = take_columns(parts.centre, of_t)
-    other, is_part = cells.around(window, torch.zeros_like(window), centre, _REACH)  # [of t, 289]
-    distance = (_centres(parts, other) - centre[..., None]).square_().sum(0).sqrt_()
-    farthest = max_speed * sweeps.batch.seconds[:, 1].index_select(0, window).abs() / sweeps.grid.pixel_size + 1
-    pair = flat_nonzero(is_part & (distance <= farthest[:, None]))
-    at, _ = split_index(pair, other.shape[1])
-    return of_t.index_select(0, at), other.view(-1).index_select(0, pair)
+    other, is_part = cells.around(window, step, centre[:, None].expand(2, *step.shape), _REACH)  # [steps, of t, 289]
+    distance = (_centres(parts, other) - centre[:, None, :, None]).square_().sum(0).sqrt_()
+    seconds = (sweeps.batch.seconds - sweeps.batch.seconds[:, 1:2]).abs()[window, step]
+    farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
+    nearest = parts.length.index_select(0, of_t) / _LENGTHS
+    is_pair = is_part & (distance <= farthest[..., None]) & (distance >= nearest[:, None])
+    if sweeps.batch.has_pairs:
+        is_pair &= _are_alike(sweeps, parts, of_t, other)
+    pair = flat_nonzero(is_pair)
+    at, _ = split_index(pair, other.shape[2])
+    return of_t.repeat(len(steps)).index_select(0, at), other.view(-1).index_select(0, pair)
+
+
+def _are_alike(sweeps: HeightSlicedSweeps, parts: _Parts, of_t: Tensor, other: Tensor) -> Tensor:
+    """Tell which other parts, (..., N, M), are of like size as N parts of t, if the window is a pair. Else all are."""
+    size = parts.pixels.size()
+    own = size.index_select(0, of_t)[:, None]
+    size = size.index_select(0, other.view(-1)).view_as(other)
+    is_like = (size <= _LIKE * own) & (own <= _LIKE * size)
+    return is_like | sweeps.has_history.index_select(0, parts.window.index_select(0, of_t))[:, None]
 
 
 def _are_best(rank: Tensor, part: Tensor, num_parts: int) -> Tensor:

@@ -13,14 +13,15 @@ from oracle.component_tree import Node, Tree
 from oracle.height_slices import SlicedSweeps
 from oracle.paired_test import count_wins
 
-GAP, CELL = 0.4, 0.8  # metres: pixels of a part, cells of the map
+GAP, LONGEST, CELL = 0.4, 8.0, 0.8  # metres: pixels of a part, length of a part, cells of the map
 NEAR, REACH = 2, 8  # cells
 ERROR, SHARE = 0.7, 0.05  # metres, and metres for each metre
 NARROWEST = 0.4  # metres
+LEAST_SIZE, LIKE = 16, 2  # in a pair: pixels times their reach of an unmatched component; ratio of numbers of pixels
 
 
 def parts_of(sweeps: SlicedSweeps, may_be_fast: np.ndarray) -> list[np.ndarray]:
-    """Pixels of a sweep that may be fast and touch in pixels of 0.4 m: at least two."""
+    """Pixels of a sweep that may be fast and touch in pixels of 0.4 m: at least two, at most 8 m long."""
     block = max(1, round(GAP / sweeps.size))
     parts = []
     for step in range(len(sweeps.elapsed)):
@@ -34,12 +35,15 @@ def parts_of(sweeps: SlicedSweeps, may_be_fast: np.ndarray) -> list[np.ndarray]:
         found.sort(
             key=lambda part: min((r // (2 * block), c // (2 * block)) for _, r, c in sweeps.pixels[part].tolist())
         )
-        parts += [part for part in found if len(part) >= 2]
+        for part in found:
+            extent = np.ptp(sweeps.pixels[part, 1:], axis=0).max()
+            if len(part) >= 2 and extent * sweeps.size <= LONGEST:
+                parts.append(part)
     return parts
 
 
 def parts_of_pair(sweeps: SlicedSweeps, component: np.ndarray) -> list[np.ndarray]:
-    """Unmatched components of t and of t+1 of two pixels or more: less than an eighth of their size is matched."""
+    """Unmatched components of t and of t+1: less than an eighth of their size is matched. Each is at most 8 m long."""
     step, row, col = sweeps.pixels.T
     reach = sweeps.reach[row, col]
     parts = []
@@ -48,7 +52,9 @@ def parts_of_pair(sweeps: SlicedSweeps, component: np.ndarray) -> list[np.ndarra
         found = [np.flatnonzero((step == own) & (component == name)) for name in np.unique(component[step == own])]
         for part in found:
             size = reach[part].sum()
-            if 8 * reach[part[is_matched[part]]].sum() < size and len(part) >= 2:
+            length = (np.ptp(sweeps.pixels[part, 1:], axis=0).max() + 1) * sweeps.size
+            is_unmatched = 8 * reach[part[is_matched[part]]].sum() < size
+            if is_unmatched and size >= LEAST_SIZE and len(part) >= 2 and length <= LONGEST:
                 parts.append(part)
     return parts
 
@@ -71,14 +77,19 @@ def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> 
 
     tracks = []
     since = np.array(sweeps.elapsed) - sweeps.elapsed[1]
-    farthest = (sweeps.config.max_speed or 60.0) * abs(sweeps.seconds[1]) / sweeps.size + 1
-    for i in np.flatnonzero(np.array(step_of) == 1).tolist():
-        for other in around(0, centres[i], REACH):
-            distance = np.linalg.norm(centres[other] - centres[i])
-            if distance <= farthest:
-                rank, track = follow(sweeps, i, (centres[i] - centres[other]) / since[0], centres, since, around)
-                # In a pair, all errors are 0, and the shortest way has the lowest rank.
-                tracks.append((rank + is_pair * distance, track))
+    for other_step in (0,) if is_pair else (0, 2):
+        seconds = abs(sweeps.seconds[other_step] - sweeps.seconds[1])
+        farthest = (sweeps.config.max_speed or 60.0) * seconds / sweeps.size + 1
+        for i in np.flatnonzero(np.array(step_of) == 1).tolist():
+            for other in around(other_step, centres[i], REACH):
+                distance = np.linalg.norm(centres[other] - centres[i])
+                length = np.ptp(sweeps.pixels[parts[i], 1:], axis=0).max() + 1
+                sizes = len(parts[i]), len(parts[other])
+                if length / 2 <= distance <= farthest and (not is_pair or max(sizes) <= LIKE * min(sizes)):
+                    velocity = (centres[i] - centres[other]) / since[other_step]
+                    rank, track = follow(sweeps, i, velocity, centres, since, around)
+                    # In a pair, all errors are 0, and the shortest way has the lowest rank.
+                    tracks.append((rank + is_pair * distance, track))
     chosen = []
     for rank, track in tracks:
         rivals = [[r for r, other in tracks if other.get(step) == track.get(step)] for step in (1, 0)]
@@ -106,7 +117,7 @@ def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> 
 
 
 def follow(sweeps, i, velocity, centres, since, around) -> tuple[float, dict[int, int]]:  # type: ignore[no-untyped-def]
-    """The rank of a velocity of part i, infinite without a part at t+1, and its part in each sweep."""
+    """The rank of a velocity of part i, infinite if too few parts confirm it, and its part in each sweep."""
     track, rank = {1: i}, 0.0
     for step in range(len(since)):
         expected = centres[i] - velocity * since[step]
@@ -120,4 +131,5 @@ def follow(sweeps, i, velocity, centres, since, around) -> tuple[float, dict[int
             rank += math.sqrt(square)
         else:
             rank += 1 << 20
-    return (rank if 0 in track else math.inf), track
+    older = sum(step >= 2 for step in track)
+    return (rank if 0 in track and 2 * older >= len(since) - 2 else math.inf), track
