@@ -54,7 +54,7 @@ def window_at_t(sweeps: Sequence[Sweep], num_history: int, num_future: int) -> W
     return Window(sweeps[4], sweeps[5], tuple(sweeps[4 - num_history : 4][::-1]), tuple(sweeps[6 : 6 + num_future]))
 
 
-@pytest.mark.parametrize("seed", [3, 8, 15])  # both sides are chosen
+@pytest.mark.parametrize("seed", [3, 12, 15])  # both sides are chosen
 def test_every_point_takes_its_motion_from_the_past_or_from_the_future(seed):
     settings = config("verified", num_history=2, num_future=2, pixel_sizes=(0.5, 0.25), min_height=0.3)
     window = scene(700 + seed, num_history=1, num_future=2, stamps=seed % 2 > 0)
