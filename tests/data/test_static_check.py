@@ -422,7 +422,7 @@ def spherical(unit):
         (camera_points, "data.read_as=points_camera"),
         (spherical(1.0), "data.read_as=points_spherical"),
         (spherical(np.pi / 180), "data.read_as=points_spherical"),
-        (lambda points, _: points @ rotations_about(1, 0.5), "degrees (turn it by +30 about y)"),
+        (lambda points, _: points @ rotations_about(1, 0.5), "about y): give points with z up"),
         (lambda points, _: points @ rotations_about(0, -0.4), "data.ego_T_lidar"),
     ],
     ids=[
@@ -440,6 +440,9 @@ def test_wrong_units_and_axes_are_recognised(source, change, found, request):
     masks = {"masks": False}
     (text,) = [text for text in find_problems(Wrong(good, points=with_strays, **masks)) if "sweep" in text][:1]
     assert found in text
+    if "about y" in found:
+        told = float(re.findall(r"turn it by \+(\d+)", text)[0])
+        assert abs(told - np.degrees(0.5)) < 3
     if "read_as=points" in found:
         reading = found.split("=")[-1]
         again = read_as(Wrong(good, points=change, masks=False), reading)
