@@ -81,6 +81,12 @@ def rotations_about(axis: int, angle: Any) -> np.ndarray:
     return result
 
 
+def rotations_of(angles: np.ndarray) -> np.ndarray:
+    """Return the rotations, (K, 3, 3), of roll, pitch and yaw, (3, K) radians."""
+    roll, pitch, yaw = (rotations_about(axis, angle) for axis, angle in enumerate(angles))
+    return yaw @ pitch @ roll  # type: ignore[no-any-return]
+
+
 def upright_poses(heading_centre: Any) -> np.ndarray:
     """Return (K, 4, 4) float64 poses of upright boxes, from rows of heading (radians about z) and x, y, z (metres)."""
     values = np.array(heading_centre, dtype=np.float64).reshape(-1, 4)

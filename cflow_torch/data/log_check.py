@@ -217,11 +217,10 @@ def _repeated(log: Log) -> list[Finding]:
 def _directions(sweep: Sweep) -> np.ndarray:
     """Return in which of 72 directions a sweep has points, (72,) bool."""
     x, y = as_numpy(sweep.points)[:, :2].astype(np.float64).T
-    angle = np.arctan2(y, x)[np.isfinite(x + y)]
-    return (
-        np.bincount(np.floor((angle / (2 * np.pi)) % 1 * _DIRECTIONS).astype(int) % _DIRECTIONS, minlength=_DIRECTIONS)
-        > 0
-    )
+    turns = np.arctan2(y, x)[np.isfinite(x + y)] / (2 * np.pi)
+    has_points = np.zeros(_DIRECTIONS, bool)
+    has_points[np.floor(turns * _DIRECTIONS).astype(int)] = True  # negative numbers count from the end
+    return has_points
 
 
 def _unreadable(log: Log) -> list[Finding]:

@@ -14,7 +14,15 @@ from typing import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.transforms import as_matrix, halfway, rigid_transform, rotations_about, to_quaternions, to_rotations
+from cflow_torch.transforms import (
+    as_matrix,
+    halfway,
+    rigid_transform,
+    rotations_about,
+    rotations_of,
+    to_quaternions,
+    to_rotations,
+)
 from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS
 from cflow_torch.windows.stillness import Structure, structure_rows
@@ -130,13 +138,10 @@ def _transposed(axes: np.ndarray) -> _OfPoses:
 def _from_degrees(poses: np.ndarray) -> np.ndarray:
     """Return poses whose angles were degrees, but were read as radians. Neighbours differ by less than pi."""
     r = poses[:, :3, :3]
-    angles = (
-        np.arctan2(r[:, 2, 1], r[:, 2, 2]),
-        -np.arcsin(r[:, 2, 0].clip(-1, 1)),
-        np.arctan2(r[:, 1, 0], r[:, 0, 0]),
-    )
-    roll, pitch, yaw = (rotations_about(axis, np.radians(np.unwrap(angle))) for axis, angle in enumerate(angles))
-    return as_matrix(yaw @ pitch @ roll, poses[:, :3, 3])
+    roll = np.arctan2(r[:, 2, 1], r[:, 2, 2])
+    pitch = -np.arcsin(r[:, 2, 0].clip(-1, 1))
+    yaw = np.arctan2(r[:, 1, 0], r[:, 0, 0])
+    return as_matrix(rotations_of(np.radians(np.unwrap((roll, pitch, yaw)))), poses[:, :3, 3])
 
 
 def _later(by: float) -> _OfPoses:

@@ -6,7 +6,7 @@ python scripts/benchmarks/boxes.py --kitti DATA/kitti-0000-c2.h5 KITTI 127   an 
                                                            sequence 0000; KITTI has label_02/0000.txt and calib/0000.txt
 python scripts/benchmarks/boxes.py --simulated av2 waymo                   a street and a crossing each
 
-The simulated drives have the seeds 340 and 341. We chose settings on PandaSet 002, sweeps 72-79, and on simulated
+The simulated drives have the seeds 300 and 301. We chose settings on PandaSet 002, sweeps 72-79, and on simulated
 drives of the seeds 320, 321, 400 and 401. An object is scored in a sweep if it moves at 0.5 m/s or more, has at least
 20 points, and is within 50 m. Its box is the box of the sweep with the largest intersection over union (IoU), seen
 from above.
@@ -35,7 +35,7 @@ from cflow_torch.data.categories import CATEGORIES
 from cflow_torch.data.log import Log, windows
 from cflow_torch.data.pandaset import _POSITION, _SIZE, PandaSetLog, _columns
 
-DRIVES = ((340, "street"), (341, "crossing"))
+DRIVES = ((300, "street"), (301, "crossing"))
 LEAST_SPEED = 0.1  # m/s; slower objects are static
 SPEED, POINTS, RANGE = 0.5, 20, 50.0  # m/s, points and metres: least speed and points, most distance of a scored object
 THRESHOLDS = (0.4, 0.7)  # of IoU

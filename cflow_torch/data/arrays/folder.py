@@ -24,17 +24,8 @@ POSE_FILES = (
 GROUND_FOLDER = "ground"
 SEARCH_DEPTH = 4
 _OTHER_STEMS = {"poses", "trajectory", "times", "timestamps", "calib"}
-_TABLES = (
-    ".txt",
-    ".csv",
-    ".tum",
-    ".log",
-    ".g2o",
-    ".json",
-    ".jsonl",
-    ".yaml",
-    ".yml",
-)  # suffixes of files that we test for poses and times
+# Suffixes of files that we test for poses and times.
+_TABLES = (".txt", ".csv", ".tum", ".log", ".g2o", ".json", ".jsonl", ".yaml", ".yml")
 _NEAR_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test in other folders
 _FIRST_UNIX, _MOST = 10**17, 50  # nanoseconds in 1973; files or folders
 _TESTED = 8192  # bytes of a file that tell what it holds

@@ -16,7 +16,7 @@ from cflow_torch.data.folders import natural_key
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.data.trajectory import Trajectory, checked_poses
-from cflow_torch.transforms import as_matrix, poses_from_quaternions, rotations_about
+from cflow_torch.transforms import as_matrix, poses_from_quaternions, rotations_of
 from cflow_torch.types import CFlowError
 
 _POSITION, _ANGLES = ("x", "y", "z"), ("roll", "pitch", "yaw")
@@ -164,13 +164,7 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
     angles = np.stack([values.get(name, zeros) for name in _ANGLES])
     if (names and "deg" in names[roles["yaw"]].lower()) or np.abs(angles).max() > 2 * np.pi:
         angles = np.radians(angles)
-    return as_matrix(_rotations(angles), positions)
-
-
-def _rotations(angles: np.ndarray) -> np.ndarray:
-    """Return the rotations, (K, 3, 3), of roll, pitch and yaw, (3, K) radians."""
-    roll, pitch, yaw = (rotations_about(axis, angle) for axis, angle in enumerate(angles))
-    return yaw @ pitch @ roll
+    return as_matrix(rotations_of(angles), positions)
 
 
 def _times_of_columns(roles: Mapping[str, int], words: np.ndarray, path: Path) -> np.ndarray | None:
