@@ -121,8 +121,8 @@ class Edges(NamedTuple):
         return torch.cat([centre, self.middle[:, 2:]], 1), noise
 
 
-class _Flow(NamedTuple):
-    """The flow of R sightings as rigid motions: the velocity of the middle of the points, and a turn about z.
+class RigidFlow(NamedTuple):
+    """The flow of R objects as rigid motions: the velocity of the middle of their points, and a turn about z.
 
     Where an object turns, the part that is seen does not move as the middle of its box.
     """
@@ -132,19 +132,17 @@ class _Flow(NamedTuple):
     turn: Tensor  # (R,) rad/s
 
     @classmethod
-    def of(cls, sightings: Sightings) -> _Flow:
-        """Fit them to the flow by least squares."""
-        row = sightings.row
-        count = len(sightings.track)
-        middle = _means(sightings.points, row, count)
-        velocity = _means(sightings.velocity, row, count)
-        arm = sightings.points - middle[row]
-        swing = sightings.velocity - velocity[row]
+    def of(cls, points: Tensor, velocity: Tensor, row: Tensor, count: int) -> RigidFlow:
+        """Fit the velocities (P, 3) of the points (P, 3) of `count` objects by least squares; `row` is their object."""
+        middle = _means(points, row, count)
+        mean = _means(velocity, row, count)
+        arm = points - middle[row]
+        swing = velocity - mean[row]
         moment = arm[:, 0] * swing[:, 1] - arm[:, 1] * swing[:, 0]
         inertia = (arm[:, :2] ** 2).sum(1)
         moments = torch.stack([moment, inertia], 1)
         total = moments.new_zeros(count, 2).index_add_(0, row, moments)
-        return cls(middle, velocity, total[:, 0] / total[:, 1].clamp(min=_LEAST_INERTIA))
+        return cls(middle, mean, total[:, 0] / total[:, 1].clamp(min=_LEAST_INERTIA))
 
     def at(self, place: Tensor) -> Tensor:
         """(R, 3) velocity at (R, 3) places."""
@@ -160,7 +158,7 @@ def whole_boxes(sightings: Sightings) -> WholeBoxes:
     """
     track = sightings.track
     count = int(track.max()) + 1 if len(track) else 0
-    flow = _Flow.of(sightings)
+    flow = RigidFlow.of(sightings.points, sightings.velocity, sightings.row, len(track))
     motion = _smoothed(sightings, flow.middle, flow.velocity, torch.full_like(sightings.seconds, _CENTROID_NOISE))
     for _ in range(_ROUNDS):
         heading = headings(motion.velocity, track, sightings.heading)
