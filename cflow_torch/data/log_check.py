@@ -12,19 +12,10 @@ from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.windows.conventions import OF_POINTS, STILL, WORLD
 from cflow_torch.windows.inspection import REPEATED, repeats
-from cflow_torch.windows.point_frame import OF_POINTS, frame_problem
-from cflow_torch.windows.readings import (
-    LEAST_SHARE,
-    MOUNTS,
-    NO_READING,
-    SCALED,
-    STILL,
-    TURNED,
-    UNKNOWN,
-    WORLD,
-    Judgement,
-)
+from cflow_torch.windows.point_frame import frame_problem
+from cflow_torch.windows.readings import LEAST_SHARE, NO_READING, UNKNOWN
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
@@ -97,19 +88,23 @@ def _frame(log: Log) -> list[Finding]:
     """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame."""
     places = {"first": 0} if known_poses(log) is not None else {"first": 0, "last": len(log.timestamps) - 1}
     for name, index in places.items():
-        reading, problem = frame_problem(log.sweep(index).points)
+        reading, problem = _problem_of(log, index)
         if problem:
             fix = f"; {_setting(log, reading)} converts them" if reading else ""
             return [Finding("frame", WRONG, f"in the {name} sweep {problem}{fix}", True)]
-    if begins_late(log):
-        text = "the first column does not seem to be x: give x, y, z first, and then others such as intensity or time"
-        return [Finding("frame", WRONG, text, True)]
     return [Finding("frame", RIGHT, "metres, around the vehicle, z up", True)]
 
 
+def _problem_of(log: Log, index: int) -> tuple[str, str]:
+    reading, problem = frame_problem(log.sweep(index).points)
+    if not problem and begins_late(log):
+        problem = "the first column does not seem to be x: give x, y, z first, and then others such as intensity"
+    return reading, problem
+
+
 def _motion(log: Log) -> list[Finding]:
-    reading, problem = frame_problem(log.sweep(0).points)
-    if (problem and not reading) or begins_late(log):
+    reading, problem = _problem_of(log, 0)
+    if problem and not reading:
         return []  # in another frame, readings of the poses mean nothing
     if reading:  # the poses are judged in the frame that the points will have
         log = ReadAs(log, reading)
@@ -135,22 +130,9 @@ def _motion(log: Log) -> list[Finding]:
         fix += "that the poses belong to this log, their times, units and quaternions" if has_poses else "pass poses"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
-        fix = " or ".join(_fix(log, judgement, each) for each in judgement.best)
+        fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
         fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
-
-
-def _fix(log: Log, judgement: Judgement, name: str) -> str:
-    """Return the setting that reads the log as found."""
-    if name == TURNED:
-        turn = np.degrees(judgement.turn)
-        return f"data.ego_T_lidar with a rotation of about {turn:.0f} degrees about z (data=arrays, hdf5 or bags)"
-    if name == SCALED:
-        return f"positions multiplied by {judgement.scale:.3g}, unless the points have another unit (feet)"
-    if name not in MOUNTS:
-        return _setting(log, name)
-    x, y = MOUNTS[name]
-    return f"data.ego_T_lidar with about {f'x = {x:g} m' if x else f'y = {y:g} m'} (data=arrays, hdf5 or bags)"
 
 
 def _setting(log: Log, reading: str) -> str:

@@ -11,14 +11,11 @@ import numpy as np
 from cflow_torch.data.log import Log, known_poses
 from cflow_torch.transforms import turn_of
 from cflow_torch.types import Sweep
+from cflow_torch.windows.conventions import OFF, STILL, TIMES, WORLD
 from cflow_torch.windows.readings import (
     GIVEN,
     LEAST_SHARE,
-    OFF,
-    STILL,
-    TIMES,
     UNKNOWN,
-    WORLD,
     Judgement,
     Pair,
     difference,

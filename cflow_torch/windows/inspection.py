@@ -13,8 +13,9 @@ from cflow_torch.config import Config
 from cflow_torch.errors import CFlowError, NoActivePoints, warn
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
+from cflow_torch.windows.conventions import INVERTED, STILL, WORLD
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import INVERTED, NO_READING, STILL, UNKNOWN, WORLD, judge, make_pair
+from cflow_torch.windows.readings import NO_READING, UNKNOWN, judge, make_pair
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import have_same_points
 
