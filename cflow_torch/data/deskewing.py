@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
+from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper, intervals_of
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.transforms import poses_at, relative_transform, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
@@ -182,12 +182,8 @@ class DeskewedLog(LogWrapper):
     @cached_property
     def _gaps(self) -> np.ndarray:
         """(K-1,) float64 seconds from each sweep to the next."""
-        stamp = self._recent.sweep(0).timestamp_ns
-        if stamp is None:
-            return np.full(len(self) - 1, _INTERVAL)
-        unit = 1e-6 if stamp == 1000 * self.timestamps[0] != self.timestamps[0] else 1e-9
-        gaps = np.diff(np.array(self.timestamps, np.int64)) * unit
-        return np.where(gaps > 0, gaps, _INTERVAL)
+        known = intervals_of(self._recent)
+        return np.full(len(self) - 1, _INTERVAL) if known is None else np.where(known > 0, known, _INTERVAL)
 
     @cached_property
     def _interval(self) -> float:

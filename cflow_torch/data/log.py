@@ -238,6 +238,15 @@ def known_poses(log: Log) -> np.ndarray | None:
     return np.asarray(poses, np.float64)
 
 
+def intervals_of(log: Log) -> np.ndarray | None:
+    """Return the (K-1,) float64 seconds from each sweep to the next; None = sweeps have no times. Reads one sweep."""
+    stamp = log.sweep(0).timestamp_ns
+    if stamp is None:
+        return None
+    is_in_microseconds = stamp == 1000 * log.timestamps[0] != log.timestamps[0]
+    return np.diff(np.array(log.timestamps, np.int64)) * (1e-6 if is_in_microseconds else 1e-9)
+
+
 def gaps_in(steps: np.ndarray) -> list[int]:
     """Return the indices of sweeps after which none follows for long, from the (K-1,) seconds between sweeps."""
     if not len(steps):

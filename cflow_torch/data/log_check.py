@@ -7,7 +7,7 @@ from typing import Callable, Iterable, List
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
-from cflow_torch.data.log import CachedLog, Log, gaps_in, known_poses
+from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
 from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
@@ -257,12 +257,9 @@ def _beams(points: np.ndarray) -> tuple[int, float]:
 
 
 def _times(log: Log) -> list[Finding]:
-    if log.sweep(0).timestamp_ns is None:
+    interval = intervals_of(log)
+    if interval is None:
         return [Finding("times", RIGHT, "the sweeps have no times, so motion is known per sweep, not per second")]
-    stamps = np.array([int(stamp) for stamp in log.timestamps])
-    nanoseconds = log.sweep(0).timestamp_ns or stamps[0]
-    unit = 1e-9 * (float(nanoseconds) / float(stamps[0]) if stamps[0] else 1.0)
-    interval = np.diff(stamps) * unit
     usual = float(np.median(interval))
     if usual <= 0 or (interval <= 0).any():
         return [Finding("times", WRONG, "times of sweeps do not ascend: give the time of each sweep")]
