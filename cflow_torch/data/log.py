@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Iterator, Mapping, Sequence, TypeVar, overload
+from typing import Any, Callable, Iterator, Mapping, Sequence, TypeVar, overload
 
 import numpy as np
 from torch.utils.data import Dataset
@@ -367,10 +367,18 @@ class CachedLog(LogWrapper):
     def __init__(self, log: Log, count: int) -> None:
         super().__init__(log)
         self._count = count
-        self._sweep = lru_cache(count)(log.sweep)
+        self._sweep: Callable[[int], Sweep] = lru_cache(count)(log.sweep)
 
     def __reduce__(self) -> Any:
         return CachedLog, (self.log, self._count)
 
+    @cached_property
+    def surrounds_poses(self) -> bool:
+        return points_surround_poses(self)
+
     def sweep(self, index: int) -> Sweep:
         return self._sweep(index)
+
+    def stop(self) -> None:
+        """Forget the sweeps, and keep none from now on, so that callers may write into what they get."""
+        self._sweep = self.log.sweep

@@ -184,16 +184,24 @@ def _deskew(log: Log) -> list[Finding]:
 
 
 def _repeated(log: Log) -> list[Finding]:
-    first = [log.sweep(index) for index in range(min(3, len(log.timestamps)))]
-    if any(repeats(pc0, pc1) for pc0, pc1 in zip(first, first[1:])):
+    """Compare the first two sweeps and, if they share few directions, also the third one."""
+    first = [log.sweep(index) for index in range(2)]
+    if repeats(*first):
         return [Finding("sweeps", WRONG, REPEATED, True)]
-    seen = [_directions(sweep) for sweep in first]
-    shared = max(float((a & b).sum() / max(min(a.sum(), b.sum()), 1)) for a, b in zip(seen, seen[1:]))
-    if shared < _LEAST_SHARED and all(each.any() for each in seen):
+    shared = _shared_directions(*first)
+    if shared < _LEAST_SHARED and len(log.timestamps) > 2:
+        shared = max(shared, _shared_directions(first[1], log.sweep(2)))
+    if shared < _LEAST_SHARED:
         text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
         fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
         return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
     return []
+
+
+def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
+    """Return the share of the directions of one sweep in which the other has points; 1 if one has no points."""
+    in0, in1 = _directions(pc0), _directions(pc1)
+    return float((in0 & in1).sum() / min(in0.sum(), in1.sum())) if in0.any() and in1.any() else 1.0
 
 
 def _directions(sweep: Sweep) -> np.ndarray:

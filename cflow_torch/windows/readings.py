@@ -69,7 +69,7 @@ class ScannedStructure:
 
     def __init__(self, points: Callable[[str], np.ndarray]) -> None:
         self.points = lru_cache(None)(points)
-        self.structure = lru_cache(None)(lambda scan: Structure(points(scan)))
+        self.structure = lru_cache(None)(lambda scan: Structure(self.points(scan)))
 
 
 @dataclass(frozen=True)
@@ -171,10 +171,11 @@ def make_pair(
     if in_world is None:
         in_world = has_poses and is_around(pc1.points, poses[1])
     centre = poses[1, :3, 3] if in_world else np.zeros(3)
-    clouds = [_cloud(sweep, centre, move) for sweep, move in zip((pc0, pc1), deskew)]
-    num_points = [len(cloud.points(OFF)) for cloud in clouds]
-    if min(num_points) < _FEWEST_POINTS or _num_blocks(clouds[0].points(OFF)) < _FEWEST_BLOCKS:
+    rows_of = [structure_rows(sweep, centre) for sweep in (pc0, pc1)]
+    if min(map(len, rows_of)) < _FEWEST_POINTS or _num_blocks(_as_it_is(pc0, rows_of[0], OFF)) < _FEWEST_BLOCKS:
         return None
+    rows_of[0] = rows_of[0][: _TIMED_POINTS if TIMES in scans else _MOST_POINTS]
+    clouds = [_cloud(*each, centre) for each in zip((pc0, pc1), rows_of, deskew)]
     transforms = _transforms(poses if around is None else around, rows) if has_poses else {GIVEN: np.eye(4)}
     if in_world:
         transforms = {name: _about(centre, T) for name, T in transforms.items()}
@@ -183,8 +184,9 @@ def make_pair(
     return Pair(clouds[0], clouds[1], transforms, tuple(scans), has_motion)
 
 
-def _cloud(sweep: Sweep, centre: np.ndarray, move: Callable[[Sweep, np.ndarray, str], np.ndarray]) -> ScannedStructure:
-    rows = structure_rows(sweep, centre)
+def _cloud(
+    sweep: Sweep, rows: np.ndarray, move: Callable[[Sweep, np.ndarray, str], np.ndarray], centre: np.ndarray
+) -> ScannedStructure:
     return ScannedStructure(lambda scan: (_as_it_is if scan == OFF else move)(sweep, rows, scan) - centre)
 
 
