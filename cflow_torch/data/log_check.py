@@ -11,14 +11,20 @@ from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_po
 from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
+from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.conventions import OF_POINTS, STILL, WORLD
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import LEAST_SHARE, NO_READING, UNKNOWN
+from cflow_torch.windows.readings import LEAST_SHARE, NO_READING, UNKNOWN, difference
+from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
+_SAMPLE, _SAME, _ACCUMULATED = 1000, 0.001, 0.3  # points, metres, and least share of points that come again
+_LEAST_MOTION = 0.2  # metres between two sweeps, or the sensor stands
+_FEW, _AROUND = 0.5, 5  # least part of the number of points that so many sweeps before and after it have
+_UNEVEN, _EVEN = 0.1, 0.5  # change of the intervals of times from one to the next, and that of the motion over it
 _DIRECTIONS, _LEAST_SHARED = 72, 0.5  # and the share of them in which neighbouring sweeps both measure
 _TOPICS = (
     *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
@@ -110,7 +116,7 @@ def _motion(log: Log) -> list[Finding]:
         log = ReadAs(log, reading)
     judgement = judge_log(log) if reading else log.judgement or judge_log(log)
     if not judgement.shares:
-        return []
+        return [Finding("ego motion", RIGHT, "not compared, because the sweeps have too little static structure", True)]
     has_poses = log.sweep(0).pose is not None
     if NO_READING in judgement.best and has_poses:
         fits = {name: judge_log(ReadAs(log, name)) for name in OF_POINTS}
@@ -188,6 +194,11 @@ def _repeated(log: Log) -> list[Finding]:
     first = [log.sweep(index) for index in range(2)]
     if repeats(*first):
         return [Finding("sweeps", WRONG, REPEATED, True)]
+    again = _share_again(*first)
+    if again > _ACCUMULATED:
+        text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
+        fix = "give the points that each sweep has measured itself, not a map or sweeps that were added up"
+        return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
     shared = _shared_directions(*first)
     if shared < _LEAST_SHARED and len(log.timestamps) > 2:
         shared = max(shared, _shared_directions(first[1], log.sweep(2)))
@@ -196,6 +207,20 @@ def _repeated(log: Log) -> list[Finding]:
         fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
         return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
     return []
+
+
+def _share_again(pc0: Sweep, pc1: Sweep) -> float:
+    """Return the share of points of a sweep that the next one has, too, moved by the ego motion; 0 if this is small."""
+    T = np.eye(4) if pc0.pose is None or pc1.pose is None else relative_transform(pc1.pose, pc0.pose)
+    if pc0.pose is not None and difference(T, np.eye(4)) < _LEAST_MOTION:
+        return 0.0  # a sensor that stands may measure the same points again
+    points0, points1 = (as_numpy(sweep.points)[:, :3].astype(np.float64) for sweep in (pc0, pc1))
+    points0, points1 = points0[are_finite(points0)], points1[are_finite(points1)]
+    if not len(points0):
+        return 0.0
+    sample = points0[:: max(len(points0) // _SAMPLE, 1)]
+    scale = IN_PLACE / _SAME
+    return Structure(scale * points1).share(scale * transform_points(sample, T), np.eye(4))
 
 
 def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
@@ -214,19 +239,29 @@ def _directions(sweep: Sweep) -> np.ndarray:
 
 
 def _unreadable(log: Log) -> list[Finding]:
-    """Find sweeps that cannot be read, if the first one can."""
-    log.sweep(0)
+    """Find sweeps that cannot be read, if the first one can, and those with few points."""
+    num_points = {0: len(log.sweep(0).points)}
     errors: dict[int, Exception] = {}
     for index in range(1, len(log.timestamps)):
         try:
-            log.sweep(index)
+            num_points[index] = len(log.sweep(index).points)
         except (CFlowError, OSError) as error:
             errors[index] = error
-    if not errors:
-        return []
-    first = min(errors)
-    count = f"{len(errors)} of {len(log.timestamps)} sweeps cannot be read"
-    return [Finding("sweeps", WRONG, f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow")]
+    findings = []
+    if errors:
+        first = min(errors)
+        count = f"{len(errors)} of {len(log.timestamps)} sweeps cannot be read"
+        text = f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow"
+        findings.append(Finding("sweeps", WRONG, text))
+    counts = np.array(list(num_points.values()))
+    usual = [int(np.median(counts[max(k - _AROUND, 0) : k + _AROUND + 1])) for k in range(len(counts))]
+    few = [k for k, number in enumerate(counts) if number < _FEW * usual[k]]
+    if few:
+        index = list(num_points)[few[0]]
+        text = f"{len(few)} of them have few points, the first is sweep {index} with {num_points[index]:,}"
+        fix = "are their files complete? Else leave these sweeps out"
+        findings.append(Finding("sweeps", WRONG, f"{text}, while those around it have {usual[few[0]]:,}: {fix}"))
+    return findings
 
 
 def _sensor(log: Log) -> list[Finding]:
@@ -281,7 +316,18 @@ def _times(log: Log) -> list[Finding]:
         return [Finding("times", WRONG, f"{text}: split the log there")]
     if not 0.01 <= usual <= 1:
         return [Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")]
+    if _change(interval) > _UNEVEN:
+        text += f", and intervals change by {100 * _change(interval):.0f} % from one to the next"
+        poses = known_poses(log)
+        steps = np.zeros(len(interval)) if poses is None else np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        if np.median(steps) > _LEAST_MOTION and _change(steps) < _EVEN * _change(steps / interval):
+            return [Finding("times", WRONG, f"{text}, but the motion does not: give times of measurement, or none")]
     return [Finding("times", RIGHT, text)]
+
+
+def _change(values: np.ndarray) -> float:
+    """Return the median change from one value to the next, as a part of the median value."""
+    return float(np.median(np.abs(np.diff(values))) / np.median(values)) if len(values) > 1 else 0.0
 
 
 def _poses(log: Log) -> list[Finding]:

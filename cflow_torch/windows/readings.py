@@ -13,10 +13,9 @@ from typing import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.conventions import (
-    MARGIN,
     MOUNTS,
     OFF,
     READINGS,
@@ -34,7 +33,8 @@ from cflow_torch.windows.stillness import Structure, structure_rows
 
 GIVEN = "as given"
 STEPS = ("steps", "steps_back")
-UNKNOWN, TURNED, SCALED, NO_READING = "unknown", "turned", "scaled", "none"  # readings that are no conventions
+# Readings that are no conventions: they follow from the points.
+UNKNOWN, TURNED, SCALED, INACCURATE, NO_READING = "unknown", "turned", "scaled", "inaccurate", "none"
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
@@ -50,14 +50,20 @@ _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading h
 _SHIFT, _PEAK = 0.15, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 _EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
+_OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
+_EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
 _OBLIQUE = np.radians(10)  # least angle between axes that are turned and those with a name
-_RESCALED = 1.1  # least factor between motions of another scale
+_RESCALED = 1.05  # least factor between motions of another scale
+_DOUBTFUL = 0.15  # share of a pair as given, below which its motion is compared with that under which the points fit
+_LARGEST_ERROR = 1.5  # metres of such a motion from that of the poses, at most half of the motion
 _HOPELESS = 0.04  # nothing fits if the share as given is below this
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
 # The search for an unknown motion correlates occupied cells of a square.
 _CELL, _CELLS = 0.1, 640  # metres, and cells along a side
 _TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4]).tolist()
-_FARTHEST_SHIFT = 5.0  # metres
+_WITHIN_CELL = np.array([(x, y) for x in (0, -0.5, 0.5) for y in (0, -0.5, 0.5)]) * _CELL
+_SMALL_TURNS = np.radians([0, -0.5, 0.5, -1, 1]).tolist()
+_FARTHEST_SHIFT = 7.0  # metres
 
 
 _OF_POSES = {name: reading.of_poses for name, reading in {**READINGS, **MOUNTS}.items() if reading.of_poses}
@@ -222,9 +228,9 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
     found: dict[str, Reading] = {}
-    if np.mean([each[GIVEN] for each in of_pairs]) < LEAST_SHARE and not any(WORLD in each for each in of_pairs):
-        found = _find_similarity(moving)
-        of_pairs = [{**each, **_shares_of_found(pair, found)} for each, pair in zip(of_pairs, moving)]
+    if min(each[GIVEN] for each in of_pairs) < _DOUBTFUL and not any(WORLD in each for each in of_pairs):
+        found, of_found = _compare_motions(moving, scan)
+        of_pairs = [{**each, **more} for each, more in zip(of_pairs, of_found)]
     shares, clear = _compare(of_pairs)
     judgement = Judgement(shares, found=found, scan=scan, shares_of_scans=shares_of_scans)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
@@ -239,31 +245,35 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
 def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...]:
     """Return the best of the readings, best first, and those that are about as good; small mistakes only with others.
 
-    Of mountings and of times, only one is named, and no factor beside a reading.
+    Of mountings and of times, only one is named. Other motions in each pair are named only if they fit clearly better.
     """
-    best = [name for name in clear if shares[name] >= _EQUAL * shares[clear[0]]]
-    best = [name for name in best if _has_opposite(name) == _has_opposite(clear[0])]
+    named = [name for name in clear if name != INACCURATE]
+    if len(named) < len(clear) and shares[INACCURATE] > _EXCUSE * max([shares[name] for name in named], default=0):
+        return (INACCURATE,)
+    best = [name for name in named if shares[name] >= _EQUAL * shares[named[0]]]
+    best = [name for name in best if name == SCALED or _is_small(name) == _is_small(best[0])]
     others = [name for kind in (MOUNTS, TIMES_OF_POSES) for name in [name for name in best if name in kind][1:]]
-    return tuple(name for name in best if name not in others and (name != SCALED or name == best[0]))
+    return tuple(name for name in best if name not in others)
 
 
-def _has_opposite(name: str) -> bool:
+def _is_small(name: str) -> bool:
     return name in _COMPARED and _COMPARED[name].opposite != ""
 
 
-def _find_similarity(pairs: Sequence[Pair]) -> dict[str, Reading]:
-    """Compare the motions under which the points fit with those of the poses: return how they are turned and scaled.
+def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Reading], list[dict[str, float]]]:
+    """Compare the motions of the poses with those under which the points fit.
 
-    Turns by nearly a multiple of 90 degrees are left out, because such readings have names, and so are scales near 1.
+    They may be turned by an angle, or longer or shorter; turns by nearly a multiple of 90 degrees are left out, because
+    such readings have names. Or each pair has another small error.
+
+    Returns:
+        These readings, and for each pair the shares under those of them that it shows.
     """
-    product, square = 0j, 0.0
-    for pair in pairs:
-        given = pair.transforms[GIVEN]
-        source = pair.source.points(OFF)[:_MOST_POINTS] @ given[:3, :3].T  # a turn of the axes keeps rotations about z
-        motion = find_motion(source, pair.target.points(OFF), turns=(0.0,))
-        product += complex(*given[:2, 3]) * complex(*motion[:2, 3]).conjugate()
-        square += abs(complex(*given[:2, 3])) ** 2
-    turn, scale = float(np.angle(product)), float(abs(product) / max(square, 1e-9))
+    motions = [_motion_of(pair, scan) for pair in pairs]
+    steps = [pair.transforms[GIVEN] for pair in pairs]
+    given, fitted = (np.array([complex(*T[:2, 3]) for T in each]) for each in (steps, motions))
+    product = complex(given @ fitted.conj())
+    turn, scale = float(np.angle(product)), float(abs(product) / max(np.sum(np.abs(given) ** 2), 1e-9))
     degrees = np.degrees(turn)
     Y = as_matrix(rotations_about(2, turn))
     found = {}
@@ -280,17 +290,32 @@ def _find_similarity(pairs: Sequence[Pair]) -> dict[str, Reading]:
             scaled(scale),
             fix=f"positions multiplied by {scale:.3g}, unless the points have another unit (feet)",
         )
-    return found
+    errors = [float(np.linalg.norm((motion - step)[:2, 3])) for motion, step in zip(motions, steps)]
+    found[INACCURATE] = Reading(
+        f"the poses are off, by up to {max(errors):.1f} m between two sweeps",
+        fix="exact poses and times, or data.odometry=refine if they are noisy",
+    )
+    of_pairs = []
+    for pair, step, motion, error in zip(pairs, steps, motions, errors):
+        read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
+        shares = {name: replace(pair, transforms={GIVEN: T}).share(scan) for name, T in read.items()}
+        if error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
+            share = replace(pair, transforms={GIVEN: motion}).share(scan)
+            shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
+        of_pairs.append(shares)
+    return found, of_pairs
 
 
-def _shares_of_found(pair: Pair, found: Mapping[str, Reading]) -> dict[str, float]:
-    """Return the share of a pair under readings that convert its motion."""
-    given = pair.transforms[GIVEN]
-    return {
-        name: replace(pair, transforms={GIVEN: reading.of_poses(given)}).share(OFF)
-        for name, reading in found.items()
-        if reading.of_poses
-    }
+def _motion_of(pair: Pair, scan: str) -> np.ndarray:
+    """Return the motion of a pair under which its points fit, with about the rotation of the poses, (4, 4) float64."""
+    rotation = pair.transforms[GIVEN].copy()
+    rotation[:2, 3] = 0
+    source = transform_points(pair.source.points(scan)[:_MOST_POINTS], rotation)
+    motion = find_motion(source, pair.target.points(scan), _SMALL_TURNS)
+    nearby = np.tile(motion, (len(_WITHIN_CELL), 1, 1))
+    nearby[:, :2, 3] += _WITHIN_CELL
+    shares = pair.target.structure(scan).shares(source, nearby)
+    return nearby[int(shares.argmax())] @ rotation
 
 
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
@@ -361,7 +386,8 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
         gains[name] = float(share / max(as_given, 1e-9))
         if share >= LEAST_SHARE and all(each[name] > each[given] for each in of_pairs if name in each):
             better.append(name)
-    known = {name: _COMPARED.get(name, Reading("", margin=MARGIN)) for name in better}
+    others = {INACCURATE: Reading("", margin=_OF_ERRORS)}
+    known = {name: {**others, **_COMPARED}.get(name, Reading("")) for name in better}
     clear = [name for name in better if gains[name] >= known[name].margin]
     clear = [name for name in clear if gains.get(known[name].opposite, 0) <= max(_OPPOSITE, gains[name] / 2)]
     return shares, sorted(clear, key=gains.__getitem__, reverse=True)
