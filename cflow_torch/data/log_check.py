@@ -21,10 +21,12 @@ from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
-_SAMPLE, _SAME, _ACCUMULATED = 1000, 0.001, 0.3  # points, metres, and least share of points that come again
+# Points of a strip of this half width that are looked for, to within so many metres, and the share that comes again.
+_STRIP, _SAMPLE, _SAME, _ACCUMULATED = 4.0, 1000, 0.001, 0.3
 _LEAST_MOTION = 0.2  # metres between two sweeps, or the sensor stands
 _FEW, _AROUND = 0.5, 5  # least part of the number of points that so many sweeps before and after it have
 _UNEVEN, _EVEN = 0.1, 0.5  # change of the intervals of times from one to the next, and that of the motion over it
+_MOST_DIRECTED = 20_000  # points that show in which directions a sweep measures
 _DIRECTIONS, _LEAST_SHARED = 72, 0.5  # and the share of them in which neighbouring sweeps both measure
 _TOPICS = (
     *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
@@ -46,7 +48,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(CachedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _motion, _lapses))
+    findings = _collect(CachedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -62,7 +64,6 @@ def examine(log: Log) -> list[Finding]:
         _times,
         _poses,
         _lapses,
-        _motion,
         _deskew,
         _repeated,
         _unreadable,
@@ -91,14 +92,21 @@ def _found(log: Log) -> list[Finding]:
 
 
 def _frame(log: Log) -> list[Finding]:
-    """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame."""
-    places = {"first": 0} if known_poses(log) is not None else {"first": 0, "last": len(log.timestamps) - 1}
-    for name, index in places.items():
-        reading, problem = _problem_of(log, index)
-        if problem:
-            fix = f"; {_setting(log, reading)} converts them" if reading else ""
-            return [Finding("frame", WRONG, f"in the {name} sweep {problem}{fix}", True)]
-    return [Finding("frame", RIGHT, "metres, around the vehicle, z up", True)]
+    """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame.
+
+    Then check the ego motion in the frame that the points will have.
+    """
+    reading, problem = _problem_of(log, 0)
+    where = "first"
+    if not problem and known_poses(log) is None:
+        where, problem = "last", frame_problem(log.sweep(len(log.timestamps) - 1).points)[1]
+    if not problem:
+        right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
+        return [right, *_motion(log, "")]
+    fix = f"; {_setting(log, reading)} converts them" if reading else ""
+    wrong = Finding("frame", WRONG, f"in the {where} sweep {problem}{fix}", True)
+    # In another frame that we do not know, readings of the poses mean nothing.
+    return [wrong, *(_motion(log, reading) if reading or where == "last" else [])]
 
 
 def _problem_of(log: Log, index: int) -> tuple[str, str]:
@@ -108,10 +116,8 @@ def _problem_of(log: Log, index: int) -> tuple[str, str]:
     return reading, problem
 
 
-def _motion(log: Log) -> list[Finding]:
-    reading, problem = _problem_of(log, 0)
-    if problem and not reading:
-        return []  # in another frame, readings of the poses mean nothing
+def _motion(log: Log, reading: str) -> list[Finding]:
+    """Check the ego motion of a log whose points are converted by a reading; "" = they are right."""
     if reading:  # the poses are judged in the frame that the points will have
         log = ReadAs(log, reading)
     judgement = judge_log(log) if reading else log.judgement or judge_log(log)
@@ -210,17 +216,22 @@ def _repeated(log: Log) -> list[Finding]:
 
 
 def _share_again(pc0: Sweep, pc1: Sweep) -> float:
-    """Return the share of points of a sweep that the next one has, too, moved by the ego motion; 0 if this is small."""
+    """Return the share of points of a sweep that the next one has, too, moved by the ego motion.
+
+    0 if the sensor has poses and stands, because it may measure the same points again.
+    """
     T = np.eye(4) if pc0.pose is None or pc1.pose is None else relative_transform(pc1.pose, pc0.pose)
     if pc0.pose is not None and difference(T, np.eye(4)) < _LEAST_MOTION:
-        return 0.0  # a sensor that stands may measure the same points again
-    points0, points1 = (as_numpy(sweep.points)[:, :3].astype(np.float64) for sweep in (pc0, pc1))
-    points0, points1 = points0[are_finite(points0)], points1[are_finite(points1)]
-    if not len(points0):
         return 0.0
-    sample = points0[:: max(len(points0) // _SAMPLE, 1)]
+    points0, points1 = (as_numpy(sweep.points)[:, :3].astype(np.float64) for sweep in (pc0, pc1))
+    is_in_strip = are_finite(points0) & (np.abs(points0[:, 1]) < _STRIP) & (np.abs(points0[:, 0]) < 5 * _STRIP)
+    if not is_in_strip.any():
+        return 0.0
+    strip = points0[is_in_strip]  # along the vehicle, so that few points are searched
+    moved = transform_points(strip[:: len(strip) // _SAMPLE + 1], T)
+    around = ((points1 > moved.min(0) - _SAME) & (points1 < moved.max(0) + _SAME)).all(axis=1)
     scale = IN_PLACE / _SAME
-    return Structure(scale * points1).share(scale * transform_points(sample, T), np.eye(4))
+    return Structure(scale * points1[around]).share(scale * moved, np.eye(4))
 
 
 def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
@@ -231,7 +242,8 @@ def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
 
 def _directions(sweep: Sweep) -> np.ndarray:
     """Return in which of 72 directions a sweep has points, (72,) bool."""
-    x, y = as_numpy(sweep.points)[:, :2].astype(np.float64).T
+    points = as_numpy(sweep.points)
+    x, y = points[:: len(points) // _MOST_DIRECTED + 1, :2].astype(np.float64).T
     turns = np.arctan2(y, x)[np.isfinite(x + y)] / (2 * np.pi)
     has_points = np.zeros(_DIRECTIONS, bool)
     has_points[np.floor(turns * _DIRECTIONS).astype(int)] = True  # negative numbers count from the end

@@ -29,7 +29,7 @@ from cflow_torch.windows.conventions import (
     scaled,
 )
 from cflow_torch.windows.deskewing import DIRECTIONS, STARTS
-from cflow_torch.windows.stillness import Structure, structure_rows
+from cflow_torch.windows.stillness import Structure, cell_keys, structure_rows
 
 GIVEN = "as given"
 STEPS = ("steps", "steps_back")
@@ -37,6 +37,7 @@ STEPS = ("steps", "steps_back")
 UNKNOWN, TURNED, SCALED, INACCURATE, NO_READING = "unknown", "turned", "scaled", "inaccurate", "none"
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
+_MOST_AROUND = 5000  # points that tell what they lie around
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
 _NEAR_GIVEN = 0.7  # share of a reading over that as given
 _FEWEST_POINTS = 150  # of source and target; fewer do not show anything
@@ -334,6 +335,9 @@ def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
     direction, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
     if direction in DIRECTIONS and shares[direction] >= _TURN * max(shares[scan] for scan in opposite):
         starts = [direction + start for start in STARTS]
+        # A start that is clearly better is so in each pair, so the first pair rules out most.
+        of_first = pairs[0].shares_of_scans(starts)
+        starts = [start for start in starts if start == direction or of_first[start] > of_first[direction]]
         of_pairs = [{**pair.shares_of_scans(starts), **each} for pair, each in zip(pairs, of_pairs)]
         of_starts, clear = _compare(of_pairs, expected)
         _, better = _compare([{start: each[start] for start in starts} for each in of_pairs], direction)
@@ -435,7 +439,7 @@ def is_around(points: Array, pose: np.ndarray) -> bool:
     position = pose[:2, 3]
     if np.linalg.norm(position) < LEAST_DISTANCE:
         return False
-    xy = as_numpy(points)[:, :2].astype(np.float64)
+    xy = as_numpy(points)[:: len(points) // _MOST_AROUND + 1, :2].astype(np.float64)
     xy = xy[np.isfinite(xy).all(1)]
     if len(xy) == 0:
         return False
@@ -451,7 +455,9 @@ def difference(T: np.ndarray, other: np.ndarray) -> float:
 
 def _num_blocks(points: np.ndarray) -> int:
     """Return how many blocks of 5 m in the plane hold points."""
-    return len(np.unique(np.floor(points[:, :2] / _BLOCK), axis=0))
+    block = np.floor(points / _BLOCK).astype(np.int64)
+    block[:, 2] = 0
+    return len(np.unique(cell_keys(block)))
 
 
 def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:
