@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Callable, Iterable, List
+from typing import Callable, Iterable, List, Mapping
 
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
-from cflow_torch.data.log_motion import find_lapses, judge_log
+from cflow_torch.data.log_motion import Neighbours, find_lapses, judge_log
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
@@ -55,7 +55,7 @@ def find_problems(log: Log) -> list[str]:
 def examine(log: Log) -> list[Finding]:
     """Check everything that `cflow check` shows, in the order of its page.
 
-    Cost: 1 to 2 s, and reads every sweep, to tell those that are missing or damaged.
+    Cost: 1 to 2 s, and reads every sweep, and 20 ms each, to tell those that are missing, damaged or misplaced.
     """
     checks = (
         _sensor,
@@ -66,7 +66,7 @@ def examine(log: Log) -> list[Finding]:
         _lapses,
         _deskew,
         _repeated,
-        _unreadable,
+        _each_sweep,
         _mask,
         _labels,
     )
@@ -250,29 +250,54 @@ def _directions(sweep: Sweep) -> np.ndarray:
     return has_points
 
 
-def _unreadable(log: Log) -> list[Finding]:
-    """Find sweeps that cannot be read, if the first one can, and those with few points."""
-    num_points = {0: len(log.sweep(0).points)}
+def _each_sweep(log: Log) -> list[Finding]:
+    """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
+    log.sweep(0)  # its error is that of the log
+    neighbours = Neighbours()
     errors: dict[int, Exception] = {}
-    for index in range(1, len(log.timestamps)):
+    for index in range(len(log.timestamps)):
         try:
-            num_points[index] = len(log.sweep(index).points)
+            neighbours.add(log.sweep(index))
         except (CFlowError, OSError) as error:
+            neighbours.add(None)
             errors[index] = error
-    findings = []
-    if errors:
-        first = min(errors)
-        count = f"{len(errors)} of {len(log.timestamps)} sweeps cannot be read"
-        text = f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow"
-        findings.append(Finding("sweeps", WRONG, text))
+    return [*_unreadable(log, errors), *_small(neighbours.num_points), *_misplaced(log, neighbours)]
+
+
+def _unreadable(log: Log, errors: Mapping[int, Exception]) -> list[Finding]:
+    if not errors:
+        return []
+    first = min(errors)
+    count = f"{len(errors)} of {len(log.timestamps)} sweeps cannot be read"
+    text = f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow"
+    return [Finding("sweeps", WRONG, text)]
+
+
+def _small(num_points: Mapping[int, int]) -> list[Finding]:
     counts = np.array(list(num_points.values()))
     usual = [int(np.median(counts[max(k - _AROUND, 0) : k + _AROUND + 1])) for k in range(len(counts))]
     few = [k for k, number in enumerate(counts) if number < _FEW * usual[k]]
-    if few:
-        index = list(num_points)[few[0]]
-        text = f"{len(few)} of them have few points, the first is sweep {index} with {num_points[index]:,}"
-        fix = "are their files complete? Else leave these sweeps out"
-        findings.append(Finding("sweeps", WRONG, f"{text}, while those around it have {usual[few[0]]:,}: {fix}"))
+    if not few:
+        return []
+    index = list(num_points)[few[0]]
+    text = f"{len(few)} of them have few points, the first is sweep {index} with {num_points[index]:,}"
+    fix = "are their files complete? Else leave these sweeps out"
+    return [Finding("sweeps", WRONG, f"{text}, while those around it have {usual[few[0]]:,}: {fix}")]
+
+
+def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
+    """Find sweeps that repeat the one before, and others that fit neither the sweep before them nor the one after."""
+    findings = []
+    repeated = [index for index in neighbours.repeated if index > 1]  # `_repeated` tells the first
+    if repeated:
+        text = f"{len(repeated)} of them repeat the points of the sweep before, the first is sweep {repeated[0]}"
+        findings.append(Finding("sweeps", WRONG, f"{text}: leave them out, or copy their files again"))
+    known = {lapse.sweep for lapse in find_lapses(log)} | set(repeated)
+    for first, last in neighbours.misplaced(log):
+        if known.isdisjoint(range(first, last + 2)):
+            which = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
+            text = f"{which} not fit those around, which fit one another: has it points or a pose of another time?"
+            findings.append(Finding("sweeps", WRONG, f"{text} Correct its files, or leave it out"))
     return findings
 
 

@@ -14,6 +14,7 @@ _FEWEST_COVERED = 0.5  # share of sweeps at a pose, if poses are farther apart t
 _SECOND = 10**9  # nanoseconds
 _SPARSE = 1.5  # sweep intervals between poses
 _TOLERANCE_NS = 1_000_000  # by which programs round times
+_EARTH = 6378137.0  # metres, radius of the Mercator projection
 
 
 class Trajectory(NamedTuple):
@@ -54,6 +55,13 @@ def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
     poses = np.tile(np.eye(4, dtype=np.result_type(matrices, np.float16)), (len(matrices), 1, 1))
     poses[:, : matrices.shape[1]] = matrices
     return np.stack([rigid_transform(pose, f"pose {row} of {source}") for row, pose in enumerate(poses)])
+
+
+def positions_of_degrees(latitude: np.ndarray, longitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the metres east and north of the first place, (K,) float64 each, by the Mercator projection there."""
+    scale = _EARTH * np.cos(np.radians(latitude[0]))
+    north = scale * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
+    return scale * np.radians(longitude - longitude[0]), north - north[0]
 
 
 def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.ndarray, np.ndarray, str]:

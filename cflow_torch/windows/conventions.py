@@ -89,13 +89,17 @@ def _joined(poses: np.ndarray) -> np.ndarray:
     return np.array(list(accumulate(poses, np.matmul)))
 
 
-def _from_degrees(poses: np.ndarray) -> np.ndarray:
-    """Return poses whose angles were degrees, but were read as radians. Neighbours differ by less than pi."""
-    r = poses[:, :3, :3]
-    roll = np.arctan2(r[:, 2, 1], r[:, 2, 2])
-    pitch = -np.arcsin(r[:, 2, 0].clip(-1, 1))
-    yaw = np.arctan2(r[:, 1, 0], r[:, 0, 0])
-    return as_matrix(rotations_of(np.radians(np.unwrap((roll, pitch, yaw)))), poses[:, :3, 3])
+def _of_angles(convert: _Convert) -> _Convert:
+    """Return what converts the angles of poses: roll, pitch and yaw, (3, K) radians, unwrapped."""
+
+    def converted(poses: np.ndarray) -> np.ndarray:
+        r = poses[:, :3, :3]
+        roll = np.arctan2(r[:, 2, 1], r[:, 2, 2])
+        pitch = -np.arcsin(r[:, 2, 0].clip(-1, 1))
+        yaw = np.arctan2(r[:, 1, 0], r[:, 0, 0])
+        return as_matrix(rotations_of(convert(np.unwrap((roll, pitch, yaw)))), poses[:, :3, 3])
+
+    return converted
 
 
 def _later(by: float) -> _Convert:
@@ -200,7 +204,11 @@ READINGS: dict[str, Reading] = {
     "compass": Reading(
         "the angles of the poses are compass headings (clockwise from north)", _transposed(AXES["left"])
     ),
-    "degrees": Reading("the angles of the poses are degrees, but were read as radians", _from_degrees),
+    "degrees": Reading("the angles of the poses are degrees, but were read as radians", _of_angles(np.radians)),
+    "yaw_first": Reading(
+        "the angles of the poses are yaw, pitch, roll, but were read as roll, pitch, yaw",
+        _of_angles(lambda angles: angles[::-1]),
+    ),
     CAMERA: Reading("the poses are of a camera (x right, y down, z forward)", turned(AXES[CAMERA])),
     "opengl": Reading("the poses are of a camera as in OpenGL (x right, y up, z backward)", turned(AXES["opengl"])),
     "left": Reading(f"{_FRAME} x axis points to the left of the points' x axis", turned(AXES["left"])),

@@ -40,7 +40,7 @@ _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse 
 _MOST_AROUND = 5000  # points that tell what they lie around
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
 _NEAR_GIVEN = 0.7  # share of a reading over that as given
-_FEWEST_POINTS = 150  # of source and target; fewer do not show anything
+FEWEST_POINTS = 150  # of source and target; fewer do not show anything
 _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
 _LEAST_MOTION, _ARM = 0.2, 20.0  # metres; poses that move points 20 m away by less do not show anything
 LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
@@ -56,8 +56,11 @@ _EXCUSE = 1.1  # share with another motion in each pair over that of a reading w
 _OBLIQUE = np.radians(10)  # least angle between axes that are turned and those with a name
 _RESCALED = 1.05  # least factor between motions of another scale
 _DOUBTFUL = 0.15  # share of a pair as given, below which its motion is compared with that under which the points fit
-_LARGEST_ERROR = 1.5  # metres of such a motion from that of the poses, at most half of the motion
-_HOPELESS = 0.04  # nothing fits if the share as given is below this
+# Metres of such a motion from that of the poses. Less in all pairs is within the cells of the search; more, or more
+# than half of the motion, is more than an error of measurement.
+_SMALLEST_ERROR, _LARGEST_ERROR = 0.08, 1.5
+# Nothing fits if the share as given is below this. Of so few points of structure, no more fit under right poses.
+_HOPELESS, _TOO_FEW = 0.04, 600
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
 # The search for an unknown motion correlates occupied cells of a square.
 _CELL, _CELLS = 0.1, 640  # metres, and cells along a side
@@ -179,7 +182,7 @@ def make_pair(
         in_world = has_poses and is_around(pc1.points, poses[1])
     centre = poses[1, :3, 3] if in_world else np.zeros(3)
     rows_of = [structure_rows(sweep, centre) for sweep in (pc0, pc1)]
-    if min(map(len, rows_of)) < _FEWEST_POINTS or _num_blocks(_as_it_is(pc0, rows_of[0], OFF)) < _FEWEST_BLOCKS:
+    if min(map(len, rows_of)) < FEWEST_POINTS or _num_blocks(_as_it_is(pc0, rows_of[0], OFF)) < _FEWEST_BLOCKS:
         return None
     rows_of[0] = rows_of[0][: _TIMED_POINTS if TIMES in scans else _MOST_POINTS]
     clouds = [_cloud(*each, centre) for each in zip((pc0, pc1), rows_of, deskew)]
@@ -238,6 +241,8 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
         return replace(judgement, best=(WORLD,))
     if clear or shares[GIVEN] >= _HOPELESS:
         return replace(judgement, best=_equals(clear, shares))
+    if np.median([len(pair.source.points(OFF)) for pair in moving]) < _TOO_FEW:
+        return Judgement({})
     # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
     is_hopeless = len(moving) > 1 or bool(_judge_motion(moving).best)
     return replace(judgement, best=(NO_READING,)) if is_hopeless else judgement
@@ -300,7 +305,7 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
     for pair, step, motion, error in zip(pairs, steps, motions, errors):
         read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
         shares = {name: replace(pair, transforms={GIVEN: T}).share(scan) for name, T in read.items()}
-        if error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
+        if max(errors) > _SMALLEST_ERROR and error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
             share = replace(pair, transforms={GIVEN: motion}).share(scan)
             shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
         of_pairs.append(shares)

@@ -148,6 +148,13 @@ def in_degrees(pose):
     return as_matrix(yaw @ pitch @ roll, pose[:3, 3])
 
 
+def rolled(pose):
+    """A pose whose yaw and roll are interchanged."""
+    roll, yaw = np.arctan2(pose[2, 1], pose[2, 2]), np.arctan2(pose[1, 0], pose[0, 0])
+    pitch = rotations_about(1, -np.arcsin(pose[2, 0]))
+    return as_matrix(rotations_about(2, roll) @ pitch @ rotations_about(0, yaw), pose[:3, 3])
+
+
 POSES = {
     "inverted": np.linalg.inv,
     CAMERA: lambda pose: pose @ as_matrix(AXES[CAMERA]),
@@ -173,6 +180,7 @@ WRONG_POSES = {
     "millimetres": scaled(1000),
     "centimetres": scaled(100),
     "feet": scaled(1 / 0.3048),
+    "yaw_first": lambda poses: each(rolled)(np.linalg.inv(poses[0]) @ poses),
     "degrees": lambda poses: each(in_degrees)(np.linalg.inv(poses[0]) @ poses),
     "steps": lambda poses: np.concatenate([poses[:1], np.linalg.inv(poses[:-1]) @ poses[1:]]),
     "steps_back": lambda poses: np.concatenate([np.linalg.inv(poses[:1]), np.linalg.inv(poses[1:]) @ poses[:-1]]),
@@ -660,6 +668,34 @@ def test_the_page_names_sweeps_with_few_points(drive):
 
     (text,) = [one.text for one in examine(Cut(drive)) if one.status == WRONG]
     assert text.startswith("2 of them have few points, the first is sweep 4 with 3,000, while those around it have 2")
+
+
+@pytest.mark.parametrize(
+    ("order", "told"),
+    [
+        (
+            [0, 1, 2, 3, 4, 5, 5, 5, 8, 9, 10, 11],
+            "2 of them repeat the points of the sweep before, the first is",
+        ),
+        ([0, 1, 2, 3, 5, 4, 6, 7, 8, 9, 10, 11], "sweeps 4 to 5 do not fit those around"),
+        ([0, 1, 2, 3, 4, 5, 11, 7, 8, 9, 10, 11], "sweep 6 does not fit those around"),
+    ],
+    ids=["dropped", "interchanged", "foreign"],
+)
+def test_the_page_names_sweeps_that_are_repeated_or_misplaced(drive, order, told):
+    texts = [one.text for one in examine(Wrong(drive, order=order)) if one.topic == "sweeps"]
+    assert len(texts) == 1 and texts[0].startswith(told)
+
+
+def test_sweeps_of_few_points_do_not_blame_the_poses(drive):
+    """A small sensor: of so few points, hardly any is measured again within 10 cm."""
+
+    class Sparse(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index)
+            return replace(sweep, points=sweep.points[::20], is_ground=sweep.is_ground[::20])
+
+    assert find_problems(Sparse(drive)) == []
 
 
 def test_the_page_lists_notes_of_the_reader_and_knows_its_gaps(drive):
