@@ -104,9 +104,9 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
     """Collect what is seen of the rows of a table, in the given order. `rank` is the position of each row in it."""
     sweeps = [each.sweep for each in seen]
     seconds = np.zeros(len(order))
-    velocity = np.zeros((len(order), 3))
     sensor = np.zeros((len(order), 3))
     points = []
+    velocities = []
     rows = []
     first = np.searchsorted(table["sweep"], sweeps)
     last = np.searchsorted(table["sweep"], sweeps, side="right")
@@ -115,20 +115,19 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
         is_in_table = np.isin(each.id, table["id"][now])
         row = rank[now][np.searchsorted(table["id"][now], each.id[is_in_table])]  # ids of a sweep ascend
         points.append(each.sensor + each.offset[is_in_table])
+        velocities.append(each.velocity[is_in_table].astype(np.float64))
         rows.append(row)
-        np.add.at(velocity, row, each.velocity[is_in_table])
         seconds[rank[now]] = each.seconds
         sensor[rank[now]] = each.sensor
     row_of_point = np.concatenate(rows)
-    count = np.bincount(row_of_point, minlength=len(order)).clip(1)
-    velocity *= (table["is_moving"][order] / count)[:, None]
+    moves = table["is_moving"][order]
     columns = (
         np.unique(table["id"][order], return_inverse=True)[1],
         seconds,
         sensor,
-        velocity,
         table["heading"][order],
         np.concatenate(points),
+        np.concatenate(velocities) * moves[row_of_point][:, None],
         row_of_point,
     )
     return Sightings(*map(torch.from_numpy, columns))

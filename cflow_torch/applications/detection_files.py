@@ -37,9 +37,9 @@ def write_nuscenes(folder: PathLike, table: Table, log: Log) -> None:
         log: the drive. The samples are the key frames of a scene of nuScenes, and all sweeps of any other log, which
             are then called `<log id>_<time stamp>`. A sample without tracks has an empty list.
 
-    Convention: boxes are in the world of the log's poses. Sizes are width, length, height. The score is the confidence
-        of the flow, 1 where the method has none. Of more than 500 boxes of a sample, we keep those with the highest
-        scores.
+    Convention: boxes are in the world of the log's poses. Sizes are width, length, height. The score is the mean
+        confidence of the flow over the track, 1 where the method has none. Of more than 500 boxes of a sample, we keep
+        those with the highest scores.
 
     Source: results formats of the detection and the tracking task of nuScenes.
     """

@@ -109,8 +109,10 @@ def class_of(table: Table, row: int) -> str:
 
 
 def score_of(table: Table) -> np.ndarray:
-    """Return the confidence of each row, (R,) float64; 1 where the method has none."""
-    return np.nan_to_num(table["confidence"], nan=1.0)
+    """Return the mean confidence of the track of each row, (R,) float64; 1 where the method has none."""
+    _, track = np.unique(table["id"], return_inverse=True)
+    confidence = np.nan_to_num(table["confidence"], nan=1.0)
+    return (np.bincount(track, confidence) / np.bincount(track))[track]
 
 
 def boxes_in_sweeps(table: Table, log: Log) -> tuple[np.ndarray, np.ndarray]:

@@ -32,6 +32,7 @@ _ANCHOR_NOISE, _FREE_NOISE = 0.15, 0.3  # standard deviation of a box: metres, p
 _DEPTHS = (0.12, 0.07)  # metres from what is seen of a person, of a cyclist back to the middle; from simulated drives
 _CENTROID_NOISE = 1.0  # metres, standard deviation of the mean of the visible points
 _MIN_SPEED = 0.5  # m/s; slower objects keep their heading
+_LEAST_INERTIA = 1e-6  # square metres
 _ROUNDS, _ROBUST_ROUNDS = 3, 3
 
 
@@ -41,9 +42,9 @@ class Sightings(NamedTuple):
     track: Tensor  # (R,) int64, 0 ... K - 1
     seconds: Tensor  # (R,)
     sensor: Tensor  # (R, 3) metres, position of the vehicle in the world
-    velocity: Tensor  # (R, 3) m/s, mean flow of the points
     heading: Tensor  # (R,) radians, where the object never moves fast enough to tell
     points: Tensor  # (P, 3) metres in the world
+    velocity: Tensor  # (P, 3) m/s, flow of the points
     row: Tensor  # (P,) int64, sighting of each point
 
 
@@ -120,6 +121,35 @@ class Edges(NamedTuple):
         return torch.cat([centre, self.middle[:, 2:]], 1), noise
 
 
+class RigidFlow(NamedTuple):
+    """The flow of R objects as rigid motions: the velocity of the middle of their points, and a turn about z.
+
+    Where an object turns, the part that is seen does not move as the middle of its box.
+    """
+
+    middle: Tensor  # (R, 3) metres
+    velocity: Tensor  # (R, 3) m/s, of the middle
+    turn: Tensor  # (R,) rad/s
+
+    @classmethod
+    def of(cls, points: Tensor, velocity: Tensor, row: Tensor, count: int) -> RigidFlow:
+        """Fit the velocities (P, 3) of the points (P, 3) of `count` objects by least squares; `row` is their object."""
+        middle = _means(points, row, count)
+        mean = _means(velocity, row, count)
+        arm = points - middle[row]
+        swing = velocity - mean[row]
+        moment = arm[:, 0] * swing[:, 1] - arm[:, 1] * swing[:, 0]
+        inertia = (arm[:, :2] ** 2).sum(1)
+        moments = torch.stack([moment, inertia], 1)
+        total = moments.new_zeros(count, 2).index_add_(0, row, moments)
+        return cls(middle, mean, total[:, 0] / total[:, 1].clamp(min=_LEAST_INERTIA))
+
+    def at(self, place: Tensor) -> Tensor:
+        """(R, 3) velocity at (R, 3) places."""
+        x, y, z = (place - self.middle).unbind(1)
+        return self.velocity + self.turn[:, None] * torch.stack([-y, x, torch.zeros_like(z)], 1)
+
+
 def whole_boxes(sightings: Sightings) -> WholeBoxes:
     """Estimate the box of each track from all its sightings.
 
@@ -128,8 +158,8 @@ def whole_boxes(sightings: Sightings) -> WholeBoxes:
     """
     track = sightings.track
     count = int(track.max()) + 1 if len(track) else 0
-    centre = _means(sightings.points, sightings.row, len(track))
-    motion = _smoothed(sightings, centre, torch.full_like(sightings.seconds, _CENTROID_NOISE))
+    flow = RigidFlow.of(sightings.points, sightings.velocity, sightings.row, len(track))
+    motion = _smoothed(sightings, flow.middle, flow.velocity, torch.full_like(sightings.seconds, _CENTROID_NOISE))
     for _ in range(_ROUNDS):
         heading = headings(motion.velocity, track, sightings.heading)
         edges = Edges.of(sightings.points, sightings.row, sightings.sensor, heading)
@@ -139,15 +169,16 @@ def whole_boxes(sightings: Sightings) -> WholeBoxes:
         kind, size = kinds_and_sizes(along_path, track, count, typical_speed)
         local, noise = edges.anchor(size[track], kind[track])
         centre = turned(local, heading)
-        motion = _smoothed(sightings, centre, noise)
+        velocity = flow.at(centre)
+        motion = _smoothed(sightings, centre, velocity, noise)
         for _ in range(_ROBUST_ROUNDS - 1):
             residual = (centre - motion.position)[:, :2].norm(dim=1)
-            motion = _smoothed(sightings, centre, torch.hypot(noise, residual))
+            motion = _smoothed(sightings, centre, velocity, torch.hypot(noise, residual))
     return WholeBoxes(motion, size[track], heading, kind[track])
 
 
-def _smoothed(sightings: Sightings, centre: Tensor, noise: Tensor) -> MotionState:
-    measured = torch.stack([centre, sightings.velocity], 1)
+def _smoothed(sightings: Sightings, centre: Tensor, velocity: Tensor, noise: Tensor) -> MotionState:
+    measured = torch.stack([centre, velocity], 1)
     deviations = torch.stack([noise, torch.full_like(noise, FLOW_NOISE)], 1)
     return smooth(sightings.track, sightings.seconds, measured, deviations)
 

@@ -11,8 +11,9 @@ drives of the seeds 320, 321, 400 and 401. An object is scored in a sweep if it 
 20 points, and is within 50 m. Its box is the box of the sweep with the largest intersection over union (IoU), seen
 from above.
 
-AP is the average precision of moving boxes, by their confidence: a box is right if its IoU with an object that is
-scored, and has no better box, is above the threshold. Boxes on objects that move without being scored are left out.
+AP is the average precision of moving boxes, by the mean confidence of their tracks: a box is right if its IoU with an
+object that is scored, and has no better box, is above the threshold. Boxes on objects that move without being scored
+are left out.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from labelled import SENSORS, LabelledLog, SimulatedLog, true_residual
 from table import markdown
 
 from cflow_torch import VerifiedFlow, make_config, make_model
+from cflow_torch.applications.track_table import score_of
 from cflow_torch.applications.tracking import track
 from cflow_torch.data.boxes import Boxes
 from cflow_torch.data.catalog import GroundSegmentedLog
@@ -168,9 +170,14 @@ class SceneBoxes(LabelledLog):
             self._known.append(Boxes(boxes.track_id, boxes.category, boxes.size, np.linalg.inv(pose) @ world))
 
     def _moved(self, index: int) -> np.ndarray:
-        """Move the boxes of a sweep by the labels of the points inside; (K, 4, 4) `T_world_box` in the next sweep."""
+        """Move the boxes of a sweep by the labels of the points inside; (K, 4, 4) `T_world_box` in the next sweep.
+
+        A moving object with few points goes on as before.
+        """
         boxes, sweep, after = self._known[index], self.sweep(index), self.sweep(index + 1)
         residual, labels = true_residual(self, index), self.labels(index)
+        before = dict(zip(self._known[index - 1].track_id, self.sweep(index - 1).pose @ self._known[index - 1].pose))
+        least = SPEED * (self.timestamps[index] - self.timestamps[index - 1]) * 1e-9
         world = sweep.pose @ boxes.pose
         for row, pose in enumerate(boxes.pose):
             local = (sweep.points[:, :3] - pose[:3, 3]) @ pose[:3, :3]
@@ -181,6 +188,9 @@ class SceneBoxes(LabelledLog):
                 start = sweep.points[inside, :3].astype(np.float64) @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
                 end = start + residual[inside] @ after.pose[:3, :3].T
                 world[row] = fit(start, end) @ world[row]
+            elif boxes.track_id[row] in before:
+                step = world[row, :3, 3] - before[boxes.track_id[row]][:3, 3]
+                world[row, :3, 3] += step if np.linalg.norm(step) >= least else 0
         return world
 
     def true_boxes(self, index: int) -> TrueBoxes:
@@ -348,6 +358,7 @@ def detections(drives: list[tuple[Any, dict[str, np.ndarray], range]]) -> Detect
     is_right: list[tuple[bool, ...]] = []
     num_true = 0
     for log, table, sweeps in drives:
+        score = score_of(table)
         for index in sweeps:
             truth = log.true_boxes(index)
             num_true += int(truth.is_scored.sum())
@@ -357,7 +368,7 @@ def detections(drives: list[tuple[Any, dict[str, np.ndarray], range]]) -> Detect
             if isinstance(log, KITTIBoxes):
                 is_counted &= log.is_labelled(index, np.stack([table[name] for name in "xyz"], 1))
             chosen = np.flatnonzero(is_counted)
-            chosen = chosen[np.argsort(-table["confidence"][chosen], kind="stable")]
+            chosen = chosen[np.argsort(-score[chosen], kind="stable")]
             taken: list[set[int]] = [set() for _ in THRESHOLDS]
             for row in chosen.tolist():
                 shares = np.array([iou(truth.corners(k), found_corners(table, row)) for k in range(len(truth.name))])
@@ -368,7 +379,7 @@ def detections(drives: list[tuple[Any, dict[str, np.ndarray], range]]) -> Detect
                     if hit:
                         each.add(int(shares_left.argmax()))
                 if any(hits) or of_objects.max(initial=0) >= shares.max(initial=0):  # else it is on an unscored object
-                    confidence.append(float(table["confidence"][row]))
+                    confidence.append(float(score[row]))
                     is_right.append(tuple(hits))
     return Detections(confidence, is_right, num_true)
 

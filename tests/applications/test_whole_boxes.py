@@ -47,14 +47,17 @@ def seen(
     for number, path in enumerate(paths):
         speed = np.linalg.norm(np.gradient(path[:, :2], INTERVAL, axis=0), axis=1)
         velocity = speed[:, None] * np.stack([np.cos(path[:, 2]), np.sin(path[:, 2])], 1)
+        rate = np.gradient(path[:, 2], INTERVAL)
         for index, (x, y, heading) in enumerate(path):
             local = visible(index, shell(size))
             turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
             points = np.column_stack([local[:, :2] @ turn.T + (x, y), local[:, 2]])
-            parts.append((number, index * INTERVAL, (*sensor, 1.5), (*velocity[index], 0.0), heading, points))
-    columns = [torch.tensor(np.array([part[k] for part in parts])) for k in range(5)]
-    row = torch.arange(len(parts)).repeat_interleave(torch.tensor([len(part[5]) for part in parts]))
-    return Sightings(*columns, torch.from_numpy(np.concatenate([part[5] for part in parts])), row)
+            flow = velocity[index] + rate[index] * np.column_stack([y - points[:, 1], points[:, 0] - x])
+            flows = np.column_stack([flow, np.zeros(len(flow))])
+            parts.append((number, index * INTERVAL, (*sensor, 1.5), heading, points, flows))
+    columns = [torch.tensor(np.array([part[k] for part in parts])) for k in range(4)]
+    row = torch.arange(len(parts)).repeat_interleave(torch.tensor([len(part[4]) for part in parts]))
+    return Sightings(*columns, *(torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (4, 5)), row)
 
 
 def straight(start: tuple[float, float], speed: float, heading: float, count: int = 20) -> np.ndarray:
@@ -73,6 +76,15 @@ def test_a_box_seen_from_all_sides_is_recovered() -> None:
     assert np.allclose(boxes.motion.position[:, :2], truth[:, :2], atol=0.03)
     assert np.allclose(boxes.motion.position[:, 2], SIZE[2] / 2, atol=1e-6)
     assert np.allclose(np.sin(boxes.heading - truth[:, 2]), 0, atol=0.03)
+
+
+def test_the_heading_of_a_turning_car_is_that_of_its_middle_though_only_its_front_is_seen() -> None:
+    """The visible front moves 12 degrees to the side, because the car turns."""
+    angle = np.linspace(0, np.pi / 4, 20)
+    bend = np.column_stack([8 * np.sin(angle), 8 - 8 * np.cos(angle), angle])
+    boxes = whole_boxes(seen([bend], (20.0, 12.0), lambda index, points: points[points[:, 0] > 1.2]))
+    assert np.abs(np.degrees(boxes.heading.numpy() - bend[:, 2])).max() < 3
+    assert np.allclose(boxes.size[:, 1], SIZE[1], atol=0.1)
 
 
 @pytest.mark.parametrize("speed", [8.0, -8.0])
