@@ -501,9 +501,13 @@ def test_a_trajectory_of_another_rate_is_not_taken_by_number(tmp_path) -> None:
         ArraysLog(tmp_path)
 
 
-def test_poses_that_are_too_rare_are_named(tmp_path) -> None:
+def test_poses_a_second_apart_are_joined_and_rarer_ones_refused(tmp_path) -> None:
     (clouds(tmp_path) / "poses.txt").write_text("\n".join(EXACT[::10]))
-    with pytest.raises(CFlowError, match="has a pose every 1 s; between poses, we interpolate up to 0.5 s"):
+    with pytest.warns(CFlowWarning, match="1 after the last pose; its poses are 1 s apart; data.odometry=refine"):
+        log = ArraysLog(tmp_path)
+    assert np.allclose(log.poses[:, 0, 3], range(11), atol=1e-6) and log.has_sparse_poses
+    (tmp_path / "poses.txt").write_text("\n".join([EXACT[0], line(20, seconds(START + 2 * 10**9))]))
+    with pytest.raises(CFlowError, match="has a pose every 2 s, and we interpolate up to 1.1 s: give more poses"):
         ArraysLog(tmp_path)
 
 

@@ -214,6 +214,13 @@ class BagLog(Log):
             self._opened = (os.getpid(), reader)
         return self._opened[1]
 
+    def close(self) -> None:
+        """Close the bag. A sweep that is read later opens it again."""
+        owner, reader = self._opened
+        if owner == os.getpid():
+            reader.close()
+        self._opened = (0, None)
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": (0, None)}
 
