@@ -112,7 +112,8 @@ def _describe_rate(known: np.ndarray) -> str:
     usual = _longest_gap(known) / _OF_STEPS
     if usual <= _LONGEST_GAP_NS:
         return ""
-    return f"its poses are {usual * 1e-9:.2g} s apart, and we interpolate; if static points move, try data.odometry=refine"
+    fix = "if static points move, try data.odometry=refine"
+    return f"its poses are {usual * 1e-9:.2g} s apart, and we interpolate: {fix}"
 
 
 def _describe_uncovered(source: str, known: np.ndarray, wanted: np.ndarray, covered: np.ndarray) -> str:
