@@ -14,9 +14,8 @@ from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, write_side
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
-from cflow_torch.data.read_as import CHANGES_POINTS
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.readings import WORLD
+from cflow_torch.windows.conventions import OF_POINTS, WORLD
 
 REMOVED_FOLDER = "removed"
 _WRITE_AGAIN = "give overwrite=true to write this log again"
@@ -105,7 +104,7 @@ def _keeps_form(log: Log, suffix: str) -> bool:
     """Test whether the numbers of points in the files of a folder of clouds can stay as they are."""
     own = log.unwrapped
     has_numbers = isinstance(own, ArraysLog) and np.array_equal(own.ego_T_lidar, np.eye(4))
-    return has_numbers and own_suffix(log).lower() == suffix.lower() and CHANGES_POINTS.isdisjoint(log.readings)
+    return has_numbers and own_suffix(log).lower() == suffix.lower() and set(OF_POINTS).isdisjoint(log.readings)
 
 
 def _viewpoint(log: Log, suffix: str) -> str | None:

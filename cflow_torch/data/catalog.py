@@ -15,7 +15,7 @@ from cflow_torch.data.deskewing import DESKEW_CHOICES, DeskewedLog
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.folders import find_folders, visible
-from cflow_torch.data.log import Log, LogWrapper
+from cflow_torch.data.log import CachedLog, Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
 from cflow_torch.data.paths import as_path, exist, is_path_like, remote_errors, safe_name
@@ -27,6 +27,7 @@ from cflow_torch.types import CFlowError, Sweep, Window
 from cflow_torch.windows.deskewing import SCANS
 
 _OF_ALL = ("find_ground", "odometry", "read_as", "own_vehicle", "deskew", "check")  # settings of every data set
+_KEPT = 12  # sweeps that several checks read while a log is opened
 _log = logging.getLogger(__name__)
 
 
@@ -284,6 +285,7 @@ def open_log(
         from cflow_torch.data.odometry import with_poses
 
         log = with_poses(log, refine=odometry == "refine")
+    log = stored = CachedLog(log, _KEPT)
     log = read_log_as(log, read_as)
     if own_vehicle is not None:
         log = OwnVehicleLog(log)
@@ -292,6 +294,7 @@ def open_log(
         log = GroundSegmentedLog(log, find_ground)
     if check:
         check_log(log)
+    stored.stop()
     return log
 
 

@@ -12,7 +12,9 @@ _ROLES = {
     "sec": "(.*stamp)?secs?",
     "nsec": "(.*stamp)?(nsecs?|nanosec)",
     "time": "t|.*time|.*stamp|(time|timestamp|stamp|t)(s|sec|secs|ns|us|ms|unix)",
-    **{axis: f"{_POSITION}({axis}|{name})m?" for axis, name in zip("xyz", ("easting", "northing", "altitude"))},
+    **{axis: f"{_POSITION}({axis}|{name})m?" for axis, name in zip("xyz", ("easting", "northing", "alt(itude)?"))},
+    "latitude": ".*lat(itude)?(deg|degrees|rad|radians)?",
+    "longitude": ".*(lon|lng|longitude)(deg|degrees|rad|radians)?",
     **{f"q{axis}": _ROTATION + axis for axis in "wxyz0123"},
     "roll": ".*roll(deg|degrees|rad|radians)?",
     "pitch": ".*pitch(deg|degrees|rad|radians)?",
@@ -28,7 +30,7 @@ def distinct_names(names: Sequence[str], padding: str = "") -> list[str]:
 
 
 def role_of_name(name: str) -> str | None:
-    """Return what a column holds: time, sec, nsec, x, y, z, qw, qx, qy, qz, roll, pitch or yaw; None = else.
+    """Return what a column holds: a key of `_ROLES`, such as time, x, qw, yaw or latitude; None = else.
 
     q0 to q3 are a quaternion of unknown order.
     """

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper, intervals_of
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.transforms import poses_at, relative_transform, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
@@ -50,10 +50,6 @@ class DeskewedLog(LogWrapper):
             raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
         super().__init__(log)
         self._deskew = deskew
-        self._recent = CachedLog(log, 2)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_recent": CachedLog(self.log, 2)}
 
     @cached_property
     def scan(self) -> str:
@@ -84,7 +80,7 @@ class DeskewedLog(LogWrapper):
         own = self.log.unwrapped
         if own.is_compensated or self.poses is None:
             return ("off",)
-        if self._recent.sweep(0).point_times is None:
+        if self.log.sweep(0).point_times is None:
             return ("off", *DIRECTIONS)
         return ("times", "off") if own.has_raw_times else ("off", "times")
 
@@ -108,7 +104,7 @@ class DeskewedLog(LogWrapper):
 
     def sweep(self, index: int) -> Sweep:
         reading = self.scan
-        sweep = self._recent.sweep(index)
+        sweep = self.log.sweep(index)
         if reading == "off" or sweep.pose is None:
             return sweep
         if reading == "times" != self._deskew and sweep.point_times is None:
@@ -153,7 +149,7 @@ class DeskewedLog(LogWrapper):
     def labels(self, index: int) -> FlowLabels | None:
         labels = self.log.labels(index)
         reading = self.scan
-        stored = self._recent.sweep(index) if labels is not None and reading != "off" else None
+        stored = self.log.sweep(index) if labels is not None and reading != "off" else None
         if labels is None or stored is None or stored.pose is None:
             return labels
         T_ego1_ego0 = self._motion(index)
@@ -176,18 +172,14 @@ class DeskewedLog(LogWrapper):
     def _motion(self, index: int) -> np.ndarray:
         """Return `T_ego1_ego0` of the pair (index, index + 1)."""
         known = self.poses
-        poses = [self._recent.sweep(k).pose if known is None else known[k] for k in (index, index + 1)]
+        poses = [self.log.sweep(k).pose if known is None else known[k] for k in (index, index + 1)]
         return relative_transform(poses[1], poses[0])
 
     @cached_property
     def _gaps(self) -> np.ndarray:
         """(K-1,) float64 seconds from each sweep to the next."""
-        stamp = self._recent.sweep(0).timestamp_ns
-        if stamp is None:
-            return np.full(len(self) - 1, _INTERVAL)
-        unit = 1e-6 if stamp == 1000 * self.timestamps[0] != self.timestamps[0] else 1e-9
-        gaps = np.diff(np.array(self.timestamps, np.int64)) * unit
-        return np.where(gaps > 0, gaps, _INTERVAL)
+        known = intervals_of(self.log)
+        return np.full(len(self) - 1, _INTERVAL) if known is None else np.where(known > 0, known, _INTERVAL)
 
     @cached_property
     def _interval(self) -> float:

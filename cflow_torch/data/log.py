@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Iterator, Mapping, Sequence, TypeVar, overload
+from typing import Any, Callable, Iterator, Mapping, Sequence, TypeVar, overload
 
 import numpy as np
 from torch.utils.data import Dataset
@@ -238,6 +238,15 @@ def known_poses(log: Log) -> np.ndarray | None:
     return np.asarray(poses, np.float64)
 
 
+def intervals_of(log: Log) -> np.ndarray | None:
+    """Return the (K-1,) float64 seconds from each sweep to the next; None = sweeps have no times. Reads one sweep."""
+    stamp = log.sweep(0).timestamp_ns
+    if stamp is None:
+        return None
+    is_in_microseconds = stamp == 1000 * log.timestamps[0] != log.timestamps[0]
+    return np.diff(np.array(log.timestamps, np.int64)) * (1e-6 if is_in_microseconds else 1e-9)
+
+
 def gaps_in(steps: np.ndarray) -> list[int]:
     """Return the indices of sweeps after which none follows for long, from the (K-1,) seconds between sweeps."""
     if not len(steps):
@@ -358,10 +367,18 @@ class CachedLog(LogWrapper):
     def __init__(self, log: Log, count: int) -> None:
         super().__init__(log)
         self._count = count
-        self._sweep = lru_cache(count)(log.sweep)
+        self._sweep: Callable[[int], Sweep] = lru_cache(count)(log.sweep)
 
     def __reduce__(self) -> Any:
         return CachedLog, (self.log, self._count)
 
+    @cached_property
+    def surrounds_poses(self) -> bool:
+        return points_surround_poses(self)
+
     def sweep(self, index: int) -> Sweep:
         return self._sweep(index)
+
+    def stop(self) -> None:
+        """Forget the sweeps, and keep none from now on, so that callers may write into what they get."""
+        self._sweep = self.log.sweep

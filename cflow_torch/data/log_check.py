@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Callable, Iterable, List
+from typing import Callable, Iterable, List, Mapping
 
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
-from cflow_torch.data.log import CachedLog, Log, gaps_in, known_poses
-from cflow_torch.data.log_motion import find_lapses, judge_log
+from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
+from cflow_torch.data.log_motion import Neighbours, find_lapses, judge_log
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
+from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.windows.conventions import OF_POINTS, STILL, WORLD
 from cflow_torch.windows.inspection import REPEATED, repeats
-from cflow_torch.windows.point_frame import OF_POINTS, frame_problem
-from cflow_torch.windows.readings import (
-    LEAST_SHARE,
-    MOUNTS,
-    NO_READING,
-    SCALED,
-    STILL,
-    TURNED,
-    UNKNOWN,
-    WORLD,
-    Judgement,
-)
+from cflow_torch.windows.point_frame import frame_problem
+from cflow_torch.windows.readings import LEAST_SHARE, NO_READING, UNKNOWN, difference
+from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
+# Points of a strip of this half width that are looked for, to within so many metres, and the share that comes again.
+_STRIP, _SAMPLE, _SAME, _ACCUMULATED = 4.0, 1000, 0.001, 0.3
+_LEAST_MOTION = 0.2  # metres between two sweeps, or the sensor stands
+_FEW, _AROUND = 0.5, 5  # least part of the number of points that so many sweeps before and after it have
+_UNEVEN, _EVEN = 0.1, 0.5  # change of the intervals of times from one to the next, and that of the motion over it
+_MOST_DIRECTED = 20_000  # points that show in which directions a sweep measures
 _DIRECTIONS, _LEAST_SHARED = 72, 0.5  # and the share of them in which neighbouring sweeps both measure
 _TOPICS = (
     *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
@@ -49,14 +48,14 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(CachedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _motion, _lapses))
+    findings = _collect(CachedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
 def examine(log: Log) -> list[Finding]:
     """Check everything that `cflow check` shows, in the order of its page.
 
-    Cost: 1 to 2 s, and reads every sweep, to tell those that are missing or damaged.
+    Cost: 1 to 2 s, and reads every sweep, and 20 ms each, to tell those that are missing, damaged or misplaced.
     """
     checks = (
         _sensor,
@@ -65,10 +64,9 @@ def examine(log: Log) -> list[Finding]:
         _times,
         _poses,
         _lapses,
-        _motion,
         _deskew,
         _repeated,
-        _unreadable,
+        _each_sweep,
         _mask,
         _labels,
     )
@@ -94,28 +92,37 @@ def _found(log: Log) -> list[Finding]:
 
 
 def _frame(log: Log) -> list[Finding]:
-    """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame."""
-    places = {"first": 0} if known_poses(log) is not None else {"first": 0, "last": len(log.timestamps) - 1}
-    for name, index in places.items():
-        reading, problem = frame_problem(log.sweep(index).points)
-        if problem:
-            fix = f"; {_setting(log, reading)} converts them" if reading else ""
-            return [Finding("frame", WRONG, f"in the {name} sweep {problem}{fix}", True)]
-    if begins_late(log):
-        text = "the first column does not seem to be x: give x, y, z first, and then others such as intensity or time"
-        return [Finding("frame", WRONG, text, True)]
-    return [Finding("frame", RIGHT, "metres, around the vehicle, z up", True)]
+    """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame.
+
+    Then check the ego motion in the frame that the points will have.
+    """
+    reading, problem = _problem_of(log, 0)
+    where = "first"
+    if not problem and known_poses(log) is None:
+        where, problem = "last", frame_problem(log.sweep(len(log.timestamps) - 1).points)[1]
+    if not problem:
+        right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
+        return [right, *_motion(log, "")]
+    fix = f"; {_setting(log, reading)} converts them" if reading else ""
+    wrong = Finding("frame", WRONG, f"in the {where} sweep {problem}{fix}", True)
+    # In another frame that we do not know, readings of the poses mean nothing.
+    return [wrong, *(_motion(log, reading) if reading or where == "last" else [])]
 
 
-def _motion(log: Log) -> list[Finding]:
-    reading, problem = frame_problem(log.sweep(0).points)
-    if (problem and not reading) or begins_late(log):
-        return []  # in another frame, readings of the poses mean nothing
+def _problem_of(log: Log, index: int) -> tuple[str, str]:
+    reading, problem = frame_problem(log.sweep(index).points)
+    if not problem and begins_late(log):
+        problem = "the first column does not seem to be x: give x, y, z first, and then others such as intensity"
+    return reading, problem
+
+
+def _motion(log: Log, reading: str) -> list[Finding]:
+    """Check the ego motion of a log whose points are converted by a reading; "" = they are right."""
     if reading:  # the poses are judged in the frame that the points will have
         log = ReadAs(log, reading)
     judgement = judge_log(log) if reading else log.judgement or judge_log(log)
     if not judgement.shares:
-        return []
+        return [Finding("ego motion", RIGHT, "not compared, because the sweeps have too little static structure", True)]
     has_poses = log.sweep(0).pose is not None
     if NO_READING in judgement.best and has_poses:
         fits = {name: judge_log(ReadAs(log, name)) for name in OF_POINTS}
@@ -135,22 +142,9 @@ def _motion(log: Log) -> list[Finding]:
         fix += "that the poses belong to this log, their times, units and quaternions" if has_poses else "pass poses"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
-        fix = " or ".join(_fix(log, judgement, each) for each in judgement.best)
+        fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
         fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
-
-
-def _fix(log: Log, judgement: Judgement, name: str) -> str:
-    """Return the setting that reads the log as found."""
-    if name == TURNED:
-        turn = np.degrees(judgement.turn)
-        return f"data.ego_T_lidar with a rotation of about {turn:.0f} degrees about z (data=arrays, hdf5 or bags)"
-    if name == SCALED:
-        return f"positions multiplied by {judgement.scale:.3g}, unless the points have another unit (feet)"
-    if name not in MOUNTS:
-        return _setting(log, name)
-    x, y = MOUNTS[name]
-    return f"data.ego_T_lidar with about {f'x = {x:g} m' if x else f'y = {y:g} m'} (data=arrays, hdf5 or bags)"
 
 
 def _setting(log: Log, reading: str) -> str:
@@ -202,41 +196,109 @@ def _deskew(log: Log) -> list[Finding]:
 
 
 def _repeated(log: Log) -> list[Finding]:
-    first = [log.sweep(index) for index in range(min(3, len(log.timestamps)))]
-    if any(repeats(pc0, pc1) for pc0, pc1 in zip(first, first[1:])):
+    """Compare the first two sweeps and, if they share few directions, also the third one."""
+    first = [log.sweep(index) for index in range(2)]
+    if repeats(*first):
         return [Finding("sweeps", WRONG, REPEATED, True)]
-    seen = [_directions(sweep) for sweep in first]
-    shared = max(float((a & b).sum() / max(min(a.sum(), b.sum()), 1)) for a, b in zip(seen, seen[1:]))
-    if shared < _LEAST_SHARED and all(each.any() for each in seen):
+    again = _share_again(*first)
+    if again > _ACCUMULATED:
+        text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
+        fix = "give the points that each sweep has measured itself, not a map or sweeps that were added up"
+        return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
+    shared = _shared_directions(*first)
+    if shared < _LEAST_SHARED and len(log.timestamps) > 2:
+        shared = max(shared, _shared_directions(first[1], log.sweep(2)))
+    if shared < _LEAST_SHARED:
         text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
         fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
         return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
     return []
 
 
+def _share_again(pc0: Sweep, pc1: Sweep) -> float:
+    """Return the share of points of a sweep that the next one has, too, moved by the ego motion.
+
+    0 if the sensor has poses and stands, because it may measure the same points again.
+    """
+    T = np.eye(4) if pc0.pose is None or pc1.pose is None else relative_transform(pc1.pose, pc0.pose)
+    if pc0.pose is not None and difference(T, np.eye(4)) < _LEAST_MOTION:
+        return 0.0
+    points0, points1 = (as_numpy(sweep.points)[:, :3].astype(np.float64) for sweep in (pc0, pc1))
+    is_in_strip = are_finite(points0) & (np.abs(points0[:, 1]) < _STRIP) & (np.abs(points0[:, 0]) < 5 * _STRIP)
+    if not is_in_strip.any():
+        return 0.0
+    strip = points0[is_in_strip]  # along the vehicle, so that few points are searched
+    moved = transform_points(strip[:: len(strip) // _SAMPLE + 1], T)
+    around = ((points1 > moved.min(0) - _SAME) & (points1 < moved.max(0) + _SAME)).all(axis=1)
+    scale = IN_PLACE / _SAME
+    return Structure(scale * points1[around]).share(scale * moved, np.eye(4))
+
+
+def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
+    """Return the share of the directions of one sweep in which the other has points; 1 if one has no points."""
+    in0, in1 = _directions(pc0), _directions(pc1)
+    return float((in0 & in1).sum() / min(in0.sum(), in1.sum())) if in0.any() and in1.any() else 1.0
+
+
 def _directions(sweep: Sweep) -> np.ndarray:
     """Return in which of 72 directions a sweep has points, (72,) bool."""
-    x, y = as_numpy(sweep.points)[:, :2].astype(np.float64).T
+    points = as_numpy(sweep.points)
+    x, y = points[:: len(points) // _MOST_DIRECTED + 1, :2].astype(np.float64).T
     turns = np.arctan2(y, x)[np.isfinite(x + y)] / (2 * np.pi)
     has_points = np.zeros(_DIRECTIONS, bool)
     has_points[np.floor(turns * _DIRECTIONS).astype(int)] = True  # negative numbers count from the end
     return has_points
 
 
-def _unreadable(log: Log) -> list[Finding]:
-    """Find sweeps that cannot be read, if the first one can."""
-    log.sweep(0)
+def _each_sweep(log: Log) -> list[Finding]:
+    """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
+    log.sweep(0)  # its error is that of the log
+    neighbours = Neighbours()
     errors: dict[int, Exception] = {}
-    for index in range(1, len(log.timestamps)):
+    for index in range(len(log.timestamps)):
         try:
-            log.sweep(index)
+            neighbours.add(log.sweep(index))
         except (CFlowError, OSError) as error:
+            neighbours.add(None)
             errors[index] = error
+    return [*_unreadable(log, errors), *_small(neighbours.num_points), *_misplaced(log, neighbours)]
+
+
+def _unreadable(log: Log, errors: Mapping[int, Exception]) -> list[Finding]:
     if not errors:
         return []
     first = min(errors)
     count = f"{len(errors)} of {len(log.timestamps)} sweeps cannot be read"
-    return [Finding("sweeps", WRONG, f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow")]
+    text = f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow"
+    return [Finding("sweeps", WRONG, text)]
+
+
+def _small(num_points: Mapping[int, int]) -> list[Finding]:
+    counts = np.array(list(num_points.values()))
+    usual = [int(np.median(counts[max(k - _AROUND, 0) : k + _AROUND + 1])) for k in range(len(counts))]
+    few = [k for k, number in enumerate(counts) if number < _FEW * usual[k]]
+    if not few:
+        return []
+    index = list(num_points)[few[0]]
+    text = f"{len(few)} of them have few points, the first is sweep {index} with {num_points[index]:,}"
+    fix = "are their files complete? Else leave these sweeps out"
+    return [Finding("sweeps", WRONG, f"{text}, while those around it have {usual[few[0]]:,}: {fix}")]
+
+
+def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
+    """Find sweeps that repeat the one before, and others that fit neither the sweep before them nor the one after."""
+    findings = []
+    repeated = [index for index in neighbours.repeated if index > 1]  # `_repeated` tells the first
+    if repeated:
+        text = f"{len(repeated)} of them repeat the points of the sweep before, the first is sweep {repeated[0]}"
+        findings.append(Finding("sweeps", WRONG, f"{text}: leave them out, or copy their files again"))
+    known = {lapse.sweep for lapse in find_lapses(log)} | set(repeated)
+    for first, last in neighbours.misplaced(log):
+        if known.isdisjoint(range(first, last + 2)):
+            which = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
+            text = f"{which} not fit those around, which fit one another: has it points or a pose of another time?"
+            findings.append(Finding("sweeps", WRONG, f"{text} Correct its files, or leave it out"))
+    return findings
 
 
 def _sensor(log: Log) -> list[Finding]:
@@ -275,12 +337,9 @@ def _beams(points: np.ndarray) -> tuple[int, float]:
 
 
 def _times(log: Log) -> list[Finding]:
-    if log.sweep(0).timestamp_ns is None:
+    interval = intervals_of(log)
+    if interval is None:
         return [Finding("times", RIGHT, "the sweeps have no times, so motion is known per sweep, not per second")]
-    stamps = np.array([int(stamp) for stamp in log.timestamps])
-    nanoseconds = log.sweep(0).timestamp_ns or stamps[0]
-    unit = 1e-9 * (float(nanoseconds) / float(stamps[0]) if stamps[0] else 1.0)
-    interval = np.diff(stamps) * unit
     usual = float(np.median(interval))
     if usual <= 0 or (interval <= 0).any():
         return [Finding("times", WRONG, "times of sweeps do not ascend: give the time of each sweep")]
@@ -294,7 +353,18 @@ def _times(log: Log) -> list[Finding]:
         return [Finding("times", WRONG, f"{text}: split the log there")]
     if not 0.01 <= usual <= 1:
         return [Finding("times", WRONG, f"{text}: are the times in the unit that the reader expects?")]
+    if _change(interval) > _UNEVEN:
+        text += f", and intervals change by {100 * _change(interval):.0f} % from one to the next"
+        poses = known_poses(log)
+        steps = np.zeros(len(interval)) if poses is None else np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        if np.median(steps) > _LEAST_MOTION and _change(steps) < _EVEN * _change(steps / interval):
+            return [Finding("times", WRONG, f"{text}, but the motion does not: give times of measurement, or none")]
     return [Finding("times", RIGHT, text)]
+
+
+def _change(values: np.ndarray) -> float:
+    """Return the median change from one value to the next, as a part of the median value."""
+    return float(np.median(np.abs(np.diff(values))) / np.median(values)) if len(values) > 1 else 0.0
 
 
 def _poses(log: Log) -> list[Finding]:

@@ -15,14 +15,11 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.point_frame import OF_POINTS
-from cflow_torch.windows.readings import CAUSES, MOUNT, OF_POSES, SHIFTS, STEPS, WORLD
+from cflow_torch.windows.conventions import OF_POINTS, READINGS, TIMES_OF_POSES, WORLD
+from cflow_torch.windows.readings import STEPS
 
-_OF_POSES = [name for name in OF_POSES if not name.startswith(MOUNT)]
 _LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
-CHANGES_POINTS = frozenset(OF_POINTS)
-"""Readings under which the numbers of the points are others than those in the files."""
-READ_AS = ("auto", None, WORLD, *_OF_POSES, *OF_POINTS)
+READ_AS = ("auto", None, *READINGS)
 
 
 def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
@@ -31,28 +28,11 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
     Args:
         log: any log.
         reading: None = as it is. "auto" = the same, unless the points are in the world's frame: then "world". Several
-            are used one after the other. What else is allowed:
-
-            - "world": points are in the world's frame, and we move them to the frame of the vehicle;
-            - "inverted": poses are T_ego_world;
-            - "still": ignore the poses;
-            - "late", "early": the pose of sweep i is at sweep i + 1, or i - 1; those at an end are extrapolated;
-              "half_late", "half_early": it is halfway there; "late_2" to "early_10": it is so many sweeps away;
-            - "steps": each pose is that of a sweep in the frame of the sweep before; "steps_back": it is the inverse;
-            - "camera", "left", "back", "right": the poses are of a frame with other axes than the points': a
-              camera's, or the x axis points to the left, backward or to the right of that of the points; "down": z
-              points down, and y to the right;
-            - "opengl": the same of a camera as in OpenGL (x right, y up, z backward);
-            - "mirrored", "mirrored_back", "swapped": poses or points are left-handed: y or x is mirrored, or both are
-              interchanged;
-            - "transposed": the rotations are those of T_ego_world, the positions those of T_world_ego; "compass":
-              angles count clockwise from the y axis (north), while x is east; "degrees": angles were read as radians;
-            - "w_first", "w_last": quaternions of the poses begin, or end, with w, but were read the other way;
-            - "millimetres", "centimetres", "feet": unit of the poses;
-            - "points_millimetres", "points_centimetres", "points_feet", "points_camera", "points_upside_down": unit or
-              axes of the points (a camera's: x right, y down, z forward; upside down: y to the right). The poses stay,
-              so give ("points_camera", "camera") if they have these axes, too;
-            - "points_spherical": the columns are range, azimuth (counterclockwise) and elevation, radians or degrees.
+            are used one after the other. What else is allowed is a name in `READINGS` of
+            `cflow_torch.windows.conventions`, whose `cause` says what it means, such as "inverted" (poses are
+            T_ego_world), "late" (the pose of sweep i is at sweep i + 1; those at an end are extrapolated), "camera"
+            (axes of the poses), "feet" (unit of the poses) and "points_feet" (unit of the points). The poses stay under
+            a reading of the points, so give ("points_camera", "camera") if both have a camera's axes.
     """
     if isinstance(reading, Sequence) and not isinstance(reading, str):
         for each in reading:
@@ -124,7 +104,7 @@ class ReadAs(LogWrapper):
         return Log.labels(self, index)
 
     def findings(self) -> list[Finding]:
-        what = CAUSES.get(self.reading, f"the log is read as {self.reading}")
+        what = READINGS[self.reading].cause
         said = Finding("frame", RIGHT, f"as you say, {what} (read_as={self.reading})")
         used = f"we move them to that of the vehicle. data.read_as={self.reading} does the same without this line"
         found = Finding("frame", FOUND, f"{what}, so {used}", True)
@@ -137,7 +117,7 @@ class ReadAs(LogWrapper):
     @cached_property
     def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
         given = self.log.trajectory
-        if given is None or self.reading in (*SHIFTS, *STEPS):
+        if given is None or self.reading in (*TIMES_OF_POSES, *STEPS):
             return None
         times, poses = given
         return times, self._convert(poses)
@@ -148,13 +128,15 @@ class ReadAs(LogWrapper):
         return self._convert(np.stack([self._given(index) for index in range(len(self))]))
 
     def _convert(self, poses: np.ndarray) -> np.ndarray:
-        return OF_POSES[self.reading](poses) if self.reading in OF_POSES else poses
+        convert = READINGS[self.reading].of_poses
+        return poses if convert is None else convert(poses)
 
     def _move(self, points: np.ndarray, index: int, pose: Any) -> np.ndarray:
         """Convert points of sweep `index`, (N, 3+), to metres in the frame of the vehicle."""
         if self.reading == WORLD:
             return transform_points(points[:, :3], np.linalg.inv(self._given(index, pose)))
-        return OF_POINTS[self.reading](points) if self.reading in OF_POINTS else points[:, :3]
+        convert = READINGS[self.reading].of_points
+        return points[:, :3] if convert is None else convert(points)
 
     def _given(self, index: int, pose: Any = None) -> np.ndarray:
         if pose is None:

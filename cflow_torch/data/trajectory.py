@@ -9,11 +9,13 @@ import numpy as np
 from cflow_torch.transforms import interpolate_motion, rigid_transform
 from cflow_torch.types import CFlowError
 
-_LONGEST_GAP_NS = 500_000_000  # longest time between two poses over which we interpolate
+# Nanoseconds between two poses over which we interpolate: half a second, or more if poses are regular and rarer.
+_LONGEST_GAP_NS, _LONGEST_STEP_NS, _OF_STEPS = 500_000_000, 1_100_000_000, 1.5
 _FEWEST_COVERED = 0.5  # share of sweeps at a pose, if poses are farther apart than that
 _SECOND = 10**9  # nanoseconds
 _SPARSE = 1.5  # sweep intervals between poses
 _TOLERANCE_NS = 1_000_000  # by which programs round times
+_EARTH = 6378137.0  # metres, radius of the Mercator projection
 
 
 class Trajectory(NamedTuple):
@@ -56,6 +58,13 @@ def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
     return np.stack([rigid_transform(pose, f"pose {row} of {source}") for row, pose in enumerate(poses)])
 
 
+def positions_of_degrees(latitude: np.ndarray, longitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the metres east and north of the first place, (K,) float64 each, by the Mercator projection there."""
+    scale = _EARTH * np.cos(np.radians(latitude[0]))
+    north = scale * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
+    return scale * np.radians(longitude - longitude[0]), north - north[0]
+
+
 def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.ndarray, np.ndarray, str]:
     """Interpolate a trajectory at the times of sweeps, with constant speed and rate of turn between two poses.
 
@@ -68,20 +77,21 @@ def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.n
         and where, "" if all have one. At exactly the time of a pose, the result is this pose, unchanged.
 
     Raises:
-        CFlowError: no sweep has a pose, or poses are mostly more than half a second apart.
+        CFlowError: no sweep has a pose, or poses are mostly more than 1.1 seconds apart.
 
     Convention: a sweep has no pose more than a millisecond before the first pose or after the last one, and within a
-        gap of more than half a second.
+        gap: more than half a second, and one and a half usual steps of the poses.
     """
     known, wanted = np.asarray(trajectory.times_ns), np.asarray(times_ns, np.int64)
     before, after, covered = _neighbours(known, wanted)
-    is_rare = bool(np.median(np.diff(known)) > _LONGEST_GAP_NS) and covered.mean() < _FEWEST_COVERED
+    is_rare = bool(np.median(np.diff(known)) > _longest_gap(known)) and covered.mean() < _FEWEST_COVERED
     if is_rare or not covered.any():
         raise CFlowError(_describe_misfit(trajectory.source, known, wanted))
     left, right, time = before[covered], after[covered], wanted[covered]
     share = np.where(left == right, 0.0, (time - known[left]) / np.maximum(known[right] - known[left], 1))
     poses = interpolate_motion(trajectory.poses[left], trajectory.poses[right], share)
-    return poses, covered, _describe_uncovered(trajectory.source, known, wanted, covered)
+    notes = [_describe_uncovered(trajectory.source, known, wanted, covered), _describe_rate(known)]
+    return poses, covered, "; ".join(filter(None, notes))
 
 
 def _describe_misfit(source: str, known: np.ndarray, wanted: np.ndarray) -> str:
@@ -93,7 +103,17 @@ def _describe_misfit(source: str, known: np.ndarray, wanted: np.ndarray) -> str:
             f"{lag * 1e-9:.6g} s. Both must count from the same time; shift the times of one, or pass no poses"
         )
     rate = np.median(np.diff(known)) * 1e-9
-    return f"{source} has a pose every {rate:.3g} s; between poses, we interpolate up to 0.5 s; {where}"
+    fix = "give more poses, or none and data.odometry=true"
+    return f"{source} has a pose every {rate:.3g} s, and we interpolate up to 1.1 s: {fix}; {where}"
+
+
+def _describe_rate(known: np.ndarray) -> str:
+    """Say that poses are far apart; "" = they are not."""
+    usual = _longest_gap(known) / _OF_STEPS
+    if usual <= _LONGEST_GAP_NS:
+        return ""
+    fix = "if static points move, try data.odometry=refine"
+    return f"its poses are {usual * 1e-9:.2g} s apart, and we interpolate: {fix}"
 
 
 def _describe_uncovered(source: str, known: np.ndarray, wanted: np.ndarray, covered: np.ndarray) -> str:
@@ -105,8 +125,14 @@ def _describe_uncovered(source: str, known: np.ndarray, wanted: np.ndarray, cove
     in_gaps = len(lost) - early - late
     places = ((early, "before the first pose"), (late, "after the last pose"), (in_gaps, "in gaps"))
     where = ", ".join(f"{count} {place}" for count, place in places if count)
-    gaps = f" of more than {_LONGEST_GAP_NS * 1e-9:g} s without poses" if in_gaps else ""
+    gaps = f" of more than {_longest_gap(known) * 1e-9:.2g} s without poses" if in_gaps else ""
     return f"{len(lost)} of {len(wanted)} sweeps have no pose in {source} and are left out: {where}{gaps}"
+
+
+def _longest_gap(known: np.ndarray) -> float:
+    """Return the longest time between two poses over which we interpolate, nanoseconds."""
+    usual = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    return max(_LONGEST_GAP_NS, _OF_STEPS * usual) if usual <= _LONGEST_STEP_NS else _LONGEST_GAP_NS
 
 
 def _neighbours(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -117,7 +143,7 @@ def _neighbours(known: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.n
     """
     after = np.searchsorted(known, wanted).clip(0, len(known) - 1)  # the first pose at the time or after it
     before = np.where(known[after] == wanted, after, after - 1).clip(0)
-    is_far = (wanted < known[0]) | (wanted > known[-1]) | (known[after] - known[before] > _LONGEST_GAP_NS)
+    is_far = (wanted < known[0]) | (wanted > known[-1]) | (known[after] - known[before] > _longest_gap(known))
     nearest = np.where(np.abs(known[after] - wanted) <= np.abs(known[before] - wanted), after, before)
     is_rounded = is_far & (np.abs(known[nearest] - wanted) <= _TOLERANCE_NS)
     before = np.where(is_rounded, nearest, before)

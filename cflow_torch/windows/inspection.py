@@ -13,8 +13,9 @@ from cflow_torch.config import Config
 from cflow_torch.errors import CFlowError, NoActivePoints, warn
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
+from cflow_torch.windows.conventions import INVERTED, STILL, WORLD
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import INVERTED, NO_READING, STILL, UNKNOWN, WORLD, judge, make_pair
+from cflow_torch.windows.readings import INACCURATE, NO_READING, UNKNOWN, judge, make_pair
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import have_same_points
 
@@ -30,6 +31,7 @@ _ADVICE = {
     STILL: "if the clouds are in one frame, leave out the transforms and poses",
     WORLD: "move them to the frame of the vehicle, or leave out the transforms and poses",
     UNKNOWN: "give T_ego1_ego0, or poses, unless most of the scene moves",
+    INACCURATE: "give more exact poses (T_ego1_ego0)",
     NO_READING: "check frame, units and times of the poses (T_ego1_ego0)",
 }
 _ADVICE_ELSE = "convert the poses (T_ego1_ego0) to the frame of the points, in metres"

@@ -2,49 +2,24 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Callable
-
 import numpy as np
 
-from cflow_torch.ground.segmentation import ground_side, has_ground
+from cflow_torch.ground.segmentation import find_ground, ground_side, has_ground
 from cflow_torch.transforms import rotations_about
 from cflow_torch.types import Array, as_numpy
-from cflow_torch.windows.readings import AXES, CAMERA
+from cflow_torch.windows.conventions import READINGS
 
 _FEWEST = 100  # points
 # Extent of the middle nine tenths of the points, in the units of the points. Clouds in metres have 5 to 200.
 _SMALLEST, _LARGEST, _MILLIMETRES = 2.0, 1000.0, 10_000.0
 _FAR = 50.0  # metres; a LiDAR has more than a twentieth of its points nearer than this
 _MOST_POINTS = 20_000
+_NEAR = 30.0  # metres
+# Metres of a sensor above the ground: trucks have up to 4. In feet, cars have 4.5 to 8.
+_HIGHEST_SENSOR, _HIGHEST_IN_FEET = 4.3, 9.0
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
 _FULL = 0.95  # least share of a turn that azimuths of a cloud span
 _TILTS = range(15, 60, 5)  # degrees; without them, ground is found up to a tilt of 14
-
-
-def _from_spherical(points: np.ndarray) -> np.ndarray:
-    """Return x, y, z of range, azimuth and elevation, which are degrees if one is larger than 2 pi."""
-    distance, azimuth, elevation = np.asarray(points[:, :3], np.float64).T
-    if np.nanmax(np.abs(azimuth), initial=0) > _TURN:
-        azimuth, elevation = np.radians(azimuth), np.radians(elevation)
-    flat = distance * np.cos(elevation)
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
-
-
-def _transformed(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return points[:, :3] @ matrix.T  # type: ignore[no-any-return]
-
-
-_TURN = 2 * np.pi + 1e-3
-# Value of `read_as` -> what converts points as stored, (N, 3+), to metres, x forward and z up.
-OF_POINTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "points_millimetres": partial(_transformed, 1e-3 * np.eye(3)),
-    "points_centimetres": partial(_transformed, 1e-2 * np.eye(3)),
-    "points_feet": partial(_transformed, 0.3048 * np.eye(3)),
-    "points_camera": partial(_transformed, AXES[CAMERA]),
-    "points_upside_down": partial(_transformed, AXES["down"]),
-    "points_spherical": _from_spherical,
-}
 
 
 def frame_problem(points: Array) -> tuple[str, str]:
@@ -77,12 +52,22 @@ def frame_problem(points: Array) -> tuple[str, str]:
     if side < 0:
         return "points_upside_down", "z seems to point down, because nearly all points lie below the ground: " + _UP
     is_tall = extent[2] > _FLAT * max(extent[0], extent[1]) and extent[1] < _FLAT * max(extent[0], extent[2])
+    height = -_height_of_ground(positions) if side > 0 and low[2] < -_HIGHEST_SENSOR else 0.0
+    if _HIGHEST_SENSOR < height < _HIGHEST_IN_FEET:
+        feet = f"the ground lies {height:.1f} m below the sensor, or {0.3048 * height:.1f} m if the points are in feet"
+        return "points_feet", f"{feet}: give points in metres"
     if side > 0:
         return "", ""
-    if is_tall and has_ground(positions @ AXES[CAMERA].T):
+    if is_tall and _has_ground_as("points_camera", positions):
         return "points_camera", "the points seem to have a camera's axes (x right, y down, z forward): " + _UP
     tilt = _tilt_of(positions)
     return "", f"the sensor seems to be tilted by about {tilt}: {_UP} (data.ego_T_lidar)" if tilt else ""
+
+
+def _height_of_ground(positions: np.ndarray) -> float:
+    """Return the median height of the ground near the sensor, 0 if there is none."""
+    heights = positions[find_ground(positions, "grid") & (np.hypot(*positions[:, :2].T) < _NEAR), 2]
+    return float(np.median(heights)) if len(heights) else 0.0
 
 
 def _is_spherical(positions: np.ndarray) -> bool:
@@ -91,8 +76,13 @@ def _is_spherical(positions: np.ndarray) -> bool:
     for turn in (2 * np.pi, 360.0):
         is_turn = _FULL * turn <= high[1] - low[1] <= 1.001 * turn and max(-low[1], high[1]) <= 1.001 * turn
         if is_turn and low[0] >= 0 and max(-low[2], high[2]) <= turn / 4:
-            return has_ground(_from_spherical(positions))
+            return _has_ground_as("points_spherical", positions)
     return False
+
+
+def _has_ground_as(reading: str, positions: np.ndarray) -> bool:
+    convert = READINGS[reading].of_points
+    return convert is not None and has_ground(convert(positions))
 
 
 def _tilt_of(positions: np.ndarray) -> str:

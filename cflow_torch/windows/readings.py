@@ -9,197 +9,69 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import accumulate
 from typing import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.transforms import (
-    as_matrix,
-    halfway,
-    rigid_transform,
-    rotations_about,
-    rotations_of,
-    to_quaternions,
-    to_rotations,
-)
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
-from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, STARTS
-from cflow_torch.windows.stillness import Structure, structure_rows
+from cflow_torch.windows.conventions import (
+    MOUNTS,
+    OFF,
+    READINGS,
+    SCAN_READINGS,
+    STILL,
+    TIMES,
+    TIMES_OF_POSES,
+    UNITS,
+    WORLD,
+    Reading,
+    scaled,
+)
+from cflow_torch.windows.deskewing import DIRECTIONS, STARTS
+from cflow_torch.windows.stillness import Structure, cell_keys, structure_rows
 
 GIVEN = "as given"
-OFF, TIMES = "off", "times"  # scans: the points stay, or move by their times
-STILL, WORLD, INVERTED, CAMERA = "still", "world", "inverted", "camera"
 STEPS = ("steps", "steps_back")
-_LATEST = 10  # sweeps
-SHIFTS: dict[str, float] = {"half_late": 0.5, "half_early": -0.5, "late": 1, "early": -1}
-SHIFTS.update({f"{name}_{k}": SHIFTS[name] * k for k in range(2, _LATEST + 1) for name in ("late", "early")})
-"""Readings of poses of another time, and how many sweeps later the pose is that is right."""
-MOUNT, UNKNOWN, TURNED, SCALED, NO_READING = "mount", "unknown", "turned", "scaled", "none"
-_FRAME = "the poses are of a frame whose"
-# What each reading says. The settings are values of `read_as` in `cflow_torch.data.catalog.open_log`.
-CAUSES = {
-    WORLD: "the points are in the world's frame",
-    INVERTED: "the poses are inverted (T_ego_world instead of T_world_ego), or the sweeps are interchanged",
-    STILL: "the static world stands still without the poses, so they are of another log, or the points are compensated",
-    "half_late": "the poses are half a sweep late (or the times of the sweeps are half a sweep early)",
-    "half_early": "the poses are half a sweep early (or the times of the sweeps are half a sweep late)",
-    **{
-        name: f"the poses are {('early', 'late')[by > 0]} (sweep i has the pose of sweep i {'+-'[by > 0]} {abs(by)})"
-        for name, by in SHIFTS.items()
-        if abs(by) >= 1
-    },
-    "steps": "the poses are steps (each is that of a sweep in the frame of the sweep before)",
-    "steps_back": "the poses are steps (each maps the sweep before to the frame of the sweep)",
-    CAMERA: "the poses are of a camera (x right, y down, z forward)",
-    "opengl": "the poses are of a camera as in OpenGL (x right, y up, z backward)",
-    "mirrored": "the y axis of the points or that of the poses is mirrored (left-handed)",
-    "mirrored_back": "the x axis of the points or that of the poses is mirrored (left-handed)",
-    "swapped": "x and y of the points or of the poses are interchanged (left-handed)",
-    "transposed": "the rotations of the poses are transposed, but not their positions",
-    "compass": "the angles of the poses are compass headings (clockwise from north)",
-    "degrees": "the angles of the poses are degrees, but were read as radians",
-    "left": f"{_FRAME} x axis points to the left of the points' x axis",
-    "back": f"{_FRAME} x axis points backward",
-    "right": f"{_FRAME} x axis points to the right of the points' x axis",
-    "down": f"{_FRAME} z axis points down (x forward, y right)",
-    "w_first": "the quaternions of the poses begin with w, but were read with w last",
-    "w_last": "the quaternions of the poses end with w, but were read with w first",
-    "millimetres": "the poses are in millimetres",
-    "centimetres": "the poses are in centimetres",
-    "feet": "the poses are in feet",
-}
-# ego_T_stored of frames with other axes: x, y and z of the stored frame, as columns.
-AXES = {
-    CAMERA: np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float),  # x right, y down, z forward
-    "opengl": np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]], float),  # x right, y up, z backward
-    "left": np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], float),  # x to the left of the vehicle
-    "back": np.diag([-1.0, -1.0, 1.0]),
-    "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
-    "down": np.diag([1.0, -1.0, -1.0]),  # x forward, y right, z down, as of inertial units
-}
-_MIRRORED = {  # the same of left-handed frames
-    "mirrored": np.diag([1.0, -1.0, 1.0]),
-    "mirrored_back": np.diag([-1.0, 1.0, 1.0]),
-    "swapped": np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1]], float),
-}
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
+# Readings that are no conventions: they follow from the points.
+UNKNOWN, TURNED, SCALED, INACCURATE, NO_READING = "unknown", "turned", "scaled", "inaccurate", "none"
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
+_MOST_AROUND = 5000  # points that tell what they lie around
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
 _NEAR_GIVEN = 0.7  # share of a reading over that as given
-_FEWEST_POINTS = 150  # of source and target; fewer do not show anything
+FEWEST_POINTS = 150  # of source and target; fewer do not show anything
 _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
 _LEAST_MOTION, _ARM = 0.2, 20.0  # metres; poses that move points 20 m away by less do not show anything
 LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 _LEAST_DIFFERENCE = 0.05  # metres; a pair shows only the readings that move these points otherwise by this
-# The best share must exceed the share as given by this factor (`_MARGINS` has others), and be at least `LEAST_SHARE`.
-_MARGIN = 1.3
-LEAST_SHARE = 0.1
+LEAST_SHARE = 0.1  # of a reading that is better than as given
 _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most, or half of what this has
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
 _EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
+_OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
+_EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
 _OBLIQUE = np.radians(10)  # least angle between axes that are turned and those with a name
-_RESCALED = 1.1  # least factor between motions of another scale
-_HOPELESS = 0.04  # nothing fits if the share as given is below this
+_RESCALED = 1.05  # least factor between motions of another scale
+_DOUBTFUL = 0.15  # share of a pair as given, below which its motion is compared with that under which the points fit
+# Metres of such a motion from that of the poses. Less in all pairs is within the cells of the search; more, or more
+# than half of the motion, is more than an error of measurement.
+_SMALLEST_ERROR, _LARGEST_ERROR = 0.08, 1.5
+# Nothing fits if the share as given is below this. Of so few points of structure, no more fit under right poses.
+_HOPELESS, _TOO_FEW = 0.04, 600
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
 # The search for an unknown motion correlates occupied cells of a square.
 _CELL, _CELLS = 0.1, 640  # metres, and cells along a side
 _TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4]).tolist()
-_FARTHEST_SHIFT = 5.0  # metres
+_WITHIN_CELL = np.array([(x, y) for x in (0, -0.5, 0.5) for y in (0, -0.5, 0.5)]) * _CELL
+_SMALL_TURNS = np.radians([0, -0.5, 0.5, -1, 1]).tolist()
+_FARTHEST_SHIFT = 7.0  # metres
 
 
-_OfPoses = Callable[[np.ndarray], np.ndarray]
-
-
-def _scaled(unit: float) -> _OfPoses:
-    return lambda poses: as_matrix(poses[..., :3, :3], unit * poses[..., :3, 3])
-
-
-def _reordered(order: Sequence[int]) -> _OfPoses:
-    return lambda poses: as_matrix(to_rotations(to_quaternions(poses[:, :3, :3])[:, order]), poses[:, :3, 3])
-
-
-def _mirrored(axes: np.ndarray) -> _OfPoses:
-    mirror = as_matrix(axes)
-    return lambda poses: mirror @ poses @ mirror
-
-
-def _moved(stored_T_ego: np.ndarray) -> _OfPoses:
-    return lambda poses: poses @ stored_T_ego
-
-
-def _transposed(axes: np.ndarray) -> _OfPoses:
-    return lambda poses: as_matrix(axes @ poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3])
-
-
-def _from_degrees(poses: np.ndarray) -> np.ndarray:
-    """Return poses whose angles were degrees, but were read as radians. Neighbours differ by less than pi."""
-    r = poses[:, :3, :3]
-    roll = np.arctan2(r[:, 2, 1], r[:, 2, 2])
-    pitch = -np.arcsin(r[:, 2, 0].clip(-1, 1))
-    yaw = np.arctan2(r[:, 1, 0], r[:, 0, 0])
-    return as_matrix(rotations_of(np.radians(np.unwrap((roll, pitch, yaw)))), poses[:, :3, 3])
-
-
-def _later(by: float) -> _OfPoses:
-    """Return what gives each sweep the pose `by` sweeps later. Beyond the ends, the motion continues."""
-
-    def convert(poses: np.ndarray) -> np.ndarray:
-        if abs(by) < 1:
-            return halfway(poses, _later(np.sign(by))(poses))
-        rows = np.arange(len(poses)) + int(by)
-        moved = poses[rows.clip(0, len(poses) - 1)]
-        for row in np.flatnonzero((rows < 0) | (rows >= len(poses))):
-            end, before = (0, 1) if by < 0 else (-1, -2)
-            step = np.linalg.inv(poses[before]) @ poses[end]
-            beyond = -rows[row] if by < 0 else rows[row] - len(poses) + 1
-            moved[row] = poses[end] @ np.linalg.matrix_power(step, int(beyond))
-        return moved
-
-    return convert
-
-
-def _joined(poses: np.ndarray) -> np.ndarray:
-    return np.array(list(accumulate(poses, np.matmul)))
-
-
-MOUNTS = {  # name -> x and y of the points' origin in the frame of the poses, metres
-    f"{MOUNT} {x:g} {y:g}": (x, y)
-    for size in (0.7, 1.4, 2.7, 4.0)
-    for x, y in ((size, 0), (-size, 0), (0, size), (0, -size))
-}
-# Reading -> what converts the poses of consecutive sweeps as given, (K, 4, 4) float64, to `T_world_ego`.
-OF_POSES: dict[str, _OfPoses] = {
-    STILL: lambda poses: np.tile(np.eye(4), (len(poses), 1, 1)),
-    INVERTED: np.linalg.inv,
-    **{name: _later(by) for name, by in SHIFTS.items()},
-    STEPS[0]: _joined,
-    STEPS[1]: lambda poses: _joined(np.linalg.inv(poses)),
-    **{name: _mirrored(axes) for name, axes in _MIRRORED.items()},
-    "transposed": _transposed(np.eye(3)),
-    "compass": _transposed(AXES["left"]),
-    "degrees": _from_degrees,
-    **{name: _moved(as_matrix(AXES[name].T)) for name in AXES},
-    **{name: _reordered(order) for name, order in (("w_first", (1, 2, 3, 0)), ("w_last", (3, 0, 1, 2)))},
-    **{name: _scaled(unit) for name, unit in _UNITS.items()},
-    **{name: _moved(as_matrix(np.eye(3), (*offset, 0))) for name, offset in MOUNTS.items()},
-}
-# Readings that differ little from another one, and the opposite mistakes: if the one is right, the other doubles it.
-_OPPOSITES = {
-    **{name: name.replace("late", "early") if by > 0 else name.replace("early", "late") for name, by in SHIFTS.items()},
-    **{name: f"{MOUNT} {0 - x:g} {0 - y:g}" for name, (x, y) in MOUNTS.items()},
-    **{scan: next(other for other in DIRECTIONS if not scan.startswith(other)) for scan in SCANS},
-}
-# Small mistakes make a small difference. Vehicles of the same speed stand still without the ego motion: up to 1.56.
-_MARGINS = {
-    **dict.fromkeys((WORLD, OFF, TIMES, "half_late", "half_early", *SCANS, *MOUNTS), 1.1),
-    **dict.fromkeys((STILL, *_UNITS), 1.7),
-    # up to 0.99 for right poses, as they change little on a straight road
-    **dict.fromkeys(("down", *_MIRRORED), 1.15),
-}
+_OF_POSES = {name: reading.of_poses for name, reading in {**READINGS, **MOUNTS}.items() if reading.of_poses}
+_COMPARED = {**READINGS, **MOUNTS, **SCAN_READINGS}
 
 
 class ScannedStructure:
@@ -207,7 +79,7 @@ class ScannedStructure:
 
     def __init__(self, points: Callable[[str], np.ndarray]) -> None:
         self.points = lru_cache(None)(points)
-        self.structure = lru_cache(None)(lambda scan: Structure(points(scan)))
+        self.structure = lru_cache(None)(lambda scan: Structure(self.points(scan)))
 
 
 @dataclass(frozen=True)
@@ -257,9 +129,7 @@ class Judgement:
 
     shares: dict[str, float]  # reading -> 0 ... 1; empty = nothing could be compared
     best: tuple[str, ...] = ()  # readings of the poses that fit clearly better than as given; equal ones together
-    motion: np.ndarray | None = None  # of `UNKNOWN`: T_target_source of the first pair
-    turn: float = 0.0  # of `TURNED`: azimuth of the points' x axis in the frame of the poses, radians
-    scale: float = 1.0  # of `SCALED`: length of the motion of the points over that of the poses
+    found: Mapping[str, Reading] = field(default_factory=dict)  # readings that follow from these points
     scan: str = ""  # the scan under which this holds; "" = not compared
     shares_of_scans: Mapping[str, float] = field(default_factory=dict)
 
@@ -268,31 +138,19 @@ class Judgement:
         """Share of structure in place as given, NaN = nothing could be compared."""
         return self.shares.get(GIVEN, float("nan"))
 
+    def reading(self, name: str) -> Reading:
+        """Return what a reading means."""
+        return self.found[name] if name in self.found else _COMPARED[name]
+
     def __str__(self) -> str:
         """What is wrong, "" = nothing."""
         if not self.best:
             return ""
-        name = self.best[0]
-        share = f"({self.given:.2f} of the static structure is in place as given, {self.shares.get(name, 0):.2f} then)"
-        if name == NO_READING:
+        if self.best == (NO_READING,):
             return f"the sweeps fit under no reading (only {self.given:.2f} of the static structure is in place)"
-        if self.motion is not None:
-            return f"the sensor moves by about {np.hypot(*self.motion[:2, 3]):.1f} m between two sweeps {share}"
-        return f"{', or '.join(map(self._cause, self.best))} {share}"
-
-    def _cause(self, name: str) -> str:
-        if name == TURNED:
-            side = "left" if self.turn > 0 else "right"
-            return (
-                f"the points' x axis points about {abs(np.degrees(self.turn)):.0f} degrees to the {side} of the poses'"
-            )
-        if name == SCALED:
-            return f"the positions of the poses are {1 / self.scale:.3g} times as long as the motion of the points"
-        if name not in MOUNTS:
-            return CAUSES[name]
-        x, y = MOUNTS[name]
-        where = f"{abs(x):g} m {'behind' if x < 0 else 'ahead of'}" if x else f"{abs(y):g} m beside"
-        return f"the points' origin is about {where} that of the poses"
+        share = self.shares.get(self.best[0], 0)
+        causes = ", or ".join(self.reading(name).cause for name in self.best)
+        return f"{causes} ({self.given:.2f} of the static structure is in place as given, {share:.2f} then)"
 
 
 def _as_it_is(sweep: Sweep, rows: np.ndarray, scan: str) -> np.ndarray:
@@ -323,10 +181,11 @@ def make_pair(
     if in_world is None:
         in_world = has_poses and is_around(pc1.points, poses[1])
     centre = poses[1, :3, 3] if in_world else np.zeros(3)
-    clouds = [_cloud(sweep, centre, move) for sweep, move in zip((pc0, pc1), deskew)]
-    num_points = [len(cloud.points(OFF)) for cloud in clouds]
-    if min(num_points) < _FEWEST_POINTS or _num_blocks(clouds[0].points(OFF)) < _FEWEST_BLOCKS:
+    rows_of = [structure_rows(sweep, centre) for sweep in (pc0, pc1)]
+    if min(map(len, rows_of)) < FEWEST_POINTS or _num_blocks(_as_it_is(pc0, rows_of[0], OFF)) < _FEWEST_BLOCKS:
         return None
+    rows_of[0] = rows_of[0][: _TIMED_POINTS if TIMES in scans else _MOST_POINTS]
+    clouds = [_cloud(*each, centre) for each in zip((pc0, pc1), rows_of, deskew)]
     transforms = _transforms(poses if around is None else around, rows) if has_poses else {GIVEN: np.eye(4)}
     if in_world:
         transforms = {name: _about(centre, T) for name, T in transforms.items()}
@@ -335,16 +194,17 @@ def make_pair(
     return Pair(clouds[0], clouds[1], transforms, tuple(scans), has_motion)
 
 
-def _cloud(sweep: Sweep, centre: np.ndarray, move: Callable[[Sweep, np.ndarray, str], np.ndarray]) -> ScannedStructure:
-    rows = structure_rows(sweep, centre)
+def _cloud(
+    sweep: Sweep, rows: np.ndarray, move: Callable[[Sweep, np.ndarray, str], np.ndarray], centre: np.ndarray
+) -> ScannedStructure:
     return ScannedStructure(lambda scan: (_as_it_is if scan == OFF else move)(sweep, rows, scan) - centre)
 
 
 def _transforms(poses: np.ndarray, rows: tuple[int, int]) -> dict[str, np.ndarray]:
     """Return T_1_0 of two rows of poses, (L, 4, 4), under each reading that moves points otherwise than as given."""
     T = _between(poses, rows)
-    read = {name: _between(convert(poses), rows) for name, convert in OF_POSES.items()}
-    for name in _UNITS:  # under them the vehicle still moves, else they say no more than `STILL`
+    read = {name: _between(convert(poses), rows) for name, convert in _OF_POSES.items()}
+    for name in UNITS:  # under them the vehicle still moves, else they say no more than `STILL`
         if np.linalg.norm(read[name][:3, 3]) < _LEAST_DIFFERENCE:
             del read[name]
     shown = {name: other for name, other in read.items() if name == STILL or difference(T, other) >= _LEAST_DIFFERENCE}
@@ -371,16 +231,18 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     fast = [pair for pair in moving if len(pair.scans) > 1]
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
-    turn, scale = 0.0, 1.0
-    if np.mean([each[GIVEN] for each in of_pairs]) < LEAST_SHARE and not any(WORLD in each for each in of_pairs):
-        turn, scale, of_similar = _find_similarity(moving)
-        of_pairs = [{**each, **similar} for each, similar in zip(of_pairs, of_similar)]
+    found: dict[str, Reading] = {}
+    if min(each[GIVEN] for each in of_pairs) < _DOUBTFUL and not any(WORLD in each for each in of_pairs):
+        found, of_found = _compare_motions(moving, scan)
+        of_pairs = [{**each, **more} for each, more in zip(of_pairs, of_found)]
     shares, clear = _compare(of_pairs)
-    judgement = Judgement(shares, turn=turn, scale=scale, scan=scan, shares_of_scans=shares_of_scans)
+    judgement = Judgement(shares, found=found, scan=scan, shares_of_scans=shares_of_scans)
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return replace(judgement, best=(WORLD,))
     if clear or shares[GIVEN] >= _HOPELESS:
         return replace(judgement, best=_equals(clear, shares))
+    if np.median([len(pair.source.points(OFF)) for pair in moving]) < _TOO_FEW:
+        return Judgement({})
     # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
     is_hopeless = len(moving) > 1 or bool(_judge_motion(moving).best)
     return replace(judgement, best=(NO_READING,)) if is_hopeless else judgement
@@ -389,41 +251,77 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
 def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...]:
     """Return the best of the readings, best first, and those that are about as good; small mistakes only with others.
 
-    Of mountings and of times, only one is named, and no factor beside a reading.
+    Of mountings and of times, only one is named. Other motions in each pair are named only if they fit clearly better.
     """
-    best = [name for name in clear if shares[name] >= _EQUAL * shares[clear[0]]]
-    best = [name for name in best if (name in _OPPOSITES) == (clear[0] in _OPPOSITES)]
-    others = [name for kind in (MOUNTS, SHIFTS) for name in [name for name in best if name in kind][1:]]
-    return tuple(name for name in best if name not in others and (name != SCALED or name == best[0]))
+    named = [name for name in clear if name != INACCURATE]
+    if len(named) < len(clear) and shares[INACCURATE] > _EXCUSE * max([shares[name] for name in named], default=0):
+        return (INACCURATE,)
+    best = [name for name in named if shares[name] >= _EQUAL * shares[named[0]]]
+    best = [name for name in best if name == SCALED or _is_small(name) == _is_small(best[0])]
+    others = [name for kind in (MOUNTS, TIMES_OF_POSES) for name in [name for name in best if name in kind][1:]]
+    return tuple(name for name in best if name not in others)
 
 
-def _find_similarity(pairs: Sequence[Pair]) -> tuple[float, float, list[dict[str, float]]]:
-    """Return how the motion under which the points fit best is turned, and its length, against that of the poses.
+def _is_small(name: str) -> bool:
+    return name in _COMPARED and _COMPARED[name].opposite != ""
+
+
+def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Reading], list[dict[str, float]]]:
+    """Compare the motions of the poses with those under which the points fit.
+
+    They may be turned by an angle, or longer or shorter; turns by nearly a multiple of 90 degrees are left out, because
+    such readings have names. Or each pair has another small error.
 
     Returns:
-        The azimuth of the points' x axis in the frame of the poses, radians; the length over that of the poses; and for
-        each pair the share under `TURNED`, unless it is nearly a multiple of 90 degrees, because such readings have
-        names, and under `SCALED`, unless it is near 1.
+        These readings, and for each pair the shares under those of them that it shows.
     """
-    product, square = 0j, 0.0
-    for pair in pairs:
-        given = pair.transforms[GIVEN]
-        source = pair.source.points(OFF)[:_MOST_POINTS] @ given[:3, :3].T  # a turn of the axes keeps rotations about z
-        motion = find_motion(source, pair.target.points(OFF), turns=(0.0,))
-        product += complex(*given[:2, 3]) * complex(*motion[:2, 3]).conjugate()
-        square += abs(complex(*given[:2, 3])) ** 2
-    turn, scale = float(np.angle(product)), float(abs(product) / max(square, 1e-9))
+    motions = [_motion_of(pair, scan) for pair in pairs]
+    steps = [pair.transforms[GIVEN] for pair in pairs]
+    given, fitted = (np.array([complex(*T[:2, 3]) for T in each]) for each in (steps, motions))
+    product = complex(given @ fitted.conj())
+    turn, scale = float(np.angle(product)), float(abs(product) / max(np.sum(np.abs(given) ** 2), 1e-9))
+    degrees = np.degrees(turn)
     Y = as_matrix(rotations_about(2, turn))
     found = {}
     if abs((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4) > _OBLIQUE:
-        found[TURNED] = lambda T: Y.T @ T @ Y
+        side = "left" if turn > 0 else "right"
+        found[TURNED] = Reading(
+            f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'",
+            lambda T: Y.T @ T @ Y,
+            fix=f"data.ego_T_lidar with a rotation of about {degrees:.0f} degrees about z (data=arrays, hdf5 or bags)",
+        )
     if scale > _RESCALED or 1e-9 < scale < 1 / _RESCALED:
-        found[SCALED] = _scaled(scale)
-    read = [
-        {name: replace(p, transforms={GIVEN: f(p.transforms[GIVEN])}).share(OFF) for name, f in found.items()}
-        for p in pairs
-    ]
-    return turn, scale, read
+        found[SCALED] = Reading(
+            f"the positions of the poses are {1 / scale:.3g} times as long as the motion of the points",
+            scaled(scale),
+            fix=f"positions multiplied by {scale:.3g}, unless the points have another unit (feet)",
+        )
+    errors = [float(np.linalg.norm((motion - step)[:2, 3])) for motion, step in zip(motions, steps)]
+    found[INACCURATE] = Reading(
+        f"the poses are off, by up to {max(errors):.1f} m between two sweeps",
+        fix="exact poses and times, or data.odometry=refine if they are noisy",
+    )
+    of_pairs = []
+    for pair, step, motion, error in zip(pairs, steps, motions, errors):
+        read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
+        shares = {name: replace(pair, transforms={GIVEN: T}).share(scan) for name, T in read.items()}
+        if max(errors) > _SMALLEST_ERROR and error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
+            share = replace(pair, transforms={GIVEN: motion}).share(scan)
+            shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
+        of_pairs.append(shares)
+    return found, of_pairs
+
+
+def _motion_of(pair: Pair, scan: str) -> np.ndarray:
+    """Return the motion of a pair under which its points fit, with about the rotation of the poses, (4, 4) float64."""
+    rotation = pair.transforms[GIVEN].copy()
+    rotation[:2, 3] = 0
+    source = transform_points(pair.source.points(scan)[:_MOST_POINTS], rotation)
+    motion = find_motion(source, pair.target.points(scan), _SMALL_TURNS)
+    nearby = np.tile(motion, (len(_WITHIN_CELL), 1, 1))
+    nearby[:, :2, 3] += _WITHIN_CELL
+    shares = pair.target.structure(scan).shares(source, nearby)
+    return nearby[int(shares.argmax())] @ rotation
 
 
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
@@ -442,6 +340,9 @@ def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
     direction, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
     if direction in DIRECTIONS and shares[direction] >= _TURN * max(shares[scan] for scan in opposite):
         starts = [direction + start for start in STARTS]
+        # A start that is clearly better is so in each pair, so the first pair rules out most.
+        of_first = pairs[0].shares_of_scans(starts)
+        starts = [start for start in starts if start == direction or of_first[start] > of_first[direction]]
         of_pairs = [{**pair.shares_of_scans(starts), **each} for pair, each in zip(pairs, of_pairs)]
         of_starts, clear = _compare(of_pairs, expected)
         _, better = _compare([{start: each[start] for start in starts} for each in of_pairs], direction)
@@ -467,7 +368,11 @@ def _judge_motion(pairs: Sequence[Pair]) -> Judgement:
         of_pairs.append(replace(pair, transforms=given).shares_of_poses(OFF))
     # Where a motion was not found, the vehicle may stand.
     shares, clear = _compare([each for each in of_pairs if UNKNOWN in each] or of_pairs)
-    return Judgement(shares, tuple(clear), motions[0] if clear else None)
+    if not clear:
+        return Judgement(shares)
+    distance = np.hypot(*motions[0][:2, 3])
+    moves = Reading(f"the sensor moves by about {distance:.1f} m between two sweeps")
+    return Judgement(shares, tuple(clear), {UNKNOWN: moves})
 
 
 def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tuple[dict[str, float], list[str]]:
@@ -490,8 +395,10 @@ def _compare(of_pairs: Sequence[Mapping[str, float]], given: str = GIVEN) -> tup
         gains[name] = float(share / max(as_given, 1e-9))
         if share >= LEAST_SHARE and all(each[name] > each[given] for each in of_pairs if name in each):
             better.append(name)
-    clear = [name for name in better if gains[name] >= _MARGINS.get(name, _MARGIN)]
-    clear = [name for name in clear if gains.get(_OPPOSITES.get(name, ""), 0) <= max(_OPPOSITE, gains[name] / 2)]
+    others = {INACCURATE: Reading("", margin=_OF_ERRORS)}
+    known = {name: {**others, **_COMPARED}.get(name, Reading("")) for name in better}
+    clear = [name for name in better if gains[name] >= known[name].margin]
+    clear = [name for name in clear if gains.get(known[name].opposite, 0) <= max(_OPPOSITE, gains[name] / 2)]
     return shares, sorted(clear, key=gains.__getitem__, reverse=True)
 
 
@@ -537,7 +444,7 @@ def is_around(points: Array, pose: np.ndarray) -> bool:
     position = pose[:2, 3]
     if np.linalg.norm(position) < LEAST_DISTANCE:
         return False
-    xy = as_numpy(points)[:, :2].astype(np.float64)
+    xy = as_numpy(points)[:: len(points) // _MOST_AROUND + 1, :2].astype(np.float64)
     xy = xy[np.isfinite(xy).all(1)]
     if len(xy) == 0:
         return False
@@ -553,7 +460,9 @@ def difference(T: np.ndarray, other: np.ndarray) -> float:
 
 def _num_blocks(points: np.ndarray) -> int:
     """Return how many blocks of 5 m in the plane hold points."""
-    return len(np.unique(np.floor(points[:, :2] / _BLOCK), axis=0))
+    block = np.floor(points / _BLOCK).astype(np.int64)
+    block[:, 2] = 0
+    return len(np.unique(cell_keys(block)))
 
 
 def _about(centre: np.ndarray, T: np.ndarray) -> np.ndarray:

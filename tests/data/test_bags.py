@@ -105,7 +105,7 @@ def test_poses_of_a_bag_may_lie_next_to_it(recording: TinyRecording, tmp_path: P
     rows = np.column_stack([recording.poses[:, :3, 3], quaternions])
     lines = [f"{t // 10**9}.{t % 10**9:09d} " + " ".join(map(str, row)) for t, row in zip(recording.timestamps, rows)]
     (tmp_path / "tum.txt").write_text("\n".join(lines))
-    with pytest.warns(CFlowWarning, match="it has no poses, so we take those of .*tum.txt"):
+    with pytest.warns(CFlowWarning, match="its poses are those of .*tum.txt"):
         log: Any = BagLog(path)
     assert np.allclose(log.poses, recording.poses, atol=1e-6)
     (tmp_path / "tum.txt").rename(tmp_path / "other.tum")

@@ -12,6 +12,7 @@ from PIL import Image
 
 from cflow_torch.data.catalog import find_sources, open_log, recognise
 from cflow_torch.data.kitti import KITTILog, find_kitti_drives
+from cflow_torch.transforms import rotations_about
 from cflow_torch.types import CFlowError, CFlowWarning
 
 STEP, CAR = 0.4, 0.7  # metres a sweep: the vehicle, and the car in the world
@@ -72,6 +73,34 @@ def write_raw(folder: Path, count: int = 3, first: int = 0) -> Path:
     (day / "calib_velo_to_cam.txt").write_text(f"calib_time: 15-Mar-2012 11:37:16\n{rigid}delta_f: 0 0\n")
     camera = f"corner_dist: 9.95e-02\nR_rect_00: {text(np.eye(3))}\nP_rect_02: {text(PROJECTION)}\n"
     (day / "calib_cam_to_cam.txt").write_text(camera)
+    return folder
+
+
+def write_kitti360(root: Path, of_camera: bool) -> Path:
+    """Four sweeps; the first has no pose. Poses are of the IMU, or of the rectified camera 0."""
+    name = "2013_05_28_drive_0000_sync"
+    folder = root / "data_3d_raw" / name
+    write_clouds(folder / "velodyne_points" / "data", 4, "{:010d}")
+    lines = [f"2013-05-28 08:46:02.{100_000_000 + 103_000_000 * index:09d}\n" for index in range(4)]
+    (folder / "velodyne_points" / "timestamps.txt").write_text("".join(lines))
+    rectified = np.eye(4)
+    rectified[:3, :3] = rotations_about(1, 0.01)
+    T_pose_lidar = rectified @ T_CAMERA_LIDAR if of_camera else np.linalg.inv(T_LIDAR_IMU)
+    (root / "calibration").mkdir()
+    calibration = root / "calibration"
+    (calibration / "calib_cam_to_velo.txt").write_text(text(np.linalg.inv(T_CAMERA_LIDAR)[:3]) + "\n")
+    (calibration / "perspective.txt").write_text(f"R_rect_00: {text(rectified[:3, :3])}\n")
+    if not of_camera:
+        T_imu_camera = T_pose_lidar @ np.linalg.inv(T_CAMERA_LIDAR)
+        (calibration / "calib_cam_to_pose.txt").write_text(f"image_00: {text(T_imu_camera[:3])}\n")
+    lines = []
+    for index in (1, 2, 3):
+        T_world_lidar = np.eye(4)
+        T_world_lidar[:3, 3] = 900 + STEP * index, 3700, 110
+        pose = T_world_lidar @ np.linalg.inv(T_pose_lidar)
+        lines.append(f"{index} {text(pose if of_camera else pose[:3])}\n")
+    (root / "data_poses" / name).mkdir(parents=True)
+    (root / "data_poses" / name / ("cam0_to_world.txt" if of_camera else "poses.txt")).write_text("".join(lines))
     return folder
 
 
@@ -160,6 +189,22 @@ def test_a_lost_sweep_keeps_the_others_at_their_times_and_poses(tmp_path: Path) 
     log = KITTILog(folder)
     assert np.diff(log.timestamps).tolist() == [206_000_000]
     assert np.allclose(np.linalg.inv(log.poses[0]) @ log.poses[1], step_pose() @ step_pose(), atol=1e-5)
+
+
+@pytest.mark.parametrize("of_camera", [False, True])
+def test_kitti_360_has_its_poses_in_another_folder_by_the_numbers_of_sweeps(tmp_path: Path, of_camera: bool) -> None:
+    folder = write_kitti360(tmp_path, of_camera)
+    assert recognise(tmp_path) == "kitti"
+    (source,) = find_sources("kitti", tmp_path)
+    with pytest.warns(CFlowWarning, match="1 of 4 sweeps have no pose"):
+        log: Any = open_log("kitti", source, check=False)
+    assert [file.stem for file in log.files] == [f"{index:010d}" for index in (1, 2, 3)]
+    assert np.allclose(log.poses[0], [[1, 0, 0, 900 + STEP], [0, 1, 0, 3700], [0, 0, 1, 110], [0, 0, 0, 1]], atol=1e-6)
+    assert np.allclose(np.linalg.inv(log.poses[0]) @ log.poses[1], step_pose(), atol=1e-6)
+    assert log.sweep(2).timestamp_ns == log.timestamps[2] and np.diff(log.timestamps).tolist() == [103_000_000] * 2
+    (tmp_path / "calibration" / "calib_cam_to_velo.txt").unlink()
+    with pytest.warns(CFlowWarning, match="data_poses.*calib_cam_to_velo.txt.*no poses"):
+        assert KITTILog(folder).poses is None
 
 
 def test_a_tracking_drive_is_read_in_the_frame_of_the_lidar(tmp_path: Path) -> None:

@@ -21,9 +21,18 @@ from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
 from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import make_drive
-from cflow_torch.transforms import as_matrix, halfway, rotations_about, to_quaternions, to_rotations
+from cflow_torch.transforms import (
+    as_matrix,
+    halfway,
+    interpolate_motion,
+    rotations_about,
+    to_quaternions,
+    to_rotations,
+    transform_points,
+)
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.readings import AXES, CAMERA, GIVEN, MOUNTS, NO_READING, UNKNOWN, WORLD, _compare
+from cflow_torch.windows.conventions import AXES, CAMERA, WORLD
+from cflow_torch.windows.readings import GIVEN, NO_READING, UNKNOWN, _compare
 
 MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
 
@@ -139,6 +148,13 @@ def in_degrees(pose):
     return as_matrix(yaw @ pitch @ roll, pose[:3, 3])
 
 
+def rolled(pose):
+    """A pose whose yaw and roll are interchanged."""
+    roll, yaw = np.arctan2(pose[2, 1], pose[2, 2]), np.arctan2(pose[1, 0], pose[0, 0])
+    pitch = rotations_about(1, -np.arcsin(pose[2, 0]))
+    return as_matrix(rotations_about(2, roll) @ pitch @ rotations_about(0, yaw), pose[:3, 3])
+
+
 POSES = {
     "inverted": np.linalg.inv,
     CAMERA: lambda pose: pose @ as_matrix(AXES[CAMERA]),
@@ -164,6 +180,7 @@ WRONG_POSES = {
     "millimetres": scaled(1000),
     "centimetres": scaled(100),
     "feet": scaled(1 / 0.3048),
+    "yaw_first": lambda poses: each(rolled)(np.linalg.inv(poses[0]) @ poses),
     "degrees": lambda poses: each(in_degrees)(np.linalg.inv(poses[0]) @ poses),
     "steps": lambda poses: np.concatenate([poses[:1], np.linalg.inv(poses[:-1]) @ poses[1:]]),
     "steps_back": lambda poses: np.concatenate([np.linalg.inv(poses[:1]), np.linalg.inv(poses[1:]) @ poses[:-1]]),
@@ -297,7 +314,7 @@ def test_poses_of_another_log_are_named(drive):
 @pytest.mark.parametrize("source", ["drive", "real"])
 def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, request):
     mixed = Wrong(request.getfixturevalue(source), poses=each(lambda pose: pose @ np.linalg.inv(MOUNTING)))
-    x, y = MOUNTS[judge_log(mixed).best[0]]
+    x, y = map(float, judge_log(mixed).best[0].split()[1:])
     assert np.hypot(x - 1.35, y) < 0.4
     assert "data.ego_T_lidar" in find_problems(mixed)[0]
 
@@ -309,6 +326,110 @@ def test_a_lidar_that_is_turned_by_any_angle_is_named(source, degrees, request):
     (problem,) = [text for text in find_problems(turned) if "ground masks" not in text]
     found = re.search(r"ego_T_lidar with a rotation of about (-?\d+) degrees about z", problem)
     assert found and abs(int(found[1]) - degrees) <= 4
+
+
+def noisy(deviation):
+    def change(poses):
+        poses = poses.copy()
+        poses[:, :3, 3] += np.random.default_rng(0).normal(0, deviation, (len(poses), 3))
+        return poses
+
+    return change
+
+
+def resampled(jitter):
+    """Poses that were interpolated at times that are off by so many sweeps."""
+    return lambda poses: interpolated(poses, np.random.default_rng(0).uniform(-jitter, jitter, len(poses)))
+
+
+@pytest.mark.parametrize(
+    ("source", "change"), [("drive", noisy(0.15)), ("turning", noisy(0.1)), ("drive", resampled(0.4))]
+)
+def test_poses_that_are_not_exact_are_told_and_no_convention_is_blamed(source, change, request):
+    (text,) = [
+        text
+        for text in find_problems(Wrong(request.getfixturevalue(source), poses=change))
+        if "ground masks" not in text and "jump" not in text
+    ]
+    assert "the poses are off, by up to 0." in text and text.endswith("data.odometry=refine if they are noisy")
+
+
+@pytest.mark.parametrize(("source", "factor"), [("drive", 1 / 0.9144), ("turning", 1.1)])
+def test_points_that_are_a_little_too_large_are_no_lidar_elsewhere(source, factor, request):
+    wrong = Wrong(request.getfixturevalue(source), lambda points, _: factor * points)
+    (text,) = [text for text in find_problems(wrong) if "ground masks" not in text]
+    found = re.search(r"positions multiplied by ([0-9.]+)", text)
+    assert found and abs(float(found[1]) / factor - 1) < 0.04
+
+
+@pytest.mark.parametrize("source", ["drive", "real"])
+def test_points_and_poses_in_feet_are_told_by_the_height_of_the_sensor(source, request):
+    good = request.getfixturevalue(source)
+    is_made = source == "drive"  # its frame is on the ground
+    shift = as_matrix(np.eye(3), (0, 0, 1.7 if is_made else 0))
+    feet = Wrong(
+        good,
+        lambda points, _: (points - shift[:3, 3]) / 0.3048,
+        lambda poses: scaled(1 / 0.3048)(poses @ shift),
+        masks=False,
+    )
+    texts = find_problems(feet)
+    assert any("below the sensor" in text and "data.read_as=points_feet" in text for text in texts)
+    assert any("data.read_as=[points_feet,feet]" in text for text in texts)
+    assert find_problems(read_as(feet, ["points_feet", "feet"])) == []
+
+
+class Accumulated(Wrong):
+    """Sweeps with the points of up to `count` sweeps before them."""
+
+    def __init__(self, log, count, **settings):
+        super().__init__(log, **settings)
+        self.count = count
+
+    def sweep(self, index):
+        sweep = super().sweep(index)
+        poses = self.true
+        older = [
+            transform_points(self.log.sweep(k).points, np.linalg.inv(poses[index]) @ poses[k])
+            for k in range(max(index - self.count, 0), index)
+        ]
+        points = np.concatenate([sweep.points, *older]).astype(np.float32)
+        return replace(sweep, points=points, is_ground=None)
+
+
+def test_sweeps_that_hold_the_points_of_earlier_ones_are_told(thin):
+    class InWorld(Accumulated):
+        def sweep(self, index):
+            sweep = super().sweep(index)
+            return replace(sweep, points=to_world(sweep.points, self.true[index]).astype(np.float32))
+
+    start = CachedLog(Wrong(thin, poses=lambda poses: np.linalg.inv(poses[0]) @ poses), 12)
+    cases = (
+        (Accumulated(start, 1), "100 % of the points"),
+        (Accumulated(start, 12), "100 % of the points"),
+        (InWorld(start, 12, poses=lambda _: None), "100 % of the points"),
+    )
+    for log, text in cases:
+        (told,) = [each for each in find_problems(log) if "to the millimetre" in each]
+        assert text in told and "not a map" in told
+
+
+def test_times_that_jitter_are_told_if_the_motion_is_even(drive):
+    late = Wrong(drive)
+    jitter = np.random.default_rng(0).uniform(-0.03, 0.03, 12) * 1e9
+    late.timestamps = [stamp + int(by) for stamp, by in zip(drive.timestamps, jitter)]
+    times = next(one for one in examine(late) if one.topic == "times")
+    assert times.status == WRONG and "but the motion does not" in times.text
+    early = Wrong(drive, poses=lambda poses: interpolated(poses, jitter / 1e8))
+    early.timestamps = late.timestamps
+    times = next(one for one in examine(early) if one.topic == "times")
+    assert times.status == RIGHT and "intervals change by" in times.text, "then the motion changes with them"
+
+
+def interpolated(poses, shift):
+    times = np.arange(len(poses)) + shift
+    before = np.floor(times).astype(int).clip(0, len(poses) - 2)
+    return interpolate_motion(poses[before], poses[before + 1], times - before)
 
 
 def jumping(poses):
@@ -536,6 +657,45 @@ def test_the_page_counts_sweeps_that_cannot_be_read(drive):
     assert texts == [
         "2 of 12 sweeps cannot be read, the first is sweep 7: sweep 7 does not exist. Their pairs have no flow"
     ]
+
+
+def test_the_page_names_sweeps_with_few_points(drive):
+    class Cut(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index)
+            kept = slice(None) if index not in (4, 7) else slice(0 if index == 7 else 3000)
+            return replace(sweep, points=sweep.points[kept], is_ground=sweep.is_ground[kept])
+
+    (text,) = [one.text for one in examine(Cut(drive)) if one.status == WRONG]
+    assert text.startswith("2 of them have few points, the first is sweep 4 with 3,000, while those around it have 2")
+
+
+@pytest.mark.parametrize(
+    ("order", "told"),
+    [
+        (
+            [0, 1, 2, 3, 4, 5, 5, 5, 8, 9, 10, 11],
+            "2 of them repeat the points of the sweep before, the first is",
+        ),
+        ([0, 1, 2, 3, 5, 4, 6, 7, 8, 9, 10, 11], "sweeps 4 to 5 do not fit those around"),
+        ([0, 1, 2, 3, 4, 5, 11, 7, 8, 9, 10, 11], "sweep 6 does not fit those around"),
+    ],
+    ids=["dropped", "interchanged", "foreign"],
+)
+def test_the_page_names_sweeps_that_are_repeated_or_misplaced(drive, order, told):
+    texts = [one.text for one in examine(Wrong(drive, order=order)) if one.topic == "sweeps"]
+    assert len(texts) == 1 and texts[0].startswith(told)
+
+
+def test_sweeps_of_few_points_do_not_blame_the_poses(drive):
+    """A small sensor: of so few points, hardly any is measured again within 10 cm."""
+
+    class Sparse(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index)
+            return replace(sweep, points=sweep.points[::20], is_ground=sweep.is_ground[::20])
+
+    assert find_problems(Sparse(drive)) == []
 
 
 def test_the_page_lists_notes_of_the_reader_and_knows_its_gaps(drive):

@@ -132,7 +132,7 @@ def test_seconds_and_nanoseconds_in_two_columns(tmp_path) -> None:
     with pytest.raises(CFlowError, match=r"a\.csv.*text before its numbers"):
         poses_text.read_poses(tmp_path / "a.csv")
     (tmp_path / "a.csv").write_text("\n".join([*EXACT[:2], line(9, seconds(STAMPS[1]))]))
-    with pytest.raises(CFlowError, match="ascend, line 3"):
+    with pytest.raises(CFlowError, match="ascend, and number 3 does not: keep one"):
         poses_text.read_poses(tmp_path / "a.csv")
 
 
@@ -243,6 +243,30 @@ def test_a_plane_pose_and_a_pose_without_a_time(tmp_path) -> None:
     assert np.allclose(plane.poses[0], as_matrix(rotations_about(2, 0.5), (2, 3, 0)))
     assert untimed.times_ns is None and np.allclose(untimed.poses[1, :3, 3], (3, 4, 0))
     assert np.allclose(untimed.poses[1, :2, 0], (1 - 2 * 0.36, 2 * 0.6 * 0.8))
+
+
+def test_places_on_the_globe_become_metres(tmp_path) -> None:
+    """The first place is the origin, x is east, and 1e-5 degrees of latitude are 1.113 m."""
+    header = "time,latitude_deg,longitude_deg,alt,roll,pitch,yaw"
+    lines = [f"{k},{60 + 1e-5 * k:.6f},{8 - 1e-5 * k:.6f},{100 + k},0,0,0.5" for k in range(3)]
+    (tmp_path / "gps.csv").write_text("\n".join([header, *lines]))
+    read = poses_text.read_poses(tmp_path / "gps.csv")
+    expected = [[-0.5566 * k, 1.1132 * k, 100 + k] for k in range(3)]
+    assert np.allclose(read.poses[:, :3, 3], expected, atol=1e-3)
+    assert np.allclose(read.poses[:, :3, :3], rotations_about(2, 0.5))
+
+
+def test_lines_with_times_may_have_any_order(tmp_path) -> None:
+    texts = [line(k, seconds(stamp)) for k, stamp in enumerate(STAMPS)]
+    (tmp_path / "poses.txt").write_text("\n".join(reversed(texts)))
+    read = poses_text.read_poses(tmp_path / "poses.txt")
+    assert read.times_ns.tolist() == STAMPS and np.allclose(read.poses[:, 0, 3], range(COUNT))
+
+
+def test_four_numbers_are_a_matrix_only_if_every_fourth_line_ends_it(tmp_path) -> None:
+    (tmp_path / "poses.txt").write_text("\n".join(f"{k} {k} 0 0.1" for k in range(12)))
+    with pytest.raises(CFlowError, match="4 numbers per line"):
+        poses_text.read_poses(tmp_path / "poses.txt")
 
 
 FRAMES = [{"file_path": f"clouds/{name}.npy", "transform_matrix": POSES[name].tolist()} for name in range(12)]
@@ -477,9 +501,13 @@ def test_a_trajectory_of_another_rate_is_not_taken_by_number(tmp_path) -> None:
         ArraysLog(tmp_path)
 
 
-def test_poses_that_are_too_rare_are_named(tmp_path) -> None:
+def test_poses_a_second_apart_are_joined_and_rarer_ones_refused(tmp_path) -> None:
     (clouds(tmp_path) / "poses.txt").write_text("\n".join(EXACT[::10]))
-    with pytest.raises(CFlowError, match="has a pose every 1 s; between poses, we interpolate up to 0.5 s"):
+    with pytest.warns(CFlowWarning, match="1 after the last pose; its poses are 1 s apart, .*=refine"):
+        log = ArraysLog(tmp_path)
+    assert np.allclose(log.poses[:, 0, 3], range(11), atol=1e-6) and log.has_sparse_poses
+    (tmp_path / "poses.txt").write_text("\n".join([EXACT[0], line(20, seconds(START + 2 * 10**9))]))
+    with pytest.raises(CFlowError, match="has a pose every 2 s, and we interpolate up to 1.1 s: give more poses"):
         ArraysLog(tmp_path)
 
 

@@ -151,14 +151,17 @@ def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
     return poses, times
 
 
-def find_poses_near(folder: Path, times_ns: Sequence[int]) -> list[Trajectory]:
-    """Find files of text that have poses at the unix times of most sweeps: below a folder, and two levels above it.
+def find_poses_near(folder: Path, times_ns: Sequence[int]) -> tuple[Trajectory | None, str]:
+    """Find the file of text that has poses at the unix times of most sweeps: below a folder, and two levels above it.
 
     Of folders next to the log or below it, we look only into those that hold nothing but tables, as others are logs. We
     read the start of at most 50 files in each of at most 50 folders.
+
+    Returns:
+        The poses, None = no file has them, or several do; and what the user should know of it.
     """
     if is_remote(folder) or times_ns[0] < _FIRST_UNIX:
-        return []
+        return None, ""
     top = folder.resolve()
     levels = [top, *top.parents[:2]]
     children = {child: sorted(visible(child))[:_MOST] for level in levels for child in sorted(visible(level))[:_MOST]}
@@ -166,7 +169,13 @@ def find_poses_near(folder: Path, times_ns: Sequence[int]) -> list[Trajectory]:
     files = [file for files in (*map(visible, levels), *plain) for file in files if file.suffix in _NEAR_TABLES]
     starts = ((file, _start_of(file, parse_poses)) for file in files)
     timed = [read_poses(file) for file, start in starts if start is not None and start.times_ns is not None]
-    return [trajectory for trajectory in timed if trajectory.covers(times_ns)]
+    found = [trajectory for trajectory in timed if trajectory.covers(times_ns)]
+    names = " and ".join(each.source for each in found)
+    if len(found) > 1:
+        return None, f"there are poses at the times of its sweeps in {names}: choose one with data.poses=FILE"
+    if not found:
+        return None, ""
+    return found[0], f"its poses are those of {names}, which has them at the times of its sweeps"
 
 
 def _has_one_pose(path: Path) -> bool:

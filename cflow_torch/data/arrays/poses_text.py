@@ -15,7 +15,7 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.data.trajectory import Trajectory, checked_poses
+from cflow_torch.data.trajectory import Trajectory, checked_poses, positions_of_degrees
 from cflow_torch.transforms import as_matrix, poses_from_quaternions, rotations_of
 from cflow_torch.types import CFlowError
 
@@ -28,6 +28,7 @@ _UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX, 13: ("time", *MATRIX), 16: MATRIX,
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz")
 """Suffixes of files whose values have names or nest, see `tables_of_values`."""
+_NAMES = "name the sweeps in the order of their times, and sort these"
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
 
@@ -89,7 +90,7 @@ def parse_poses(content: bytes, path: Path) -> Trajectory:
 
 def _poses_of_table(table: Table, path: Path) -> Trajectory:
     names, words, labels = table
-    if not names and words.shape[1] == 4 and len(words) % 4 == 0:  # a matrix in four lines
+    if not names and (words.shape[1], len(words) % 4) == (4, 0) and _are_homogeneous(words[3::4]):  # four lines each
         words = words.reshape(-1, 16)
     roles = _roles(names)
     unnamed = _UNNAMED.get(words.shape[1], ())
@@ -108,12 +109,21 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     if not is_known.any():
         raise CFlowError(f"{path} has no line of finite numbers")
     if not _TIMES.isdisjoint(roles):  # programs write a line twice; without times, lines repeat if the vehicle stands
-        words = words[is_known & np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]
+        words = words[is_known]
+        words = words[np.argsort(_nanoseconds(roles, words), kind="stable")]
+        words = words[np.concatenate([[True], (words[1:] != words[:-1]).any(axis=1)])]
         is_known = np.ones(len(words), bool)
     poses = np.full((len(words), 4, 4), np.nan)
     poses[is_known] = _poses_of_columns(names, roles, words[is_known], path)
     is_kitti = MATRIX[0] in roles and not names and words.shape[1] in (12, 13)
-    return Trajectory(poses, _times_of_columns(roles, words, path), is_kitti, str(path), labels)
+    times = None
+    if not _TIMES.isdisjoint(roles):
+        times = _ascending(path, _nanoseconds(roles, words), "keep one of the poses of a time")
+    return Trajectory(poses, times, is_kitti, str(path), labels)
+
+
+def _are_homogeneous(rows: np.ndarray) -> bool:
+    return bool((rows.astype(np.float64) == (0, 0, 0, 1)).all())
 
 
 def _end_in_quaternions(words: np.ndarray) -> bool:
@@ -143,7 +153,8 @@ def _roles(names: Sequence[str]) -> dict[str, int]:
     has_rotation = any(
         set(group) <= set(first) for group in ({"z", *_QUATERNION}, {"z", "q0", "q1", "q2", "q3"}, {"yaw"})
     )
-    return first if MATRIX[0] in first or ({"x", "y"} <= set(first) and has_rotation) else {}
+    has_position = {"x", "y"} <= set(first) or {"latitude", "longitude"} <= set(first)
+    return first if MATRIX[0] in first or (has_position and has_rotation) else {}
 
 
 def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.ndarray, path: Path) -> np.ndarray:
@@ -154,6 +165,8 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
         poses = checked_poses(np.stack([values[name] for name in MATRIX], axis=1).reshape(-1, 3, 4), str(path))
         is_inverse = bool(names) and any(each in names[roles[MATRIX[0]]].lower() for each in _INVERSE)
         return np.linalg.inv(poses) if is_inverse else poses
+    if "x" not in values:
+        values["x"], values["y"] = positions_of_degrees(values["latitude"], values["longitude"])
     positions = np.stack([values.get(axis, zeros) for axis in _POSITION], axis=1)
     if "q0" in values and not set(_QUATERNION) <= set(values):
         q0, _, q2, _ = (np.abs(values[f"q{k}"]).sum() for k in range(4))
@@ -167,12 +180,12 @@ def _poses_of_columns(names: Sequence[str], roles: Mapping[str, int], words: np.
     return as_matrix(rotations_of(angles), positions)
 
 
-def _times_of_columns(roles: Mapping[str, int], words: np.ndarray, path: Path) -> np.ndarray | None:
-    """Return the nanoseconds of poses, ascending; None = there are no times."""
+def _nanoseconds(roles: Mapping[str, int], words: np.ndarray) -> np.ndarray:
+    """Return the times of poses, (K,) int64 nanoseconds."""
     if {"sec", "nsec"} <= set(roles):
         pairs = words[:, [roles["sec"], roles["nsec"]]].tolist()
-        return _ascending(path, [str(int(second) * 10**9 + int(rest)) for second, rest in pairs])
-    return _ascending(path, words[:, roles["time"]].tolist()) if "time" in roles else None
+        return np.array([int(second) * 10**9 + int(rest) for second, rest in pairs], np.int64)
+    return np.array(nanoseconds_of_numbers(words[:, roles["time"]].tolist()), np.int64)
 
 
 def read_times(path: PathLike) -> np.ndarray:
@@ -191,20 +204,19 @@ def parse_times(content: bytes, path: Path) -> np.ndarray:
         lines = [line for line in content.decode("utf-8-sig").splitlines() if line.strip() and line.strip()[0] != "#"]
     dates = nanoseconds_of_dates(lines)
     if dates:
-        return _ascending(path, [str(date) for date in dates])
+        return _ascending(path, np.array(dates, np.int64))
     words = parse_table(content, path).words
     if words.shape[1] != 1:
         raise CFlowError(f"{path} must have one time in seconds per line")
-    return _ascending(path, words[:, 0].tolist())
+    return _ascending(path, np.array(nanoseconds_of_numbers(words[:, 0].tolist()), np.int64))
 
 
-def _ascending(path: Path, words: Sequence[str]) -> np.ndarray:
-    """Convert texts of times to (K,) int64 nanoseconds, see `nanoseconds_of_numbers`; they must ascend."""
-    result = np.array(nanoseconds_of_numbers(words), dtype=np.int64)
-    falls = np.diff(result) <= 0
+def _ascending(path: Path, times: np.ndarray, fix: str = _NAMES) -> np.ndarray:
+    """Return (K,) int64 nanoseconds, which must ascend; `fix` says how to correct those that do not."""
+    falls = np.diff(times) <= 0
     if falls.any():
-        raise CFlowError(f"{path}: times must ascend, line {int(falls.argmax()) + 2} does not: sort its lines by time")
-    return result
+        raise CFlowError(f"{path}: times must ascend, and number {int(falls.argmax()) + 2} does not: {fix}")
+    return times
 
 
 def write_kitti_poses(path: PathLike, poses: np.ndarray) -> None:

@@ -108,7 +108,8 @@ class ArraysLog(Log):
         trajectory, are_of_lidar = self._trajectory(poses, calibration)
         stamps = self._times(times, trajectory)
         if trajectory is None and poses == "auto" and stamps is not None:
-            trajectory = self._poses_near(stamps)
+            trajectory, note = find_poses_near(self.folder, stamps)
+            self._note(note)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.gaps = self._with_gaps_in_time() if self._has_times and trajectory is None else frozenset()
@@ -183,16 +184,6 @@ class ArraysLog(Log):
             )
             return trajectory, True
         return trajectory._replace(poses=converted), True
-
-    def _poses_near(self, stamps: list[int]) -> Trajectory | None:
-        """Return the poses of the only file in other folders that has them at the times of the sweeps."""
-        found = find_poses_near(self.folder, stamps)
-        names = " and ".join(each.source for each in found)
-        if len(found) > 1:
-            self._note(f"there are poses at the times of its sweeps in {names}: choose one with data.poses=FILE")
-            return None
-        self._note(f"its poses are those of {names}, which has them at the times of its sweeps" if found else "")
-        return found[0] if found else None
 
     def _fits(self, path: Path) -> bool:
         """Test whether a structured file has poses of the sweeps, because such files often hold other poses."""

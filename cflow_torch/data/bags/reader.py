@@ -122,7 +122,8 @@ class BagLog(Log):
             self._check_count(f"{self.path}: {self.topic}")
             trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
             if trajectory is None and poses == "auto":
-                trajectory = self._poses_near()
+                trajectory, note = find_poses_near(self.path.parent, self.timestamps)
+                self._note(note)
             if trajectory is not None:
                 self._use_poses(trajectory)
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
@@ -162,15 +163,6 @@ class BagLog(Log):
         if trajectory is not None and trajectory.times_ns is None:
             raise CFlowError(f"{files[0]} has no times: give a bag poses with times (TUM)")
         return trajectory
-
-    def _poses_near(self) -> Trajectory | None:
-        found = find_poses_near(self.path.parent, self.timestamps)
-        names = " and ".join(each.source for each in found)
-        if len(found) > 1:
-            self._note(f"it has no poses, but {names} have them at the times of its clouds: choose data.poses=FILE")
-        elif found:
-            self._note(f"it has no poses, so we take those of {names} for poses of {self.frame}")
-        return found[0] if len(found) == 1 else None
 
     def _use_poses(self, trajectory: Trajectory) -> None:
         """Take poses with times, and keep the sweeps that have one."""
@@ -221,6 +213,13 @@ class BagLog(Log):
             reader.open()
             self._opened = (os.getpid(), reader)
         return self._opened[1]
+
+    def close(self) -> None:
+        """Close the bag. A sweep that is read later opens it again."""
+        owner, reader = self._opened
+        if owner == os.getpid():
+            reader.close()
+        self._opened = (0, None)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": (0, None)}

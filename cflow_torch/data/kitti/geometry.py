@@ -9,10 +9,10 @@ import numpy as np
 
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.paths import read_start
-from cflow_torch.transforms import as_matrix, rotations_about
+from cflow_torch.data.trajectory import positions_of_degrees
+from cflow_torch.transforms import as_matrix, rotations_of
 from cflow_torch.types import CFlowError
 
-_EARTH = 6378137.0  # metres, radius of the Mercator projection
 _NUM_OXTS = 30  # numbers per measurement: latitude, longitude, altitude, roll, pitch, yaw, ...
 IMAGE_SIZE = (1242, 375)  # pixels; the rectified images of all days are within 18 pixels of it
 
@@ -29,20 +29,15 @@ def png_size(file: Path) -> tuple[int, int]:
 def poses_from_oxts(table: np.ndarray, file: Any) -> np.ndarray:
     """Convert measurements, (K, 30) float64, to poses (K, 4, 4) `T_world_imu`. The world begins at the first one.
 
-    Convention: world x is east, y north, z up, by the Mercator projection at the latitude of the first measurement.
+    Convention: world x is east, y north, z up, see `positions_of_degrees`.
         Roll, pitch and yaw are radians about x (ahead), y (left) and z (up); yaw 0 = east.
 
     Source: the description of the data set, Geiger et al., "Vision meets Robotics: The KITTI Dataset", 2013.
     """
     if table.ndim != 2 or table.shape[1] < 6 or not np.isfinite(table[:, :6]).all():
         raise CFlowError(f"{file} has shape {table.shape}; {_NUM_OXTS} finite numbers per measurement are expected")
-    latitude, longitude = np.radians(table[:, :2]).T
-    scale = _EARTH * np.cos(latitude[0])
-    north = np.log(np.tan(np.pi / 4 + latitude / 2))
-    position = np.stack([scale * longitude, scale * north, table[:, 2]], axis=1)
-    roll, pitch, yaw = table[:, 3:6].T
-    rotation = rotations_about(2, yaw) @ rotations_about(1, pitch) @ rotations_about(0, roll)
-    return as_matrix(rotation, position - position[0])
+    east, north = positions_of_degrees(*table[:, :2].T)
+    return as_matrix(rotations_of(table[:, 3:6].T), np.stack([east, north, table[:, 2] - table[0, 2]], axis=1))
 
 
 def in_image(points: np.ndarray, projection: np.ndarray, regions: np.ndarray) -> np.ndarray:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cflow_torch.data.arrays.poses_text import read_times
+from cflow_torch.data.arrays.poses_text import read_poses, read_times
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.tables import read_numbers
 from cflow_torch.data.boxes import flow_from_boxes
@@ -20,6 +21,7 @@ from cflow_torch.data.kitti.geometry import IMAGE_SIZE, in_image, png_size, pose
 from cflow_torch.data.kitti.labels import FrameBoxes
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.paths import PathLike, exist, remote_errors
+from cflow_torch.data.trajectory import Trajectory
 from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep
@@ -47,6 +49,9 @@ class KITTILog(ArraysLog):
         - Raw drives and the tracking set have poses from OXTS (GPS and IMU), moved to the LiDAR by the calibration
           (calib_imu_to_velo.txt in the folder of the drive or of its day; calib/NNNN.txt). Without calibration or with
           fewer measurements than sweeps, we warn, and there are no poses.
+        - KITTI-360 has raw drives in `data_3d_raw`, and poses of the IMU in `data_poses/<drive>/poses.txt` (or of the
+          camera in cam0_to_world.txt), moved to the LiDAR by `calibration`. Sweeps without a pose are left out, and we
+          say so.
         - Poses of sequences (poses.txt, ../../poses/NN.txt) are of the camera, converted by `Tr` of calib.txt. If they
           drive along x (the LiDAR's axis ahead) and not along z (the camera's), they are the LiDAR's, and we say so.
         - Ground masks come from the classes of points in `labels`. Sweeps without a class of the ground, as in labels
@@ -77,7 +82,12 @@ class KITTILog(ArraysLog):
         self._frames = [int(file.stem) for file in self.files]
         if source.layout == "raw":
             self._read_times()
-        if is_auto and not is_sequence:
+        if is_auto and _kitti360(root) is not None:
+            trajectory = self._poses_of_kitti360()
+            if trajectory is not None:
+                self.poses = self._pose_per_sweep(trajectory, list(self.timestamps) if self._has_times else None)
+                self._frames = [int(file.stem) for file in self.files]
+        elif is_auto and not is_sequence:
             self.poses = self._poses_from_oxts()
 
     def sweep(self, index: int) -> Sweep:
@@ -169,6 +179,29 @@ class KITTILog(ArraysLog):
         T_world_lidar = poses @ np.linalg.inv(transform(calibration, root, *names))
         return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar  # type: ignore[no-any-return]
 
+    def _poses_of_kitti360(self) -> Trajectory | None:
+        """Return the poses of the LiDAR, by number of the sweep; None, with a warning, if a file is missing."""
+        root: Any = _kitti360(self.drive.root)
+        folder, calibration = root / "data_poses" / self.drive.name, root / "calibration"
+        of_imu, of_camera = folder / "poses.txt", folder / "cam0_to_world.txt"
+        mounts = calibration / "calib_cam_to_velo.txt", calibration / "calib_cam_to_pose.txt"
+        has_imu = exist(of_imu, mounts[1])
+        if not exist(mounts[0]) or not (has_imu or exist(of_camera)):
+            self._note(
+                f"there is no {of_imu} with {' and '.join(map(str, mounts))}, so it has no poses. Download them, or "
+                "set data.odometry=true"
+            )
+            return None
+        T_lidar_camera = transform({"cam_to_velo": read_numbers(mounts[0]).ravel()}, mounts[0], "cam_to_velo")
+        trajectory = read_poses(of_imu if has_imu else of_camera)
+        if has_imu:
+            T_pose_camera = transform(read_calibration(mounts[1]), mounts[1], "image_00")
+        else:
+            perspective = calibration / "perspective.txt"
+            values = read_calibration(perspective) if exist(perspective) else {"R_rect_00": np.eye(3).ravel()}
+            T_pose_camera = transform(values, perspective, "R_rect_00")
+        return trajectory._replace(poses=trajectory.poses @ T_pose_camera @ np.linalg.inv(T_lidar_camera))
+
     def _calibration(self, *names: str) -> dict[str, np.ndarray] | None:
         """Read the calibration of the drive: key of a line -> numbers; None if a file is missing.
 
@@ -246,3 +279,9 @@ class KITTILog(ArraysLog):
                 raise CFlowError(f"{tracks} needs the calibration calib/{tracks.name}, which is missing; download it")
             return stored_labels.read_tracking_labels(tracks, np.linalg.inv(camera[0]))
         return {}
+
+
+def _kitti360(drive: Path) -> Path | None:
+    """Return the folder of KITTI-360 to which a drive belongs; None = it is another drive."""
+    parent = drive.resolve().parent
+    return parent.parent if parent.name == "data_3d_raw" else None
