@@ -102,6 +102,11 @@ class Config(Settings):
         return 0
 
     @property
+    def num_compared(self) -> int | None:
+        """How many of the sweeps before t we compare with t+1; None = all of them."""
+        return None
+
+    @property
     def num_future(self) -> int:
         """Number of sweeps after t+1."""
         return 0
@@ -204,6 +209,14 @@ class VerifiedConfig(_WithHistory):
         "twice as many of them as of the sweeps before t. The method then takes twice the time",
         low=0,
     )
+    num_compared: Optional[int] = setting(  # type: ignore[assignment]
+        None,
+        "how many of the sweeps before t the method compares with t+1: the farthest, the nearest, and others evenly "
+        "between them; likewise of those after t+1. None = all of them",
+        kind=int,
+        optional=True,
+        low=1,
+    )
     max_object_length: Optional[float] = setting(
         25.0,
         "metres: a component that is longer than this at t+1 moves only if both of its ends move (trams, trains). "
@@ -251,7 +264,7 @@ _DEFAULT: dict[str, Any] = {
 PRESETS: dict[str, Config] = {
     "default": VerifiedConfig(**_DEFAULT),
     "offline": VerifiedConfig(**{**_DEFAULT, "num_future": 4}),
-    "live": VerifiedConfig(**{**_DEFAULT, "num_history": 2, "point_cloud_range": _HARNESS_REGION}),
+    "live": VerifiedConfig(**{**_DEFAULT, "num_compared": 2, "point_cloud_range": _HARNESS_REGION}),
     "paper": DenseConfig(),
     # Chosen on the simulated seeds 200 ... 209: docs/method.md.
     "keypoints": KeypointsConfig(

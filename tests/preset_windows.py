@@ -14,7 +14,7 @@ PRESETS = ("default", "offline", "paper", "keypoints")
 
 def small(preset: str, **overrides: Any) -> Config:
     """A preset on 16 m x 14 m with pixels of 0.25 m, and two older sweeps if the method uses history."""
-    given: dict[str, Any] = {"pixel_sizes": (0.5, 0.25) if preset in ("default", "offline") else (0.25,)}
+    given: dict[str, Any] = {"pixel_sizes": (0.5, 0.25) if preset in ("default", "offline", "live") else (0.25,)}
     if preset in ("paper", "keypoints"):
         given["max_extent"] = 5.0
     if preset != "keypoints":

@@ -107,7 +107,7 @@ def test_presets_have_the_paper_s_base_row_and_documented_changes():
     assert (default.pixel_sizes, default.num_history) == ((0.4, 0.2, 0.1), 4)
     assert make_config("offline") == default.replace(num_future=4) and make_config("offline").num_sweeps == 10
     near = make_config("keypoints").point_cloud_range
-    assert make_config("live") == default.replace(num_history=2, point_cloud_range=near) and near[:2] == (-51.2, -51.2)
+    assert make_config("live") == default.replace(num_compared=2, point_cloud_range=near) and near[:2] == (-51.2, -51.2)
     assert make_config(pixel_size=0.2).pixel_sizes == (0.2,)
     with pytest.raises(CFlowError, match="give one of them"):
         make_config(pixel_size=0.2, pixel_sizes=(0.4,))

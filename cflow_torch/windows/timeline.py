@@ -54,6 +54,7 @@ class Timeline:
         sides = [_side(of_window, is_past=True) for of_window in sources]
         if config.num_future > 0:
             sides += [_side(of_window, is_past=False) for of_window in sources]
+        sides = [_compared(side, config.num_compared) for side in sides]
         table = np.zeros((5, len(sides), 1 + max(map(len, sides))))
         farthest = max(map(abs, (*grid.lower[:2], *grid.upper[:2])))
         entries: list[Entry] = []
@@ -77,6 +78,19 @@ def _side(sources: Sequence[SourceSweep], is_past: bool) -> list[SourceSweep]:
     if is_past:
         return [source for source in sources if source.intervals > 0]
     return [sources[0], *(source for source in sources if source.intervals < 0)]
+
+
+def _compared(side: list[SourceSweep], count: int | None) -> list[SourceSweep]:
+    """Keep t, and of the other sweeps of a side `count`: the farthest, the nearest, and others evenly between them.
+
+    A motion of several intervals is longer, so the farthest sweep shows slow objects best. None = keep all.
+    """
+    sweep_t, *others = side
+    if count is None or len(others) <= count:
+        return side
+    last = len(others) - 1
+    steps_back = [number * last // max(count - 1, 1) for number in range(count)]
+    return [sweep_t, *(others[last - step] for step in reversed(steps_back))]
 
 
 def _entries(

@@ -149,7 +149,7 @@ def test_the_page_lists_every_setting(cflow, capsys):
     rows = [line[2:-2].split(" | ") for line in page.splitlines() if line.startswith("| `model.")]
     assert len(rows) == sum(len(fields(kind)) for kind in METHODS.values())
     name, *cells = next(row for row in reversed(rows) if row[0] == "`model.num_history`")
-    changed = "default `4`, offline `4`, live `2`"
+    changed = "default `4`, offline `4`, live `4`"
     assert cells[:3] == ["`0`", changed, "a whole number of at least 0"] and "sweeps" in cells[3]
     assert "dense \\| keypoints" in page, "bars in cells are escaped"
     sections = dict(section.split("\n\n", 1) for section in page.split("\n## ")[1:])

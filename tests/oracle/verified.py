@@ -86,17 +86,16 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
 
 
 def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_levels: int) -> tuple[Vector, int]:
-    """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations
-    (as many for fast objects), that of the near counts. Nodes of changed pixels need more of them. With history, all
+    """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations,
+    that of the near counts. Fast objects need twice as many of both, nodes of changed pixels more. With history, all
     must gain a slice for eight pixels."""
     z = CHANGED_Z if node.level == num_levels else sweeps.config.significance
     is_fast = node.level > num_levels
-    near_z = z if is_fast else 2 * z
     least = 16 * len(node.members) / 8 * sweeps.has_history
     evidence = []
     for motion in candidates:
         exact, near = (count_wins(sweeps, node.members, motion, is_near).sum(1).tolist() for is_near in (False, True))
-        own = evidence_of(*exact, z) + evidence_of(*near, near_z)
+        own = evidence_of(*exact, 2 * z if is_fast else z) + evidence_of(*near, 2 * z)
         stays = is_fast and LEAVES * exact[1] > exact[0]
         counts = own > least and not stays and not slides_along_itself(sweeps, node.members, motion)
         evidence.append(own if counts else 0)
