@@ -118,7 +118,7 @@ def test_points_of_another_car_in_few_sweeps_do_not_make_the_length_seen() -> No
     path = straight((6, 0.0), 7.0, 0.0)
 
     def rear(index: int, points: np.ndarray) -> np.ndarray:
-        other = np.array([[9.0, 5.0, 0.5]]) + np.linspace(0, 1, 9)[:, None]
+        other = np.array([[7.0, 7.0, 0.5]]) + np.linspace(0, 1, 9)[:, None]
         of_car = points[points[:, 0] < -1.5]
         return np.concatenate([of_car, other]) if index in (3, 4) else of_car
 
