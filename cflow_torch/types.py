@@ -23,42 +23,59 @@ MOVING, MIN_MOVING = 0.05, 0.5
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}
 # No sweep has more columns than this, so a wider array is a transposed one, (3, N) or (4, N).
 _MOST_COLUMNS = 64
-_OBJECT = np.dtype("i8, 3f8, 3f8, 3f8, f8, i8, f8, f8")
-_OBJECT.names = ("id", "centre", "size", "velocity", "heading", "num_points", "confidence", "moving")
+_COLUMNS = {
+    "id": "i8",
+    **dict.fromkeys(("x", "y", "z", "length", "width", "height", "vx", "vy", "vz", "heading"), "f8"),
+    "num_points": "i8",
+    **dict.fromkeys(("confidence", "moving"), "f8"),
+}
 
-# The columns of the fields of `ObjectTable` that are vectors.
-_OBJECT_COLUMNS = {"centre": "xyz", "size": ("length", "width", "height"), "velocity": ("vx", "vy", "vz")}
+
+class ObjectRow(np.void):
+    """A row of an `ObjectTable`."""
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return a number, or one of the vectors centre, size and velocity, (3,) float64."""
+        is_vector = isinstance(key, str) and key in _VECTORS.names
+        return self.view(_VECTORS)[key] if is_vector else super().__getitem__(key)
+
+
+_OBJECT: Any = np.dtype((ObjectRow, list(_COLUMNS.items())))  # type: ignore[arg-type]  # its stubs know np.void only
+# The vectors of an object: three columns each, of the same bytes.
+_VECTORS: Any = np.dtype(
+    {
+        "names": ["centre", "size", "velocity"],
+        "formats": ["3f8"] * 3,
+        "offsets": [_OBJECT.fields[name][1] for name in ("x", "length", "vx")],
+        "itemsize": _OBJECT.itemsize,
+    }
+)
 
 
 class ObjectTable(np.ndarray):
     """The moving objects of a result: a structured array, (K,), see `FlowResult.objects`.
 
     Examples:
-        >>> records = result.objects(points).to_records()
-        >>> table = pandas.DataFrame(records)
-        >>> text = json.dumps(records)
+        >>> table = pandas.DataFrame(result.objects(points))
+        >>> text = json.dumps(result.objects(points).to_records())
     """
 
     def to_records(self) -> list[dict[str, Any]]:
-        """Return a dictionary of plain numbers per object, for a data frame or JSON.
+        """Return a dictionary of plain numbers per object, with the names of the columns, for JSON.
 
-        The keys are id, x, y, z (centre, metres), length, width, height (metres), vx, vy, vz (m/s), heading (radians),
-        num_points, confidence and moving. A NaN, which JSON does not have, becomes None.
+        A NaN, which JSON does not have, becomes None.
         """
-        records = []
-        for row in self.reshape(-1):
-            record: dict[str, Any] = {"id": int(row["id"])}
-            for field, names in _OBJECT_COLUMNS.items():
-                record.update(zip(names, row[field].tolist()))
-            record["heading"] = float(row["heading"])
-            record["num_points"] = int(row["num_points"])
-            for field in ("confidence", "moving"):
-                record[field] = None if np.isnan(row[field]) else float(row[field])
-            records.append(record)
-        return records
+        names = self.dtype.names or ()
+        rows = [row.tolist() for row in self.reshape(-1)]
+        return [{name: None if value != value else value for name, value in zip(names, row)} for row in rows]
 
     def __getitem__(self, key: Any) -> Any:
-        """Return one row, some rows, or a field. A field is a plain array."""
+        """Return a row, some rows, a column, or one of the vectors centre, size and velocity, (K, 3) float64.
+
+        A column and a vector are plain arrays, which share the memory of the table.
+        """
+        if isinstance(key, str) and key in _VECTORS.names:
+            return self.view(_VECTORS, np.ndarray)[key]
         value = super().__getitem__(key)
         return value.view(np.ndarray) if isinstance(value, np.ndarray) and value.dtype.names is None else value
 
@@ -330,11 +347,12 @@ class FlowResult:
                 Without `moving`, it has no effect.
 
         Returns:
-            (K,) structured array, sorted by id, in the ego frame at t+1. `id`: cluster_id. `centre`: (3,) metres, of
-            the box. `size`: (3,) metres, length along the heading, width, height. `velocity`: (3,) m/s over ground,
-            mean over the points. `heading`: direction of the velocity, radians from +x to the left. `num_points`:
-            number of points. `confidence`, `moving`: means over the points, NaN if the method has none. `to_records()`
-            of the array returns dictionaries for a data frame or JSON.
+            (K,) structured array, sorted by id, in the ego frame at t+1, which `pandas.DataFrame` takes. `id`:
+            cluster_id. `x`, `y`, `z`: metres, centre of the box. `length` along the heading, `width`, `height`: metres.
+            `vx`, `vy`, `vz`: m/s over ground, mean over the points. `heading`: direction of the velocity, radians from
+            +x to the left. `num_points`: number of points. `confidence`, `moving`: means over the points, NaN if the
+            method has none. `centre`, `size` and `velocity` are vectors of these columns. `to_records()` of the array
+            returns dictionaries for JSON.
 
         Convention:
             The box encloses the points of sweep t, moved by their flow. If only one side of an object is visible, the
@@ -359,13 +377,12 @@ class FlowResult:
             return objects
         objects["id"] = clusters.id
         objects["num_points"] = clusters.num_points
-        objects["velocity"] = clusters.mean(values["residual_flow"]) / sweep_interval
+        objects["velocity"][:] = clusters.mean(values["residual_flow"]) / sweep_interval
         objects["heading"] = np.arctan2(objects["velocity"][:, 1], objects["velocity"][:, 0])
         for name in ("confidence", "moving"):
             objects[name] = clusters.mean(values[name]) if name in values else np.nan
-        objects["centre"], objects["size"] = clusters.boxes(
-            self._positions(points) + values["flow"], objects["heading"]
-        )
+        moved = self._positions(points) + values["flow"]
+        objects["centre"][:], objects["size"][:] = clusters.boxes(moved, objects["heading"])
         is_fast = np.linalg.norm(objects["velocity"], axis=1) >= min_speed
         is_static = objects["moving"] < min_moving  # False for NaN
         return objects[is_fast & (objects["num_points"] >= min_points) & ~is_static]

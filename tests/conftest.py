@@ -25,6 +25,9 @@ if sys.dont_write_bytecode:
     os.environ.update(PYTHONDONTWRITEBYTECODE="", PYTHONPYCACHEPREFIX=sys.pycache_prefix)
 
 
+os.fsync = lambda _: None  # files of tests need not outlive a power cut
+
+
 def pytest_collection_finish() -> None:
     """Let the garbage collector search less: not what is imported by now, and not after every 700 new objects."""
     gc.freeze()

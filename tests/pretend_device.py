@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map
 
 IS_THERE = hasattr(backend_registration, "_setup_privateuseone_for_python_backend")
 # Operations for whose result the host has to wait.
@@ -86,7 +85,8 @@ class PretendDevice(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         name = func._schema.name.split("::")[1]
-        tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
+        tensors: list[Tensor] = []
+        _each(lambda x: tensors.append(x) if isinstance(x, Tensor) else None, [args, list(kwargs.values())])
         remote = [x for x in tensors if isinstance(x, _Remote)]
         local = [x for x in tensors if not isinstance(x, _Remote)]
         target = torch.device(kwargs["device"]) if kwargs.get("device") is not None else None
@@ -101,7 +101,7 @@ class PretendDevice(TorchDispatchMode):
             self._launches += not _is_free(func, name)
         if kwargs.get("device") is not None and is_here:
             kwargs["device"] = torch.device("cpu")
-        out = func(*tree_map(_host, args), **tree_map(_host, kwargs))
+        out = func(*_each(_host, args), **{key: _each(_host, value) for key, value in kwargs.items()})
         if not is_here:
             return out
         known = {id(x.host): x for x in remote}  # written in place
@@ -109,7 +109,7 @@ class PretendDevice(TorchDispatchMode):
         def wrapped(x: Any) -> Any:
             return x if not isinstance(x, Tensor) else known[id(x)] if id(x) in known else _Remote(_plain(x))
 
-        return tree_map(wrapped, out)
+        return _each(wrapped, out)
 
 
 # torch wraps the method, and the wrapper imports its compiler, which takes seconds.
@@ -132,6 +132,11 @@ class _Constructors(TorchFunctionMode):
             self._device._waits += 1
             return args[0].host.tolist()
         return func(*args, **kwargs)
+
+
+def _each(use: Callable[[Any], Any], value: Any) -> Any:
+    """Call a function with each member of nested lists and tuples; torch's `tree_map` takes longer than the kernels."""
+    return type(value)([_each(use, x) for x in value]) if isinstance(value, (list, tuple)) else use(value)
 
 
 def _host(x: Any) -> Any:

@@ -71,6 +71,20 @@ _register()
 
 def run_with_hydra(name: str, call: Call) -> None:
     """Let Hydra compose the settings of a command and run it with them, or with those of each job of a sweep."""
+
+    @hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
+    def job(composed: Any) -> Any:
+        with errors_told(name):
+            values: Any = OmegaConf.to_container(composed, resolve=True)
+            values.pop("versions", None)  # of the config.yaml of an earlier run
+            settings = WITH_SETTINGS[name].of(values)  # checks the values, before torch is imported
+            show_warnings_as_lines()
+            settings = replace(settings, data=_complete(settings))
+            from cflow_torch.windows.memory import keep_freed_memory  # imports torch, which takes seconds
+
+            keep_freed_memory()
+            return import_module(f"cflow_torch.cli.{name}").task(settings)
+
     with errors_told(name):
         # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
         parsed = _PARSER.parse_overrides(call.overrides)
@@ -79,29 +93,7 @@ def run_with_hydra(name: str, call: Call) -> None:
         names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
         sys.argv = [f"cflow {name}", *call.overrides, names, *call.options]
-
-        @hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
-        def job(composed: Any) -> Any:
-            return run_job(name, composed)
-
         job()
-
-
-def run_job(name: str, composed: Any) -> Any:
-    """Run a command with the settings that Hydra has composed, perhaps as a job of a sweep.
-
-    Values are checked before torch is imported.
-    """
-    with errors_told(name):
-        values: Any = OmegaConf.to_container(composed, resolve=True)
-        values.pop("versions", None)  # of the config.yaml of an earlier run
-        settings = WITH_SETTINGS[name].of(values)
-        show_warnings_as_lines()
-        settings = replace(settings, data=_complete(settings))
-        from cflow_torch.windows.memory import keep_freed_memory  # imports torch, which takes seconds
-
-        keep_freed_memory()
-        return import_module(f"cflow_torch.cli.{name}").task(settings)
 
 
 def _complete(settings: Command) -> dict[str, Any]:

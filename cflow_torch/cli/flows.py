@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any, Callable, Sequence
 
-from cflow_torch.config import PRESETS
 from cflow_torch.data.flow_file import read_flow
-from cflow_torch.data.json_file import json_ready, read_json
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import as_path
-from cflow_torch.fleet.changes import flatten
 from cflow_torch.fleet.manifest import MANIFEST, frame_file
 from cflow_torch.types import CFlowError, FlowResult
 
@@ -36,15 +33,3 @@ def method_of_flow(folder: Any, log_id: str) -> dict[str, Any] | None:
     """Return the settings of the method that made the flow files of a log; None = they have no manifest."""
     manifest = as_path(folder) / log_id / MANIFEST
     return read_json(manifest).get("run", {}).get("method") if manifest.exists() else None
-
-
-def preset_of_flow(folder: Any, log_id: str) -> str | None:
-    """Return the preset of the flow files of a log: of its method, the one with the fewest other settings."""
-    method = flatten(method_of_flow(folder, log_id) or {})
-
-    def num_changes(name: str) -> int:
-        settings = flatten(json_ready(asdict(PRESETS[name])))
-        return sum(value != settings[key] for key, value in method.items() if key in settings)
-
-    names = [name for name, config in PRESETS.items() if config.method == method.get("method")]
-    return min(names, key=num_changes, default=None)

@@ -39,8 +39,25 @@ more examples:
 
 def main(argv: list[str] | None = None) -> None:
     """Run one command. Exit with status 1 if something failed, 2 if the call was wrong, 130 after Ctrl-C."""
+    command, *words = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if command == "help":  # cflow help eval
+        command, *words = [*words, "--help"]
     try:
-        _run(list(sys.argv[1:] if argv is None else argv))
+        if command in ("-h", "--help"):
+            print(HELP)
+        elif command in ("-V", "--version"):
+            print(f"cflow_torch {__version__}")
+        elif command not in COMMANDS:
+            raise CFlowError(f"unknown command {command!r}{near(command, COMMANDS)}: give one of {', '.join(COMMANDS)}")
+        elif "-h" in words or "--help" in words:
+            print(help_of(command), end="")
+        elif command in WITH_SETTINGS:
+            call = read_call(words, command)
+            from cflow_torch.cli.compose import run_with_hydra  # imports Hydra, which takes half a second
+
+            run_with_hydra(command, call)
+        else:
+            import_module(f"cflow_torch.cli.{command}").task(words)
         sys.stdout.flush()
     except CFlowError as error:
         exit_wrong(error)
@@ -53,27 +70,6 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("stopped by Ctrl-C", file=sys.stderr)
         raise SystemExit(128 + 2) from None  # as if SIGINT had ended it
-
-
-def _run(arguments: list[str]) -> None:
-    if arguments[:1] == ["help"]:  # cflow help eval
-        arguments = [*arguments[1:], "--help"]
-    command, *words = arguments or ["--help"]
-    if command in ("-h", "--help"):
-        print(HELP)
-    elif command in ("-V", "--version"):
-        print(f"cflow_torch {__version__}")
-    elif command not in COMMANDS:
-        raise CFlowError(f"unknown command {command!r}{near(command, COMMANDS)}: give one of {', '.join(COMMANDS)}")
-    elif "-h" in words or "--help" in words:
-        print(help_of(command), end="")
-    elif command in WITH_SETTINGS:
-        call = read_call(words, command)
-        from cflow_torch.cli.compose import run_with_hydra  # imports Hydra, which takes half a second
-
-        run_with_hydra(command, call)
-    else:
-        import_module(f"cflow_torch.cli.{command}").task(words)
 
 
 if __name__ == "__main__":

@@ -12,13 +12,14 @@ from cflow_torch.applications.track_table import TRACKS_FILE, Table, read_tracks
 from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.cli.commands import View
 from cflow_torch.cli.failures import Failures, collect_failures, finish
-from cflow_torch.cli.flows import preset_of_flow, stored_flow
+from cflow_torch.cli.flows import method_of_flow, stored_flow
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import chosen_preset, local_folder, write_config
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
+from cflow_torch.fleet.changes import nearest_preset
 from cflow_torch.fleet.progress import Progress
 from cflow_torch.types import CFlowError, FlowResult
 from cflow_torch.viz.page import load_k3d, save_page
@@ -73,7 +74,7 @@ def _save_page(cfg: View, log: Log, results: Iterator[tuple[int, FlowResult]], f
         results if table is not None else tracked(),
         file,
         tracks=lambda: tracker.table() if table is None else table,
-        preset=chosen_preset() if cfg.flow is None else preset_of_flow(cfg.flow, log.log_id),
+        preset=chosen_preset() if cfg.flow is None else nearest_preset(method_of_flow(cfg.flow, log.log_id) or {}),
         max_flow=cfg.max_flow,
         voxel=cfg.voxel,
     )

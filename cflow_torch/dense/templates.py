@@ -52,22 +52,18 @@ def make_pairs(clusters: Clusters, batch: Batch, pixel_size: float | Tensor, max
     slot = (pixels.cluster * num_sources + pixels.step - 1).index_select(0, older)
     pairs = flat_nonzero(draw(slot, num_slots))
     cluster, source = split_index(pairs, num_sources)
+    radius = None
+    if max_speed is not None:
+        seconds = batch.seconds[clusters.window[cluster], source + 1].abs()
+        # A GPU multiplies by the reciprocal of a plain number, which rounds differently.
+        side = pixel_size[cluster] if isinstance(pixel_size, Tensor) else torch.full_like(seconds, pixel_size)
+        radius = max_speed * seconds / side + 1  # one for rounding
     return TemplatePairs(
         template=Images(renumber(pairs, num_slots).index_select(0, slot), *gather(older, row, col)),
         target=Images(*gather(newest, pixels.cluster, row, col)),
         cluster=cluster,
         source=source,
         size=clusters.size,
-        radius=_radius(batch.seconds[clusters.window[cluster], source + 1], cluster, pixel_size, max_speed),
+        radius=radius,
         pixel=older,
     )
-
-
-def _radius(seconds: Tensor, cluster: Tensor, pixel_size: float | Tensor, max_speed: float | None) -> Tensor | None:
-    """Return how many pixels an object may move in the seconds of each pair, and one for rounding, (J,) float64."""
-    if max_speed is None:
-        return None
-    if isinstance(pixel_size, Tensor):
-        return max_speed * seconds.abs() / pixel_size[cluster] + 1
-    # A GPU multiplies by the reciprocal of a plain number, which rounds differently.
-    return max_speed * seconds.abs() / torch.full_like(seconds, pixel_size) + 1

@@ -23,8 +23,9 @@ from cflow_torch.simulator.narrow import build_narrow
 from cflow_torch.simulator.objects import own_truck
 from cflow_torch.simulator.profiles import PROFILES, WEATHER, in_weather
 from cflow_torch.simulator.recording import UnitReturns
+from cflow_torch.simulator.rolling import Shots
 from cflow_torch.simulator.scene import Scene
-from cflow_torch.simulator.sensors import LidarProfile
+from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
 from cflow_torch.simulator.street import build_street
 from cflow_torch.transforms import transform_each
 from cflow_torch.types import CFlowError, Sweep
@@ -214,13 +215,15 @@ class Drive(Log):
         generator = torch.Generator().manual_seed(int(stream))
         seconds = float(self._seconds[index])
         ground = self.scene.ground
-        if self._profile.is_rolling:
-            ego = self._motion.ego_motion(seconds)
-            solids = self._motion.solids(index)
-            return scan_rolling(self._profile, solids, ground, ego, generator)
-        solids_now = self.scene.solids(seconds, self._body_poses[index])
         pose = torch.from_numpy(self.poses[index])
-        return scan(self._profile, solids_now, ground, pose, generator)
+        if not self._profile.is_rolling:
+            return scan(self._profile, self.scene.solids(seconds, self._body_poses[index]), ground, pose, generator)
+        solids = self._motion.solids(index)
+
+        def shots_of(unit: SpinningLidar, phase: float) -> Shots:
+            return self._motion.shots(unit, seconds, phase, solids.origin)
+
+        return scan_rolling(self._profile, solids, ground, pose, shots_of, generator)
 
     def _extent(self, index: int, returns: Returns) -> np.ndarray:
         """(num_bodies, 3) float64 size of the smallest upright box, centred on a body's axis, that holds its points."""

@@ -49,23 +49,6 @@ class Returns:
     column: Tensor
 
 
-@dataclass(frozen=True)
-class EgoMotion:
-    """Motion of the vehicle during a sweep.
-
-    Args:
-        T_world_ego: (4, 4) float64 at the time stamp.
-        T_world_unit: for each unit (C, 4, 4) float64, its poses when it fires its C active columns.
-        seconds: for each unit (C,) float64, the times of these columns.
-        speed: (2,) upper bounds of the speed (m/s) and the rotation rate (rad/s) of all units.
-    """
-
-    T_world_ego: Tensor
-    T_world_unit: list[Tensor]
-    seconds: list[Tensor]
-    speed: tuple[float, float]
-
-
 def scan(
     profile: LidarProfile, solids: Solids, ground: Ground, T_world_ego: Tensor, generator: torch.Generator
 ) -> Returns:
@@ -104,19 +87,29 @@ def scan(
 
 
 def scan_rolling(
-    profile: LidarProfile, solids: MovingSolids, ground: Ground, ego: EgoMotion, generator: torch.Generator
+    profile: LidarProfile,
+    solids: MovingSolids,
+    ground: Ground,
+    T_world_ego: Tensor,
+    shots_of: Callable[[SpinningLidar, float], Shots],
+    generator: torch.Generator,
 ) -> Returns:
-    """Simulate a rolling sweep of all units of a vehicle: every column of shots has its own time and ego pose."""
+    """Simulate a rolling sweep of all units of a vehicle: every column of shots has its own time and ego pose.
+
+    Args:
+        T_world_ego: (4, 4) float64, at the time stamp.
+        shots_of: function that returns the shots of a unit from the phase of its columns, 0 ... 1.
+    """
     of_units = []
     for number, unit in enumerate(profile.units):
         phase = torch.rand((), generator=generator, dtype=torch.float64).item() if unit.has_jitter else 0.5
-        shots = _shots(unit, ego, number, phase, solids.origin)
+        shots = shots_of(unit, phase)
         image, cosine_at = cast_shots(
             shots, solids, ground, min(unit.max_range or profile.max_range, profile.max_range)
         )
         hit, distance, reflected = _measure(image, unit, profile, solids, cosine_at, generator)
         if profile.is_deskewed and not unit.is_virtual:
-            points, local = _deskewed_points(shots, image, hit, distance, unit, ego, solids.origin)
+            points, local = _deskewed_points(shots, image, hit, distance, unit, T_world_ego, solids.origin)
         else:
             points, local = _points_at_shots(shots, hit, distance, unit)
         first, _ = unit.active_columns or (0, unit.num_columns)
@@ -128,32 +121,17 @@ def scan_rolling(
     return _concatenate(of_units)
 
 
-def _shots(unit: SpinningLidar, ego: EgoMotion, number: int, phase: float, origin: Tensor) -> Shots:
-    """Return the shots of unit `number`; `phase`, 0 ... 1, shifts its columns, and `origin` is as in `MovingSolids`."""
-    first, end = unit.active_columns or (0, unit.num_columns)
-    step = math.radians(unit.span) / unit.num_columns
-    T_world_unit = ego.T_world_unit[number].clone()
-    T_world_unit[:, :3, 3] -= origin
-    return Shots(
-        azimuth=math.radians(unit.start) + step * (torch.arange(first, end).double() + phase),
-        seconds=ego.seconds[number],
-        T_world_sensor=T_world_unit,
-        elevation=torch.tensor(unit.elevations, dtype=torch.float64).deg2rad().sort().values,
-        speed=(0.0, 0.0) if unit.is_virtual else ego.speed,
-    )
-
-
 def _deskewed_points(
     shots: Shots,
     image: RangeImage,
     hit: Tensor,
     distance: Tensor,
     unit: SpinningLidar,
-    ego: EgoMotion,
+    T_world_ego: Tensor,
     origin: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return the points that were hit, (3, N) float32, in the ego frame at the time stamp, and in that of the unit."""
-    T_ego_world = torch.linalg.inv(ego.T_world_ego)
+    T_ego_world = torch.linalg.inv(T_world_ego)
     T_ego_world[:3, 3] += T_ego_world[:3, :3] @ origin
     column = hit // len(unit.elevations)
     sensor = shots.T_world_sensor[:, :3, 3].T.float().contiguous().index_select(1, column)
@@ -212,8 +190,8 @@ def _measure(
         margin = margin * torch.exp(-2 * profile.extinction * distance)
     chance = (1 - dropout) * torch.sigmoid(4 * margin.clamp(min=1e-12).log())
     chance = torch.where(is_foliage, FOLIAGE_RETURN * chance, chance)
-    if isinstance(solids, MovingSolids):
-        chance = chance.masked_fill(torch.cat([solids.is_own, torch.tensor([False])]).take(solid), 0.0)
+    is_own = torch.cat([solids.is_own, torch.tensor([False])]).take(solid)
+    chance = chance.masked_fill(is_own, 0.0)
     kept = (luck < chance).nonzero()[:, 0]
     return hit[kept], (distance + noise)[kept], reflected[kept]
 

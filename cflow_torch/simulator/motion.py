@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from cflow_torch.simulator.lidar import EgoMotion, Returns
-from cflow_torch.simulator.rolling import MovingSolids
+from cflow_torch.simulator.lidar import Returns
+from cflow_torch.simulator.rolling import MovingSolids, Shots
 from cflow_torch.simulator.scene import Scene
-from cflow_torch.simulator.sensors import LidarProfile
+from cflow_torch.simulator.sensors import LidarProfile, SpinningLidar
 from cflow_torch.transforms import transform_each
 
 _NUM_INTERVALS = 4  # per sweep; poses are interpolated within each, element by element: legs are exact to 0.3 mm
@@ -36,7 +38,6 @@ class SceneMotion:
         self._row[solids] = np.arange(len(solids))
         self._static = scene.solids(0.0, scene.body_poses(np.zeros(1))[0])
         self._T_static_world = _inverse(self._static.pose.numpy())
-        self._is_own = torch.from_numpy(body >= len(scene.bodies) - scene.num_own)
 
     def ego_poses(self, seconds: np.ndarray) -> np.ndarray:
         """(T, 4, 4) float64 `T_world_ego` at `seconds` (T,)."""
@@ -44,24 +45,34 @@ class SceneMotion:
         poses[:, :3, 3] += self._profile.ego_height * poses[:, :3, 2]
         return poses
 
-    def ego_motion(self, seconds: float) -> EgoMotion:
-        """Motion of the LiDARs during the sweep with time stamp `seconds`."""
+    def shots(self, unit: SpinningLidar, seconds: float, phase: float, origin: Tensor) -> Shots:
+        """Shots of a LiDAR in the sweep with time stamp `seconds`.
+
+        `phase`, 0 ... 1, shifts its columns, and `origin` is as in `MovingSolids`.
+        """
         profile = self._profile
         interval = profile.sweep_interval_ns * 1e-9
-        stamped = self.ego_poses(np.array([seconds]))[0]
-        poses = []
-        times = []
-        for unit in profile.units:
-            columns = np.arange(*(unit.active_columns or (0, unit.num_columns)))
-            shots = seconds + interval * (columns / unit.num_columns - profile.reference)
-            ego = np.broadcast_to(stamped, (len(shots), 4, 4)) if unit.is_virtual else self.ego_poses(shots)
-            poses.append(torch.from_numpy(ego @ unit.T_ego_sensor))
-            times.append(torch.from_numpy(shots))
+        first, end = unit.active_columns or (0, unit.num_columns)
+        times = seconds + interval * (np.arange(first, end) / unit.num_columns - profile.reference)
+        # All shots of a virtual unit are taken from the pose at the time stamp.
+        ego = self.ego_poses(np.full(len(times), seconds) if unit.is_virtual else times)
+        T_world_sensor = torch.from_numpy(ego @ unit.T_ego_sensor)
+        T_world_sensor[:, :3, 3] -= origin
+        step = math.radians(unit.span) / unit.num_columns
+        return Shots(
+            azimuth=math.radians(unit.start) + step * (torch.arange(first, end).double() + phase),
+            seconds=torch.from_numpy(times),
+            T_world_sensor=T_world_sensor,
+            elevation=torch.tensor(unit.elevations, dtype=torch.float64).deg2rad().sort().values,
+            speed=(0.0, 0.0) if unit.is_virtual else self._speed(seconds),
+        )
+
+    def _speed(self, seconds: float) -> tuple[float, float]:
+        """Bounds of the LiDARs' speed, m/s, and rotation rate, rad/s, for any time up to a second after `seconds`."""
         route = self._scene.ego
-        # An upper bound for any time up to a second after the time stamp.
         speed = abs(route.speed) + abs(route.acceleration) * (seconds + 1)
         yaw_rate = speed * (1 / route.radius + abs(self._scene.ground.curvature))
-        return EgoMotion(torch.from_numpy(stamped), poses, times, (1.1 * speed + 6 * yaw_rate, 1.1 * yaw_rate))
+        return 1.1 * speed + 6 * yaw_rate, 1.1 * yaw_rate
 
     @cached_property
     def _dynamic_poses(self) -> np.ndarray:
@@ -83,7 +94,7 @@ class SceneMotion:
             half_size=static.half_size,
             albedo=static.albedo,
             is_foliage=static.is_foliage,
-            is_own=self._is_own,
+            is_own=static.is_own,
             origin=torch.from_numpy(origin),
             knots=torch.from_numpy(knots),
             static=torch.from_numpy(_relative_to(self._T_static_world, origin)),

@@ -29,6 +29,7 @@ class Solids:
         half_size: (P, 3) float64, metres, by which the axes of the unit solid are scaled.
         albedo: (P,) float32 in (0, 1], share of the light that is reflected.
         is_foliage: (P,) bool.
+        is_own: (P,) bool, part of the recording vehicle.
     """
 
     kind: Tensor
@@ -36,6 +37,7 @@ class Solids:
     half_size: Tensor
     albedo: Tensor
     is_foliage: Tensor
+    is_own: Tensor
 
 
 class RayBlocks(NamedTuple):

@@ -75,4 +75,5 @@ class Scene:
             torch.from_numpy(of["half"]),
             torch.from_numpy(of["albedo"]).float(),
             torch.from_numpy(of["is_foliage"]),
+            torch.from_numpy(self.body_of_solid >= len(self.bodies) - self.num_own),
         )

@@ -195,6 +195,8 @@ def test_objects_are_the_moving_objects_of_the_simulator(drive, result):
     assert [first["length"], first["width"], first["height"]] == row["size"].tolist()
     assert [first["vx"], first["vy"], first["vz"]] == row["velocity"].tolist()
     assert (first["heading"], first["num_points"]) == (row["heading"], row["num_points"])
+    pandas = pytest.importorskip("pandas")
+    assert pandas.DataFrame(objects[:2]).to_dict("records") == records
     without = FlowResult.of({**vars(result), "confidence": None}).objects(drive.sweep(3).points).to_records()
     assert without[0]["confidence"] is None and json.dumps(without, allow_nan=False)
     empty = result.objects(drive.sweep(3).points, min_speed=1e3)

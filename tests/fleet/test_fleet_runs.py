@@ -88,6 +88,8 @@ def test_incomplete_files_are_computed_again(fleet, single, out):
 def test_other_settings_are_rejected_by_name(fleet, single, out):
     with pytest.raises(CFlowError, match=re.escape("method.pixel_sizes was [0.4], is [0.8]") + ".*overwrite=true"):
         run(fleet, out, settings=OTHER)
+    with pytest.raises(CFlowError, match="preset was paper, is keypoints; "):
+        run(fleet, out, settings={"config": make_config("keypoints", pixel_size=0.4)})
     with pytest.raises(CFlowError, match="find_ground was None, is grid"):
         run(fleet, out, settings={"settings": {"find_ground": "grid"}})
     with pytest.raises(CFlowError, match="remove that folder"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Sequence, Tuple
+from functools import reduce
+from itertools import product
+from typing import Callable, Sequence, Tuple
 
 import numpy as np
 
@@ -77,11 +79,12 @@ def value_at(image: np.ndarray, *index: np.ndarray) -> np.ndarray:
     return np.where(inside, image[tuple(np.where(inside, axis, 0) for axis in index)], 0)
 
 
-def over_squares(image: np.ndarray, reach: int, combine: np.ufunc) -> np.ndarray:
+def over_squares(image: np.ndarray, reach: int, combine: Callable[..., np.ndarray]) -> np.ndarray:
     """Combine, for each pixel of (..., H, W), those at most `reach` rows and columns away."""
     padded = np.pad(image, [(0, 0)] * (image.ndim - 2) + [(reach, reach)] * 2)
-    squares = np.lib.stride_tricks.sliding_window_view(padded, (2 * reach + 1,) * 2, (-2, -1))
-    return combine.reduce(squares, axis=(-2, -1))
+    rows, cols = image.shape[-2:]
+    shifts = product(range(2 * reach + 1), repeat=2)
+    return reduce(combine, (padded[..., row : row + rows, col : col + cols] for row, col in shifts))
 
 
 def slice_of(z: np.ndarray, height: float = SLICE_HEIGHT, num_slices: int = NUM_SLICES) -> np.ndarray:

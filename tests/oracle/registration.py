@@ -49,6 +49,7 @@ class Voxels:
 
     Attributes:
         step, layer, object_id: (V,).
+        bordered: the pixels of t+1, as `SlicedSweeps.number`, with a border of two pixels.
         position: (V, 3), centroid of its points in units from the lower corner and z = 0: each coordinate rounded to
             the nearest unit, their mean down to a whole one.
     """
@@ -67,6 +68,7 @@ class Voxels:
         self.step, self.object_id = sweeps.pixels[pixel, 0], object_of[pixel]
         self.plane = sweeps.pixels[pixel, 1:].sum(1) + self.layer
         self.number = {key: number for number, key in enumerate(keys.tolist())}
+        self.bordered = np.pad(sweeps.number[0], 2, constant_values=-1)
 
     def of(self, object_id: int, most: float) -> np.ndarray:
         """The voxels of an object before t+1; if they are more than `most`, those in every n-th diagonal plane."""
@@ -76,10 +78,10 @@ class Voxels:
     def around(self, layer: int, position: np.ndarray) -> list[int]:
         """Voxels of t+1 in the 3 x 3 pixels around a position, in its layer and those next to it, the last of which is
         below the first: pixel by pixel in raster order. Beyond the border, there are none."""
-        image = np.pad(self.sweeps.number[0], 2, constant_values=-1)
-        col, row = np.floor(position[:2] / self.sweeps.size).astype(int)
-        row, col = np.clip((row, col), -1, np.array(self.sweeps.number[0].shape)) + 2
-        square = image[row - 1 : row + 2, col - 1 : col + 2].ravel().tolist()
+        height, width = self.sweeps.number[0].shape
+        col, row = (math.floor(x / self.sweeps.size) for x in position[:2].tolist())
+        row, col = min(max(row, -1), height) + 2, min(max(col, -1), width) + 2
+        square = self.bordered[row - 1 : row + 2, col - 1 : col + 2].ravel().tolist()
         keys = [pixel * NUM_LAYERS + (layer + up) % NUM_LAYERS for pixel, up in product(square, (-1, 0, 1))]
         return [self.number[key] for key in keys if key in self.number]
 

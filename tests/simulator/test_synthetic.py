@@ -16,7 +16,6 @@ from cflow_torch.simulator.lidar import scan
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.range_image import cast_shots, cast_solids
 from cflow_torch.simulator.raycast import BOX, CYLINDER, ELLIPSOID, Solids, ray_directions
-from cflow_torch.simulator.rolling import Shots
 from cflow_torch.simulator.scene import Scene
 from cflow_torch.simulator.trajectories import Route, Towed
 from cflow_torch.transforms import transform_points
@@ -63,7 +62,7 @@ def random_solids(rng, number):
     pose[1, :3, :3], pose[1, :3, 3], half[1], kind[1] = np.eye(3), (0, 0, 3), (5, 5, 0.1), BOX
     keep = np.linalg.norm(pose[:, :3, 3], axis=1) > 2.9
     kind, pose, half = kind[keep], pose[keep], half[keep]
-    return Solids(*map(torch.from_numpy, (kind, pose, half, np.full(len(kind), 0.5, np.float32), kind < 0)))
+    return Solids(*map(torch.from_numpy, (kind, pose, half, np.full(len(kind), 0.5, np.float32), kind < 0, kind < 0)))
 
 
 @pytest.mark.parametrize("max_candidates", [1 << 20, 100])
@@ -92,23 +91,19 @@ def test_rolling_shots_equal_brute_force(name):
     scene = Scene(street.ground, street.ego, bodies)
     drive = Drive(scene, PROFILES[name], 0, 2, "small")
     seconds = float(drive._seconds[1])
-    ego, solids = drive._motion.ego_motion(seconds), drive._motion.solids(1)
+    solids = drive._motion.solids(1)
     checked = wrong = wrong_solid = 0
     for number in (0, 1):
         unit = drive._profile.units[number]
-        first, end = unit.active_columns or (0, unit.num_columns)
-        chosen = np.linspace(0, end - first - 1, 8).astype(int)
-        T_world_sensor = ego.T_world_unit[number].clone()
-        T_world_sensor[:, :3, 3] -= solids.origin
-        azimuth = np.radians(unit.start + unit.span / unit.num_columns * (np.arange(first, end) + 0.5))
-        up = drive.elevations(unit.name)
-        speed = (0.0, 0.0) if unit.is_virtual else ego.speed
-        shots = Shots(torch.from_numpy(azimuth), ego.seconds[number], T_world_sensor, torch.from_numpy(up), speed)
+        shots = drive._motion.shots(unit, seconds, 0.5, solids.origin)
+        azimuth, up = shots.azimuth.numpy(), drive.elevations(unit.name)
+        chosen = np.linspace(0, len(azimuth) - 1, 8).astype(int)
         max_range = unit.max_range or drive._profile.max_range
         image, _ = cast_shots(shots, solids, scene.ground, max_range)
         distance, solid = (values.view(len(azimuth), -1).numpy() for values in (image.distance, image.solid))
         for column in chosen:
-            now, T = float(ego.seconds[number][column]), ego.T_world_unit[number][column].numpy()
+            now = float(shots.seconds[column])
+            T = drive._motion.ego_poses(np.array([seconds if unit.is_virtual else now]))[0] @ unit.T_ego_sensor
             there = scene.solids(now, scene.body_poses(np.array([now]))[0])
             ray = np.stack([np.cos(azimuth[column]) * np.cos(up), np.sin(azimuth[column]) * np.cos(up), np.sin(up)])
             ranges = brute_force(there, T[:3, 3], T[:3, :3] @ ray)
@@ -147,7 +142,7 @@ def test_a_wall_occludes_a_box_behind_it():
     pose = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     pose[:, :3, 3] = torch.tensor([[10.0, 0, 1], [20.0, 0, 1], [20.0, 30, 1]])
     half = torch.tensor([[0.1, 8, 3], [1, 1, 1], [1, 1, 1]], dtype=torch.float64)
-    solids = Solids(torch.zeros(3, dtype=torch.int64), pose, half, torch.ones(3), torch.zeros(3) > 0)
+    solids = Solids(torch.zeros(3, dtype=torch.int64), pose, half, torch.ones(3), *2 * [torch.zeros(3) > 0])
     ground, ego = Ground(slope=(0.0, 0.0), curvature=0.0, kerb=0.0), torch.eye(4, dtype=torch.float64)
     returns = scan(PROFILES["av2"], solids, ground, ego, torch.Generator().manual_seed(0))
     points, solid = returns.points.numpy(), returns.solid.numpy()

@@ -206,7 +206,10 @@ def picture(tab: Any) -> np.ndarray:
 
 def are_of(pixels: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """(H, W) bool: pixels that have one of (C, 3) colours, within 2 levels."""
-    return (np.abs(pixels[:, :, None] - colors).max(axis=3) <= 2).any(axis=2)
+    keys, key_of_pixel = np.unique(pixels @ (1 << 16, 1 << 8, 1), return_inverse=True)
+    shades = np.stack([keys >> 16, keys >> 8 & 255, keys & 255], axis=-1)
+    is_one = (np.abs(shades[:, None] - colors).max(axis=2) <= 2).any(axis=1)
+    return is_one[key_of_pixel.reshape(pixels.shape[:2])]
 
 
 def count_of(pixels: np.ndarray, colors: np.ndarray) -> int:

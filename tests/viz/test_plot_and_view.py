@@ -18,9 +18,10 @@ from small_logs import make_small_drive
 from cflow_torch import CFlowError
 from cflow_torch.cli import plot as plot_command
 from cflow_torch.cli import view as view_command
-from cflow_torch.cli.flows import preset_of_flow
+from cflow_torch.cli.flows import method_of_flow
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
+from cflow_torch.fleet.changes import nearest_preset
 from cflow_torch.simulator.writers.av2 import write_av2_log
 from cflow_torch.viz import page
 
@@ -130,7 +131,7 @@ def test_a_view_of_estimated_and_of_stored_flow(form, package, ending, stored_fl
     assert cflow(*view, f"flow={stored_flow}", "device=no_such_device") == 1, "nothing is estimated"
     printed = capsys.readouterr()
     assert f"{file}: 2 pairs" in printed.out and "1 failed" in printed.err and file.is_file()
-    assert preset_of_flow(stored_flow, NAME) == "paper" and preset_of_flow(tmp_path, NAME) is None
+    assert nearest_preset(method_of_flow(stored_flow, NAME)) == "paper" and method_of_flow(tmp_path, NAME) is None
     if form == "html":
         assert '"preset":"paper"' in re.sub(r"\s", "", file.read_text(encoding="utf-8")), "the page names the method"
     assert cflow(*view, "flow=nowhere") == 2 and "flow=nowhere is not a folder" in capsys.readouterr().err
