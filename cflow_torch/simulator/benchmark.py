@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.data.hdf5.writer import write_hdf5_scene
-from cflow_torch.simulator.drive import Drive, make_drive
+from cflow_torch.simulator.drive import Drive, drive_name, make_drive
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 _HERE = Path(__file__).parent
@@ -99,10 +99,10 @@ def benchmark_logs(
     num_simulated = num_sweeps * int(chosen.settings.get("sweep_step", 1))
     found: list[Any] = []
     for number, seed in enumerate(tqdm(seeds, unit="drive", desc=profile, disable=None, file=sys.stderr)):
-        # This is cheap: the writer simulates the sweeps.
-        drive = make_drive(seed, num_simulated, profile, scenes[number % len(scenes)])
-        target = folder / drive.log_id
+        scene = scenes[number % len(scenes)]
+        target = folder / drive_name(seed, profile, scene)
         if not target.is_dir():
+            drive = make_drive(seed, num_simulated, profile, scene)
             folder.mkdir(parents=True, exist_ok=True)
             scratch = Path(tempfile.mkdtemp(prefix=".making-", dir=folder))
             try:

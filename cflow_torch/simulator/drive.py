@@ -283,8 +283,13 @@ def make_drive(
     if lidars.has_trailer:
         own = own_truck(world.ego)
         world = replace(world, bodies=(*world.bodies, *own), num_own=len(own))
+    return Drive(world, lidars, seed, num_sweeps, drive_name(seed, profile, scene, weather))
+
+
+def drive_name(seed: int, profile: str, scene: str, weather: str = "clear") -> str:
+    """Return the `log_id` of a drive."""
     parts = [profile, *([scene] if scene != "street" else []), *([weather] if weather != "clear" else [])]
-    return Drive(world, lidars, seed, num_sweeps, f"synthetic-{'-'.join(parts)}-{seed:04d}")
+    return f"synthetic-{'-'.join(parts)}-{seed:04d}"
 
 
 def _choose(kind: str, name: str, options: Mapping[str, T]) -> T:

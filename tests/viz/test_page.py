@@ -348,7 +348,7 @@ COVER = """(() => {
 })()"""
 
 
-@pytest.mark.parametrize("size", [(390, 760), (360, 640)])
+@pytest.mark.parametrize("size", [pytest.param((390, 760), marks=pytest.mark.slow), (360, 640)])
 def test_a_phone_shows_the_object_that_it_follows_beside_its_panel(
     browser: Any, drive_page: Path, size: tuple[int, int]
 ) -> None:
