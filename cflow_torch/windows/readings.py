@@ -314,6 +314,9 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
             share = replace(pair, transforms={GIVEN: motion}).share(scan)
             shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
         of_pairs.append(shares)
+    if sum(INACCURATE in shares for shares in of_pairs) < min(2, len(pairs)):  # one of several may have another cause
+        for shares in of_pairs:
+            shares.pop(INACCURATE, None)
     return found, of_pairs
 
 
