@@ -95,8 +95,11 @@ class Edges(NamedTuple):
         return Edges(*(values - origin for values in self))
 
     def is_seen(self) -> Tensor:
-        """(R, 2) bool: the sensor looks at a long side, which shows the length; at an end, which shows the width."""
-        side = torch.atan2(self.view[:, 1].abs(), self.view[:, 0].abs())
+        """(R, 2) bool: the sensor looks at a long side, which shows the length; at an end, which shows the width.
+
+        The edges are relative to a point of the object. A few points of another object in one sweep do not move it.
+        """
+        side = torch.atan2(self.sensor[:, 1].abs(), self.sensor[:, 0].abs())
         return torch.stack([side >= _SEEN_ANGLE, side <= math.pi / 2 - _SEEN_ANGLE], 1)
 
     def anchor(self, size: Tensor, kind: Tensor) -> tuple[Tensor, Tensor]:

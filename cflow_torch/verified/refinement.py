@@ -14,7 +14,7 @@ covariance of the voxels around both ends.
                 align           repeatedly: correspond (move the source, find the nearest target), linearise, solve.
                                 The first half of the iterations uses a sample of large objects.
             if points have times:
-                stretch         corrects the motion for the time between two measurements of an object
+                stretch         the time between two measurements of an object, by which we divide its motion
                 if the window has history:
                     deskew          moves the points to the instant of their sweep
                     Registration    of the moved points
@@ -52,12 +52,12 @@ NUM_LAYERS = 32  # number of layers of voxels before they repeat
 MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _NOISE = 0.05  # metres, standard deviation between two centroids, besides the covariances of their surfaces
 _FARTHEST = 0.2  # metres, between the two voxels of a correspondence
-_KERNEL = 3.0  # scale of the Geman-McClure kernel, in variances of both surfaces
+_KERNEL = 3.0  # scale of the Geman-McClure kernel, in variances of the residual
 # The prior holds x and y near the start as firmly as two correspondences do, and the tangent of half the angle near
 # zero as firmly as five correspondences at 1 m from the centre.
 _PRIOR = (2.0, 2.0, 20.0)
-# The least ratio of `Registration.stretch`. At 0.75, the beam hits the object a quarter turn earlier than one sweep
-# before. An object that moves so far around the sensor in a sweep is nearer to it than its own length. So a smaller
+# The least ratio of `Registration.stretch`. At 0.75, the beam hits the object again after three quarters of a turn. An
+# object that moves so far around the sensor in a sweep is nearer to it than its own length. So a smaller
 # ratio means that the seam between two sweeps crosses the object.
 _LEAST_STRETCH = 0.75
 _NUM_ITERATIONS = 4
@@ -117,12 +117,12 @@ def register_deskewed(
     deskewed = Registration(deskew(with_history, sweeps, divided), sweeps, len(start))
     again = deskewed.align(start / stretch, num_iterations)
     is_again = Groups(with_history.object_id, len(start)).size() > 0
-    return again.where(is_again, divided), apparent
+    return again.where(is_again, divided), apparent  # `again` where it is known, else `divided`
 
 
 @dataclass(frozen=True)
 class Source:
-    """K voxels of t and of older sweeps, which we move to t+1."""
+    """K voxels of the sweeps other than t+1, which we move to t+1."""
 
     voxel: Tensor  # (K,) int64
     by_object: Groups  # the voxels, grouped by object; each one is in a group

@@ -75,7 +75,7 @@ STEPS: dict[str, dict[str, Any]] = {
     "no links of fast objects": {"link_unlinked": lambda sweeps, components, tree, max_speed: tree},
     "no objects under overhangs": {"add_overhung": lambda sweeps, components, tree: (sweeps, tree)},
     "no aperture test": {"verify": partial(paired_test.verify, slides=_nothing_slides)},
-    "no least gain": {"verify": partial(paired_test.verify, least_share=math.inf)},
+    "no least gain": {"verify": partial(paired_test.verify, pixels_per_slice=math.inf)},
     "no price of an object": {"select_objects": partial(selection.select_objects, price=0)},
     "no dissent": {"select_objects": partial(selection.select_objects, dissent=_no_dissent)},
     "no margin": {"motion_margin": _without_margin},

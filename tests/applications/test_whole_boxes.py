@@ -113,6 +113,19 @@ def test_where_the_length_is_never_seen_the_box_reaches_away_from_the_sensor() -
     assert np.allclose(rear, path[:, 0] - SIZE[0] / 2, atol=0.02), "the end that is seen"
 
 
+def test_points_of_another_car_in_few_sweeps_do_not_make_the_length_seen() -> None:
+    """The sensor is behind the car. Points far beside it would have their middle at the side of the sensor."""
+    path = straight((6, 0.0), 7.0, 0.0)
+
+    def rear(index: int, points: np.ndarray) -> np.ndarray:
+        other = np.array([[7.0, 7.0, 0.5]]) + np.linspace(0, 1, 9)[:, None]
+        of_car = points[points[:, 0] < -1.5]
+        return np.concatenate([of_car, other]) if index in (3, 4) else of_car
+
+    boxes = whole_boxes(seen([path], (0.0, 0.0), rear))
+    assert np.allclose(boxes.size[:, 0], 4.5) and np.allclose(boxes.size[:, 1], SIZE[1], atol=0.02)
+
+
 def test_points_of_other_objects_in_some_sweeps_change_nothing() -> None:
     path = straight((8, 6), 9.0, 0.0)
     clean = whole_boxes(seen([path], (0.0, 0.0)))
