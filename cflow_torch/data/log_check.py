@@ -26,7 +26,7 @@ _STRIP, _SAMPLE, _SAME, _ACCUMULATED = 4.0, 1000, 0.001, 0.3
 _LEAST_MOTION = 0.2  # metres between two sweeps, or the sensor stands
 _GRID = 0.2  # share of different coordinates, below which points lie on a grid
 _UNEVEN, _EVEN = 0.1, 0.5  # change of the intervals of times from one to the next, and that of the motion over it
-_MOST_DIRECTED = 20_000  # points that show in which directions a sweep measures
+_MOST_SEEN = 20_000  # points that show in which directions a sweep measures, and whether they lie on a grid
 _DIRECTIONS, _LEAST_SHARED = 72, 0.5  # and the share of them in which neighbouring sweeps both measure
 _TOPICS = (
     *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
@@ -236,7 +236,8 @@ def _share_again(pc0: Sweep, pc1: Sweep) -> float:
 
 def _is_grid(sweep: Sweep) -> bool:
     """Test whether a sweep was thinned to a grid: most points have an x that others have, too."""
-    x = as_numpy(sweep.points)[:, 0]
+    points = as_numpy(sweep.points)
+    x = points[:: len(points) // _MOST_SEEN + 1, 0]
     return len(np.unique(x)) < _GRID * len(x)
 
 
@@ -249,7 +250,7 @@ def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
 def _directions(sweep: Sweep) -> np.ndarray:
     """Return in which of 72 directions a sweep has points, (72,) bool."""
     points = as_numpy(sweep.points)
-    x, y = points[:: len(points) // _MOST_DIRECTED + 1, :2].astype(np.float64).T
+    x, y = points[:: len(points) // _MOST_SEEN + 1, :2].astype(np.float64).T
     turns = np.arctan2(y, x)[np.isfinite(x + y)] / (2 * np.pi)
     has_points = np.zeros(_DIRECTIONS, bool)
     has_points[np.floor(turns * _DIRECTIONS).astype(int)] = True  # negative numbers count from the end

@@ -261,10 +261,9 @@ class Neighbours:
 
     def add(self, sweep: Sweep | None) -> None:
         index = self._count
-        structure: np.ndarray = np.zeros((0, 3))
+        structure = _structure(sweep)
         if sweep is not None:
             self.num_points[index] = int(are_finite(as_numpy(sweep.points)).sum())
-            structure = as_numpy(sweep.points)[structure_rows(sweep), :3].astype(np.float64)
         if self._last is not None and sweep is not None and repeats(self._last, sweep):
             self.repeated.append(index)
         if index:
@@ -296,16 +295,20 @@ class Neighbours:
         for first, after in edges.tolist():  # the pairs of sweeps first - 1, ..., after - 1 are low
             last = after - 2
             has_ends = first > 0 and after <= len(shares)
-            if has_ends and last >= first and self._share(log, first - 1, last + 1) < _MISPLACED * usual[first - 1]:
-                continue
+            if has_ends and last >= first:
+                pc0, pc1 = log.sweep(first - 1), log.sweep(last + 1)
+                if _share_in_place(pc0, _structure(pc0), pc1, _structure(pc1)) < _MISPLACED * usual[first - 1]:
+                    continue
             if has_ends or last >= first:
                 runs.append((first, last))
         return runs
 
-    def _share(self, log: Log, first: int, second: int) -> float:
-        sweeps = [log.sweep(index) for index in (first, second)]
-        structures = [as_numpy(each.points)[structure_rows(each), :3].astype(np.float64) for each in sweeps]
-        return _share_in_place(sweeps[0], structures[0], sweeps[1], structures[1])
+
+def _structure(sweep: Sweep | None) -> np.ndarray:
+    """Return the points of the static structure of a sweep, (K, 3) float64; None = it has none."""
+    if sweep is None:
+        return np.zeros((0, 3))
+    return as_numpy(sweep.points)[structure_rows(sweep), :3].astype(np.float64)
 
 
 def _median(values: np.ndarray) -> float:
