@@ -280,6 +280,26 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
     """
     motions = [_motion_of(pair, scan) for pair in pairs]
     steps = [pair.transforms[GIVEN] for pair in pairs]
+    errors = [float(np.linalg.norm((motion - step)[:2, 3])) for motion, step in zip(motions, steps)]
+    found = _readings_of_motions(steps, motions, max(errors))
+    of_pairs = []
+    for pair, step, motion, error in zip(pairs, steps, motions, errors):
+        read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
+        shares = {name: replace(pair, transforms={GIVEN: T}).share(scan) for name, T in read.items()}
+        if max(errors) > _SMALLEST_ERROR and error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
+            share = replace(pair, transforms={GIVEN: motion}).share(scan)
+            shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
+        of_pairs.append(shares)
+    if sum(INACCURATE in shares for shares in of_pairs) < min(2, len(pairs)):  # one of several may have another cause
+        for shares in of_pairs:
+            shares.pop(INACCURATE, None)
+    return found, of_pairs
+
+
+def _readings_of_motions(
+    steps: Sequence[np.ndarray], motions: Sequence[np.ndarray], largest_error: float
+) -> dict[str, Reading]:
+    """Return how motions of the poses may differ from those of the points, (4, 4) each: turned, scaled, or inexact."""
     given, fitted = (np.array([complex(*T[:2, 3]) for T in each]) for each in (steps, motions))
     product = complex(given @ fitted.conj())
     turn, scale = float(np.angle(product)), float(abs(product) / max(np.sum(np.abs(given) ** 2), 1e-9))
@@ -301,23 +321,11 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
             scaled(scale),
             fix=f"positions multiplied by {scale:.3g}, unless the points have another unit (feet)",
         )
-    errors = [float(np.linalg.norm((motion - step)[:2, 3])) for motion, step in zip(motions, steps)]
     found[INACCURATE] = Reading(
-        f"the poses are off, by up to {max(errors):.1f} m between two sweeps",
+        f"the poses are off, by up to {largest_error:.1f} m between two sweeps",
         fix="exact poses and times, or data.odometry=refine if they are noisy",
     )
-    of_pairs = []
-    for pair, step, motion, error in zip(pairs, steps, motions, errors):
-        read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
-        shares = {name: replace(pair, transforms={GIVEN: T}).share(scan) for name, T in read.items()}
-        if max(errors) > _SMALLEST_ERROR and error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
-            share = replace(pair, transforms={GIVEN: motion}).share(scan)
-            shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
-        of_pairs.append(shares)
-    if sum(INACCURATE in shares for shares in of_pairs) < min(2, len(pairs)):  # one of several may have another cause
-        for shares in of_pairs:
-            shares.pop(INACCURATE, None)
-    return found, of_pairs
+    return found
 
 
 def _motion_of(pair: Pair, scan: str) -> np.ndarray:
