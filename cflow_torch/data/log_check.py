@@ -8,7 +8,7 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
-from cflow_torch.data.log_motion import Neighbours, find_lapses, judge_log
+from cflow_torch.data.log_motion import Neighbours, find_lapses, find_missing, judge_log
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
@@ -24,9 +24,9 @@ _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the
 # Points of a strip of this half width that are looked for, to within so many metres, and the share that comes again.
 _STRIP, _SAMPLE, _SAME, _ACCUMULATED = 4.0, 1000, 0.001, 0.3
 _LEAST_MOTION = 0.2  # metres between two sweeps, or the sensor stands
-_FEW, _AROUND = 0.5, 5  # least part of the number of points that so many sweeps before and after it have
+_GRID = 0.2  # share of different coordinates, below which points lie on a grid
 _UNEVEN, _EVEN = 0.1, 0.5  # change of the intervals of times from one to the next, and that of the motion over it
-_MOST_DIRECTED = 20_000  # points that show in which directions a sweep measures
+_MOST_SEEN = 20_000  # points that show in which directions a sweep measures, and whether they lie on a grid
 _DIRECTIONS, _LEAST_SHARED = 72, 0.5  # and the share of them in which neighbouring sweeps both measure
 _TOPICS = (
     *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
@@ -200,7 +200,7 @@ def _repeated(log: Log) -> list[Finding]:
     first = [log.sweep(index) for index in range(2)]
     if repeats(*first):
         return [Finding("sweeps", WRONG, REPEATED, True)]
-    again = _share_again(*first)
+    again = 0.0 if _is_grid(first[0]) else _share_again(*first)
     if again > _ACCUMULATED:
         text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
         fix = "give the points that each sweep has measured itself, not a map or sweeps that were added up"
@@ -234,6 +234,13 @@ def _share_again(pc0: Sweep, pc1: Sweep) -> float:
     return Structure(scale * points1[around]).share(scale * moved, np.eye(4))
 
 
+def _is_grid(sweep: Sweep) -> bool:
+    """Test whether a sweep was thinned to a grid: most points have an x that others have, too."""
+    points = as_numpy(sweep.points)
+    x = points[:: len(points) // _MOST_SEEN + 1, 0]
+    return len(np.unique(x)) < _GRID * len(x)
+
+
 def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
     """Return the share of the directions of one sweep in which the other has points; 1 if one has no points."""
     in0, in1 = _directions(pc0), _directions(pc1)
@@ -243,7 +250,7 @@ def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
 def _directions(sweep: Sweep) -> np.ndarray:
     """Return in which of 72 directions a sweep has points, (72,) bool."""
     points = as_numpy(sweep.points)
-    x, y = points[:: len(points) // _MOST_DIRECTED + 1, :2].astype(np.float64).T
+    x, y = points[:: len(points) // _MOST_SEEN + 1, :2].astype(np.float64).T
     turns = np.arctan2(y, x)[np.isfinite(x + y)] / (2 * np.pi)
     has_points = np.zeros(_DIRECTIONS, bool)
     has_points[np.floor(turns * _DIRECTIONS).astype(int)] = True  # negative numbers count from the end
@@ -261,7 +268,7 @@ def _each_sweep(log: Log) -> list[Finding]:
         except (CFlowError, OSError) as error:
             neighbours.add(None)
             errors[index] = error
-    return [*_unreadable(log, errors), *_small(neighbours.num_points), *_misplaced(log, neighbours)]
+    return [*_unreadable(log, errors), *_small(neighbours), *_misplaced(log, neighbours)]
 
 
 def _unreadable(log: Log, errors: Mapping[int, Exception]) -> list[Finding]:
@@ -273,16 +280,14 @@ def _unreadable(log: Log, errors: Mapping[int, Exception]) -> list[Finding]:
     return [Finding("sweeps", WRONG, text)]
 
 
-def _small(num_points: Mapping[int, int]) -> list[Finding]:
-    counts = np.array(list(num_points.values()))
-    usual = [int(np.median(counts[max(k - _AROUND, 0) : k + _AROUND + 1])) for k in range(len(counts))]
-    few = [k for k, number in enumerate(counts) if number < _FEW * usual[k]]
-    if not few:
+def _small(neighbours: Neighbours) -> list[Finding]:
+    small = neighbours.small
+    if not small:
         return []
-    index = list(num_points)[few[0]]
-    text = f"{len(few)} of them have few points, the first is sweep {index} with {num_points[index]:,}"
+    index = min(small)
+    text = f"{len(small)} of them have few points, the first is sweep {index} with {neighbours.num_points[index]:,}"
     fix = "are their files complete? Else leave these sweeps out"
-    return [Finding("sweeps", WRONG, f"{text}, while those around it have {usual[few[0]]:,}: {fix}")]
+    return [Finding("sweeps", WRONG, f"{text}, while those around it have {small[index]:,}: {fix}")]
 
 
 def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
@@ -292,12 +297,27 @@ def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
     if repeated:
         text = f"{len(repeated)} of them repeat the points of the sweep before, the first is sweep {repeated[0]}"
         findings.append(Finding("sweeps", WRONG, f"{text}: leave them out, or copy their files again"))
-    known = {lapse.sweep for lapse in find_lapses(log)} | set(repeated)
+    missing = find_missing(log)
+    for index, metres in missing:
+        text = f"sweeps seem to be missing before sweep {index}, because the vehicle moves {metres:.1f} m there"
+        findings.append(Finding("sweeps", WRONG, f"{text}: give the times of the sweeps"))
+    known = (
+        {lapse.sweep for lapse in find_lapses(log)}
+        | set(repeated)
+        | {index for index, _ in missing}
+        | set(neighbours.small)
+    )
     for first, last in neighbours.misplaced(log):
-        if known.isdisjoint(range(first, last + 2)):
-            which = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
-            text = f"{which} not fit those around, which fit one another: has it points or a pose of another time?"
-            findings.append(Finding("sweeps", WRONG, f"{text} Correct its files, or leave it out"))
+        if not known.isdisjoint(range(first, last + 2)):
+            continue
+        which = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
+        what = (
+            f"{which} not fit those around: has it points or a pose of another time? Correct its files, or leave it out"
+        )
+        if last < first:
+            which = f"sweeps {last} and {first} do not fit each other, while those around do"
+            what = f"{which}: are sweeps missing between them, or do poses jump? Split the log there"
+        findings.append(Finding("sweeps", WRONG, what))
     return findings
 
 

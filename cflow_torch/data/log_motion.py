@@ -24,7 +24,7 @@ from cflow_torch.windows.readings import (
     judge,
     make_pair,
 )
-from cflow_torch.windows.stillness import Structure, structure_rows
+from cflow_torch.windows.stillness import Structure, are_finite, structure_rows
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
 _BEFORE = 100  # sweeps before a suspect step, from whose poses other readings of it follow
@@ -40,8 +40,10 @@ _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
 _FEWEST_POSES = 5  # that tell a usual step
 _AS_AROUND, _CLEARLY = "as around it", 1.3  # factor by which another reading is better than the steps around
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
+_LONG = 1.7  # length of a step over the usual one, if sweeps are missing
 _COMPARED = 300  # points of each sweep that are compared with the next one
-_AROUND, _MISPLACED = 10, 0.5  # sweeps on each side that tell a usual share, and the part of it that is too low
+_AROUND = 10  # sweeps on each side that tell a usual share, or number of points
+_MISPLACED, _FEW = 0.5, 0.5  # parts of the usual share and of the usual number of points that are too low
 
 
 class Lapse(NamedTuple):
@@ -211,6 +213,20 @@ def find_lapses(log: Log) -> list[Lapse]:
     return lapses
 
 
+def find_missing(log: Log) -> list[tuple[int, float]]:
+    """Find sweeps before which others are missing, with the metres to the sweep before: steps that the points confirm.
+
+    In logs with times, steps are in proportion to them.
+    """
+    steps = steps_of(log)
+    if steps is None:
+        return []
+    lengths, usual = (np.linalg.norm(each[:, :3, 3], axis=1) for each in (steps.given, steps.usual))
+    long = [k for k in steps.suspects if lengths[k] > _LONG * usual[k] and usual[k] > _LEAST_MOTION]
+    confirmed = sorted(k for k in long if _contradicted(log, k, steps.usual[k], steps.given[k]))
+    return [(k + 1, float(lengths[k])) for k in confirmed]
+
+
 def _contradicted(log: Log, index: int, step: np.ndarray, usual: np.ndarray) -> bool:
     """Test whether a step fits best as those around it, and not under another reading of all poses."""
     start = max(index - _BEFORE, 0)
@@ -230,7 +246,7 @@ class Neighbours:
     """Compares each sweep with the one before it: `add` all sweeps of a log in order, None = it cannot be read.
 
     Attributes:
-        num_points: number of the points of each sweep that could be read.
+        num_points: number of the finite points of each sweep that could be read.
         repeated: indices of the sweeps that have the points of the sweep before.
         shares: share of the static structure of each sweep that is in place in the next one; NaN = unknown.
     """
@@ -245,10 +261,9 @@ class Neighbours:
 
     def add(self, sweep: Sweep | None) -> None:
         index = self._count
-        structure: np.ndarray = np.zeros((0, 3))
+        structure = _structure(sweep)
         if sweep is not None:
-            self.num_points[index] = len(sweep.points)
-            structure = as_numpy(sweep.points)[structure_rows(sweep), :3].astype(np.float64)
+            self.num_points[index] = int(are_finite(as_numpy(sweep.points)).sum())
         if self._last is not None and sweep is not None and repeats(self._last, sweep):
             self.repeated.append(index)
         if index:
@@ -256,25 +271,44 @@ class Neighbours:
         self._count += 1
         self._last, self._structure = sweep, structure
 
+    @property
+    def small(self) -> dict[int, int]:
+        """The sweeps with few points, and how many those around each have."""
+        counts = np.array(list(self.num_points.values()))
+        around = [int(_median(counts[max(k - _AROUND, 0) : k + _AROUND + 1])) for k in range(len(counts))]
+        known = zip(self.num_points.items(), around)
+        return {index: usual for (index, number), usual in known if number < _FEW * usual}
+
     def misplaced(self, log: Log) -> list[tuple[int, int]]:
         """Return runs of sweeps, first and last, that fit neither the sweep before them nor that after, but these fit.
 
+        At the ends of the log, one neighbour is enough. A run without a sweep, (k + 1, k), is a pair that does not fit.
         Cost: reads two sweeps of each run again.
         """
         shares = np.array(self.shares)
         usual = np.array([_median(shares[max(k - _AROUND, 0) : k + _AROUND + 1]) for k in range(len(shares))])
         with np.errstate(invalid="ignore"):
             is_low = (usual >= LEAST_SHARE) & (shares < _MISPLACED * usual)
-        edges = np.flatnonzero(np.diff(is_low, prepend=False, append=False)).reshape(-1, 2)
+        is_low[list(log.gaps)] = False
+        edges = np.flatnonzero(np.diff([False, True, *is_low, True, False])).reshape(-1, 2)
         runs = []
-        for before, after in edges.tolist():  # sweeps: the pairs between them are low
-            if after - before < 2:
-                continue
-            ends = [log.sweep(index) for index in (before, after)]
-            structures = [as_numpy(end.points)[structure_rows(end), :3].astype(np.float64) for end in ends]
-            if _share_in_place(ends[0], structures[0], ends[1], structures[1]) >= _MISPLACED * usual[before]:
-                runs.append((before + 1, after - 1))
+        for first, after in edges.tolist():  # the pairs of sweeps first - 1, ..., after - 1 are low
+            last = after - 2
+            has_ends = first > 0 and after <= len(shares)
+            if has_ends and last >= first:
+                pc0, pc1 = log.sweep(first - 1), log.sweep(last + 1)
+                if _share_in_place(pc0, _structure(pc0), pc1, _structure(pc1)) < _MISPLACED * usual[first - 1]:
+                    continue
+            if has_ends or last >= first:
+                runs.append((first, last))
         return runs
+
+
+def _structure(sweep: Sweep | None) -> np.ndarray:
+    """Return the points of the static structure of a sweep, (K, 3) float64; None = it has none."""
+    if sweep is None:
+        return np.zeros((0, 3))
+    return as_numpy(sweep.points)[structure_rows(sweep), :3].astype(np.float64)
 
 
 def _median(values: np.ndarray) -> float:

@@ -58,7 +58,8 @@ def _is_in_world(log: Log) -> bool:
 def begins_late(log: Log) -> bool:
     """Test whether clouds have another column before x, y and z: the second to fourth have ground, the others none."""
     columns = as_numpy(log.sweep(0).points)[:, :3]
-    if len(columns) == 0 or not np.nanmin(columns[:, 0]) >= 0 or has_ground(columns):
+    known = columns[np.isfinite(columns[:, 0]), 0]
+    if not len(known) or known.min() < 0 or has_ground(columns):
         return False
     fourth = log.columns(0).get("column_3", np.zeros(0))
     if len(fourth) != len(columns) or np.ptp(np.quantile(fourth, (0.05, 0.95))) < _LEAST_HEIGHT:

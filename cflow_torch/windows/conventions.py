@@ -225,6 +225,7 @@ READINGS: dict[str, Reading] = {
         for name, unit in UNITS.items()
     },
     "points_camera": Reading("the points have a camera's axes", of_points=_of_axes(AXES[CAMERA])),
+    "points_opengl": Reading("y of the points is up", of_points=_of_axes(AXES["opengl"])),
     "points_upside_down": Reading("z of the points is down", of_points=_of_axes(AXES["down"])),
     "points_spherical": Reading("the points are range, azimuth and elevation", of_points=_from_spherical),
 }

@@ -18,6 +18,10 @@ _NEAR = 30.0  # metres
 # Metres of a sensor above the ground: trucks have up to 4. In feet, cars have 4.5 to 8.
 _HIGHEST_SENSOR, _HIGHEST_IN_FEET = 4.3, 9.0
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
+_TALL = {  # readings of clouds that are flat in y
+    "points_camera": "a camera's axes (x right, y down, z forward)",
+    "points_opengl": "y up (x right, z backward)",
+}
 _FULL = 0.95  # least share of a turn that azimuths of a cloud span
 _TILTS = range(15, 60, 5)  # degrees; without them, ground is found up to a tilt of 14
 
@@ -58,8 +62,9 @@ def frame_problem(points: Array) -> tuple[str, str]:
         return "points_feet", f"{feet}: give points in metres"
     if side > 0:
         return "", ""
-    if is_tall and _has_ground_as("points_camera", positions):
-        return "points_camera", "the points seem to have a camera's axes (x right, y down, z forward): " + _UP
+    for reading, axes in _TALL.items() if is_tall else ():
+        if _has_ground_as(reading, positions):
+            return reading, f"the points seem to have {axes}: {_UP}"
     tilt = _tilt_of(positions)
     return "", f"the sensor seems to be tilted by about {tilt}: {_UP} (data.ego_T_lidar)" if tilt else ""
 
@@ -82,7 +87,7 @@ def _is_spherical(positions: np.ndarray) -> bool:
 
 def _has_ground_as(reading: str, positions: np.ndarray) -> bool:
     convert = READINGS[reading].of_points
-    return convert is not None and has_ground(convert(positions))
+    return convert is not None and ground_side(convert(positions)) > 0
 
 
 def _tilt_of(positions: np.ndarray) -> str:

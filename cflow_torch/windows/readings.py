@@ -53,14 +53,14 @@ _TURN = 1.1  # share of a direction over that of its opposite, from which other 
 _EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 _OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
-_OBLIQUE = np.radians(10)  # least angle between axes that are turned and those with a name
+_SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
 _RESCALED = 1.05  # least factor between motions of another scale
 _DOUBTFUL = 0.15  # share of a pair as given, below which its motion is compared with that under which the points fit
 # Metres of such a motion from that of the poses. Less in all pairs is within the cells of the search; more, or more
 # than half of the motion, is more than an error of measurement.
 _SMALLEST_ERROR, _LARGEST_ERROR = 0.08, 1.5
-# Nothing fits if the share as given is below this. Of so few points of structure, no more fit under right poses.
-_HOPELESS, _TOO_FEW = 0.04, 600
+# Nothing fits if the share as given is below this. Of sweeps with so few points, no more fit under right poses.
+_HOPELESS, _SPARSE = 0.04, 3000
 _SEARCHED = 0.4  # share as given, below which we look for an unknown motion
 # The search for an unknown motion correlates occupied cells of a square.
 _CELL, _CELLS = 0.1, 640  # metres, and cells along a side
@@ -95,6 +95,7 @@ class Pair:
     transforms: dict[str, np.ndarray]  # reading of the poses -> (4, 4) float64, source to target
     scans: tuple[str, ...]  # how points may move to the instant of their sweep, as `deskew`; the first one is expected
     has_motion: bool  # the poses move the structure enough to tell readings apart
+    is_sparse: bool = False  # the sweeps have so few points that hardly any is measured again
 
     def share(self, scan: str, count: int = _MOST_POINTS, shift: float = 0.0) -> float:
         """Return the share of the first `count` points in place as given, moved by `shift` metres along the path."""
@@ -191,7 +192,8 @@ def make_pair(
         transforms = {name: _about(centre, T) for name, T in transforms.items()}
         transforms[WORLD] = transforms.pop(STILL)
     has_motion = has_poses and (in_world or difference(transforms[GIVEN], np.eye(4)) >= _LEAST_MOTION)
-    return Pair(clouds[0], clouds[1], transforms, tuple(scans), has_motion)
+    is_sparse = min(len(pc0.points), len(pc1.points)) < _SPARSE
+    return Pair(clouds[0], clouds[1], transforms, tuple(scans), has_motion, is_sparse)
 
 
 def _cloud(
@@ -241,7 +243,7 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
         return replace(judgement, best=(WORLD,))
     if clear or shares[GIVEN] >= _HOPELESS:
         return replace(judgement, best=_equals(clear, shares))
-    if np.median([len(pair.source.points(OFF)) for pair in moving]) < _TOO_FEW:
+    if any(pair.is_sparse for pair in moving):
         return Judgement({})
     # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
     is_hopeless = len(moving) > 1 or bool(_judge_motion(moving).best)
@@ -257,7 +259,8 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
     if len(named) < len(clear) and shares[INACCURATE] > _EXCUSE * max([shares[name] for name in named], default=0):
         return (INACCURATE,)
     best = [name for name in named if shares[name] >= _EQUAL * shares[named[0]]]
-    best = [name for name in best if name == SCALED or _is_small(name) == _is_small(best[0])]
+    best.sort(key=lambda name: name == TURNED)  # in turns, a slight one is as good as another mounting
+    best = [name for name in best if name in (SCALED, TURNED) or _is_small(name) == _is_small(best[0])]
     others = [name for kind in (MOUNTS, TIMES_OF_POSES) for name in [name for name in best if name in kind][1:]]
     return tuple(name for name in best if name not in others)
 
@@ -277,13 +280,35 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
     """
     motions = [_motion_of(pair, scan) for pair in pairs]
     steps = [pair.transforms[GIVEN] for pair in pairs]
+    errors = [float(np.linalg.norm((motion - step)[:2, 3])) for motion, step in zip(motions, steps)]
+    found = _readings_of_motions(steps, motions, max(errors))
+    of_pairs = []
+    for pair, step, motion, error in zip(pairs, steps, motions, errors):
+        read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
+        shares = {name: replace(pair, transforms={GIVEN: T}).share(scan) for name, T in read.items()}
+        if max(errors) > _SMALLEST_ERROR and error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
+            share = replace(pair, transforms={GIVEN: motion}).share(scan)
+            shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
+        of_pairs.append(shares)
+    if sum(INACCURATE in shares for shares in of_pairs) < min(2, len(pairs)):  # one of several may have another cause
+        for shares in of_pairs:
+            shares.pop(INACCURATE, None)
+    return found, of_pairs
+
+
+def _readings_of_motions(
+    steps: Sequence[np.ndarray], motions: Sequence[np.ndarray], largest_error: float
+) -> dict[str, Reading]:
+    """Return how motions of the poses may differ from those of the points, (4, 4) each: turned, scaled, or inexact."""
     given, fitted = (np.array([complex(*T[:2, 3]) for T in each]) for each in (steps, motions))
     product = complex(given @ fitted.conj())
     turn, scale = float(np.angle(product)), float(abs(product) / max(np.sum(np.abs(given) ** 2), 1e-9))
     degrees = np.degrees(turn)
     Y = as_matrix(rotations_about(2, turn))
     found = {}
-    if abs((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4) > _OBLIQUE:
+    turns = np.angle(given * fitted.conj())
+    is_slight = abs(turn) > _SLIGHT and bool((turns * np.sign(turn) > abs(turn) / 2).all())  # not only in turns
+    if abs((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4) > _OBLIQUE or (abs(turn) < np.pi / 4 and is_slight):
         side = "left" if turn > 0 else "right"
         found[TURNED] = Reading(
             f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'",
@@ -296,20 +321,11 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
             scaled(scale),
             fix=f"positions multiplied by {scale:.3g}, unless the points have another unit (feet)",
         )
-    errors = [float(np.linalg.norm((motion - step)[:2, 3])) for motion, step in zip(motions, steps)]
     found[INACCURATE] = Reading(
-        f"the poses are off, by up to {max(errors):.1f} m between two sweeps",
+        f"the poses are off, by up to {largest_error:.1f} m between two sweeps",
         fix="exact poses and times, or data.odometry=refine if they are noisy",
     )
-    of_pairs = []
-    for pair, step, motion, error in zip(pairs, steps, motions, errors):
-        read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
-        shares = {name: replace(pair, transforms={GIVEN: T}).share(scan) for name, T in read.items()}
-        if max(errors) > _SMALLEST_ERROR and error <= min(_LARGEST_ERROR, float(np.linalg.norm(step[:2, 3])) / 2):
-            share = replace(pair, transforms={GIVEN: motion}).share(scan)
-            shares.update({INACCURATE: share} if share > pair.share(scan) else {})  # else it fits as given
-        of_pairs.append(shares)
-    return found, of_pairs
+    return found
 
 
 def _motion_of(pair: Pair, scan: str) -> np.ndarray:

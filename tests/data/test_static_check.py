@@ -319,7 +319,9 @@ def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, request):
     assert "data.ego_T_lidar" in find_problems(mixed)[0]
 
 
-@pytest.mark.parametrize(("source", "degrees"), [("drive", 30), ("drive", -135), ("real", 45)])
+@pytest.mark.parametrize(
+    ("source", "degrees"), [("drive", 30), ("drive", -135), ("drive", -4), ("real", 45), ("real", 5)]
+)
 def test_a_lidar_that_is_turned_by_any_angle_is_named(source, degrees, request):
     turn = rotations_about(2, np.radians(degrees))
     turned = Wrong(request.getfixturevalue(source), points=lambda points, _: points @ turn)
@@ -541,13 +543,14 @@ def spherical(unit):
         (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
         (lambda points, _: points @ AXES["down"], "data.read_as=points_upside_down"),
         (camera_points, "data.read_as=points_camera"),
+        (lambda points, _: points @ AXES["opengl"], "data.read_as=points_opengl"),
         (spherical(1.0), "data.read_as=points_spherical"),
         (spherical(np.pi / 180), "data.read_as=points_spherical"),
         (lambda points, _: points @ rotations_about(1, 0.5), "about y): give points with z up"),
         (lambda points, _: points @ rotations_about(0, -0.4), "data.ego_T_lidar"),
     ],
     ids=[
-        *("millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera"),
+        *("millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera", "y up"),
         *("radians", "degrees", "pitch", "roll"),
     ],
 )
@@ -679,12 +682,75 @@ def test_the_page_names_sweeps_with_few_points(drive):
         ),
         ([0, 1, 2, 3, 5, 4, 6, 7, 8, 9, 10, 11], "sweeps 4 to 5 do not fit those around"),
         ([0, 1, 2, 3, 4, 5, 11, 7, 8, 9, 10, 11], "sweep 6 does not fit those around"),
+        ([9, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11], "sweep 0 does not fit those around"),
+        ([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 2], "sweep 11 does not fit those around"),
     ],
-    ids=["dropped", "interchanged", "foreign"],
+    ids=["dropped", "interchanged", "foreign", "first", "last"],
 )
 def test_the_page_names_sweeps_that_are_repeated_or_misplaced(drive, order, told):
     texts = [one.text for one in examine(Wrong(drive, order=order)) if one.topic == "sweeps"]
     assert len(texts) == 1 and texts[0].startswith(told)
+
+
+@pytest.mark.parametrize(
+    ("of_poses", "told"),
+    [
+        (
+            [0, 1, 2, 3, 4, 5, 9, 10, 11],
+            "sweeps seem to be missing before sweep 6, because the vehicle moves 2.5 m there",
+        ),
+        (range(9), "sweeps 5 and 6 do not fit each other, while those around do"),
+    ],
+    ids=["with their poses", "without"],
+)
+def test_the_page_names_missing_sweeps_of_a_log_without_times(drive, of_poses, told):
+    class Untimed(Wrong):
+        def sweep(self, index):
+            return replace(super().sweep(index), timestamp_ns=None)
+
+    log = Untimed(drive, poses=lambda poses: poses[of_poses], order=[0, 1, 2, 3, 4, 5, 9, 10, 11])
+    log.timestamps = range(9)
+    (text,) = [one.text for one in examine(log) if one.topic == "sweeps"]
+    assert text.startswith(told)
+
+
+def test_sweeps_without_a_finite_point_are_told_and_change_nothing_else(drive):
+    def blank(points, pose):
+        return points * (np.nan if np.array_equal(pose, drive.sweep(0).pose) else 1)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (text,) = [one.text for one in examine(Wrong(drive, points=blank)) if one.status == WRONG]
+    assert text.startswith("1 of them have few points, the first is sweep 0 with 0")
+
+
+def twice(points, _):
+    """Two returns of each shot; one of ten is from something behind."""
+    rng = np.random.default_rng(len(points))
+    behind = 1 + (rng.random(len(points)) < 0.1) * rng.uniform(0.02, 0.2, len(points))
+    return np.stack([points, points * behind[:, None]], axis=1).reshape(-1, 3)
+
+
+def without_sector(points, _):
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    return np.where((np.abs(azimuth - len(points) % 3) < 0.4)[:, None], np.nan, points)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        twice,
+        without_sector,
+        lambda points, _: np.concatenate([points, points]),
+        lambda points, _: np.unique(np.floor(points / 0.2), axis=0) * 0.2 + 0.1,
+        lambda points, _: points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < 0.6],
+        lambda points, _: points[np.abs(np.arctan2(points[:, 2] - 1.6, np.hypot(points[:, 0], points[:, 1]))) < 0.005],
+    ],
+    ids=["dual returns", "NaN sectors", "points twice", "a grid", "a view ahead", "one ring"],
+)
+def test_unusual_but_right_sweeps_stay_silent(drive, change):
+    texts = find_problems(Wrong(drive, points=change, masks=False))
+    assert texts == []
 
 
 def test_sweeps_of_few_points_do_not_blame_the_poses(drive):

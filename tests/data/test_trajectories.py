@@ -132,7 +132,7 @@ def test_seconds_and_nanoseconds_in_two_columns(tmp_path) -> None:
     with pytest.raises(CFlowError, match=r"a\.csv.*text before its numbers"):
         poses_text.read_poses(tmp_path / "a.csv")
     (tmp_path / "a.csv").write_text("\n".join([*EXACT[:2], line(9, seconds(STAMPS[1]))]))
-    with pytest.raises(CFlowError, match="ascend, and number 3 does not: keep one"):
+    with pytest.raises(CFlowError, match="ascend, and number 3 does not: write all digits"):
         poses_text.read_poses(tmp_path / "a.csv")
 
 
@@ -213,6 +213,7 @@ LAYOUTS = {
         ),
         "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 " + "1 " * 21,
     ],
+    "printed by NumPy": [line for pose in POSES for line in str(pose).splitlines()],
     "four lines": rows(POSES.reshape(48, 4)),
     "radians": ["t,x,y,z,roll,pitch,yaw", *rows([(k, *POSES[k, :3, 3], *ANGLES[k]) for k in range(12)], ",")],
     "degrees": ["x y z roll_deg pitch_deg yaw_deg", *rows(DEGREES)],

@@ -28,7 +28,7 @@ _UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX, 13: ("time", *MATRIX), 16: MATRIX,
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz")
 """Suffixes of files whose values have names or nest, see `tables_of_values`."""
-_NAMES = "name the sweeps in the order of their times, and sort these"
+_NAMES = "write all digits, and name the sweeps in the order of their times"
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
 
@@ -118,7 +118,7 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     is_kitti = MATRIX[0] in roles and not names and words.shape[1] in (12, 13)
     times = None
     if not _TIMES.isdisjoint(roles):
-        times = _ascending(path, _nanoseconds(roles, words), "keep one of the poses of a time")
+        times = _ascending(path, _nanoseconds(roles, words), "write all digits, and one pose of a time")
     return Trajectory(poses, times, is_kitti, str(path), labels)
 
 

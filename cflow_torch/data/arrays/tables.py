@@ -173,6 +173,7 @@ def _text_of(value: Any) -> str:
 
 def _split(line: str) -> list[str]:
     decimal = line.replace(",", ".") if ";" in line else line  # as some languages write numbers
+    decimal = re.sub(r"[\[\]]", " ", decimal).strip()  # as NumPy prints matrices
     return re.split(r"[\s,;]+", decimal.rstrip(",; "))
 
 
