@@ -28,7 +28,7 @@ from cflow_torch.verified.paired_test import NEAR_Z, PER_SLICE, Counts, Verdict,
 
 # The price of an object on each level. Children move separately only if that gains more evidence.
 PRICE = 4 * PER_SLICE
-_DISSENT_Z = 2.0  # factor of z for nodes that dissent
+_DISSENT_Z = 4.0  # factor of z for nodes that dissent
 _LEAST_DIFFERENCE = 1.0  # finest pixels per sweep interval, between the motions of a winner and of a node that dissents
 
 
@@ -65,7 +65,7 @@ def select_objects(
     Args:
         components, tree: `tree` includes nodes under overhangs, `components` does not.
         verdict: the best motion of each node, and its evidence; 0 = none is significant.
-        significance: z of the paired test. For a node against the winner around it, z is twice as large.
+        significance: z of the paired test. For a node against the winner around it, z is four times as large.
         price: of an object, in units of `PER_SLICE`.
         dissent: `with_dissent`, or what an ablation puts in its place.
 

@@ -120,13 +120,13 @@ def dissent(sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], winner:
 
 
 def gain(sweeps: SlicedSweeps, members: np.ndarray, motion: Vector, other: Vector, z: float) -> int:
-    """Evidence of one motion against another: what one wins against static, the other loses. z counts twice."""
+    """Evidence of one motion against another: what one wins against static, the other loses. z counts four times."""
     total = 0
     for is_near in (False, True):
         (won, lost), (other_won, other_lost) = (
             count_wins(sweeps, members, each, is_near).sum(1).tolist() for each in (motion, other)
         )
-        total += evidence_of(won + other_lost, lost + other_won, (4 if is_near else 2) * z)
+        total += evidence_of(won + other_lost, lost + other_won, (8 if is_near else 4) * z)
     return total
 
 
