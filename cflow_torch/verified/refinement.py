@@ -57,8 +57,8 @@ _KERNEL = 3.0  # scale of the Geman-McClure kernel, in variances of the residual
 # zero as firmly as five correspondences at 1 m from the centre.
 _PRIOR = (2.0, 2.0, 20.0)
 # The least ratio of `Registration.stretch`. At 0.75, the beam hits the object again after three quarters of a turn. An
-# object that moves so far around the sensor in a sweep is nearer to it than its own length. So a smaller
-# ratio means that the seam between two sweeps crosses the object.
+# object that moves so far around the sensor in a sweep is nearer to it than its own length. So a smaller ratio means
+# that the seam between two sweeps crosses the object.
 _LEAST_STRETCH = 0.75
 _NUM_ITERATIONS = 4
 _SAMPLE = 512  # voxels of an object, about, in the first half of the iterations

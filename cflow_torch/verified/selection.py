@@ -1,12 +1,7 @@
 """Select objects among the nodes of the component tree: which motion does each pixel take?
 
-A component wins if its motion has more evidence than its children together. But it may hold two objects, and the motion
-of the larger one wins. Where the smaller one is, hardly anything is found, neither in place nor at the targets of that
-motion, so the evidence does not fall. Therefore a node inside a winner *dissents* if its own motion, or "static", beats
-the motion of the winner in its own pixels. Two sweeps are too few to tell:
-
-    winner     [   A     A  c  p ]     a car A, a cyclist c behind it and a parked car p: all move as A
-    dissent              [c][p]        c moves by itself, p is static
+A component wins if its motion has more evidence than its children together. A node inside a winner may dissent
+(`dissent.py`).
 
 P is the number of drawn pixels. The pixels of copies follow, and P' counts both.
 """
@@ -23,13 +18,12 @@ from torch import Tensor
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.verified.component_tree import Components, Tree, corners_at_newest, longer_side
+from cflow_torch.verified.dissent import with_dissent
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.paired_test import NEAR_Z, PER_SLICE, Counts, Verdict, count_wins
+from cflow_torch.verified.paired_test import PER_SLICE, Verdict
 
 # The price of an object on each level. Children move separately only if that gains more evidence.
 PRICE = 4 * PER_SLICE
-_DISSENT_Z = 4.0  # factor of z for nodes that dissent
-_LEAST_DIFFERENCE = 1.0  # finest pixels per sweep interval, between the motions of a winner and of a node that dissents
 
 
 @dataclass(frozen=True)
@@ -58,7 +52,7 @@ def select_objects(
     verdict: Verdict,
     significance: float,
     price: int = PRICE,
-    dissent: Callable[..., Tensor] | None = None,
+    dissent: Callable[..., Tensor] = with_dissent,
 ) -> Objects:
     """Select objects from the leaves up, then let nodes inside the winners dissent.
 
@@ -67,7 +61,7 @@ def select_objects(
         verdict: the best motion of each node, and its evidence; 0 = none is significant.
         significance: z of the paired test. For a node against the winner around it, z is four times as large.
         price: of an object, in units of `PER_SLICE`.
-        dissent: `with_dissent`, or what an ablation puts in its place.
+        dissent: finds the nodes inside a winner that do not move with it.
 
     Returns:
         The objects. A pixel belongs to the first of these that exists:
@@ -87,7 +81,7 @@ def select_objects(
     none = tree.count
     node = torch.arange(none, device=verdict.evidence.device)
     winner = _winners(tree, node, verdict.evidence, price)
-    taken = (dissent or with_dissent)(sweeps, tree, verdict, winner, significance, price)
+    taken = dissent(sweeps, tree, verdict, winner, significance, price)
     by_pixel = Groups(tree.pixel, sweeps.num_pixels)  # the members
     moving = _moving_nodes(tree, by_pixel, taken, verdict.evidence)
 
@@ -116,45 +110,6 @@ def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
     for _ in range(tree.num_levels - 1):
         winner = torch.minimum(winner, tree.by_parent.spread(winner, none=tree.count))
     return winner
-
-
-def with_dissent(
-    sweeps: HeightSlicedSweeps, tree: Tree, verdict: Verdict, winner: Tensor, significance: float, price: int
-) -> Tensor:
-    """Return the node whose motion each node takes, (N,) int64; N = it is static.
-
-    `winner` is (N,), the result of `_winners`.
-    """
-    none = tree.count
-    node = torch.arange(none, device=winner.device)
-    motion = verdict.motion
-    motion_around = Groups(winner, none).spread(motion)  # [N, 2]
-    has_history = sweeps.has_history.index_select(0, tree.window)
-    is_inside = (tree.kind < tree.num_levels) & (winner < none) & (winner != node) & has_history
-    differs = ((motion - motion_around).abs() >= _LEAST_DIFFERENCE).any(1)
-    inside = flat_nonzero(is_inside & differs)
-    if len(inside) == 0:
-        return winner
-    dissents = torch.zeros_like(is_inside)
-    dissents[inside] = _gain(sweeps, tree, inside, motion, motion_around, _DISSENT_Z * significance) > price
-    own = torch.where(motion.any(1), node, none)
-    taken = winner
-    for level in range(1, tree.num_levels):
-        of_level = torch.where(dissents, own, tree.by_parent.spread(taken, none=none))
-        taken = torch.where(is_inside & (tree.kind == level), of_level, taken)
-    return taken
-
-
-def _gain(sweeps: HeightSlicedSweeps, tree: Tree, node: Tensor, motion: Tensor, other: Tensor, z: float) -> Tensor:
-    """Return the evidence of motions against others in the pixels of K nodes, (K,) int64, units of `PER_SLICE`.
-
-    The motions are (N, 2) each, of all nodes. What one motion wins against "static", the other one loses against it.
-    """
-    pixel, members = tree.pixels_of(node)
-    motions = torch.stack((motion.index_select(0, node), other.index_select(0, node)), 1)  # [K, 2, 2]
-    wins = count_wins(sweeps, sweeps.pixels[pixel], members, motions)
-    exact, near = (Counts(n.won[:, 0] + n.lost[:, 1], n.lost[:, 0] + n.won[:, 1]) for n in (wins.exact, wins.near))
-    return exact.evidence(z) + near.evidence(NEAR_Z * z)
 
 
 def _moving_nodes(tree: Tree, by_pixel: Groups, taken: Tensor, evidence: Tensor) -> Tensor:
