@@ -8,7 +8,8 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
-from cflow_torch.data.log_motion import Neighbours, find_lapses, find_missing, judge_log
+from cflow_torch.data.log_motion import find_lapses, find_missing, judge_log
+from cflow_torch.data.neighbours import Neighbours
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
@@ -21,16 +22,30 @@ from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
-# Points of a strip of this half width that are looked for, to within so many metres, and the share that comes again.
-_STRIP, _SAMPLE, _SAME, _ACCUMULATED = 4.0, 1000, 0.001, 0.3
+_STRIP = 4.0  # metres, half width of the strip whose points are looked for in the next sweep
+_SAMPLE = 1000  # points of the strip that are looked for
+_SAME = 0.001  # metres between two equal points
+_ACCUMULATED = 0.3  # share of points that come again, if sweeps are added up
 _LEAST_MOTION = 0.2  # metres between two sweeps, or the sensor stands
 _GRID = 0.2  # share of different coordinates, below which points lie on a grid
-_UNEVEN, _EVEN = 0.1, 0.5  # change of the intervals of times from one to the next, and that of the motion over it
+_UNEVEN = 0.1  # change of the intervals of times from one to the next
+_EVEN = 0.5  # change of the motion over that of the intervals
 _MOST_SEEN = 20_000  # points that show in which directions a sweep measures, and whether they lie on a grid
-_DIRECTIONS, _LEAST_SHARED = 72, 0.5  # and the share of them in which neighbouring sweeps both measure
+_DIRECTIONS = 72  # of a turn
+_LEAST_SHARED = 0.5  # share of the directions in which neighbouring sweeps both measure
 _TOPICS = (
-    *("log", "sensor", "frame", "times", "ego motion", "poses", "de-skewing", "sweeps", "ground", "own vehicle"),
-    *("labels", "reader"),
+    "log",
+    "sensor",
+    "frame",
+    "times",
+    "ego motion",
+    "poses",
+    "de-skewing",
+    "sweeps",
+    "ground",
+    "own vehicle",
+    "labels",
+    "reader",
 )
 _Check = Callable[[Log], List[Finding]]
 
@@ -310,14 +325,14 @@ def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
     for first, last in neighbours.misplaced(log):
         if not known.isdisjoint(range(first, last + 2)):
             continue
-        which = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
-        what = (
-            f"{which} not fit those around: has it points or a pose of another time? Correct its files, or leave it out"
-        )
         if last < first:
-            which = f"sweeps {last} and {first} do not fit each other, while those around do"
-            what = f"{which}: are sweeps missing between them, or do poses jump? Split the log there"
-        findings.append(Finding("sweeps", WRONG, what))
+            what = f"sweeps {last} and {first} do not fit each other, while those around do"
+            fix = "are sweeps missing between them, or do poses jump? Split the log there"
+        else:
+            what = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
+            what += " not fit those around"
+            fix = "has it points or a pose of another time? Correct its files, or leave it out"
+        findings.append(Finding("sweeps", WRONG, f"{what}: {fix}"))
     return findings
 
 

@@ -9,12 +9,10 @@ from typing import Callable, Iterator, Mapping, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.log import Log, known_poses
-from cflow_torch.transforms import relative_transform, turn_of
-from cflow_torch.types import Sweep, as_numpy
+from cflow_torch.transforms import turn_of
+from cflow_torch.types import Sweep
 from cflow_torch.windows.conventions import OFF, STILL, TIMES, WORLD
-from cflow_torch.windows.inspection import repeats
 from cflow_torch.windows.readings import (
-    FEWEST_POINTS,
     GIVEN,
     LEAST_SHARE,
     UNKNOWN,
@@ -24,7 +22,6 @@ from cflow_torch.windows.readings import (
     judge,
     make_pair,
 )
-from cflow_torch.windows.stillness import Structure, are_finite, structure_rows
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
 _BEFORE = 100  # sweeps before a suspect step, from whose poses other readings of it follow
@@ -41,9 +38,6 @@ _FEWEST_POSES = 5  # that tell a usual step
 _AS_AROUND, _CLEARLY = "as around it", 1.3  # factor by which another reading is better than the steps around
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
 _LONG = 1.7  # length of a step over the usual one, if sweeps are missing
-_COMPARED = 300  # points of each sweep that are compared with the next one
-_AROUND = 10  # sweeps on each side that tell a usual share, or number of points
-_MISPLACED, _FEW = 0.5, 0.5  # parts of the usual share and of the usual number of points that are too low
 
 
 class Lapse(NamedTuple):
@@ -240,86 +234,3 @@ def _contradicted(log: Log, index: int, step: np.ndarray, usual: np.ndarray) -> 
         return False
     shares = replace(pair, transforms={**pair.transforms, **transforms}).shares_of_poses(OFF)
     return max(shares.values()) < max(_CLEARLY * shares[_AS_AROUND], LEAST_SHARE)
-
-
-class Neighbours:
-    """Compares each sweep with the one before it: `add` all sweeps of a log in order, None = it cannot be read.
-
-    Attributes:
-        num_points: number of the finite points of each sweep that could be read.
-        repeated: indices of the sweeps that have the points of the sweep before.
-        shares: share of the static structure of each sweep that is in place in the next one; NaN = unknown.
-    """
-
-    def __init__(self) -> None:
-        self.num_points: dict[int, int] = {}
-        self.repeated: list[int] = []
-        self.shares: list[float] = []
-        self._count = 0
-        self._last: Sweep | None = None
-        self._structure: np.ndarray = np.zeros((0, 3))
-
-    def add(self, sweep: Sweep | None) -> None:
-        index = self._count
-        structure = _structure(sweep)
-        if sweep is not None:
-            self.num_points[index] = int(are_finite(as_numpy(sweep.points)).sum())
-        if self._last is not None and sweep is not None and repeats(self._last, sweep):
-            self.repeated.append(index)
-        if index:
-            self.shares.append(_share_in_place(self._last, self._structure, sweep, structure))
-        self._count += 1
-        self._last, self._structure = sweep, structure
-
-    @property
-    def small(self) -> dict[int, int]:
-        """The sweeps with few points, and how many those around each have."""
-        counts = np.array(list(self.num_points.values()))
-        around = [int(_median(counts[max(k - _AROUND, 0) : k + _AROUND + 1])) for k in range(len(counts))]
-        known = zip(self.num_points.items(), around)
-        return {index: usual for (index, number), usual in known if number < _FEW * usual}
-
-    def misplaced(self, log: Log) -> list[tuple[int, int]]:
-        """Return runs of sweeps, first and last, that fit neither the sweep before them nor that after, but these fit.
-
-        At the ends of the log, one neighbour is enough. A run without a sweep, (k + 1, k), is a pair that does not fit.
-        Cost: reads two sweeps of each run again.
-        """
-        shares = np.array(self.shares)
-        usual = np.array([_median(shares[max(k - _AROUND, 0) : k + _AROUND + 1]) for k in range(len(shares))])
-        with np.errstate(invalid="ignore"):
-            is_low = (usual >= LEAST_SHARE) & (shares < _MISPLACED * usual)
-        is_low[list(log.gaps)] = False
-        edges = np.flatnonzero(np.diff([False, True, *is_low, True, False])).reshape(-1, 2)
-        runs = []
-        for first, after in edges.tolist():  # the pairs of sweeps first - 1, ..., after - 1 are low
-            last = after - 2
-            has_ends = first > 0 and after <= len(shares)
-            if has_ends and last >= first:
-                pc0, pc1 = log.sweep(first - 1), log.sweep(last + 1)
-                if _share_in_place(pc0, _structure(pc0), pc1, _structure(pc1)) < _MISPLACED * usual[first - 1]:
-                    continue
-            if has_ends or last >= first:
-                runs.append((first, last))
-        return runs
-
-
-def _structure(sweep: Sweep | None) -> np.ndarray:
-    """Return the points of the static structure of a sweep, (K, 3) float64; None = it has none."""
-    if sweep is None:
-        return np.zeros((0, 3))
-    return as_numpy(sweep.points)[structure_rows(sweep), :3].astype(np.float64)
-
-
-def _median(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else 0.0
-
-
-def _share_in_place(pc0: Sweep | None, points0: np.ndarray, pc1: Sweep | None, points1: np.ndarray) -> float:
-    """Return the share of the structure of a sweep, (K, 3), in place in that of another; NaN = too little of it."""
-    if pc0 is None or pc1 is None or min(len(points0), len(points1)) < FEWEST_POINTS:
-        return float("nan")
-    has_poses = pc0.pose is not None and pc1.pose is not None
-    T = relative_transform(pc1.pose, pc0.pose) if has_poses else np.eye(4)
-    return Structure(points1).share(points0[:_COMPARED], T)

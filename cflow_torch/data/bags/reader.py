@@ -120,10 +120,7 @@ class BagLog(Log):
             self.frame = frame or self._ego_frame()
             self.timestamps = sorted(self._arrival)
             self._check_count(f"{self.path}: {self.topic}")
-            trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
-            if trajectory is None and poses == "auto":
-                trajectory, note = find_poses_near(self.path.parent, self.timestamps)
-                self._note(note)
+            trajectory = self._find_poses(topics, poses, tracks)
             if trajectory is not None:
                 self._use_poses(trajectory)
             self._check_count(f"{self.path}: {self.topic}, while there are poses,")
@@ -146,6 +143,14 @@ class BagLog(Log):
             return self._chosen(topics, (*_POSE_TYPES, *_OTHER_POSES), poses, "poses")
         has_usual = not set(_POSE_TYPES).isdisjoint(topics.values())
         return self._chosen(topics, _POSE_TYPES if has_usual else _OTHER_POSES, None, "poses")
+
+    def _find_poses(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
+        """Return the poses of the file that is named, of the bag or, with "auto", of a file near the bag."""
+        trajectory = self._poses_of_file(poses) or self._poses_of_bag(topics, poses, tracks)
+        if trajectory is None and poses == "auto":
+            trajectory, note = find_poses_near(self.path.parent, self.timestamps)
+            self._note(note)
+        return trajectory
 
     def _poses_of_bag(self, topics: dict[str, str], poses: str | None, tracks: dict[str, Any]) -> Trajectory | None:
         """Return the poses of transforms or of a topic; None = there are none. Clouds of another clock are shifted."""
