@@ -36,13 +36,13 @@ class ObjectRow(np.void):
 
     def __getitem__(self, key: Any) -> Any:
         """Return a number, or one of the vectors centre, size and velocity, (3,) float64."""
-        is_vector = isinstance(key, str) and key in _VECTORS.names
-        return self.view(_VECTORS)[key] if is_vector else super().__getitem__(key)
+        is_vector = isinstance(key, str) and key in _OBJECT_VECTORS.names
+        return self.view(_OBJECT_VECTORS)[key] if is_vector else super().__getitem__(key)
 
 
 _OBJECT: Any = np.dtype((ObjectRow, list(_COLUMNS.items())))  # type: ignore[arg-type]  # its stubs know np.void only
 # The vectors of an object: three columns each, of the same bytes.
-_VECTORS: Any = np.dtype(
+_OBJECT_VECTORS: Any = np.dtype(
     {
         "names": ["centre", "size", "velocity"],
         "formats": ["3f8"] * 3,
@@ -74,8 +74,8 @@ class ObjectTable(np.ndarray):
 
         A column and a vector are plain arrays, which share the memory of the table.
         """
-        if isinstance(key, str) and key in _VECTORS.names:
-            return self.view(_VECTORS, np.ndarray)[key]
+        if isinstance(key, str) and key in _OBJECT_VECTORS.names:
+            return self.view(_OBJECT_VECTORS, np.ndarray)[key]
         value = super().__getitem__(key)
         return value.view(np.ndarray) if isinstance(value, np.ndarray) and value.dtype.names is None else value
 

@@ -325,13 +325,13 @@ def track(
         `cluster_id`: of this sweep's flow, -1 while it is static or where its flow is missing; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;
         `is_confirmed`: True as soon as the track has moved enough. With enough confidence, both ends of its box must
-        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much,
-        it is enough that one end has moved by its summed flow ± 25 %, at least 0.3 m plus a twentieth of the
-        length. Otherwise, and if it is
-        narrower or lower than 0.12 m, its flow in at least three sweeps must add up to the larger of 1.5 m and its
-        length, and the box must have moved by this sum ± 25 %. Tracks that are never confirmed are left out. Points
-        whose place also holds static points before the track comes and after it has left are not of the track. A track
-        of which this holds for most of its points, in most of the sweeps in which it moves, is left out.
+        have moved by 0.3 m plus a tenth of its length, and the box by 0.5 to 2 times its summed flow. With much, it is
+        enough that one end has moved by its summed flow ± 25 %, at least 0.3 m plus a twentieth of the length.
+        Otherwise, and if it is narrower or lower than 0.12 m, its flow in at least three sweeps must add up to the
+        larger of 1.5 m and its length, and the box must have moved by this sum ± 25 %. Tracks that are never confirmed
+        are left out. Points whose place also holds static points before the track comes and after it has left are not
+        of the track. A track of which this holds for most of its points, in most of the sweeps in which it moves, is
+        left out.
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
