@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, regroup
 from cflow_torch.applications.completion import TrackedPoints, complete
+from cflow_torch.applications.floor import UNKNOWN_FLOOR, Floor
 from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
 from cflow_torch.applications.people import divide_people
@@ -94,6 +95,7 @@ class Tracker:
         self._interval = sweep_interval
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
         self.times = Times(0.0, sweep_interval, 0.0, 0.0)  # of the last sweep
+        self.floor = UNKNOWN_FLOOR  # of the last sweep
         self._num_sweeps = 0
         self._num_tracks = 0
         self._tracks = TrackStates()
@@ -119,14 +121,16 @@ class Tracker:
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
         times = self._times(sweeps)
+        floor = Floor.of(sweeps.pc0)
         self.times = times
+        self.floor = floor
         groups = MovingGroups.of(sweeps, result)
         tracks, points = self._predict(times, groups.point.device)
         groups = regroup(groups, tracks)
         matches = match(tracks, points.position, points.track, groups)
         flow = groups.mean(groups.step)
         sensor = groups.point.new_tensor(pose_of(sweeps.pc0)[:3, 3])
-        tracks, track_of_group = self._update(tracks, groups, flow, matches, times, sensor)
+        tracks, track_of_group = self._update(tracks, groups, flow, matches, times, sensor, floor)
         track_of_point = _track_of_point(groups, matches, track_of_group)
         has_track = track_of_point >= 0
         track_id = torch.full((len(result.residual_flow),), -1, device=track_of_point.device)
@@ -179,6 +183,7 @@ class Tracker:
         matches: TrackMatches,
         times: Times,
         sensor: Tensor,
+        floor: Floor,
     ) -> tuple[TrackStates, Tensor]:
         """Begin tracks for groups without a match, and update all tracks by the mean flow (G, 3) of each group.
 
@@ -219,19 +224,26 @@ class Tracker:
         tracks.is_confirmed.logical_or_(tracks.have_shown_motion())
         tracks.travel[track_of_group] += flow  # to the next sweep
 
-        self._measure(tracks, track_of_group, groups, flow / times.interval, sensor)
+        self._measure(tracks, track_of_group, groups, flow / times.interval, sensor, floor)
         position = tracks.motion.position[stopped]
         at_rest = torch.stack([position, torch.zeros_like(position)], 1)
         tracks.measure(stopped, at_rest, at_rest.new_tensor([_REST_NOISE, FLOW_NOISE]).expand(len(stopped), 2))
         return tracks, track_of_group
 
     def _measure(
-        self, tracks: TrackStates, track_of_group: Tensor, groups: MovingGroups, velocity: Tensor, sensor: Tensor
+        self,
+        tracks: TrackStates,
+        track_of_group: Tensor,
+        groups: MovingGroups,
+        velocity: Tensor,
+        sensor: Tensor,
+        floor: Floor,
     ) -> None:
         """Update the whole boxes of moving tracks by the visible edges and the mean velocity (G, 3) of their groups."""
         heading = tracks.heading[track_of_group]
         moves = groups.group >= 0
-        edges = Edges.of(groups.point[moves], groups.group[moves], sensor.expand_as(velocity), heading)
+        height = torch.from_numpy(floor.below(tracks.box[track_of_group].cpu().numpy())).to(heading.device)
+        edges = Edges.of(groups.point[moves], groups.group[moves], sensor.expand_as(velocity), heading, height)
         kind, whole = self._whole_sizes(tracks, track_of_group, edges, velocity)
         centre, deviation = edges.anchor(whole, kind)
         measured = torch.stack([turned(centre, heading), velocity], 1)
@@ -374,7 +386,7 @@ class LogTracker:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
-        points = TrackedPoints.of(index, sweeps, result, track_id, self._tracker.times)
+        points = TrackedPoints.of(index, sweeps, result, track_id, self._tracker.times, self._tracker.floor)
         free = FreePoints.of(sweeps, result, points)
         now = SweepTracks(table, points, int(self._log.timestamps[index]), free)
         self._find_before(now)
