@@ -120,24 +120,22 @@ class Tracker:
         sweeps = sweeps if isinstance(sweeps, Window) else Window(*sweeps)
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
-        times = self._times(sweeps)
-        floor = Floor.of(sweeps.pc0)
-        self.times = times
-        self.floor = floor
+        self.times = self._times(sweeps)
+        self.floor = Floor.of(sweeps.pc0)
         groups = MovingGroups.of(sweeps, result)
-        tracks, points = self._predict(times, groups.point.device)
+        tracks, points = self._predict(self.times, groups.point.device)
         groups = regroup(groups, tracks)
         matches = match(tracks, points.position, points.track, groups)
         flow = groups.mean(groups.step)
         sensor = groups.point.new_tensor(pose_of(sweeps.pc0)[:3, 3])
-        tracks, track_of_group = self._update(tracks, groups, flow, matches, times, sensor, floor)
+        tracks, track_of_group = self._update(tracks, groups, flow, matches, self.times, sensor)
         track_of_point = _track_of_point(groups, matches, track_of_group)
         has_track = track_of_point >= 0
         track_id = torch.full((len(result.residual_flow),), -1, device=track_of_point.device)
         track_id[groups.row[has_track]] = tracks.id[track_of_point[has_track]]
-        table = self._table(tracks, times.now, sweeps.pc0.timestamp_ns)
+        table = self._table(tracks, self.times.now, sweeps.pc0.timestamp_ns)
 
-        step = tracks.motion.velocity * times.interval
+        step = tracks.motion.velocity * self.times.interval
         step[track_of_group] = flow
         points = _missing_points(points, tracks, step).followed_by(_seen_points(groups, track_of_point, step))
         is_kept = tracks.missed <= _MAX_MISSED
@@ -183,7 +181,6 @@ class Tracker:
         matches: TrackMatches,
         times: Times,
         sensor: Tensor,
-        floor: Floor,
     ) -> tuple[TrackStates, Tensor]:
         """Begin tracks for groups without a match, and update all tracks by the mean flow (G, 3) of each group.
 
@@ -224,25 +221,19 @@ class Tracker:
         tracks.is_confirmed.logical_or_(tracks.have_shown_motion())
         tracks.travel[track_of_group] += flow  # to the next sweep
 
-        self._measure(tracks, track_of_group, groups, flow / times.interval, sensor, floor)
+        self._measure(tracks, track_of_group, groups, flow / times.interval, sensor)
         position = tracks.motion.position[stopped]
         at_rest = torch.stack([position, torch.zeros_like(position)], 1)
         tracks.measure(stopped, at_rest, at_rest.new_tensor([_REST_NOISE, FLOW_NOISE]).expand(len(stopped), 2))
         return tracks, track_of_group
 
     def _measure(
-        self,
-        tracks: TrackStates,
-        track_of_group: Tensor,
-        groups: MovingGroups,
-        velocity: Tensor,
-        sensor: Tensor,
-        floor: Floor,
+        self, tracks: TrackStates, track_of_group: Tensor, groups: MovingGroups, velocity: Tensor, sensor: Tensor
     ) -> None:
         """Update the whole boxes of moving tracks by the visible edges and the mean velocity (G, 3) of their groups."""
         heading = tracks.heading[track_of_group]
         moves = groups.group >= 0
-        height = torch.from_numpy(floor.below(tracks.box[track_of_group].cpu().numpy())).to(heading.device)
+        height = torch.from_numpy(self.floor.below(tracks.box[track_of_group].cpu().numpy())).to(heading.device)
         edges = Edges.of(groups.point[moves], groups.group[moves], sensor.expand_as(velocity), heading, height)
         kind, whole = self._whole_sizes(tracks, track_of_group, edges, velocity)
         centre, deviation = edges.anchor(whole, kind)
