@@ -7,6 +7,7 @@ from typing import NamedTuple, Sequence
 import numpy as np
 import torch
 
+from cflow_torch.applications.floor import Floor
 from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_state import Times
 from cflow_torch.applications.track_table import Table
@@ -26,9 +27,12 @@ class TrackedPoints(NamedTuple):
     id: np.ndarray  # (M,) int64 ids of their tracks
     offset: np.ndarray  # (M, 3) float32 metres, from the vehicle to each point, axes of the world
     velocity: np.ndarray  # (M, 3) float32 m/s, flow in the world
+    floor: Floor  # the ground
 
     @classmethod
-    def of(cls, index: int, sweeps: Window, result: FlowResult, track_id: np.ndarray, times: Times) -> TrackedPoints:
+    def of(
+        cls, index: int, sweeps: Window, result: FlowResult, track_id: np.ndarray, times: Times, floor: Floor
+    ) -> TrackedPoints:
         """Keep the points of sweep `index` that have an id, of (N,) ids where -1 = no track."""
         T_world_ego0 = pose_of(sweeps.pc0)
         T_world_ego1 = pose_of(sweeps.pc1)
@@ -38,7 +42,7 @@ class TrackedPoints(NamedTuple):
         step = as_numpy(result.residual_flow)[row].astype(np.float64) @ T_world_ego1[:3, :3].T
         offset = (position - sensor).astype(np.float32)
         velocity = (step / times.interval).astype(np.float32)
-        return cls(index, len(track_id), times.now, sensor, row, track_id[row], offset, velocity)
+        return cls(index, len(track_id), times.now, sensor, row, track_id[row], offset, velocity, floor)
 
     def of_track(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the positions of the points of a track, (P, 3) float64 metres in the world, and its mean velocity."""
@@ -105,6 +109,7 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
     sweeps = [each.sweep for each in seen]
     seconds = np.zeros(len(order))
     sensor = np.zeros((len(order), 3))
+    floor = np.zeros(len(order))
     points = []
     velocities = []
     rows = []
@@ -119,6 +124,7 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
         rows.append(row)
         seconds[rank[now]] = each.seconds
         sensor[rank[now]] = each.sensor
+        floor[rank[now]] = each.floor.below(np.stack([table[axis][now] for axis in "xyz"], 1))
     row_of_point = np.concatenate(rows)
     moves = table["is_moving"][order]
     columns = (
@@ -126,6 +132,7 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
         seconds,
         sensor,
         table["heading"][order],
+        floor,
         np.concatenate(points),
         np.concatenate(velocities) * moves[row_of_point][:, None],
         row_of_point,

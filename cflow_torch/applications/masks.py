@@ -8,20 +8,18 @@ from typing import Any, Iterable, Sequence
 import numpy as np
 
 from cflow_torch.applications.moving_groups import pose_of
-from cflow_torch.applications.track_table import Table, boxes_in_sweeps
+from cflow_torch.applications.track_table import Table, box_corners, boxes_in_sweeps
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
-from cflow_torch.transforms import transform_points, upright_poses
 from cflow_torch.types import CFlowError, FlowResult, as_numpy
 
 DYNAMIC, STATIC = 255, 0  # values of pixels
 _RADIUS = 0.15  # metres around a moving point
 _MARGIN = 0.1  # metres, added to each side of a box
 _NEAREST = 0.1  # metres from the camera; we cut off what is nearer
-_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))  # rows of _CORNERS
+_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))  # rows of `box_corners`
 
 
 def write_masks(folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]], table: Table) -> None:
@@ -119,10 +117,8 @@ def _corners(log: Log, rows: Table) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, 8, 3)), np.zeros((0, 3))
     centre, heading = boxes_in_sweeps(rows, log)
     size = np.stack([rows[name] for name in ("length", "width", "height")], 1) + 2 * _MARGIN
-    boxes = upright_poses(np.concatenate([heading[:, None], centre], 1))
-    corners = [transform_points(_CORNERS * sides, box) for sides, box in zip(size, boxes)]
     velocity = np.stack([rows[name] for name in ("vx", "vy", "vz")], 1)
-    return np.stack(corners), velocity @ pose_of(log.sweep(int(rows["sweep"][0])))[:3, :3]
+    return box_corners(centre, heading, size), velocity @ pose_of(log.sweep(int(rows["sweep"][0])))[:3, :3]
 
 
 _NEEDS_PILLOW = "masks need Pillow (extra viz): pip install Pillow"

@@ -14,7 +14,7 @@ from cflow_torch.data.atomic import atomic_file, write_text
 from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
-from cflow_torch.transforms import transform_each
+from cflow_torch.transforms import transform_each, transform_points, upright_poses
 
 Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # next to the flow files of a log
@@ -32,6 +32,7 @@ COLUMNS = {
 UNKNOWN = "unknown"  # class of tracks of older tables
 KITTI_NAMES = {"car": "Car", "pedestrian": "Pedestrian", "cyclist": "Cyclist", "truck": "Truck"}
 """Class of a track -> name in KITTI and OpenPCDet, in the order of OpenPCDet's labels 1, 2, 3, 4."""
+_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
 def join_tables(tables: Sequence[Table]) -> Table:
@@ -79,29 +80,6 @@ def write_mot(path: PathLike, table: Table, log: Log) -> None:
     _write_lines(path, "%d,%d,-1,-1,-1,-1,%.3f,%.3f,%.3f,%.3f", *columns, table["x"], table["y"], table["z"])
 
 
-def write_kitti(path: PathLike, table: Table, log: Log) -> None:
-    """Write tracks as text of KITTI's tracking benchmark, with poses from the log: a line of 18 columns per row.
-
-    Frames and ids count from 0; the type is Misc where the class is unknown; unknown columns are -1. The camera is
-    at the origin of the ego frame of the sweep, looks to +x, and has KITTI's axes: x to the right, y down, z ahead. The
-    position is the middle of the lower face of the box.
-
-    Source: development kit of the KITTI tracking benchmark (2012).
-    """
-    centre, heading = boxes_in_sweeps(table, log)
-    x, y, z = -centre[:, 1], table["height"] / 2 - centre[:, 2], centre[:, 0]
-    rotation = _wrapped(-heading - np.pi / 2)
-    alpha = _wrapped(rotation - np.arctan2(x, z))
-    size = (table["height"], table["width"], table["length"])
-    numbers = np.stack([alpha, *size, x, y, z, rotation, score_of(table)], 1)
-    lines = []
-    for row, values in enumerate(numbers.tolist()):
-        kind = KITTI_NAMES.get(str(table["class"][row]), "Misc") if "class" in table else "Misc"
-        first = f"{table['sweep'][row]} {table['id'][row]} {kind} -1 -1 {values[0]:.6f} -1 -1 -1 -1"
-        lines.append(" ".join([first, *(f"{value:.6f}" for value in values[1:])]) + "\n")
-    write_text(as_path(path), "".join(lines))
-
-
 def class_of(table: Table, row: int) -> str:
     """Return the class of a row; a car where it is unknown."""
     name = str(table["class"][row]) if "class" in table else UNKNOWN
@@ -126,9 +104,17 @@ def boxes_in_sweeps(table: Table, log: Log) -> tuple[np.ndarray, np.ndarray]:
     return transform_each(centre, T_ego_world), np.arctan2(ahead[:, 1], ahead[:, 0])
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """Angles in -pi ... pi."""
-    return np.arctan2(np.sin(angle), np.cos(angle))
+def box_corners(centre: np.ndarray, heading: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the corners of upright boxes, (R, 8, 3) metres. Their order is that of x, y, z; the last changes fastest.
+
+    Args:
+        centre: (R, 3) metres.
+        heading: (R,) radians.
+        size: (R, 3) length, width, height, metres.
+    """
+    boxes = upright_poses(np.concatenate([heading[:, None], centre], 1))
+    corners = [transform_points(_CORNERS * sides, box) for sides, box in zip(size, boxes)]
+    return np.stack(corners) if corners else np.zeros((0, 8, 3))
 
 
 def _write_lines(path: PathLike, form: str, *columns: np.ndarray) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, regroup
 from cflow_torch.applications.completion import TrackedPoints, complete
+from cflow_torch.applications.floor import UNKNOWN_FLOOR, Floor
 from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
 from cflow_torch.applications.moving_groups import MOVING, MovingGroups, pose_of
 from cflow_torch.applications.people import divide_people
@@ -94,6 +95,7 @@ class Tracker:
         self._interval = sweep_interval
         self._clock: tuple[float, float] | None = None  # time of the last sweep, and of the end of its flow
         self.times = Times(0.0, sweep_interval, 0.0, 0.0)  # of the last sweep
+        self.floor = UNKNOWN_FLOOR  # of the last sweep
         self._num_sweeps = 0
         self._num_tracks = 0
         self._tracks = TrackStates()
@@ -118,22 +120,22 @@ class Tracker:
         sweeps = sweeps if isinstance(sweeps, Window) else Window(*sweeps)
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
             raise CFlowError("tracks need residual flow, cluster_id and is_valid: `cflow flow` writes them by default")
-        times = self._times(sweeps)
-        self.times = times
+        self.times = self._times(sweeps)
+        self.floor = Floor.of(sweeps.pc0)
         groups = MovingGroups.of(sweeps, result)
-        tracks, points = self._predict(times, groups.point.device)
+        tracks, points = self._predict(self.times, groups.point.device)
         groups = regroup(groups, tracks)
         matches = match(tracks, points.position, points.track, groups)
         flow = groups.mean(groups.step)
         sensor = groups.point.new_tensor(pose_of(sweeps.pc0)[:3, 3])
-        tracks, track_of_group = self._update(tracks, groups, flow, matches, times, sensor)
+        tracks, track_of_group = self._update(tracks, groups, flow, matches, self.times, sensor)
         track_of_point = _track_of_point(groups, matches, track_of_group)
         has_track = track_of_point >= 0
         track_id = torch.full((len(result.residual_flow),), -1, device=track_of_point.device)
         track_id[groups.row[has_track]] = tracks.id[track_of_point[has_track]]
-        table = self._table(tracks, times.now, sweeps.pc0.timestamp_ns)
+        table = self._table(tracks, self.times.now, sweeps.pc0.timestamp_ns)
 
-        step = tracks.motion.velocity * times.interval
+        step = tracks.motion.velocity * self.times.interval
         step[track_of_group] = flow
         points = _missing_points(points, tracks, step).followed_by(_seen_points(groups, track_of_point, step))
         is_kept = tracks.missed <= _MAX_MISSED
@@ -231,7 +233,8 @@ class Tracker:
         """Update the whole boxes of moving tracks by the visible edges and the mean velocity (G, 3) of their groups."""
         heading = tracks.heading[track_of_group]
         moves = groups.group >= 0
-        edges = Edges.of(groups.point[moves], groups.group[moves], sensor.expand_as(velocity), heading)
+        height = torch.from_numpy(self.floor.below(tracks.box[track_of_group].cpu().numpy())).to(heading.device)
+        edges = Edges.of(groups.point[moves], groups.group[moves], sensor.expand_as(velocity), heading, height)
         kind, whole = self._whole_sizes(tracks, track_of_group, edges, velocity)
         centre, deviation = edges.anchor(whole, kind)
         measured = torch.stack([turned(centre, heading), velocity], 1)
@@ -374,7 +377,7 @@ class LogTracker:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
-        points = TrackedPoints.of(index, sweeps, result, track_id, self._tracker.times)
+        points = TrackedPoints.of(index, sweeps, result, track_id, self._tracker.times, self._tracker.floor)
         free = FreePoints.of(sweeps, result, points)
         now = SweepTracks(table, points, int(self._log.timestamps[index]), free)
         self._find_before(now)

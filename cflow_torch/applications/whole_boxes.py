@@ -26,6 +26,7 @@ _LONG_CAR, _HIGH_CAR = 6.0, 2.6  # metres; larger vehicles are trucks
 
 _SEEN_ANGLE = math.radians(15)  # a side is seen if the view of the sensor meets it at this angle at least
 _SHARE = 0.75  # quantile over the sweeps of where an edge is seen; points of other objects are beyond
+_MOST_HIDDEN = 1.5  # metres above the ground, where what is seen of an object begins: others hide the lower part
 _STRAY = 0.003  # share of the points of one sweep that are beyond an edge
 FLOW_NOISE = 0.2  # m/s, standard deviation
 _ANCHOR_NOISE, _FREE_NOISE = 0.15, 0.3  # standard deviation of a box: metres, plus a share of what is not seen
@@ -43,6 +44,7 @@ class Sightings(NamedTuple):
     seconds: Tensor  # (R,)
     sensor: Tensor  # (R, 3) metres, position of the vehicle in the world
     heading: Tensor  # (R,) radians, where the object never moves fast enough to tell
+    floor: Tensor  # (R,) metres, height of the ground below the object, NaN = unknown
     points: Tensor  # (P, 3) metres in the world
     velocity: Tensor  # (P, 3) m/s, flow of the points
     row: Tensor  # (P,) int64, sighting of each point
@@ -66,14 +68,19 @@ class Edges(NamedTuple):
     sensor: Tensor  # (R, 3)
 
     @classmethod
-    def of(cls, points: Tensor, row: Tensor, sensor: Tensor, heading: Tensor) -> Edges:
-        """Turn points (P, 3) of R objects into the axes of boxes with (R,) headings; few points are strays."""
+    def of(cls, points: Tensor, row: Tensor, sensor: Tensor, heading: Tensor, floor: Tensor) -> Edges:
+        """Turn points (P, 3) of R objects into the axes of boxes with (R,) headings; few points are strays.
+
+        Objects stand on the `floor`, (R,) metres, unless what we see of them is far above it; NaN = it is unknown.
+        """
         local = turned(points, -heading[row])
         count = len(heading)
         shares = (_STRAY, 1 - _STRAY, 0.5)
         low, high, median = torch.stack(
             [torch.stack(quantiles(local[:, axis], row, count, *shares)) for axis in range(3)], 2
         )
+        stands = (floor <= low[:, 2]) & (floor >= low[:, 2] - _MOST_HIDDEN)
+        low[:, 2] = torch.where(stands, floor, low[:, 2])
         return cls(low, high, median, turned(sensor, -heading))
 
     @property
@@ -121,7 +128,8 @@ class Edges(NamedTuple):
         behind = visible - depth[:, None] * F.normalize(self.view[:, :2])
         centre = torch.where((kind <= CYCLIST)[:, None], behind, (self.middle + shift)[:, :2])
         noise = _ANCHOR_NOISE + _FREE_NOISE * missing[:, :2].abs().amax(1)
-        return torch.cat([centre, self.middle[:, 2:]], 1), noise
+        height = self.low[:, 2:] + size[:, 2:] / 2
+        return torch.cat([centre, height], 1), noise
 
 
 class RigidFlow(NamedTuple):
@@ -165,7 +173,7 @@ def whole_boxes(sightings: Sightings) -> WholeBoxes:
     motion = _smoothed(sightings, flow.middle, flow.velocity, torch.full_like(sightings.seconds, _CENTROID_NOISE))
     for _ in range(_ROUNDS):
         heading = headings(motion.velocity, track, sightings.heading)
-        edges = Edges.of(sightings.points, sightings.row, sightings.sensor, heading)
+        edges = Edges.of(sightings.points, sightings.row, sightings.sensor, heading, sightings.floor)
         speed = motion.velocity[:, :2].norm(dim=1)
         along_path = edges.relative_to(turned(motion.position, -heading))
         (typical_speed,) = quantiles(speed, track, count, _SHARE)

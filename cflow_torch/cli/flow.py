@@ -29,9 +29,10 @@ from cflow_torch.applications.instance_files import (
     INSTANCES_FILE,
     write_drivestudio,
 )
+from cflow_torch.applications.kitti_tracks import write_kitti
 from cflow_torch.applications.masks import check_cameras, check_pillow, write_masks
 from cflow_torch.applications.moving_labels import write_moving_labels
-from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_kitti, write_mot, write_tracks
+from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
 from cflow_torch.cli.commands import Flow, FlowFiles
 from cflow_torch.cli.failures import Failures, UnfinishedJob, collect_failures, is_sweep

@@ -14,10 +14,12 @@ from cflow_torch.data.log import Log
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
 from cflow_torch.simulator.drive import Drive
+from cflow_torch.transforms import transform_each
 from cflow_torch.types import Sweep
 
 SENSORS = ("av2", "nuscenes", "truckscenes", "waymo", "aevascenes")
 WITH_MASKS = ("av2", "aevascenes")  # sensors whose data sets have ground masks
+RAW = ("truckscenes",)  # sensors whose points are in the ego frame at the instant of each one; the reader de-skews them
 
 
 class Truth(NamedTuple):
@@ -60,13 +62,19 @@ class SimulatedLog(Log):
     """A simulated drive with the sweep rate and ground masks of its data set, and with the truth."""
 
     def __init__(self, profile: str, seed: int, scene: str, num_sweeps: int, drive: Drive | None = None) -> None:
-        self.step, self._has_masks = 2 if profile == "nuscenes" else 1, profile in WITH_MASKS
+        self.step = 2 if profile == "nuscenes" else 1
+        self._has_masks = profile in WITH_MASKS
+        self._is_raw = profile in RAW
         self.drive = drive or make_drive(seed, num_sweeps * self.step, profile, scene)
         self.log_id, self.timestamps = self.drive.log_id, self.drive.timestamps[:: self.step]
 
     def sweep(self, index: int) -> Sweep:
-        """Sweep of the drive, without its mask if the data set has none."""
+        """Sweep of the drive as the reader of its data set gives it: de-skewed, and without its mask if it has none."""
         sweep = self.drive.sweep(index * self.step)
+        if self._is_raw:
+            poses = self.drive.poses_at(index * self.step, sweep.point_times * 1e9)
+            points = transform_each(sweep.points.astype(np.float64), np.linalg.inv(sweep.pose) @ poses)
+            sweep = replace(sweep, points=points.astype(np.float32))
         return sweep if self._has_masks else replace(sweep, is_ground=None)
 
     def truth(self, index: int) -> Truth:

@@ -18,9 +18,11 @@ from staged_cars import SIZE, Staged, straight
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
 from cflow_torch.applications.association import VOXELS, box_of_point, enclosing_boxes, link
 from cflow_torch.applications.instance_files import write_drivestudio
-from cflow_torch.applications.track_table import join_tables, read_tracks, write_kitti, write_mot, write_tracks
+from cflow_torch.applications.kitti_tracks import write_kitti
+from cflow_torch.applications.track_table import join_tables, read_tracks, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
 from cflow_torch.data.av2 import AV2Log
+from cflow_torch.data.camera import Camera, intrinsic_matrix
 from cflow_torch.data.catalog import find_sources, open_log
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import windows
@@ -400,6 +402,40 @@ def test_tracks_are_written_as_text(tmp_path: Path) -> None:
     assert np.allclose(rotation, -np.pi / 2, atol=1e-5), "KITTI: 0 = along x of the camera, negative to the left"
     alpha = np.array([line[5] for line in lines], float)
     assert np.allclose(alpha, rotation - np.arctan2(x, z), atol=1e-4)
+
+
+class Calibrated(Staged):
+    """A vehicle at rest that has turned by 90 degrees to the left, with the cameras of KITTI."""
+
+    T_camera0_lidar = np.array([[0.0, -1, 0, 0.01], [0, 0, -1, -0.07], [1, 0, 0, -0.27], [0, 0, 0, 1]])
+
+    def cameras(self, index: int) -> list[Camera]:
+        beside = np.eye(4)
+        beside[0, 3] = 0.06  # camera 2 is to the left of camera 0
+        matrix = intrinsic_matrix(720, 720, 620, 187)
+        return [Camera("image_02", f"{index:06d}", (1242, 375), matrix, beside @ self.T_camera0_lidar)]
+
+
+def test_tracks_of_a_calibrated_drive_are_in_the_frame_of_kittis_labels(tmp_path: Path) -> None:
+    """A car 20 m ahead crosses the image from the left, drives out of it, and another one is behind."""
+    vehicle = np.tile(pose(0, -20, np.pi / 2, 1), (12, 1, 1))
+    log = Calibrated([straight((-8, 0), (1.6, 0.0)), straight((-8, -50), (0.9, 0.0))], vehicle)
+    table = track(log, log.results())
+    write_kitti(tmp_path / "kitti.txt", table, log)
+    numbers = np.array([line.split()[5:] for line in (tmp_path / "kitti.txt").read_text().splitlines()], float)
+    middle = log.middle(0)[:11]
+    u = 620 + 720 * (middle[:, 0] + 0.07) / (middle[:, 1] + 20 - 0.27)
+    assert len(numbers) == ((u > -100) & (u < 1342)).sum() == 11
+    x, y, z, rotation = numbers[:, 8:12].T
+    np.testing.assert_allclose(x, middle[:, 0] + 0.01, atol=0.05)
+    np.testing.assert_allclose(y, 1 - 0.07, atol=1e-5)
+    np.testing.assert_allclose(z, middle[:, 1] + 20 - 0.27, atol=0.05)
+    np.testing.assert_allclose(rotation, 0, atol=1e-5)
+    rectangle = numbers[:, 1:5]
+    for index in range(11):
+        points = log.cameras(0)[0].see(log.sweep(index).points[log.world(index)[2] == 0])
+        pixels = log.cameras(0)[0].project(points).clip(0, (1241, 374))
+        np.testing.assert_allclose(rectangle[index], [*pixels.min(0), *pixels.max(0)], atol=3)
 
 
 def read_instances(folder: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Callable
 
 import numpy as np
 import pytest
 import torch
+from scenes import pose
 
+from cflow_torch.applications.floor import Floor
 from cflow_torch.applications.smoothing import ACCELERATION, MotionState, smooth
 from cflow_torch.applications.whole_boxes import (
     CAR,
@@ -20,6 +23,8 @@ from cflow_torch.applications.whole_boxes import (
     quantiles,
     whole_boxes,
 )
+from cflow_torch.transforms import transform_points
+from cflow_torch.types import Sweep
 
 INTERVAL = 0.1
 SIZE = (4.2, 1.8, 1.4)
@@ -41,6 +46,7 @@ def seen(
     sensor: tuple[float, float],
     visible: Callable[[int, np.ndarray], np.ndarray] = lambda index, points: points,
     size: tuple[float, float, float] = SIZE,
+    floor: float = np.nan,
 ) -> Sightings:
     """Sightings of objects on paths, (T, 3) x, y, heading; `visible` chooses their points in each sweep."""
     parts = []
@@ -54,16 +60,41 @@ def seen(
             points = np.column_stack([local[:, :2] @ turn.T + (x, y), local[:, 2]])
             flow = velocity[index] + rate[index] * np.column_stack([y - points[:, 1], points[:, 0] - x])
             flows = np.column_stack([flow, np.zeros(len(flow))])
-            parts.append((number, index * INTERVAL, (*sensor, 1.5), heading, points, flows))
-    columns = [torch.tensor(np.array([part[k] for part in parts])) for k in range(4)]
-    row = torch.arange(len(parts)).repeat_interleave(torch.tensor([len(part[4]) for part in parts]))
-    return Sightings(*columns, *(torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (4, 5)), row)
+            parts.append((number, index * INTERVAL, (*sensor, 1.5), heading, floor, points, flows))
+    columns = [torch.tensor(np.array([part[k] for part in parts])) for k in range(5)]
+    row = torch.arange(len(parts)).repeat_interleave(torch.tensor([len(part[5]) for part in parts]))
+    return Sightings(*columns, *(torch.from_numpy(np.concatenate([part[k] for part in parts])) for k in (5, 6)), row)
 
 
 def straight(start: tuple[float, float], speed: float, heading: float, count: int = 20) -> np.ndarray:
     distance = speed * INTERVAL * np.arange(count)[:, None]
     place = np.array(start) + distance * [np.cos(heading), np.sin(heading)]
     return np.column_stack([place, np.full(count, heading)])
+
+
+def test_a_box_stands_on_the_ground_also_where_its_lower_part_is_hidden() -> None:
+    """The ground is 0.3 m below the lowest points; in every third sweep, a wall hides half of the car."""
+
+    def behind_a_wall(index: int, points: np.ndarray) -> np.ndarray:
+        return points[points[:, 2] > 0.5] if index % 3 == 0 else points
+
+    path = straight((-6, 7), 9.0, 0.1)
+    boxes = whole_boxes(seen([path], (0.0, 0.0), behind_a_wall, floor=-0.3))
+    assert np.allclose(boxes.size[:, 2], SIZE[2] + 0.3, atol=1e-6)
+    assert np.allclose(boxes.motion.position[:, 2], (SIZE[2] - 0.3) / 2, atol=1e-6)
+    bridge = whole_boxes(seen([path], (0.0, 0.0), floor=-5.0))
+    assert np.allclose(bridge.size[:, 2], SIZE[2], atol=1e-6), "this ground is that of a road below"
+
+
+def test_the_floor_is_the_ground_around_and_unknown_elsewhere() -> None:
+    x, y = np.meshgrid(np.arange(0, 40, 0.5), np.arange(-5, 5, 0.5), indexing="ij")
+    ground = np.stack([x, y, 0.02 * x], -1).reshape(-1, 3)
+    points = np.concatenate([ground, ground + (0, 0, 9), [[np.nan, 0, 0]]]).astype(np.float32)
+    sweep = Sweep(points, np.arange(len(points)) < len(ground), pose(10, 0, np.pi / 2, 1))
+    floor = Floor.of(sweep)
+    place = transform_points(np.array([[20.0, 0, 1], [60, 0, 0], [30, 1, 0]]), sweep.pose)
+    np.testing.assert_allclose(floor.below(place), np.array([0.4, np.nan, 0.6]) + sweep.pose[2, 3], atol=0.05)
+    assert np.isnan(Floor.of(replace(sweep, is_ground=None)).below(place)).all()
 
 
 def test_a_box_seen_from_all_sides_is_recovered() -> None:

@@ -335,10 +335,17 @@ def test_a_phone_shows_all_controls(browser: Any, drive_page: Path) -> None:
     assert head["y"] + head["height"] <= side["y"] and side["y"] + side["height"] <= time["y"], "nothing overlaps"
     assert head["y"] + head["height"] <= objects["y"] and objects["x"] + objects["width"] <= side["x"]
     tab.locator("#objects summary").click()
+    tab.wait_for_function(f"{NUM_CUT} === 0")  # no panel cuts off a label
     assert tab.locator("#list tbody tr").first.is_visible() and tab.evaluate(LIST_FITS), "no column is cut off"
     labels = tab.locator("#labels span:not(.ring)").all_inner_texts()
     assert labels and all(re.fullmatch(r"#\d+", text) for text in labels), "ids only"
     context.close()
+
+
+# Number of labels that a panel covers in part.
+NUM_CUT = """[...document.querySelectorAll("#labels span:not([hidden])")].map(e => e.getBoundingClientRect()).filter(
+  a => ["head", "objects", "side", "time"].map(id => document.getElementById(id).getBoundingClientRect()).some(
+    b => a.right > b.left && a.left < b.right && a.bottom > b.top && a.top < b.bottom)).length"""
 
 
 # What is drawn at the middle of the label of the chosen object.

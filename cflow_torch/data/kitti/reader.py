@@ -237,6 +237,12 @@ class KITTILog(ArraysLog):
                 cameras.append(Camera(f"image_{name}", image, size, projection[:, :3], T_camera_lidar))
         return cameras
 
+    @cached_property
+    def T_camera0_lidar(self) -> np.ndarray | None:
+        """(4, 4) float64, to the frame of KITTI's labels: camera 0 after rectification. None without calibration."""
+        camera = self._camera()
+        return None if camera is None else camera[0]
+
     def _image_size(self, camera: str) -> tuple[int, int]:
         """Return width and height of the images of a camera, of the drive if it has images."""
         root = self.drive.root

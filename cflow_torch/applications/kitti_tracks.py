@@ -1,0 +1,88 @@
+"""Write tracks as text of KITTI's tracking benchmark."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cflow_torch.applications.track_table import KITTI_NAMES, Table, box_corners, boxes_in_sweeps, score_of
+from cflow_torch.data.atomic import write_text
+from cflow_torch.data.log import Log
+from cflow_torch.data.paths import PathLike, as_path
+from cflow_torch.transforms import transform_points
+
+_AHEAD = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+_ANNOTATED_CAMERA = "image_02"
+
+
+class _Boxes(NamedTuple):
+    """R boxes as the camera sees them."""
+
+    position: np.ndarray  # (R, 3) metres, middle of the lower face, frame of the camera
+    turn: np.ndarray  # (R,) radians, rotation_y
+    rectangle: np.ndarray  # (R, 4) pixels: left, top, right, bottom; -1 = unknown
+    is_seen: np.ndarray  # (R,) bool
+
+
+def write_kitti(path: PathLike, table: Table, log: Log) -> None:
+    """Write tracks as text of KITTI's tracking benchmark: a line of 18 columns per row.
+
+    Frames and ids count from 0; the type is Misc where the class is unknown; unknown columns are -1.
+
+    Args:
+        path: the file.
+        table: tracks, see `track`.
+        log: the drive. If it is a drive of KITTI with its calibration, boxes are in the frame of KITTI's labels, the
+            rectified camera 0, have rectangles in the image of camera 2, and are left out where it does not see them.
+
+    Convention: KITTI's camera has x to the right, y down, z ahead. Without calibration, it is at the origin of the
+        ego frame of the sweep and looks to +x. The position is the middle of the lower face of the box.
+
+    Source: development kit of the KITTI tracking benchmark (2012).
+    """
+    size = np.stack([table[name] for name in ("length", "width", "height")], 1)
+    boxes = _seen_by_camera(table, log, size)
+    alpha = _wrapped(boxes.turn - np.arctan2(boxes.position[:, 0], boxes.position[:, 2]))
+    columns = (alpha, boxes.rectangle, size[:, ::-1], boxes.position, boxes.turn, score_of(table))
+    numbers = np.column_stack(columns)
+    lines = []
+    for row in np.flatnonzero(boxes.is_seen).tolist():
+        kind = KITTI_NAMES.get(str(table["class"][row]), "Misc") if "class" in table else "Misc"
+        values = " ".join(f"{value:.6f}" for value in numbers[row])
+        lines.append(f"{table['sweep'][row]} {table['id'][row]} {kind} -1 -1 {values}\n")
+    write_text(as_path(path), "".join(lines))
+
+
+def _seen_by_camera(table: Table, log: Log, size: np.ndarray) -> _Boxes:
+    """Convert boxes of (R, 3) size to the frame of the camera."""
+    centre, heading = boxes_in_sweeps(table, log)
+    T_camera0_lidar = getattr(log, "T_camera0_lidar", None)
+    T_camera_ego = _AHEAD if T_camera0_lidar is None else T_camera0_lidar
+    foot = centre - size * (0, 0, 0.5)
+    ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))], 1) @ T_camera_ego[:3, :3].T
+    turn = np.arctan2(-ahead[:, 2], ahead[:, 0])
+    rectangle = np.full((len(centre), 4), -1.0)
+    is_seen: Any = np.ones(len(centre), bool)
+    if T_camera0_lidar is not None:
+        rectangle = _rectangles(log, box_corners(centre, heading, size))
+        is_seen = np.all(rectangle[:, 2:] > rectangle[:, :2], axis=1)
+    return _Boxes(transform_points(foot, T_camera_ego), turn, rectangle, is_seen)
+
+
+def _rectangles(log: Log, corners: np.ndarray) -> np.ndarray:
+    """Return the rectangles around boxes in the image, (R, 4) pixels; without area for a box outside of it.
+
+    The corners are (R, 8, 3) metres. Corners behind the camera are ignored.
+    """
+    (camera,) = (each for each in log.cameras(0) if each.name == _ANNOTATED_CAMERA)
+    pixels = camera.project(camera.see(corners.reshape(-1, 3))).reshape(-1, 8, 2)
+    last = np.array(camera.size) - 1.0
+    low = np.where(np.isnan(pixels), np.inf, pixels).min(axis=1)
+    high = np.where(np.isnan(pixels), -np.inf, pixels).max(axis=1)
+    return np.concatenate([low.clip(0, last), high.clip(0, last)], 1)
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    """Angles in -pi ... pi."""
+    return np.arctan2(np.sin(angle), np.cos(angle))
