@@ -12,6 +12,7 @@ from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
 
 _CELL = 2.0  # metres; we take the ground points of a cell and of those around it
+_FARTHEST = 300.0  # metres, from the vehicle in x and y; a stray return must not make the map huge
 _FEWEST_POINTS = 5  # ground points in 3 x 3 cells; with fewer, the height is unknown
 
 
@@ -26,7 +27,9 @@ class Floor(NamedTuple):
         """Collect the ground points of a sweep; without a mask, the ground is unknown everywhere."""
         points = as_numpy(sweep.points)[:, :3]
         is_ground = np.zeros(len(points), bool) if sweep.is_ground is None else as_numpy(sweep.is_ground)
-        ground = points[is_ground & np.isfinite(points).all(axis=1)]
+        # NaN and infinity are not near.
+        is_near = (np.abs(points[:, :2]) <= _FARTHEST).all(axis=1) & np.isfinite(points[:, 2])
+        ground = points[is_ground & is_near]
         if not len(ground):
             return UNKNOWN_FLOOR
         x, y, z = transform_points(ground, pose_of(sweep)).T

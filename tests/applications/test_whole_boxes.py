@@ -89,6 +89,7 @@ def test_a_box_stands_on_the_ground_also_where_its_lower_part_is_hidden() -> Non
 def test_the_floor_is_the_ground_around_and_unknown_elsewhere() -> None:
     x, y = np.meshgrid(np.arange(0, 40, 0.5), np.arange(-5, 5, 0.5), indexing="ij")
     ground = np.stack([x, y, 0.02 * x], -1).reshape(-1, 3)
+    ground = np.concatenate([ground, [[1e6, 1e6, 5.0]]])  # a stray return, for which the map has no room
     points = np.concatenate([ground, ground + (0, 0, 9), [[np.nan, 0, 0]]]).astype(np.float32)
     sweep = Sweep(points, np.arange(len(points)) < len(ground), pose(10, 0, np.pi / 2, 1))
     floor = Floor.of(sweep)
