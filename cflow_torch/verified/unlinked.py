@@ -53,8 +53,9 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
     Convention:
         Parts have the pixels of a sweep that are missing, or that every other sweep lacks. A part of t takes its
         velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least half of
-        the older sweeps. Of the velocities of a part of t, or of t+1, the one with the most sweeps wins, then the one
-        with the smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part
+        the older sweeps. A sweep before t-1 for which it puts the part outside of the region is not counted. Of the
+        velocities of a part of t, or of t+1, the one that the fewest sweeps lack wins, then the one with the smallest
+        errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part
         belongs to its first node. The velocity of a node must win more slices near its targets than it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
@@ -150,6 +151,13 @@ class _Map:
         part = self._part.index_select(0, place.view(-1)).view_as(place)
         return (part - 1).clamp_(min=0).long(), part > 0
 
+    def contains(self, centre: Tensor) -> Tensor:
+        """Tell which places, (2, ...), finest pixels, are in the region, a cell or more from its border, (...) bool."""
+        row, col = (centre / self._cell).floor_()
+        last_row = self._height - 2 * _REACH - 1
+        last_col = self._width - 2 * _REACH - 1
+        return (row >= 1) & (row < last_row) & (col >= 1) & (col < last_col)
+
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
         row, col = (centre / self._cell).floor_().long() + _REACH
@@ -176,11 +184,15 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     before_t = elapsed - elapsed[:, 1:2]
     interval = before_t.gather(1, parts.step.index_select(0, other)[:, None])[:, 0]
     velocity = (take_columns(parts.centre, of_t) - take_columns(parts.centre, other)) / interval  # [2, H]
-    part, error = _follow(parts, cells, of_t, velocity, before_t)  # [H, S] each
+    place = take_columns(parts.centre, of_t)[..., None] - velocity[..., None] * before_t  # [2, H, S]
+    part, error = _follow(parts, cells, of_t, place)  # [H, S] each
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
     is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
-    rank = _ranks(error, is_found, is_given)
+    # An older sweep cannot confirm that an object was outside of the region, so only t-1 must always do it.
+    is_counted = is_given & cells.contains(place)
+    is_counted[:, :3] = is_given[:, :3]
+    rank = _ranks(error, is_found, is_counted)
     if sweeps.batch.has_pairs:
         # There, all errors are 0, and the shortest way has the lowest rank.
         rank += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
@@ -189,17 +201,16 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
 
 
-def _follow(parts: _Parts, cells: _Map, of_t: Tensor, velocity: Tensor, before_t: Tensor) -> tuple[Tensor, Tensor]:
+def _follow(parts: _Parts, cells: _Map, of_t: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
     """Find the nearest part of each sweep to where a velocity puts a part of t, and its distance, (H, S) each.
 
-    `of_t` is (H,), `velocity` (2, H), and `before_t`, sweep intervals from each sweep to t, (H, S). In t,
-    it is the part itself, and the distance is 0. Without a part near, the distance is infinite.
+    `of_t` is (H,), and `place` is (2, H, S), finest pixels. In t, the nearest part is the part itself, and the distance
+    is 0. Without a part near, the distance is infinite.
     """
-    expected = take_columns(parts.centre, of_t)[..., None] - velocity[..., None] * before_t  # [2, H, S]
-    step = torch.arange(before_t.shape[1], device=of_t.device).expand_as(before_t)
-    window = parts.window.index_select(0, of_t)[:, None].expand_as(before_t)
-    part, is_part = cells.around(window, step, expected, _NEAR)  # [H, S, 25]
-    square = (_centres(parts, part) - expected[..., None]).square_().sum(0).masked_fill_(~is_part, math.inf)
+    step = torch.arange(place.shape[2], device=of_t.device).expand(place.shape[1:])
+    window = parts.window.index_select(0, of_t)[:, None].expand_as(step)
+    part, is_part = cells.around(window, step, place, _NEAR)  # [H, S, 25]
+    square = (_centres(parts, part) - place[..., None]).square_().sum(0).masked_fill_(~is_part, math.inf)
     nearest, index = square.min(2)  # [H, S]
     part = part.gather(2, index[..., None])[..., 0]
     part[:, 1] = of_t
@@ -207,14 +218,14 @@ def _follow(parts: _Parts, cells: _Map, of_t: Tensor, velocity: Tensor, before_t
     return part, nearest.sqrt_()
 
 
-def _ranks(error: Tensor, is_found: Tensor, is_given: Tensor) -> Tensor:
+def _ranks(error: Tensor, is_found: Tensor, is_counted: Tensor) -> Tensor:
     """Rank velocities by the sweeps that confirm them, then by their errors, (H,) float64: the lowest is the best.
 
     The arguments are (H, S). The rank is infinite without a part at t+1, or with parts in less than half of the older
-    sweeps.
+    sweeps that count.
     """
-    is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_given[:, 2:].sum(1))
-    num_lacking = (is_given & ~is_found).sum(1)
+    is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_counted[:, 2:].sum(1))
+    num_lacking = (is_counted & ~is_found).sum(1)
     rank = error.masked_fill(~is_found, 0.0).sum(1) + num_lacking * _LACKING
     return rank.masked_fill(~is_confirmed, math.inf)
 

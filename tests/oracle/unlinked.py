@@ -118,18 +118,23 @@ def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> 
 
 def follow(sweeps, i, velocity, centres, since, around) -> tuple[float, dict[int, int]]:  # type: ignore[no-untyped-def]
     """The rank of a velocity of part i, infinite if too few parts confirm it, and its part in each sweep."""
-    track, rank = {1: i}, 0.0
+    track, rank, num_older = {1: i}, 0.0, 0
+    cell = max(1, round(CELL / sweeps.size))
+    most = (np.array(sweeps.image.shape[1:]) - 1) // cell
     for step in range(len(since)):
         expected = centres[i] - velocity * since[step]
         distances = [(float(((centres[p] - expected) ** 2).sum()), p) for p in around(step, expected, NEAR)]
         square, part = min(distances, key=lambda pair: pair[0], default=(math.inf, -1))
         bound = ERROR / sweeps.size + SHARE * math.hypot(*velocity) * abs(since[step])
+        where = np.floor(expected / cell)
+        is_counted = step <= 2 or ((where >= 1) & (where < most)).all()  # a cell or more from the border of the region
+        num_older += step >= 2 and is_counted
         if step == 1:
             continue
         if math.sqrt(square) <= bound:
             track[step] = part
             rank += math.sqrt(square)
-        else:
+        elif is_counted:
             rank += 1 << 20
-    older = sum(step >= 2 for step in track)
-    return (rank if 0 in track and 2 * older >= len(since) - 2 else math.inf), track
+    found = sum(step >= 2 for step in track)
+    return (rank if 0 in track and 2 * found >= num_older else math.inf), track

@@ -70,6 +70,18 @@ def test_a_far_car_of_few_points_is_found(step, num_points):
     assert len(result.cluster_id[3000:].unique()) == 1 and not result.residual_flow[:3000].any()
 
 
+def test_a_car_that_has_just_entered_the_region_is_found():
+    """Only t-1 can confirm it. At t-2, it was outside of the region and its margin, which end at x = -64 m."""
+    entering = front(1, 30) - (84.0, 0.0, 0.0)
+    result = flow_as_oracle(window(entering, 3.5), MODEL.config)
+    flow = result.residual_flow[3000:]
+    assert torch.allclose(flow, torch.tensor([3.5, 0.0, 0.0]).expand_as(flow), atol=0.05)
+    # Without t-1, nothing confirms it.
+    sweeps = window(entering, 3.5)
+    lone = replace(sweeps, pch=(Sweep(sweeps.pc1.points[:3000], pose=np.eye(4)), *sweeps.pch[1:]))
+    assert not MODEL([lone])[0].residual_flow.any()
+
+
 @pytest.mark.parametrize("step", [-2.2, 3.5])
 def test_in_a_pair_an_unmatched_component_goes_with_the_nearest_one_of_like_size(step):
     shape = np.concatenate((front(1, 40), front(2, 40) + (14.0, 4.0, 0.0)))  # two cars
