@@ -7,6 +7,8 @@ are too few to tell:
 
     winner     [   A     A  c  p ]     a car A, a cyclist c behind it and a parked car p: all move as A
     dissent              [c][p]        c moves by itself, p is static
+
+A component of changed pixels is in no other node, but its pixels may take the motion of a winner. It dissents likewise.
 """
 
 from __future__ import annotations
@@ -16,12 +18,15 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.verified.component_tree import Tree
+from cflow_torch.verified.component_tree import NodeKind, Tree
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import NEAR_Z, Counts, Verdict, count_wins
 
 _DISSENT_Z = 4.0  # factor of z for nodes that dissent
-_LEAST_DIFFERENCE = 1.0  # finest pixels per sweep interval, between the motions of a winner and of a node that dissents
+# Finest pixels per sweep interval, between the motions of a winner and of a node that dissents. Changed pixels are
+# often the outline of an object, which tells its motion less well than the whole object.
+_LEAST_DIFFERENCE = 1.0
+_LEAST_DIFFERENCE_OF_CHANGED = 2.0
 
 
 def with_dissent(
@@ -34,22 +39,49 @@ def with_dissent(
     """
     none = tree.count
     node = torch.arange(none, device=winner.device)
-    motion = verdict.motion
-    motion_around = Groups(winner, none).spread(motion)  # [N, 2]
     has_history = sweeps.has_history.index_select(0, tree.window)
     is_inside = (tree.kind < tree.num_levels) & (winner < none) & (winner != node) & has_history
-    differs = ((motion - motion_around).abs() >= _LEAST_DIFFERENCE).any(1)
-    inside = flat_nonzero(is_inside & differs)
-    if len(inside) == 0:
-        return winner
-    dissents = torch.zeros_like(is_inside)
-    dissents[inside] = _gain(sweeps, tree, inside, motion, motion_around, _DISSENT_Z * significance) > price
-    own = torch.where(motion.any(1), node, none)
+    dissents = _dissent(sweeps, tree, verdict, is_inside, winner, _LEAST_DIFFERENCE, significance, price)
+    own = torch.where(verdict.motion.any(1), node, none)
     taken = winner
     for level in range(1, tree.num_levels):
         of_level = torch.where(dissents, own, tree.by_parent.spread(taken, none=none))
         taken = torch.where(is_inside & (tree.kind == level), of_level, taken)
     return taken
+
+
+def changed_dissent(
+    sweeps: HeightSlicedSweeps, tree: Tree, verdict: Verdict, of_pixel: Tensor, significance: float, price: int
+) -> Tensor:
+    """Tell which nodes of changed pixels do not move with the winner around them, (N,) bool.
+
+    `of_pixel` is (P',) int64, the node of the levels whose motion each pixel takes; N = none. If the pixels of a node
+    take several motions, the node is compared with the first of these nodes, the coarsest.
+    """
+    winner = tree.members.min(of_pixel.index_select(0, tree.pixel), empty=tree.count)
+    is_inside = (tree.kind == NodeKind.CHANGED) & (winner < tree.count) & verdict.motion.any(1)
+    return _dissent(sweeps, tree, verdict, is_inside, winner, _LEAST_DIFFERENCE_OF_CHANGED, significance, price)
+
+
+def _dissent(
+    sweeps: HeightSlicedSweeps,
+    tree: Tree,
+    verdict: Verdict,
+    is_inside: Tensor,
+    winner: Tensor,
+    least_difference: float,
+    significance: float,
+    price: int,
+) -> Tensor:
+    """Tell which nodes inside a winner dissent, (N,) bool. `is_inside` is (N,) bool, `winner` (N,) int64."""
+    motion = verdict.motion
+    motion_around = Groups(winner, tree.count).spread(motion)  # [N, 2]
+    differs = ((motion - motion_around).abs() >= least_difference).any(1)
+    inside = flat_nonzero(is_inside & differs)
+    dissents = torch.zeros_like(is_inside)
+    if len(inside) > 0:
+        dissents[inside] = _gain(sweeps, tree, inside, motion, motion_around, _DISSENT_Z * significance) > price
+    return dissents
 
 
 def _gain(sweeps: HeightSlicedSweeps, tree: Tree, node: Tensor, motion: Tensor, other: Tensor, z: float) -> Tensor:

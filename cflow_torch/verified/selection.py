@@ -18,7 +18,7 @@ from torch import Tensor
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import flat_nonzero
 from cflow_torch.verified.component_tree import Components, Tree, corners_at_newest, longer_side
-from cflow_torch.verified.dissent import with_dissent
+from cflow_torch.verified.dissent import changed_dissent, with_dissent
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import PER_SLICE, Verdict
 
@@ -53,6 +53,7 @@ def select_objects(
     significance: float,
     price: int = PRICE,
     dissent: Callable[..., Tensor] = with_dissent,
+    dissent_of_changed: Callable[..., Tensor] = changed_dissent,
 ) -> Objects:
     """Select objects from the leaves up, then let nodes inside the winners dissent.
 
@@ -62,11 +63,12 @@ def select_objects(
         significance: z of the paired test. For a node against the winner around it, z is four times as large.
         price: of an object, in units of `PER_SLICE`.
         dissent: finds the nodes inside a winner that do not move with it.
+        dissent_of_changed: finds the nodes of changed pixels that do not move with the winner around them.
 
     Returns:
         The objects. A pixel belongs to the first of these that exists:
-        1. the node whose motion the finest of its nodes of the levels takes, or its node of another kind with the most
-           evidence, if that has more;
+        1. the node whose motion the finest of its nodes of the levels takes, or a node of another kind, if that has
+           more evidence or dissents; of several, the one with the most evidence;
         2. its plain component, if that is linked. Then it is static.
         Otherwise it is static and belongs to no object.
 
@@ -74,7 +76,8 @@ def select_objects(
         The value of a child is its own evidence or the sum of its children's values, whichever is more, minus `price`,
         but at least 0. The coarsest node with more evidence than its children wins. Ties: the children win.
         With history, a node inside a winner dissents if its motion differs from that of the winner by a pixel per sweep
-        interval in y or in x, and gains more than `price`. Otherwise, it takes the motion that its parent takes.
+        interval in y or in x, and gains more than `price`. Otherwise, it takes the motion that its parent takes. A node
+        of changed pixels dissents if its motion differs by two pixels.
 
     Cost: a few passes over the nodes for each level, and over the members; the paired test of nodes that may dissent.
     """
@@ -83,7 +86,9 @@ def select_objects(
     winner = _winners(tree, node, verdict.evidence, price)
     taken = dissent(sweeps, tree, verdict, winner, significance, price)
     by_pixel = Groups(tree.pixel, sweeps.num_pixels)  # the members
-    moving = _moving_nodes(tree, by_pixel, taken, verdict.evidence)
+    of_level = _nodes_of_levels(tree, by_pixel, taken)
+    dissents = dissent_of_changed(sweeps, tree, verdict, of_level, significance, price)
+    moving = _moving_nodes(tree, of_level, verdict.evidence, dissents)
 
     # The key of an object is the number of its node, else N plus the number of its component.
     plain_node = torch.where(tree.kind == tree.num_levels - 1, node, none)
@@ -112,24 +117,36 @@ def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
     return winner
 
 
-def _moving_nodes(tree: Tree, by_pixel: Groups, taken: Tensor, evidence: Tensor) -> Tensor:
-    """Return the moving node of each pixel, (P',) int64, N = none; see `select_objects`.
+def _nodes_of_levels(tree: Tree, by_pixel: Groups, taken: Tensor) -> Tensor:
+    """Return the moving node of the levels of each pixel, (P',) int64, N = none.
 
     `by_pixel` groups the members by pixel, `taken` is the result of `with_dissent`.
     """
     none = tree.count
     node = torch.arange(none, device=taken.device)
-    is_of_level = tree.kind < tree.num_levels
     # Nodes are listed level by level, so the finest node of a pixel has the largest number.
-    finest = by_pixel.max(tree.members.spread(torch.where(is_of_level, node, -1), none=-1), empty=-1)  # [P']
-    of_level = torch.where(finest >= 0, F.pad(taken, (0, 1), value=none).index_select(0, finest.clamp(min=0)), none)
+    of_level = torch.where(tree.kind < tree.num_levels, node, -1)
+    finest = by_pixel.max(tree.members.spread(of_level, none=-1), empty=-1)  # [P']
+    return torch.where(finest >= 0, F.pad(taken, (0, 1), value=none).index_select(0, finest.clamp(min=0)), none)
+
+
+def _moving_nodes(tree: Tree, of_level: Tensor, evidence: Tensor, dissents: Tensor) -> Tensor:
+    """Return the moving node of each pixel, (P',) int64, N = none; see `select_objects`.
+
+    `of_level` is (P',) int64, that of the levels. `dissents`, (N,) bool, tells which nodes of changed pixels do.
+    """
+    none = tree.count
+    is_other = (tree.kind >= tree.num_levels) & (evidence > 0)
+    member = flat_nonzero(tree.members.spread(is_other))
+    node = tree.members.of_item.index_select(0, member)
+    pixel = tree.pixel.index_select(0, member)
+    own = evidence.index_select(0, node)
+    rival = F.pad(evidence, (0, 1)).index_select(0, of_level.index_select(0, pixel))  # of none, 0
+    wins = (own > rival) | dissents.index_select(0, node)
     # The largest key is that of the node with the most evidence. Ties: the first.
-    key = torch.where(is_of_level | (taken == none), -1, (evidence + 1) * none - 1 - node)
-    key = by_pixel.max(tree.members.spread(key, none=-1), empty=-1)  # [P']
-    other = torch.where(key >= 0, none - 1 - key % max(none, 1), none)
-    evidence_of = F.pad(evidence, (0, 1))  # of none, 0
-    is_more = evidence_of.index_select(0, other) > evidence_of.index_select(0, of_level)
-    return torch.where(is_more, other, of_level)
+    key = torch.where(wins, (own + 1) * none - 1 - node, -1)
+    key = Groups(pixel, len(of_level)).max(key, empty=-1)  # [P']
+    return torch.where(key >= 0, none - 1 - key % max(none, 1), of_level)
 
 
 def _keys_of_components(components: Components, first: int, num_pixels: int) -> Tensor:

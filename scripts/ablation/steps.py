@@ -64,6 +64,11 @@ def _no_dissent(sweeps: Any, tree: Any, verdict: Any, winner: Tensor, significan
     return winner
 
 
+def _no_changed_dissent(sweeps: Any, tree: Any, verdict: Any, *given: Any) -> Tensor:
+    return torch.zeros_like(verdict.evidence, dtype=torch.bool)
+
+
+_WITHOUT_DISSENT = partial(selection.select_objects, dissent=_no_dissent, dissent_of_changed=_no_changed_dissent)
 # For each row of the table, the steps of `VerifiedFlow` that it replaces.
 STEPS: dict[str, dict[str, Any]] = {
     "all steps": {},
@@ -77,7 +82,7 @@ STEPS: dict[str, dict[str, Any]] = {
     "no aperture test": {"verify": partial(paired_test.verify, slides=_nothing_slides)},
     "no least gain": {"verify": partial(paired_test.verify, pixels_per_slice=math.inf)},
     "no price of an object": {"select_objects": partial(selection.select_objects, price=0)},
-    "no dissent": {"select_objects": partial(selection.select_objects, dissent=_no_dissent)},
+    "no dissent": {"select_objects": _WITHOUT_DISSENT},
     "no margin": {"motion_margin": _without_margin},
     "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
     "no slow objects of pairs": {"refine": partial(refinement.refine, slow=_nothing_is_slow)},

@@ -119,6 +119,21 @@ def dissent(sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], winner:
     return taken
 
 
+def changed_dissents(
+    sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], number: int, around: np.ndarray, z: float
+) -> bool:
+    """Does a node of changed pixels not move with the first of the nodes whose motions its pixels take, `around`?
+
+    The motions differ by two pixels in y or in x, and its own one gains more than `PRICE`.
+    """
+    node, winners = tree.nodes[number], around[around >= 0]
+    if node.level != len(tree.levels) or not any(motions[number]) or not len(winners):
+        return False
+    other = motions[winners.min()]
+    differs = max(abs(a - b) for a, b in zip(motions[number], other)) >= 2
+    return differs and gain(sweeps, node.members, motions[number], other, z) > PRICE
+
+
 def gain(sweeps: SlicedSweeps, members: np.ndarray, motion: Vector, other: Vector, z: float) -> int:
     """Evidence of one motion against another: what one wins against static, the other loses. z counts four times."""
     total = 0
@@ -137,8 +152,8 @@ def select_objects(
     of each object; -1 = none.
 
     A pixel moves with the node whose motion its finest node in the tree takes; but with its first node of changed
-    pixels or of a fast object, if that has more evidence. Else it is static with its plain component, if that is
-    linked.
+    pixels or of a fast object, if that has more evidence, or if the changed pixels dissent. Else it is static with its
+    plain component, if that is linked.
     """
     nodes, num_levels, plain = tree.nodes, len(tree.levels), tree.levels[-1]
     name, moving = np.full((2, len(plain)), -1)
@@ -152,11 +167,15 @@ def select_objects(
         if node.level == num_levels - 1:
             name[node.members] = i
     name = np.where(moving >= 0, moving, name)
+    most = np.zeros(len(plain), dtype=int)  # evidence of the best other node
     for i, node in enumerate(nodes):
-        if node.level >= num_levels:
-            rivals = [evidence[number] if number >= 0 else 0 for number in moving[node.members].tolist()]
-            gained = node.members[np.array(rivals) < evidence[i]]
-            moving[gained] = name[gained] = i
+        if node.level >= num_levels and evidence[i] > 0:
+            around = moving[node.members]
+            rivals = np.array([evidence[number] if number >= 0 else 0 for number in around.tolist()])
+            wins = (evidence[i] > rivals) | changed_dissents(sweeps, tree, motions, i, around, z)
+            gained = node.members[wins & (evidence[i] > most[node.members])]
+            most[gained] = evidence[i]
+            name[gained] = i
     names, first = np.unique(name[name >= 0], return_index=True)
     names = names[first.argsort()]
     position = {own: number for number, own in enumerate(names.tolist())}

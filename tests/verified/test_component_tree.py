@@ -189,6 +189,28 @@ def test_inside_a_car_a_cyclist_moves_by_himself_and_a_parked_car_is_static(z, d
         assert (flow[(row == first) | (row == first + 1), 1] == (own if dissents else 4.0)).all()
 
 
+@pytest.mark.parametrize("own, z, dissents", [(2.0, 1.5, True), (3.0, 1.5, False), (2.0, 100.0, False)])
+def test_changed_pixels_inside_a_moving_car_move_by_themselves(own, z, dissents):
+    # A person walks along the car, pixel to pixel, so no component of a level separates them. The pixels of the person
+    # have changed. His motion must differ by two pixels from that of the car, which moves by 4.
+    images = np.zeros((1, 4, 20, 40), dtype=np.uint8)
+    for step in range(4):
+        for row, first, length in ((3, 20 - 4 * step, 12), (5, 24 - int(own) * step, 8)):
+            images[0, step, row : row + 2, first : first + length] = 15
+    sweeps = from_images(images, SIZE)
+    every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
+    is_person = sweeps.pixels.row_col[0] >= 5
+    components = find_components(sweeps, ChangedPixels(every, is_person, ~every), (2, 1))
+    nodes = movable_nodes(sweeps, components, None)
+    assert nodes.kind.tolist() == [0, 1, NodeKind.CHANGED]
+    speed = torch.tensor([4.0, 4.0, own], dtype=torch.float64)
+    motion = torch.stack((0 * speed, speed), 1)
+    objects = select_objects(sweeps, components, nodes, Verdict(motion, torch.tensor([9000, 8000, 4000])), z)
+    flow = objects.pixels.spread(objects.by_node.spread(motion))[:, 1]
+    assert (flow[~is_person] == 4.0).all()
+    assert (flow[is_person] == (own if dissents else 4.0)).all()
+
+
 def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_of_it_has_no_evidence():
     images = np.zeros((1, 3, 9, 20), dtype=np.uint8)
     images[0, :2, 4, 2:5] = images[0, :2, 4, 9:12] = 1  # two components of changed pixels
