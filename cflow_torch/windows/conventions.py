@@ -236,6 +236,9 @@ OF_POINTS = tuple(name for name, reading in READINGS.items() if reading.of_point
 _OPPOSITE = dict(zip(DIRECTIONS, reversed(list(DIRECTIONS))))
 SCAN_READINGS = {
     **{name: Reading("", margin=_SMALL) for name in (OFF, TIMES)},
-    **{name: Reading("", margin=_SMALL, opposite=_OPPOSITE[direction]) for name, (direction, _) in SCANS.items()},
+    **{
+        name: Reading("", margin=_SMALL, opposite=_OPPOSITE[direction] + instant)
+        for name, (direction, _, instant) in SCANS.items()
+    },
 }
 """How points may move to the instant of their sweep: values of `deskew`, compared as readings of the poses are."""
