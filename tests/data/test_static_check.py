@@ -548,10 +548,13 @@ def spherical(unit):
         (spherical(np.pi / 180), "data.read_as=points_spherical"),
         (lambda points, _: points @ rotations_about(1, 0.5), "about y): give points with z up"),
         (lambda points, _: points @ rotations_about(0, -0.4), "data.ego_T_lidar"),
+        (lambda points, _: points @ rotations_about(1, np.radians(8)), "8 degrees (turn it by +8 about y)"),
+        (lambda points, _: points @ rotations_about(0, np.radians(-12)), "12 degrees (turn it by -12 about x)"),
+        (lambda points, _: points @ rotations_about(1, 0.1) @ rotations_about(0, 0.15), "+6 about y and +9 about x"),
     ],
     ids=[
         *("millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera", "y up"),
-        *("radians", "degrees", "pitch", "roll"),
+        *("radians", "degrees", "pitch", "roll", "slight pitch", "slight roll", "both"),
     ],
 )
 @pytest.mark.parametrize("source", ["drive", pytest.param("real", marks=pytest.mark.slow)])
@@ -564,7 +567,7 @@ def test_wrong_units_and_axes_are_recognised(source, change, found, request):
     masks = {"masks": False}
     (text,) = [text for text in find_problems(Wrong(good, points=with_strays, **masks)) if "sweep" in text][:1]
     assert found in text
-    if "about y" in found:
+    if found.startswith("about y"):
         told = float(re.findall(r"turn it by \+(\d+)", text)[0])
         assert abs(told - np.degrees(0.5)) < 3
     if "read_as=points" in found:
@@ -684,12 +687,16 @@ def test_the_page_names_sweeps_with_few_points(drive):
         ([0, 1, 2, 3, 4, 5, 11, 7, 8, 9, 10, 11], "sweep 6 does not fit those around"),
         ([9, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11], "sweep 0 does not fit those around"),
         ([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 2], "sweep 11 does not fit those around"),
+        (
+            [0, 1, 2, 3, 4, 4, 6, 7, 8, 9, 10, 11],
+            "1 of them repeat the points of the sweep before, the first is sweep 5",
+        ),
     ],
-    ids=["dropped", "interchanged", "foreign", "first", "last"],
+    ids=["dropped", "interchanged", "foreign", "first", "last", "middle"],
 )
 def test_the_page_names_sweeps_that_are_repeated_or_misplaced(drive, order, told):
-    texts = [one.text for one in examine(Wrong(drive, order=order)) if one.topic == "sweeps"]
-    assert len(texts) == 1 and texts[0].startswith(told)
+    wrong = [one for one in examine(Wrong(drive, order=order)) if one.status == WRONG]
+    assert [one.topic for one in wrong] == ["sweeps"] and wrong[0].text.startswith(told)
 
 
 @pytest.mark.parametrize(
