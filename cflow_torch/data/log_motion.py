@@ -8,7 +8,7 @@ from typing import Callable, Container, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.log import Log, known_poses
+from cflow_torch.data.log import Log, known_poses, poses_beyond
 from cflow_torch.transforms import turn_of
 from cflow_torch.windows.conventions import MARGIN, OFF, STILL, TIMES, WORLD
 from cflow_torch.windows.inspection import repeats
@@ -175,11 +175,13 @@ def _make_pairs(
 ) -> Iterator[Pair | None]:
     """Read and prepare the pairs."""
     # Where poses are interpolated over several sweeps, an error of it looks as if they were of another time.
-    neighbours = None if log.unwrapped.has_sparse_poses else poses
+    extended, num_before = None, 0
+    if poses is not None and not log.unwrapped.has_sparse_poses:
+        extended, num_before = poses_beyond(log, poses, _REACH)
     sweeps = {index: log.sweep(index) for pair in chosen for index in pair}
     for first, second in chosen:
-        start = max(first - _REACH, 0)
-        around = None if neighbours is None else neighbours[start : second + _REACH + 1]
+        start = max(first - _REACH, -num_before)
+        around = None if extended is None else extended[start + num_before : second + num_before + _REACH + 1]
         least = _LEAST_TIMED if TIMES in scans else _LEAST_SPEED
         is_fast = poses is not None and difference(_motion(poses, first, second), np.eye(4)) >= least * (second - first)
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}

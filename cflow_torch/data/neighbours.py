@@ -79,6 +79,19 @@ class Neighbours:
         return runs
 
 
+def alternate(log: Log) -> bool:
+    """Test whether sweeps fit the second next one, but not the next: those of two sensors in turns."""
+    first = (len(log.timestamps) - 4) // 2
+    if first < 0:
+        return False
+    sweeps = [log.sweep(first + k) for k in range(4)]
+    points = [_structure(sweep) for sweep in sweeps]
+    pairs = ((0, 1), (1, 2), (2, 3)), ((0, 2), (1, 3))
+    near, second = ([_share_in_place(sweeps[a], points[a], sweeps[b], points[b]) for a, b in each] for each in pairs)
+    # Poses may be those of one of the sensors, so only its sweeps fit.
+    return max(second) >= LEAST_SHARE and max(near) < _MISPLACED * max(second)
+
+
 def _structure(sweep: Sweep | None) -> np.ndarray:
     """Return the points of the static structure of a sweep, (K, 3) float64; None = it has none."""
     if sweep is None:

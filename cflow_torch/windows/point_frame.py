@@ -18,9 +18,10 @@ _NEAR = 30.0  # metres
 # Metres of a sensor above the ground: trucks have up to 4. In feet, cars have 4.5 to 8.
 _HIGHEST_SENSOR, _HIGHEST_IN_FEET = 4.3, 9.0
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
-_TALL = {  # readings of clouds that are flat in y
+_TALL = {  # readings of clouds that are flat in y or x, not in z
     "points_camera": "a camera's axes (x right, y down, z forward)",
     "points_opengl": "y up (x right, z backward)",
+    "points_z_first": "z in the first column (z, x, y)",
 }
 _FULL = 0.95  # least share of a turn that azimuths of a cloud span
 _TILTS = range(15, 60, 15)  # degrees; without them, ground is found up to a tilt of 14
@@ -56,7 +57,7 @@ def frame_problem(points: Array) -> tuple[str, str]:
     side = ground_side(positions)
     if side < 0:
         return "points_upside_down", "z seems to point down, because nearly all points lie below the ground: " + _UP
-    is_tall = extent[2] > _FLAT * max(extent[0], extent[1]) and extent[1] < _FLAT * max(extent[0], extent[2])
+    is_tall = extent[2] > _FLAT * max(extent[0], extent[1]) and min(extent[:2]) < _FLAT * extent[2]
     height = -_height_of_ground(positions) if side > 0 and low[2] < -_HIGHEST_SENSOR else 0.0
     if _HIGHEST_SENSOR < height < _HIGHEST_IN_FEET:
         feet = f"the ground lies {height:.1f} m below the sensor, or {0.3048 * height:.1f} m if the points are in feet"

@@ -51,7 +51,7 @@ _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading h
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
-_EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
+EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 _OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
 _SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
@@ -259,7 +259,7 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
     named = [name for name in clear if name != INACCURATE]
     if len(named) < len(clear) and shares[INACCURATE] > _EXCUSE * max([shares[name] for name in named], default=0):
         return (INACCURATE,)
-    best = [name for name in named if shares[name] >= _EQUAL * shares[named[0]]]
+    best = [name for name in named if shares[name] >= EQUAL * shares[named[0]]]
     best.sort(key=lambda name: name == TURNED)  # in turns, a slight one is as good as another mounting
     best = [name for name in best if name in (SCALED, TURNED) or _is_small(name) == _is_small(best[0])]
     others = [name for kind in (MOUNTS, TIMES_OF_POSES) for name in [name for name in best if name in kind][1:]]
