@@ -51,7 +51,7 @@ class Lapse(NamedTuple):
 def choose_pairs(
     num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int] = (), without: Container[int] = ()
 ) -> list[tuple[int, int]]:
-    """Choose pairs of sweeps that show wrong readings best, up to four, in order.
+    """Choose pairs of sweeps that show wrong readings best, up to three, in order.
 
     With poses, these are the pairs over which the vehicle turns most, in which it is fastest, and whose motion differs
     most from that one sweep earlier, and later, because they show poses that are early or late. The sweeps of a pair
@@ -106,7 +106,7 @@ def _change(poses: np.ndarray, first: int, second: int) -> float:
 
 
 def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: Sequence[str] = (OFF,)) -> Judgement:
-    """Compare the readings of a log over up to four pairs of sweeps.
+    """Compare the readings of a log over up to three pairs of sweeps, and over others before one is named.
 
     Args:
         log: the log, as given.
@@ -126,7 +126,7 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
             return judgement
     judgement = judge(make_pairs(chosen, scans, False))
     if judgement.best and poses is not None:  # are only a few sweeps wrong?
-        pairs = _pairs_without_repeats(log, poses, jumps, ())
+        pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before
         judgement = judgement if pairs == chosen else judge(make_pairs(pairs, scans, False))
         others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
         again = judge(make_pairs(others, scans, False)) if judgement.best and others else judgement
