@@ -146,15 +146,15 @@ def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
     """The result of the method of the settings, which is the oracle's, without the steps that the oracle lacks."""
     with pytest.MonkeyPatch.context() as without:
         without.setattr(VerifiedFlow, "add_overhung", staticmethod(lambda sweeps, components, tree: (sweeps, tree)))
-        without.setattr(VerifiedFlow, "refine", staticmethod(partial(refine, add_slow=_nothing_is_slow)))
+        without.setattr(VerifiedFlow, "refine", staticmethod(partial(refine, slow=_nothing_is_slow)))
         (result,) = make_model(settings)([window])
     assert_same(result, reference_flow(window, settings))
     return result
 
 
-def _nothing_is_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: torch.Tensor, _: torch.Tensor) -> torch.Tensor:
-    """The motion of all objects, instead of `with_slow_objects`."""
-    return flow
+def _nothing_is_slow(sweeps: HeightSlicedSweeps, objects: Objects, may_be_slow: torch.Tensor) -> torch.Tensor:
+    """No motion, instead of `find_slow`."""
+    return torch.zeros((objects.count, 2), dtype=torch.float64)
 
 
 def assert_same_bits(a: FlowResult, b: FlowResult) -> None:

@@ -20,6 +20,11 @@ ROOMS = (
     *("dense", "keypoints", "verified", "estimate", "data", "simulator", "evaluation", "viz", "fleet", "applications"),
     *("integrations", "configs", "cli"),
 )
+# Methods of the standard library that Python 3.8 lacks, and slices of Path.parents.
+NEWER = re.compile(
+    r"\.parents\[[^\]]*:|\.(removeprefix|removesuffix|is_relative_to|with_stem|hardlink_to|bit_count|pairwise)\("
+    r"|functools import [^\n]*\bcache\b|\b(?:zip|map)\([^()]*strict="
+)
 HEAVY = ("kornia", "matplotlib", "hydra", "omegaconf", "pyarrow", "h5py", "cv2", "sklearn", "ray", "rerun", "k3d")
 
 
@@ -33,6 +38,14 @@ def test_imports_point_one_way():
                 if room != "__init__" and ROOMS.index(other) > ROOMS.index(room):
                     wrong.append(f"{file.relative_to(PACKAGE)} imports {node.module}")
     assert not wrong
+
+
+def test_nothing_newer_than_python_3_8_is_used():
+    """CI runs newer versions only; CONTRIBUTING tells how to test the oldest one."""
+    files = {file: file.read_text(encoding="utf-8") for file in PACKAGE.rglob("*.py")}
+    found = {str(file): NEWER.search(text).group() for file, text in files.items() if NEWER.search(text)}
+    assert not found
+    assert NEWER.search("[top, *top.parents[:2]]") and not NEWER.search("file.parents[2]")
 
 
 def test_importing_loads_nothing_heavy_and_changes_nothing():

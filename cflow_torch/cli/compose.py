@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cflow_torch.cli.commands import ENGINES, NOT_GIVEN, PICTURES, WITH_SETTINGS, Check, Command, Plot, own_fields
 from cflow_torch.cli.failures import UnfinishedJob, exit_if_refused, exit_wrong
-from cflow_torch.cli.words import Call, check_exists
+from cflow_torch.cli.words import check_exists
 from cflow_torch.config import PRESETS
 from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.progress import show_warnings_as_lines
@@ -69,7 +69,7 @@ def _defaults(kind: type[Settings]) -> dict[str, Any]:
 _register()
 
 
-def run_with_hydra(name: str, call: Call) -> None:
+def run_with_hydra(name: str, overrides: list[str], options: list[str]) -> None:
     """Let Hydra compose the settings of a command and run it with them, or with those of each job of a sweep."""
 
     @hydra.main(version_base="1.3", config_path="pkg://cflow_torch.configs", config_name=name)
@@ -87,12 +87,12 @@ def run_with_hydra(name: str, call: Call) -> None:
 
     with errors_told(name):
         # A job's folder is named after the swept settings, and after experiment and data.label if they are given.
-        parsed = _PARSER.parse_overrides(call.overrides)
+        parsed = _PARSER.parse_overrides(overrides)
         fixed = {str(one.key_or_group) for one in parsed if not one.is_sweep_override()}
         unnamed = {"output", "overwrite", *fixed} - {"experiment", "data.label"}
         names = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(sorted(unnamed))}]"
         os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
-        sys.argv = [f"cflow {name}", *call.overrides, names, *call.options]
+        sys.argv = [f"cflow {name}", *overrides, names, *options]
         job()
 
 

@@ -52,10 +52,10 @@ def main(argv: list[str] | None = None) -> None:
         elif "-h" in words or "--help" in words:
             print(help_of(command), end="")
         elif command in WITH_SETTINGS:
-            call = read_call(words, command)
+            overrides, options = read_call(words, command)
             from cflow_torch.cli.compose import run_with_hydra  # imports Hydra, which takes half a second
 
-            run_with_hydra(command, call)
+            run_with_hydra(command, overrides, options)
         else:
             import_module(f"cflow_torch.cli.{command}").task(words)
         sys.stdout.flush()

@@ -38,15 +38,10 @@ class Words(NamedTuple):
     options: list[str]
 
 
-class Call(NamedTuple):
-    """A call as Hydra reads it."""
+def read_call(words: list[str], command: str) -> tuple[list[str], list[str]]:
+    """Return the overrides and the options for Hydra, from the words after a command.
 
-    overrides: list[str]
-    options: list[str]
-
-
-def read_call(words: list[str], command: str) -> Call:
-    """Read the words after a command. An option, a path or a name that does not exist is a `CFlowError`.
+    An option, a path or a name that does not exist is a `CFlowError`.
 
     With `--config-dir`, your own configurations may have other choices and settings of groups; Hydra knows them.
     """
@@ -58,7 +53,7 @@ def read_call(words: list[str], command: str) -> Call:
     for path in call.paths if not given & {"-c", "--cfg"} else ():  # these only print the settings
         check_exists(path)
     _check_settings(call.settings, command, bool(given & set(_OWN_CONFIGS)))
-    return Call(hydra_overrides(kind, call), call.options)
+    return hydra_overrides(kind, call), call.options
 
 
 def split(words: list[str]) -> Words:
@@ -173,17 +168,15 @@ def hydra_overrides(command: type[Command], call: Words) -> list[str]:
     for name, owners in known_settings(command).items():
         if any(limits and limits["kind"] is str for limits in owners.values()):
             texts.add(name)
-    overrides = [_override(word, texts) for word in call.settings]
+    overrides = []
+    for word in call.settings:
+        key, _, value = word.partition("=")
+        overrides.append(f"{key}={_as_text(value)}" if key.lstrip("+") in texts else word)
     if len(call.paths) == 1:
         overrides.append(f"data.root={_quoted(call.paths[0])}")
     elif call.paths:
         overrides.append(f"data.root=[{','.join(map(_quoted, call.paths))}]")
     return overrides
-
-
-def _override(word: str, texts: set[str]) -> str:
-    key, _, value = word.partition("=")
-    return f"{key}={_as_text(value)}" if key.lstrip("+") in texts else word
 
 
 def _as_text(value: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cflow_torch.data.log import Log
+from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import relative_transform
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.inspection import repeats
@@ -80,11 +81,17 @@ class Neighbours:
 
 
 def alternate(log: Log) -> bool:
-    """Test whether sweeps fit the second next one, but not the next: those of two sensors in turns."""
+    """Test whether sweeps fit the second next one, but not the next: those of two sensors in turns.
+
+    False if a sweep cannot be read.
+    """
     first = (len(log.timestamps) - 4) // 2
     if first < 0:
         return False
-    sweeps = [log.sweep(first + k) for k in range(4)]
+    try:
+        sweeps = [log.sweep(first + k) for k in range(4)]
+    except (CFlowError, OSError):
+        return False
     points = [_structure(sweep) for sweep in sweeps]
     pairs = ((0, 1), (1, 2), (2, 3)), ((0, 2), (1, 3))
     near, second = ([_share_in_place(sweeps[a], points[a], sweeps[b], points[b]) for a, b in each] for each in pairs)

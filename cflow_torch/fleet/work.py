@@ -79,37 +79,34 @@ class Worker:
             frame fails, `Failed` has no time stamp.
         """
         try:
-            yield from self._run(part)
+            log = self._open(part.source)
+            folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
+            stamps = part.stamps(log)
+            if part.only is not None:
+                stamps = {i: stamp for i, stamp in stamps.items() if stamp == part.only}
+            complete = set() if self._job.redo else complete_frames(folder)
+            todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
+            manifest: Any = checked_manifest(folder, log, self._job.identity) if todo or complete else None
+            remove_stale(folder)
+            yield Opened(part.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
+            checks = bool(self._job.settings.get("check", True))
+            if checks and 0 in todo:
+                with suppress(Exception):  # if a sweep cannot be read, its frames fail below
+                    for text in find_problems(log):
+                        yield Noted(part.number, log.log_id, text)
+            claim = lru_cache(partial(claim_log, folder, manifest))  # once, before the first frame
+            for frame in self._pass(log, partial(self._write, folder, claim), todo):
+                name = f"{log.log_id}/{frame.timestamp}"
+                if checks and frame.is_repetition:
+                    yield Noted(part.number, name, "the next sweep has the same points")
+                if isinstance(frame.content, Exception):
+                    yield Failed(part.number, name, describe_error(frame.content), frame.timestamp)
+                else:
+                    yield Done(part.number, frame.timestamp, frame.seconds)
         except BrokenExecutor:
             raise
         except Exception as error:
             yield Failed(part.number, source_name(part.source), describe_error(error))
-
-    def _run(self, part: Part) -> Iterator[Event]:
-        log = self._open(part.source)
-        folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
-        stamps = part.stamps(log)
-        if part.only is not None:
-            stamps = {i: stamp for i, stamp in stamps.items() if stamp == part.only}
-        complete = set() if self._job.redo else complete_frames(folder)
-        todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
-        manifest: Any = checked_manifest(folder, log, self._job.identity) if todo or complete else None
-        remove_stale(folder)
-        yield Opened(part.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
-        checks = bool(self._job.settings.get("check", True))
-        if checks and 0 in todo:
-            with suppress(Exception):  # if a sweep cannot be read, its frames fail below
-                for text in find_problems(log):
-                    yield Noted(part.number, log.log_id, text)
-        claim = lru_cache(partial(claim_log, folder, manifest))  # once, before the first frame
-        for frame in self._pass(log, partial(self._write, folder, claim), todo):
-            name = f"{log.log_id}/{frame.timestamp}"
-            if checks and frame.is_repetition:
-                yield Noted(part.number, name, "the next sweep has the same points")
-            if isinstance(frame.content, Exception):
-                yield Failed(part.number, name, describe_error(frame.content), frame.timestamp)
-            else:
-                yield Done(part.number, frame.timestamp, frame.seconds)
 
     def close(self) -> None:
         """Close the log. We do not wait for reads and writes that hang."""

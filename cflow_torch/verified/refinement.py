@@ -7,12 +7,13 @@ itself. Therefore a correspondence counts mainly across the surface: its informa
 covariance of the voxels around both ends.
 
     refine
-        with_slow_objects       in pairs, objects slower than a pixel per sweep start to move
+        find_slow               in pairs, objects that may move by less than a pixel; they start with one pixel
         points_of_objects       the points of the moving objects
         register_deskewed
             Registration        voxels with centroids and covariances; the target and the source
                 align           repeatedly: correspond (move the source, find the nearest target), linearise, solve.
                                 The first half of the iterations uses a sample of large objects.
+                improves        slow objects whose motion does not match better than none stay static
             if points have times:
                 stretch         the time between two measurements of an object, by which we divide its motion
                 if the window has history:
@@ -36,7 +37,7 @@ from cflow_torch.ops.linear import full, inverse, matvec, upper
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.rigid_motion import RigidMotion, rotate
 from cflow_torch.verified.selection import Objects
-from cflow_torch.verified.subpixel_motion import with_slow_objects
+from cflow_torch.verified.slow_objects import find_slow
 from cflow_torch.verified.voxel_centroids import (
     ObjectPoints,
     Voxels,
@@ -61,6 +62,9 @@ _PRIOR = (2.0, 2.0, 20.0)
 # that the seam between two sweeps crosses the object.
 _LEAST_STRETCH = 0.75
 _NUM_ITERATIONS = 4
+# What the motion of a slow object must gain: standard deviations of noise, and a share of a perfect match per voxel.
+_SLOW_Z = 3.0
+_LEAST_GAIN = 0.03
 _SAMPLE = 512  # voxels of an object, about, in the first half of the iterations
 STEP_LENGTH = 1.4  # of an iteration; above 1, because the nearest voxels change with each one
 
@@ -70,7 +74,7 @@ def refine(
     objects: Objects,
     motion: Tensor,
     longest: float | None,
-    add_slow: Callable[..., Tensor] = with_slow_objects,
+    slow: Callable[..., Tensor] = find_slow,
     num_iterations: int = _NUM_ITERATIONS,
 ) -> tuple[RigidMotion, RigidMotion]:
     """Return the final motion of objects, and their apparent motion, which differs from it if points have times.
@@ -80,24 +84,31 @@ def refine(
     Args:
         motion: (G, 2) float64, (y, x), finest pixels per sweep interval.
         longest: metres; static objects that are longer at t+1 stay static. None = no bound.
-        add_slow: finds the motion of slow objects of pairs.
+        slow: finds the objects of pairs that may move by less than a pixel.
         num_iterations: of registration.
     """
     length = objects.length_at_newest(sweeps)
     flow = motion.flip(1) * sweeps.grid.pixel_size  # [G, 2], x and y, metres per sweep interval
-    start = add_slow(sweeps, objects, flow, length <= (math.inf if longest is None else longest))
+    may_be_slow = ~flow.any(1) & (length <= (math.inf if longest is None else longest))
+    of_slow = slow(sweeps, objects, may_be_slow)
+    start = flow + of_slow
     points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
-    return register_deskewed(points, sweeps, start, num_iterations)
+    return register_deskewed(points, sweeps, start, of_slow.any(1), num_iterations)
 
 
 def register_deskewed(
-    points: ObjectPoints, sweeps: HeightSlicedSweeps, start: Tensor, num_iterations: int = _NUM_ITERATIONS
+    points: ObjectPoints,
+    sweeps: HeightSlicedSweeps,
+    start: Tensor,
+    is_slow: Tensor,
+    num_iterations: int = _NUM_ITERATIONS,
 ) -> tuple[RigidMotion, RigidMotion]:
     """Register objects, and correct their motion per sweep interval for the times of points.
 
     Args:
         points: points of the objects that move, in sweeps at most `MOST_TIME` sweep intervals from t+1.
         start: (G, 2) float64, x and y, metres per sweep interval, from which registration starts.
+        is_slow: (G,) bool, objects of pairs that stay static unless their motion matches better than none.
 
     Returns:
         The motion, and the apparent motion, which registration finds. Without times, both are equal. With times, we
@@ -109,6 +120,8 @@ def register_deskewed(
     """
     registration = Registration(points, sweeps, len(start))
     apparent = registration.align(start, num_iterations)
+    if sweeps.batch.has_pairs:
+        apparent = apparent.only(~is_slow | registration.improves(apparent, is_slow))
     if points.time is None:
         return apparent, apparent
     stretch = registration.stretch(apparent)[:, None]
@@ -211,6 +224,7 @@ class Correspondences:
     by_object: Groups  # the correspondences, grouped by object
     elapsed: Tensor  # (K,) float64, sweep intervals from the source to t+1
     arm: Tensor  # (2, K) float64, metres, from the centre of the object at t+1 to the moved voxel
+    weight: Tensor  # (K,) float64, 1 = at the same position, 0 = no pair
     pull: Tensor  # (3, K) float64, metres, information times the residual from the moved voxel to the target
     information: Tensor  # (3, 3, K) float64; the identity = a pair at distance 0 without surfaces, 0 = no pair
 
@@ -287,17 +301,40 @@ class Registration:
         information = full(inverse(covariance))
         pull = matvec(information, residual)  # [3, K]
         square = (residual * pull).sum(0)  # squared Mahalanobis distance
+        weight = (1 + square / _KERNEL).pow(-2) * (is_near & is_same)
         # In units of 1 / noise^2: two centroids without surfaces, at distance 0, have the identity as information.
-        weight = (1 + square / _KERNEL).pow(-2) * _NOISE**2 * (is_near & is_same)
+        scale = weight * _NOISE**2
         return Correspondences(
             source=source.voxel,
             target=target,
             by_object=source.by_object,
             elapsed=source.elapsed,
             arm=arm,
-            pull=pull * weight,
-            information=information * weight,
+            weight=weight,
+            pull=pull * scale,
+            information=information * scale,
         )
+
+    def improves(self, rigid: RigidMotion, asked: Tensor) -> Tensor:
+        """Tell which objects match t+1 significantly better with a motion than without, (G,) bool.
+
+        `asked`, (G,) bool, are the objects to compare. The result is False for others.
+
+        Convention: a voxel gains the weight of its correspondence with the motion minus that without. The sum over the
+            object must exceed `_SLOW_Z` standard deviations of noise, the root of the sum of squares, and reach
+            `_LEAST_GAIN` per voxel.
+
+        Cost: 54 lookups for each voxel of the source.
+        """
+        moved = torch.cat((rigid.flow.t(), rigid.rotation[None]))  # [3, G]
+        source = self._source[flat_nonzero(self._source.by_object.spread(asked))]
+        sums = torch.zeros_like(moved)
+        for some in source.chunks():
+            static = self._correspond(some, torch.zeros_like(moved))
+            gain = self._correspond(some, moved).weight - static.weight
+            sums = sums + some.by_object.sum(torch.stack((gain, gain.square(), torch.ones_like(gain))))
+        gain, square, count = sums
+        return (gain > _SLOW_Z * square.sqrt()) & (gain >= _LEAST_GAIN * count)
 
     def stretch(self, rigid: RigidMotion) -> Tensor:
         """Return the time between two measurements of an object, divided by the time between their sweeps.

@@ -12,6 +12,8 @@ from functools import lru_cache
 from typing import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
@@ -442,32 +444,32 @@ def find_motion(source: np.ndarray, target: np.ndarray, turns: Sequence[float] =
 
     Both are (N, 3) float64, metres. Return (4, 4) float64. Each rotation costs one correlation by FFT, 10 ms.
     """
-    image = np.fft.rfft2(_image(target, 1))
+    image = torch.fft.rfft2(_image(target, 1))
     reach = int(_FARTHEST_SHIFT / _CELL)
     steps = np.r_[0 : reach + 1, -reach:0]
-    most = -1.0
+    most = -1
     found = np.eye(4)
     for turn in turns:
         T = as_matrix(rotations_about(2, turn))
-        turned = np.fft.rfft2(_image(source @ T[:3, :3].T, 0))
-        counts = np.fft.irfft2(image * np.conj(turned), (_CELLS, _CELLS))[np.ix_(steps, steps)]
+        turned = torch.fft.rfft2(_image(source @ T[:3, :3].T, 0))
+        counts = torch.fft.irfft2(image * turned.conj(), (_CELLS, _CELLS)).round().numpy()[np.ix_(steps, steps)]
         row, column = np.unravel_index(int(counts.argmax()), counts.shape)
-        if counts[row, column] > most + 0.5:  # counts are whole but for rounding; ties: the first
-            most = float(counts[row, column])
+        if counts[row, column] > most:  # ties: the first
+            most = int(counts[row, column])
             T[:2, 3] = _CELL * steps[row], _CELL * steps[column]
             found = T
     return found
 
 
-def _image(points: np.ndarray, margin: int) -> np.ndarray:
-    """Return the occupied cells, (C, C) float64, 1 = occupied, with a margin of so many cells around each point."""
+def _image(points: np.ndarray, margin: int) -> Tensor:
+    """Return the occupied cells, (C, C) float32, 1 = occupied, with a margin of so many cells around each point."""
     cell = np.floor(points[:, :2] / _CELL).astype(np.int64) + _CELLS // 2
     cell = cell[((cell > margin) & (cell < _CELLS - 1 - margin)).all(1)]
-    image = np.zeros((_CELLS, _CELLS))
+    image = np.zeros((_CELLS, _CELLS), np.float32)
     for row in range(-margin, margin + 1):
         for col in range(-margin, margin + 1):
             image[cell[:, 0] + row, cell[:, 1] + col] = 1
-    return image
+    return torch.from_numpy(image)
 
 
 def is_around(points: Array, pose: np.ndarray) -> bool:

@@ -12,7 +12,8 @@ from cflow_torch.types import Sweep, as_numpy
 NEAREST, FARTHEST = 3.0, 40.0  # metres from the origin in the plane: beyond the vehicle itself, and dense enough
 VOXEL = 0.3  # metres; one point per voxel, so that near surfaces do not outvote the rest
 IN_PLACE = 0.1  # metres; a point is in place if another is this near
-_OFFSETS = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], np.int64)
+_KEY = np.array((1 << 42, 1 << 21, 1))  # of a cell: 21 bits for each of x, y and z, which varies fastest
+_OFFSETS = [int(_KEY @ (x, y, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # keys of cells next to one another
 _MOST = 1e5  # metres; coordinates are clamped to it, so that absurd poses do not overflow
 _COLUMN, _TALL = 0.8, 0.35  # metres, side and least height of the columns of structure; ground is flatter
 _LEAST_GROUND = 0.02  # share of points; a mask with less is not believed
@@ -85,7 +86,7 @@ class Structure:
         keys = cell_keys(np.floor(points / IN_PLACE).astype(np.int64))
         order = np.argsort(keys, kind="stable")
         self._points = points[order]
-        self._sorted = keys[order]
+        self._sorted = np.append(keys[order], np.iinfo(np.int64).max)  # the end, so that every search finds a key
 
     def share(self, source: np.ndarray, T_target_source: np.ndarray) -> float:
         """Return the share of source points that have a point of the structure within 0.1 m, 0 to 1.
@@ -96,7 +97,7 @@ class Structure:
 
         Under the right transform, thinned sweeps of real drives (`structure_rows`) give 0.15 to 0.45.
 
-        Cost: 6 ms for 1500 source points.
+        Cost: 1 ms for 1500 source points.
         """
         return float(self.shares(source, np.asarray(T_target_source)[None])[0])
 
@@ -113,15 +114,17 @@ class Structure:
         """Test which points, (N, 3) in the frame of the structure, are in place, (N,) bool."""
         moved = np.clip(points, -_MOST, _MOST)
         in_place = np.zeros(len(moved), bool)
-        cell = np.floor(moved / IN_PLACE).astype(np.int64)
-        order = np.argsort(cell_keys(cell))  # the searches below are several times faster in this order
+        keys = cell_keys(np.floor(moved / IN_PLACE).astype(np.int64))
+        order = np.argsort(keys)  # the searches below are several times faster in this order
         moved = moved[order]
-        cell = cell[order]
+        keys = keys[order]
         for offset in _OFFSETS:  # z varies fastest in a key: the three cells above one another are one range of keys
-            lowest = cell_keys(cell + (*offset, -1))
+            lowest = keys + offset - 1
             start = np.searchsorted(self._sorted, lowest, "left")
-            count = np.searchsorted(self._sorted, lowest + 2, "right") - start
-            row = np.repeat(np.arange(len(moved)), count)
+            near = np.flatnonzero(self._sorted[start] <= lowest + 2)  # points with points of the structure there
+            start = start[near]
+            count = np.searchsorted(self._sorted, lowest[near] + 2, "right") - start
+            row = np.repeat(near, count)
             neighbour = np.arange(len(row)) + np.repeat(start - np.cumsum(count) + count, count)
             distance = np.linalg.norm(moved[row] - self._points[neighbour], axis=1)
             in_place[order[row[distance <= IN_PLACE]]] = True
@@ -129,5 +132,5 @@ class Structure:
 
 
 def cell_keys(cell: np.ndarray) -> np.ndarray:
-    """Return one int64 per cell, (N,): 21 bits for each of x, y and z, which varies fastest."""
-    return (cell + (1 << 20)) @ np.array((1 << 42, 1 << 21, 1))  # type: ignore[no-any-return]
+    """Return one int64 per cell, (N,), see `_KEY`."""
+    return (cell + (1 << 20)) @ _KEY  # type: ignore[no-any-return]

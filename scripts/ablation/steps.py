@@ -44,8 +44,8 @@ def _nothing_slides(sweeps: Any, pixels: Any, groups: Any, motions: Tensor) -> T
     return torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
 
 
-def _nothing_is_slow(sweeps: Any, objects: Any, flow: Tensor, may_be_slow: Tensor) -> Tensor:
-    return flow
+def _nothing_is_slow(sweeps: Any, objects: Any, may_be_slow: Tensor) -> Tensor:
+    return torch.zeros((len(may_be_slow), 2), dtype=torch.float64, device=may_be_slow.device)
 
 
 def _no_ends_move(sweeps: Any, pixels: Any, groups: Groups) -> Tensor:
@@ -80,7 +80,7 @@ STEPS: dict[str, dict[str, Any]] = {
     "no dissent": {"select_objects": partial(selection.select_objects, dissent=_no_dissent)},
     "no margin": {"motion_margin": _without_margin},
     "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
-    "no slow objects of pairs": {"refine": partial(refinement.refine, add_slow=_nothing_is_slow)},
+    "no slow objects of pairs": {"refine": partial(refinement.refine, slow=_nothing_is_slow)},
     "long vehicles are static": {"movable_nodes": partial(component_tree.movable_nodes, ends_move=_no_ends_move)},
 }
 SETTINGS: dict[str, dict[str, Any]] = {

@@ -91,7 +91,7 @@ def extrapolated(step):
 
 
 class Thinned(LogWrapper):
-    """Every third point: a real sweep has four times as many as a simulated one, which tell a check nothing more."""
+    """Every third point: more of them tell a check nothing more."""
 
     def sweep(self, index):
         sweep = self.log.sweep(index)
@@ -105,13 +105,12 @@ def drive_of(seed=2, num_sweeps=12, profile="demo", scene="street"):
 
 
 @pytest.fixture
-def drive():
+def whole():
     return drive_of()
 
 
 @pytest.fixture(scope="module")
-def thin():
-    """A third of the points of the drive, for tests that write it."""
+def drive():
     return CachedLog(Thinned(drive_of()), 12)
 
 
@@ -256,26 +255,26 @@ def test_a_mounting_that_one_pair_shows_weakly_is_not_named():
     assert _compare([straight, {**turn, "mount 0 0.7": 0.22}])[1] == ["mount 0 0.7"]
 
 
-def test_opening_a_folder_finds_points_in_the_world(thin, tmp_path):
-    write_array_log(Wrong(thin, points=to_world, masks=False, name="log"), tmp_path)
+def test_opening_a_folder_finds_points_in_the_world(drive, tmp_path):
+    write_array_log(Wrong(drive, points=to_world, masks=False, name="log"), tmp_path)
     with pytest.warns(CFlowWarning, match="world's frame"):
         log = open_log("arrays", tmp_path / "log", find_ground="grid")
-    assert np.allclose(log.sweep(11).points, thin.sweep(11).points, atol=1e-3)
+    assert np.allclose(log.sweep(11).points, drive.sweep(11).points, atol=1e-3)
     assert not np.allclose(open_log("arrays", tmp_path / "log", read_as=None).sweep(11).points, log.sweep(11).points)
     with pytest.raises(CFlowError, match="read_as='sideways': give one of auto, null, world"):
         open_log("arrays", tmp_path / "log", read_as="sideways")
 
 
-def test_scenes_and_bags_in_the_world_are_found_when_they_are_opened(thin, tmp_path):
+def test_scenes_and_bags_in_the_world_are_found_when_they_are_opened(drive, tmp_path):
     """Own data in the world's frame, in a scene, and in a bag whose headers name the LiDAR's frame."""
     h5py = pytest.importorskip("h5py")
     pytest.importorskip("rosbags")
     from bag_writer import BagWriter
 
-    world = Wrong(thin, points=to_world)
+    world = Wrong(drive, points=to_world)
     writer = BagWriter(tmp_path, "ros1")
     with h5py.File(tmp_path / "scene.h5", "w") as file:
-        for index, time in enumerate(thin.timestamps):
+        for index, time in enumerate(drive.timestamps):
             sweep, group = world.sweep(index), file.create_group(str(time))
             group["lidar"], group["pose"], group["ground_mask"] = sweep.points, sweep.pose, sweep.is_ground
             transform = writer.transform(time, "odom", "velodyne", sweep.pose)
@@ -286,19 +285,19 @@ def test_scenes_and_bags_in_the_world_are_found_when_they_are_opened(thin, tmp_p
     for name, path in (("hdf5", tmp_path / "scene.h5"), ("bags", tmp_path / "drive.bag")):
         with pytest.warns(CFlowWarning, match="world's frame, so we move them to that of the vehicle"):
             log = open_log(name, path, find_ground="grid")
-        assert np.allclose(log.sweep(11).points, thin.sweep(11).points, atol=1e-3)
+        assert np.allclose(log.sweep(11).points, drive.sweep(11).points, atol=1e-3)
 
 
-def test_labels_move_with_the_points(drive):
+def test_labels_move_with_the_points(whole):
     """Flow in the world's axes becomes flow in the axes of the vehicle at t+1."""
-    truth = drive.labels(8)
+    truth = whole.labels(8)
 
     class Labelled(Wrong):
         def _labels(self, index):
-            end = to_world(drive.sweep(index).points + drive.labels(index).flow, self.true[index + 1])
-            return replace(drive.labels(index), flow=(end - self.sweep(index).points).astype(np.float32))
+            end = to_world(whole.sweep(index).points + whole.labels(index).flow, self.true[index + 1])
+            return replace(whole.labels(index), flow=(end - self.sweep(index).points).astype(np.float32))
 
-    labels = read_as(Labelled(drive, points=to_world)).labels(8)
+    labels = read_as(Labelled(whole, points=to_world)).labels(8)
     assert np.allclose(labels.flow, truth.flow, atol=1e-3) and len(labels.flow) == len(truth.flow)
 
 
@@ -357,7 +356,7 @@ def test_poses_that_are_not_exact_are_told_and_no_convention_is_blamed(source, c
     assert "the poses are off, by up to 0." in text and text.endswith("data.odometry=refine if they are noisy")
 
 
-@pytest.mark.parametrize(("source", "factor"), [("drive", 1 / 0.9144), ("turning", 1.1)])
+@pytest.mark.parametrize(("source", "factor"), [("whole", 1 / 0.9144), ("turning", 1.1)])
 def test_points_that_are_a_little_too_large_are_no_lidar_elsewhere(source, factor, request):
     wrong = Wrong(request.getfixturevalue(source), lambda points, _: factor * points)
     (text,) = [text for text in find_problems(wrong) if "ground masks" not in text]
@@ -400,13 +399,13 @@ class Accumulated(Wrong):
         return replace(sweep, points=points, is_ground=None)
 
 
-def test_sweeps_that_hold_the_points_of_earlier_ones_are_told(thin):
+def test_sweeps_that_hold_the_points_of_earlier_ones_are_told(drive):
     class InWorld(Accumulated):
         def sweep(self, index):
             sweep = super().sweep(index)
             return replace(sweep, points=to_world(sweep.points, self.true[index]).astype(np.float32))
 
-    start = CachedLog(Wrong(thin, poses=lambda poses: np.linalg.inv(poses[0]) @ poses), 12)
+    start = CachedLog(Wrong(drive, poses=lambda poses: np.linalg.inv(poses[0]) @ poses), 12)
     cases = (
         (Accumulated(start, 1), "100 % of the points"),
         (Accumulated(start, 12), "100 % of the points"),
@@ -587,14 +586,14 @@ def test_points_in_feet_are_told_by_the_motion(drive):
 
 
 @pytest.mark.parametrize("first", [np.linalg.norm, lambda points, axis: np.arange(len(points)) % 32])
-def test_a_column_before_x_is_told_and_no_pose_is_blamed(thin, tmp_path, first):
-    write_array_log(thin, tmp_path)
-    for file in (tmp_path / thin.log_id / "points").iterdir():
+def test_a_column_before_x_is_told_and_no_pose_is_blamed(drive, tmp_path, first):
+    write_array_log(drive, tmp_path)
+    for file in (tmp_path / drive.log_id / "points").iterdir():
         points = np.load(file)
         np.save(file, np.column_stack([first(points, axis=1), points]).astype(np.float32))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        open_log("arrays", tmp_path / thin.log_id, ground=None)
+        open_log("arrays", tmp_path / drive.log_id, ground=None)
     texts = [str(each.message) for each in caught]
     assert any("first column does not seem to be x" in text for text in texts)
     assert not any("the poses" in text or "world's frame" in text for text in texts)
@@ -702,14 +701,14 @@ def test_the_page_counts_sweeps_that_cannot_be_read(drive):
     ]
 
 
-def test_the_page_names_sweeps_with_few_points(drive):
+def test_the_page_names_sweeps_with_few_points(whole):
     class Cut(Wrong):
         def sweep(self, index):
             sweep = super().sweep(index)
             kept = slice(None) if index not in (4, 7) else slice(0 if index == 7 else 3000)
             return replace(sweep, points=sweep.points[kept], is_ground=sweep.is_ground[kept])
 
-    (text,) = [one.text for one in examine(Cut(drive)) if one.status == WRONG]
+    (text,) = [one.text for one in examine(Cut(whole)) if one.status == WRONG]
     assert text.startswith("2 of them have few points, the first is sweep 4 with 3,000, while those around it have 2")
 
 
@@ -874,12 +873,12 @@ def test_two_clouds_with_a_transform_of_another_frame_have_one_cause(drive, chan
     assert len(texts) == 1 and cause in texts[0]
 
 
-def test_the_command_prints_a_page_or_json(thin, tmp_path, capsys):
+def test_the_command_prints_a_page_or_json(drive, tmp_path, capsys):
     pytest.importorskip("hydra")
     from command_line import cflow
 
     for name, change in (("good", None), ("bad", WRONG_POSES["inverted"])):
-        write_array_log(Wrong(thin, poses=change, name=name), tmp_path)
+        write_array_log(Wrong(drive, poses=change, name=name), tmp_path)
     assert cflow("check", tmp_path / "good") == 0
     page = capsys.readouterr().out
     assert "good (arrays): nothing is wrong" in page and "ego motion   right" in page

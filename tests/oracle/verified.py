@@ -2,7 +2,7 @@
 
 Order of reading: verified_flow -> `height_slices`, `changed_pixels`, `component_tree`, `candidates`; verify ->
 `paired_test`, `aperture`; `registration`, `confidence`. Hand-made scenes test what is not here: objects under
-overhangs, sub-pixel motion of pairs, sweeps after t+1, and times of points.
+overhangs, slow objects of pairs, sweeps after t+1, and times of points.
 """
 
 from __future__ import annotations

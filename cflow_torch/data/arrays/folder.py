@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import islice
 from pathlib import Path
 from typing import Any, Callable, Sequence
 
@@ -163,7 +164,7 @@ def find_poses_near(folder: Path, times_ns: Sequence[int]) -> tuple[Trajectory |
     if is_remote(folder) or times_ns[0] < _FIRST_UNIX:
         return None, ""
     top = folder.resolve()
-    levels = [top, *top.parents[:2]]
+    levels = [top, *islice(top.parents, 2)]
     children = {child: sorted(visible(child))[:_MOST] for level in levels for child in sorted(visible(level))[:_MOST]}
     plain = [files for files in children.values() if all(file.suffix in _TABLES for file in files)]
     files = [file for files in (*map(visible, levels), *plain) for file in files if file.suffix in _NEAR_TABLES]
