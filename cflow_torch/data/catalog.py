@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 
-from cflow_torch.data.deskewing import DESKEW_CHOICES, DeskewedLog
+from cflow_torch.data.deskewing import DeskewedLog, check_deskew
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.folders import find_folders, visible
@@ -261,10 +261,10 @@ def open_log(
         deskew = "auto" if deskew else "off"
     if read_as in ("times", *SCANS) and deskew == "auto":  # how sweeps are scanned is a reading of the log, too
         deskew, read_as = read_as, "auto"
+    check_deskew(deskew)
     given = {
         "find_ground": (find_ground, GROUND_METHODS),
         "odometry": (odometry, (False, True, "refine")),
-        "deskew": (deskew, DESKEW_CHOICES),
         "own_vehicle": (own_vehicle, ("auto", None)),
     }
     for setting, (value, choices) in given.items():

@@ -13,13 +13,20 @@ from cflow_torch.data.log import FlowLabels, Log, LogWrapper, intervals_of
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.transforms import poses_at, relative_transform, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
-from cflow_torch.windows.deskewing import DIRECTIONS, SCANS, deskew_points, scan_fractions
+from cflow_torch.windows.deskewing import DIRECTIONS, ENDINGS, SCANS, deskew_points, scan_fractions
 from cflow_torch.windows.readings import Judgement
 
-DESKEW_CHOICES = ("auto", "times", "off", *SCANS)
+_CHOICES = ("auto", "times", "off", *DIRECTIONS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
 _SLICE = 1e-4  # seconds during which we use one pose of a trajectory: 3 mm at 30 m/s
 _INTERVAL = 0.1  # seconds between sweeps without time stamps, as models assume
+_INSTANTS = {"start": "the instant is the start of a turn", "end": "the instant is the end of a turn"}
+
+
+def check_deskew(deskew: Any) -> None:
+    """Refuse what `DeskewedLog` does not know."""
+    if deskew not in (*_CHOICES, *SCANS):
+        raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(_CHOICES)}, or a direction {ENDINGS}")
 
 
 class DeskewedLog(LogWrapper):
@@ -27,27 +34,27 @@ class DeskewedLog(LogWrapper):
 
     Args:
         log: the log; sweeps without poses stay as they are.
-        deskew: "times" = by `Sweep.point_times`; "clockwise", "counterclockwise", "clockwise_left", ... = by the
-            azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = the scan under which
+        deskew: "times" = by `Sweep.point_times`; "clockwise", "counterclockwise", "clockwise_left_at_start", ... = by
+            the azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = the scan under which
             the static world stands still best (`cflow_torch.windows.readings`). Without a clear one, points with times
             of raw points are moved by these, and others stay.
 
     Attributes:
-        scan: how the sweeps are read, one of `DESKEW_CHOICES` but "auto". It is decided at first use, by the log alone.
+        scan: how the sweeps are read, a value of `deskew` but "auto". It is decided at first use, by the log alone.
 
     Convention:
         - The motion between neighbouring poses has a constant velocity and rotation rate. Before the first and after
           the last pose, it continues.
         - Points that are moved by their azimuth get `point_times`, from which the verified method corrects the motion
-          of objects. The instant of their sweep is when the LiDAR looks ahead.
+          of objects. The instant of their sweep is when the LiDAR looks ahead, or the start or the end of the turn.
+        - Times that are all equal do not say anything, and are ignored.
         - Labels keep the residual flow of static points. By the azimuth, we take those of dynamic points as motions
           between points as measured, because boxes are drawn around these. So we move both ends to the instants of
           their sweeps, and divide the motion by the turns between the two measurements.
     """
 
     def __init__(self, log: Log, deskew: str = "auto") -> None:
-        if deskew not in DESKEW_CHOICES:
-            raise CFlowError(f"deskew={deskew!r}: choose one of {', '.join(DESKEW_CHOICES)}")
+        check_deskew(deskew)
         super().__init__(log)
         self._deskew = deskew
 
@@ -80,7 +87,8 @@ class DeskewedLog(LogWrapper):
         own = self.log.unwrapped
         if own.is_compensated or self.poses is None:
             return ("off",)
-        if self.log.sweep(0).point_times is None:
+        times = self.log.sweep(0).point_times
+        if times is None or not len(times) or np.ptp(as_numpy(times)) == 0:  # equal times do not say anything
             return ("off", *DIRECTIONS)
         return ("times", "off") if own.has_raw_times else ("off", "times")
 
@@ -98,7 +106,8 @@ class DeskewedLog(LogWrapper):
         same = f"data.deskew={scan} does the same without this line"
         if scan == "off":
             return f"its points have times, but seem to be de-skewed already, so we leave them{measured}. {same}"
-        by = "the times of its points" if scan == "times" else f"the azimuth ({scan}; ahead = the instant)"
+        instant = _INSTANTS.get(scan.partition("_at_")[2], "ahead = the instant")
+        by = "the times of its points" if scan == "times" else f"the azimuth ({scan}; {instant})"
         moved = f"its sweeps are not de-skewed, so we move each point by the ego motion according to {by}"
         return f"{moved}{measured}. {same}, data.deskew=off leaves the points as they are"
 
@@ -120,7 +129,7 @@ class DeskewedLog(LogWrapper):
         if reading != "times":
             return self._seconds_by_azimuth(as_numpy(sweep.points)[rows], reading)
         if sweep.point_times is None:
-            others = ", ".join(name for name in DESKEW_CHOICES if name != "times")
+            others = ", ".join(name for name in _CHOICES if name != "times")
             raise CFlowError(f"log {self.log_id} has no times of points for deskew=times: choose one of {others}")
         return as_numpy(sweep.point_times)[rows].astype(np.float64)
 

@@ -13,6 +13,7 @@ from torch.utils.data import Dataset
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
 from cflow_torch.errors import MissingFile, warn
+from cflow_torch.transforms import poses_at
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
 from cflow_torch.windows.readings import LEAST_DISTANCE, Judgement, is_around
 
@@ -236,6 +237,22 @@ def known_poses(log: Log) -> np.ndarray | None:
     if poses is None or np.shape(poses) != (len(log.timestamps), 4, 4) or not np.isfinite(poses).all():
         return None
     return np.asarray(poses, np.float64)
+
+
+def poses_beyond(log: Log, poses: np.ndarray, count: int) -> tuple[np.ndarray, int]:
+    """Return the poses of a log, and up to `count` more on each side if its trajectory goes on, (L, 4, 4) float64.
+
+    Also return how many are before the first sweep. All are a usual interval of the sweeps apart.
+    """
+    if log.trajectory is None or len(log.timestamps) != len(poses):
+        return poses, 0
+    known, driven = log.trajectory
+    interval = int(np.median(np.diff(log.timestamps)))
+    before = log.timestamps[0] - interval * np.arange(count, 0, -1)
+    after = log.timestamps[-1] + interval * np.arange(1, count + 1)
+    before, after = before[before >= known[0]], after[after <= known[-1]]
+    sides = [poses_at(times, known, driven) if len(times) else poses[:0] for times in (before, after)]
+    return np.concatenate([sides[0], poses, sides[1]]), len(before)
 
 
 def intervals_of(log: Log) -> np.ndarray | None:

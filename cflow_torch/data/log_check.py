@@ -9,15 +9,15 @@ import numpy as np
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
 from cflow_torch.data.log_motion import find_lapses, find_missing, judge_log
-from cflow_torch.data.neighbours import Neighbours
+from cflow_torch.data.neighbours import Neighbours, alternate
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import OF_POINTS, STILL, WORLD
+from cflow_torch.windows.conventions import OF_POINTS, READINGS, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import LEAST_SHARE, NO_READING, UNKNOWN, difference
+from cflow_torch.windows.readings import EQUAL, HALVES, LEAST_SHARE, NO_READING, UNKNOWN, Judgement, difference
 from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite
 
 _CACHED = 12  # sweeps that several checks read
@@ -47,6 +47,14 @@ _TOPICS = (
     "labels",
     "reader",
 )
+_TWO_SENSORS = Finding(
+    "sweeps",
+    WRONG,
+    "each sweep fits the second next one, but not the next, so they seem to be those of two sensors in turns: give "
+    "those of one sensor (data.suffix, data.topic)",
+    True,
+)
+_NUM_SWEEPS = {name: 0.5 if name in HALVES else int(name.partition("_")[2] or 1) for name in TIMES_OF_POSES}
 _Check = Callable[[Log], List[Finding]]
 
 
@@ -118,10 +126,22 @@ def _frame(log: Log) -> list[Finding]:
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
         return [right, *_motion(log, "")]
+    unit = _fitting_unit(log, reading)
+    if unit != reading:
+        reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
     wrong = Finding("frame", WRONG, f"in the {where} sweep {problem}{fix}", True)
     # In another frame that we do not know, readings of the poses mean nothing.
     return [wrong, *(_motion(log, reading) if reading or where == "last" else [])]
+
+
+def _fitting_unit(log: Log, reading: str) -> str:
+    """Return the unit of the points under which they fit the poses, if `reading` is a unit; else `reading`."""
+    units = [f"points_{unit}" for unit in UNITS]
+    if reading not in units or known_poses(log) is None:
+        return reading
+    judged = ((unit, judge_log(ReadAs(log, unit))) for unit in (reading, *units))
+    return next((unit for unit, each in judged if not each.best and each.given >= LEAST_SHARE), reading)
 
 
 def _problem_of(log: Log, index: int) -> tuple[str, str]:
@@ -139,6 +159,8 @@ def _motion(log: Log, reading: str) -> list[Finding]:
     if not judgement.shares:
         return [Finding("ego motion", RIGHT, "not compared, because the sweeps have too little static structure", True)]
     has_poses = log.sweep(0).pose is not None
+    if has_poses and judgement.best and alternate(log):
+        return [_TWO_SENSORS]
     if NO_READING in judgement.best and has_poses:
         fits = {name: judge_log(ReadAs(log, name)) for name in OF_POINTS}
         fitting = [name for name, each in fits.items() if not each.best and each.given >= LEAST_SHARE]
@@ -157,9 +179,23 @@ def _motion(log: Log, reading: str) -> list[Finding]:
         fix += "that the poses belong to this log, their times, units and quaternions" if has_poses else "pass poses"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
+        why += _shift_of_clocks(log, judgement)
         fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
         fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
+
+
+def _shift_of_clocks(log: Log, judgement: Judgement) -> str:
+    """Return what poses of another time mean if they have times, with all shifts that fit as well; "" = nothing."""
+    best, interval = judgement.best[0], intervals_of(log)
+    if best not in TIMES_OF_POSES or log.trajectory is None or interval is None:
+        return ""
+    least = EQUAL * judgement.shares[best]
+    kind = best.partition("_")[0]
+    equal = [name for name, share in judgement.shares.items() if name.startswith(kind) and share >= least]
+    seconds = [_NUM_SWEEPS[name] * float(np.median(interval)) for name in equal]
+    shift = f"{min(seconds):.2g}" + (f" to {max(seconds):.2g}" if len(seconds) > 1 else "")
+    return f" the clocks of sweeps and poses may differ by {shift} s, because"
 
 
 def _setting(log: Log, reading: str) -> str:
@@ -171,6 +207,8 @@ def _lapses(log: Log) -> list[Finding]:
     lapses = find_lapses(log)
     if not lapses:
         return []
+    if alternate(log):
+        return [_TWO_SENSORS]
     texts = [
         f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
         if each.is_single
@@ -322,7 +360,7 @@ def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
         | {index for index, _ in missing}
         | set(neighbours.small)
     )
-    for first, last in neighbours.misplaced(log):
+    for first, last in [] if alternate(log) else neighbours.misplaced(log):
         if not known.isdisjoint(range(first, last + 2)):
             continue
         if last < first:

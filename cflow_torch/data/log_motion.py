@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Callable, Iterator, Mapping, NamedTuple, Sequence
+from typing import Callable, Container, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
-from cflow_torch.data.log import Log, known_poses
+from cflow_torch.data.log import Log, known_poses, poses_beyond
 from cflow_torch.transforms import turn_of
-from cflow_torch.types import Sweep
-from cflow_torch.windows.conventions import OFF, STILL, TIMES, WORLD
+from cflow_torch.windows.conventions import MARGIN, OFF, STILL, TIMES, WORLD
+from cflow_torch.windows.inspection import repeats
 from cflow_torch.windows.readings import (
     GIVEN,
     LEAST_SHARE,
@@ -48,17 +48,22 @@ class Lapse(NamedTuple):
     is_single: bool  # True: only this pose is wrong; False: all later poses are shifted
 
 
-def choose_pairs(num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int] = ()) -> list[tuple[int, int]]:
-    """Choose pairs of sweeps that show wrong readings best, up to four, in order.
+def choose_pairs(
+    num_sweeps: int, poses: np.ndarray | None, jumps: Sequence[int] = (), without: Container[int] = ()
+) -> list[tuple[int, int]]:
+    """Choose pairs of sweeps that show wrong readings best, up to three, in order.
 
     With poses, these are the pairs over which the vehicle turns most, in which it is fastest, and whose motion differs
     most from that one sweep earlier, and later, because they show poses that are early or late. The sweeps of a pair
     are up to five apart, and up to 6.4 m, because readings differ more over a longer motion. No pair and no neighbour
-    of it reaches over the steps `jumps`, if others are left. Without poses, and if the vehicle does not move, they are
-    neighbours spread over the log.
+    of it reaches over the steps `jumps`, if others are left. No pair has a sweep that is in `without`. Without poses,
+    and if the vehicle does not move, they are neighbours spread over the log.
     """
     firsts = range(num_sweeps - 1)
     pairs = [] if poses is None else [(first, _partner(poses, first, jumps)) for first in firsts]
+    pairs = [pair for pair in pairs if pair[0] not in without and pair[1] not in without]
+    if poses is not None and not pairs:
+        return []
     if poses is None or max(difference(_motion(poses, *pair), np.eye(4)) for pair in pairs) < _LEAST_MOTION:
         spread = {min(num_sweeps * part // 6, num_sweeps - 2) for part in (1, 3, 5)}
         return [(first, first + 1) for first in sorted(spread)]
@@ -101,7 +106,7 @@ def _change(poses: np.ndarray, first: int, second: int) -> float:
 
 
 def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: Sequence[str] = (OFF,)) -> Judgement:
-    """Compare the readings of a log over up to four pairs of sweeps.
+    """Compare the readings of a log over up to three pairs of sweeps, and over others before one is named.
 
     Args:
         log: the log, as given.
@@ -112,16 +117,20 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     """
     poses = known_poses(log)
     steps = steps_of(log)
-    chosen = choose_pairs(len(log.timestamps), poses, () if steps is None else steps.suspects)
-    sweeps = {index: log.sweep(index) for pair in chosen for index in pair}
-    # Where poses are interpolated over several sweeps, an error of it looks as if they were of another time.
-    neighbours = None if log.unwrapped.has_sparse_poses else poses
-    pairs = partial(_make_pairs, sweeps, chosen, poses, neighbours, deskew)
+    jumps = () if steps is None else steps.suspects
+    chosen = choose_pairs(len(log.timestamps), poses, jumps)
+    make_pairs = partial(_make_pairs, log, poses, deskew)
     if log.surrounds_poses:
-        judgement = judge(pairs((OFF,), True))
+        judgement = judge(make_pairs(chosen, (OFF,), True))
         if WORLD in judgement.best:
             return judgement
-    judgement = judge(pairs(scans, False))
+    judgement = judge(make_pairs(chosen, scans, False))
+    if judgement.best and poses is not None:  # are only a few sweeps wrong?
+        pairs = _pairs_without_repeats(log, poses, jumps, ()) or chosen  # all may repeat the one before
+        judgement = judgement if pairs == chosen else judge(make_pairs(pairs, scans, False))
+        others = _pairs_without_repeats(log, poses, jumps, {index for pair in pairs for index in pair})
+        again = judge(make_pairs(others, scans, False)) if judgement.best and others else judgement
+        judgement = again if _contradicts(again, judgement) else judgement
     is_in_doubt = not judgement.best and judgement.given < _DOUBTFUL
     if poses is not None and is_in_doubt and _usual_speed(poses) < _LEAST_TIMED:
         spread = choose_pairs(len(log.timestamps), None)
@@ -133,19 +142,46 @@ def judge_log(log: Log, deskew: Callable[..., np.ndarray] | None = None, scans: 
     return judgement
 
 
+def _pairs_without_repeats(
+    log: Log, poses: np.ndarray, jumps: Sequence[int], without: Container[int]
+) -> list[tuple[int, int]]:
+    """Choose pairs of sweeps that are not in `without`, and do not repeat the one before."""
+    excluded = {index for index in range(len(log.timestamps)) if index in without}
+    while True:
+        pairs = choose_pairs(len(log.timestamps), poses, jumps, excluded)
+        sweeps = {index for pair in pairs for index in pair if index > 0}
+        repeated = {index for index in sweeps if repeats(log.sweep(index - 1), log.sweep(index))}
+        if not repeated:
+            return pairs
+        excluded |= repeated
+
+
+def _contradicts(again: Judgement, judgement: Judgement) -> bool:
+    """Test whether other sweeps fit clearly better as given, and show that the best reading is wrong.
+
+    Then only a few sweeps are wrong, such as one that repeats the one before. Errors of measurement differ by sweep.
+    """
+    shown = again.shares.get(judgement.best[0], float("nan")) if judgement.best else float("nan")
+    return not again.best and shown <= again.given and again.given >= max(LEAST_SHARE, MARGIN * judgement.given)
+
+
 def _make_pairs(
-    sweeps: Mapping[int, Sweep],
-    chosen: Sequence[tuple[int, int]],
+    log: Log,
     poses: np.ndarray | None,
-    neighbours: np.ndarray | None,
     deskew: Callable[..., np.ndarray] | None,
+    chosen: Sequence[tuple[int, int]],
     scans: Sequence[str],
     in_world: bool,
 ) -> Iterator[Pair | None]:
-    """Prepare the pairs; `neighbours` are the poses that tell those before and after a sweep, None = they do not."""
+    """Read and prepare the pairs."""
+    # Where poses are interpolated over several sweeps, an error of it looks as if they were of another time.
+    extended, num_before = None, 0
+    if poses is not None and not log.unwrapped.has_sparse_poses:
+        extended, num_before = poses_beyond(log, poses, _REACH)
+    sweeps = {index: log.sweep(index) for pair in chosen for index in pair}
     for first, second in chosen:
-        start = max(first - _REACH, 0)
-        around = None if neighbours is None else neighbours[start : second + _REACH + 1]
+        start = max(first - _REACH, -num_before)
+        around = None if extended is None else extended[start + num_before : second + num_before + _REACH + 1]
         least = _LEAST_TIMED if TIMES in scans else _LEAST_SPEED
         is_fast = poses is not None and difference(_motion(poses, first, second), np.eye(4)) >= least * (second - first)
         how = {} if deskew is None else {"deskew": [partial(deskew, index) for index in (first, second)]}

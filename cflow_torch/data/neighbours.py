@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cflow_torch.data.log import Log
+from cflow_torch.errors import CFlowError
 from cflow_torch.transforms import relative_transform
 from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.inspection import repeats
@@ -77,6 +78,25 @@ class Neighbours:
             if has_ends or last >= first:
                 runs.append((first, last))
         return runs
+
+
+def alternate(log: Log) -> bool:
+    """Test whether sweeps fit the second next one, but not the next: those of two sensors in turns.
+
+    False if a sweep cannot be read.
+    """
+    first = (len(log.timestamps) - 4) // 2
+    if first < 0:
+        return False
+    try:
+        sweeps = [log.sweep(first + k) for k in range(4)]
+    except (CFlowError, OSError):
+        return False
+    points = [_structure(sweep) for sweep in sweeps]
+    pairs = ((0, 1), (1, 2), (2, 3)), ((0, 2), (1, 3))
+    near, second = ([_share_in_place(sweeps[a], points[a], sweeps[b], points[b]) for a, b in each] for each in pairs)
+    # Poses may be those of one of the sensors, so only its sweeps fit.
+    return max(second) >= LEAST_SHARE and max(near) < _MISPLACED * max(second)
 
 
 def _structure(sweep: Sweep | None) -> np.ndarray:

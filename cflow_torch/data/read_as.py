@@ -9,13 +9,13 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper, points_surround_poses
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper, points_surround_poses, poses_beyond
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import OF_POINTS, READINGS, TIMES_OF_POSES, WORLD
+from cflow_torch.windows.conventions import LATEST, OF_POINTS, READINGS, TIMES_OF_POSES, WORLD
 from cflow_torch.windows.readings import STEPS
 
 _LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
@@ -126,7 +126,11 @@ class ReadAs(LogWrapper):
     @cached_property
     def _converted(self) -> np.ndarray:
         """The (K, 4, 4) poses of all sweeps, as `T_world_ego`."""
-        return self._convert(np.stack([self._given(index) for index in range(len(self))]))
+        given = np.stack([self._given(index) for index in range(len(self))])
+        if self.reading not in TIMES_OF_POSES:
+            return self._convert(given)
+        extended, num_before = poses_beyond(self.log, given, LATEST)
+        return self._convert(extended)[num_before : num_before + len(given)]
 
     def _convert(self, poses: np.ndarray) -> np.ndarray:
         convert = READINGS[self.reading].of_poses

@@ -23,7 +23,7 @@ _SMALL = 1.1  # the same of small mistakes, which make a small difference
 # Vehicles of the same speed stand still without the ego motion: up to 1.56. Mirrored axes change little on a straight
 # road: up to 0.99 for right poses.
 _OF_STILL, _OF_MIRRORED = 1.7, 1.15
-_LATEST = 10  # sweeps
+LATEST = 10  # sweeps
 _TURN = 2 * np.pi + 1e-3  # larger azimuths are degrees
 AXES = {  # ego_T_stored of frames with other axes: x, y and z of the stored frame, as columns
     CAMERA: np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float),  # x right, y down, z forward
@@ -36,8 +36,10 @@ AXES = {  # ego_T_stored of frames with other axes: x, y and z of the stored fra
     "mirrored": np.diag([1.0, -1.0, 1.0]),
     "mirrored_back": np.diag([-1.0, 1.0, 1.0]),
     "swapped": np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1]], float),
+    "swapped_back": np.array([[0, -1, 0], [-1, 0, 0], [0, 0, 1]], float),
+    "z_first": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], float),  # z, x, y
 }
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
 
 _Convert = Callable[[np.ndarray], np.ndarray]
 
@@ -141,7 +143,7 @@ def _times_of_poses() -> dict[str, Reading]:
         "half_late": Reading(late, _later(0.5), margin=_SMALL, opposite="half_early"),
         "half_early": Reading(early, _later(-0.5), margin=_SMALL, opposite="half_late"),
     }
-    for count in range(1, _LATEST + 1):
+    for count in range(1, LATEST + 1):
         ending = f"_{count}" if count > 1 else ""
         for name, sign, other in (("late", 1, "early"), ("early", -1, "late")):
             cause = f"the poses are {name} (sweep i has the pose of sweep i {'-+'[sign < 0]} {count})"
@@ -200,6 +202,11 @@ READINGS: dict[str, Reading] = {
         _mirrored(AXES["swapped"]),
         margin=_OF_MIRRORED,
     ),
+    "swapped_back": Reading(
+        "x and y of the points or of the poses are interchanged and reversed (left-handed)",
+        _mirrored(AXES["swapped_back"]),
+        margin=_OF_MIRRORED,
+    ),
     "transposed": Reading("the rotations of the poses are transposed, but not their positions", _transposed(np.eye(3))),
     "compass": Reading(
         "the angles of the poses are compass headings (clockwise from north)", _transposed(AXES["left"])
@@ -226,6 +233,7 @@ READINGS: dict[str, Reading] = {
     },
     "points_camera": Reading("the points have a camera's axes", of_points=_of_axes(AXES[CAMERA])),
     "points_opengl": Reading("y of the points is up", of_points=_of_axes(AXES["opengl"])),
+    "points_z_first": Reading("the columns of the points are z, x, y", of_points=_of_axes(AXES["z_first"])),
     "points_upside_down": Reading("z of the points is down", of_points=_of_axes(AXES["down"])),
     "points_spherical": Reading("the points are range, azimuth and elevation", of_points=_from_spherical),
 }
@@ -236,6 +244,9 @@ OF_POINTS = tuple(name for name, reading in READINGS.items() if reading.of_point
 _OPPOSITE = dict(zip(DIRECTIONS, reversed(list(DIRECTIONS))))
 SCAN_READINGS = {
     **{name: Reading("", margin=_SMALL) for name in (OFF, TIMES)},
-    **{name: Reading("", margin=_SMALL, opposite=_OPPOSITE[direction]) for name, (direction, _) in SCANS.items()},
+    **{
+        name: Reading("", margin=_SMALL, opposite=_OPPOSITE[direction] + instant)
+        for name, (direction, _, instant) in SCANS.items()
+    },
 }
 """How points may move to the instant of their sweep: values of `deskew`, compared as readings of the poses are."""

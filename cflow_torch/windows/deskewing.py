@@ -15,8 +15,12 @@ from cflow_torch.windows.ego_motion import compensate
 
 DIRECTIONS = {"clockwise": -1.0, "counterclockwise": 1.0}  # seen from above -> sign of the growing azimuth
 STARTS = {"": 0.5, "_left": 0.25, "_ahead": 0.0, "_right": -0.25}  # ending of the name -> azimuth of the start, turns
-SCANS = {f"{name}{start}": (name, start) for start in STARTS for name in DIRECTIONS}
+INSTANTS = {"": None, "_at_start": 0.0, "_at_end": -1.0}  # ending of the name -> turns from the instant to the start
+SCANS = {
+    f"{name}{start}{instant}": (name, start, instant) for instant in INSTANTS for start in STARTS for name in DIRECTIONS
+}
 """Names of scans: clockwise and counterclockwise begin behind the vehicle, clockwise_left at its left, and so on."""
+ENDINGS = "with _left, _ahead or _right behind it, then _at_start or _at_end"
 _SMALLEST_SINE = 1e-12  # of the angle; a smaller rotation has no axis, and moves no point by a nanometre
 
 
@@ -27,22 +31,25 @@ def scan_fractions(points: Array, direction: str, origin: Any = (0.0, 0.0, 0.0))
         points: (N, 3+) float, metres, as measured, x forward and y left.
         direction: "clockwise" or "counterclockwise", seen from above, for a turn that begins behind the vehicle. With
             the ending "_left", "_ahead" or "_right" the turn begins there. KITTI's LiDAR turns clockwise from behind.
+            The last ending, "_at_start" or "_at_end", tells the instant of the sweep.
         origin: (3,) float, metres, position of the LiDAR in the frame of the points.
 
-    Convention: 0 = ahead, negative = earlier. So the instant of the sweep is when the LiDAR looks ahead. The result is
-        in (-0.5, 0.5] for a turn that begins behind, as KITTI's, [-0.25, 0.75) for "clockwise_left", and [0, 1) for one
-        that begins ahead. If you name a wrong start, some points are one turn off in every sweep: static objects still
-        stay in place, unless they pass the start.
+    Convention: 0 = the instant of the sweep, negative = earlier. The instant is when the LiDAR looks ahead, unless the
+        name says that it is the start or the end of the turn. The result is in (-0.5, 0.5] for a turn that begins
+        behind, as KITTI's, [-0.25, 0.75) for "clockwise_left", and [0, 1) for one that begins ahead. It is in [0, 1)
+        for every "_at_start", and in [-1, 0) for every "_at_end". If you name a wrong start, some points are one turn
+        off in every sweep: static objects still stay in place, unless they pass the start.
     """
     if direction not in SCANS:
-        raise CFlowError(f"direction={direction!r}: choose one of {', '.join(SCANS)}")
-    name, start = SCANS[direction]
+        raise CFlowError(f"direction={direction!r}: choose one of {', '.join(DIRECTIONS)}, or one {ENDINGS}")
+    name, start, instant = SCANS[direction]
     x, y, _ = (point_rows("points", points) - np.asarray(origin, np.float64)).T
     turns = DIRECTIONS[name] * np.arctan2(y, x) / (2 * np.pi)
-    if not start:
+    if not start and not instant:
         return turns
     first = -((-DIRECTIONS[name] * STARTS[start]) % 1)  # between -1 and 0
-    return first + (turns - first) % 1
+    to_start = INSTANTS[instant]
+    return (first if to_start is None else to_start) + (turns - first) % 1
 
 
 def deskew_points(points: Array, fraction: Array, T_ego1_ego0: Any, T_ego0_before: Any = None) -> np.ndarray:

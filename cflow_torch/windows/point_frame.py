@@ -18,12 +18,14 @@ _NEAR = 30.0  # metres
 # Metres of a sensor above the ground: trucks have up to 4. In feet, cars have 4.5 to 8.
 _HIGHEST_SENSOR, _HIGHEST_IN_FEET = 4.3, 9.0
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
-_TALL = {  # readings of clouds that are flat in y
+_TALL = {  # readings of clouds that are flat in y or x, not in z
     "points_camera": "a camera's axes (x right, y down, z forward)",
     "points_opengl": "y up (x right, z backward)",
+    "points_z_first": "z in the first column (z, x, y)",
 }
 _FULL = 0.95  # least share of a turn that azimuths of a cloud span
-_TILTS = range(15, 60, 5)  # degrees; without them, ground is found up to a tilt of 14
+_TILTS = range(15, 60, 15)  # degrees; without them, ground is found up to a tilt of 14
+_LEAST_TILT = 5.0  # degrees; roads rise by less within 30 m
 
 
 def frame_problem(points: Array) -> tuple[str, str]:
@@ -55,14 +57,12 @@ def frame_problem(points: Array) -> tuple[str, str]:
     side = ground_side(positions)
     if side < 0:
         return "points_upside_down", "z seems to point down, because nearly all points lie below the ground: " + _UP
-    is_tall = extent[2] > _FLAT * max(extent[0], extent[1]) and extent[1] < _FLAT * max(extent[0], extent[2])
+    is_tall = extent[2] > _FLAT * max(extent[0], extent[1]) and min(extent[:2]) < _FLAT * extent[2]
     height = -_height_of_ground(positions) if side > 0 and low[2] < -_HIGHEST_SENSOR else 0.0
     if _HIGHEST_SENSOR < height < _HIGHEST_IN_FEET:
         feet = f"the ground lies {height:.1f} m below the sensor, or {0.3048 * height:.1f} m if the points are in feet"
         return "points_feet", f"{feet}: give points in metres"
-    if side > 0:
-        return "", ""
-    for reading, axes in _TALL.items() if is_tall else ():
+    for reading, axes in _TALL.items() if is_tall and side == 0 else ():
         if _has_ground_as(reading, positions):
             return reading, f"the points seem to have {axes}: {_UP}"
     tilt = _tilt_of(positions)
@@ -91,14 +91,33 @@ def _has_ground_as(reading: str, positions: np.ndarray) -> bool:
 
 
 def _tilt_of(positions: np.ndarray) -> str:
-    """Return the angle and the axis about which points without ground must be turned to have some; "" = none is."""
-    for name, axis, sign in (("y", 1, 1), ("y", 1, -1), ("x", 0, 1), ("x", 0, -1)):
-        turned = {tilt: positions @ rotations_about(axis, np.radians(sign * tilt)).T for tilt in _TILTS}
-        found = [tilt for tilt, points in turned.items() if has_ground(points)]
-        if found:
-            tilt = np.mean(found)
-            return f"{tilt:.0f} degrees (turn it by {sign * tilt:+.0f} about {name})"
+    """Return the angle by which the ground near the sensor is tilted, and how to level it; "" = it is level or unknown.
+
+    If there is no ground, we turn the points until they have some.
+    """
+    for axis, turn in ((0, 0), *((axis, sign * turn) for axis in (1, 0) for sign in (1, -1) for turn in _TILTS)):
+        turned = positions @ rotations_about(axis, np.radians(turn)).T
+        if turn and not has_ground(turned):
+            continue
+        slopes = _slopes_of_ground(turned)
+        if slopes is None:
+            continue
+        about_x, about_y = (axis == 0) * turn - slopes[1], (axis == 1) * turn + slopes[0]
+        tilt = float(np.hypot(about_x, about_y))
+        turns = [
+            f"{angle:+.0f} about {name}" for angle, name in ((about_y, "y"), (about_x, "x")) if 3 * abs(angle) > tilt
+        ]
+        return f"{tilt:.0f} degrees (turn it by {' and '.join(turns)})" if tilt >= _LEAST_TILT else ""
     return ""
+
+
+def _slopes_of_ground(positions: np.ndarray) -> np.ndarray | None:
+    """Return the slopes of the plane of the ground near the sensor along x and y, degrees; None = too little of it."""
+    ground = positions[find_ground(positions, "grid") & (np.hypot(*positions[:, :2].T) < _NEAR)]
+    if len(ground) < _FEWEST:
+        return None
+    plane, *_ = np.linalg.lstsq(np.column_stack([ground[:, :2], np.ones(len(ground))]), ground[:, 2], rcond=None)
+    return np.degrees(np.arctan(plane[:2]))  # type: ignore[no-any-return]
 
 
 _UP = "give points with z up"

@@ -30,11 +30,12 @@ from cflow_torch.windows.conventions import (
     Reading,
     scaled,
 )
-from cflow_torch.windows.deskewing import DIRECTIONS, STARTS
+from cflow_torch.windows.deskewing import DIRECTIONS, INSTANTS, SCANS
 from cflow_torch.windows.stillness import Structure, cell_keys, structure_rows
 
 GIVEN = "as given"
 STEPS = ("steps", "steps_back")
+HALVES = ("half_late", "half_early")
 # Readings that are no conventions: they follow from the points.
 UNKNOWN, TURNED, SCALED, INACCURATE, NO_READING = "unknown", "turned", "scaled", "inaccurate", "none"
 
@@ -52,7 +53,7 @@ _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading h
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2
 _TURN = 1.1  # share of a direction over that of its opposite, from which other starts of its turn are compared
-_EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
+EQUAL = 0.95  # readings whose share is at least this part of the best one are named together
 _OF_ERRORS = 1.2  # least share with another motion in each pair over that as given
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
 _SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
@@ -260,7 +261,7 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
     named = [name for name in clear if name != INACCURATE]
     if len(named) < len(clear) and shares[INACCURATE] > _EXCUSE * max([shares[name] for name in named], default=0):
         return (INACCURATE,)
-    best = [name for name in named if shares[name] >= _EQUAL * shares[named[0]]]
+    best = [name for name in named if shares[name] >= EQUAL * shares[named[0]]]
     best.sort(key=lambda name: name == TURNED)  # in turns, a slight one is as good as another mounting
     best = [name for name in best if name in (SCALED, TURNED) or _is_small(name) == _is_small(best[0])]
     others = [name for kind in (MOUNTS, TIMES_OF_POSES) for name in [name for name in best if name in kind][1:]]
@@ -345,26 +346,44 @@ def _motion_of(pair: Pair, scan: str) -> np.ndarray:
 def _best_scan(pairs: Sequence[Pair]) -> tuple[str, dict[str, float]]:
     """Return the scan under which the world stands still, and the shares of those that were compared.
 
+    The instant of a sweep is when the LiDAR looks ahead. If no such scan is clearly better than as given, it may be the
+    start or the end of a turn, which shows where the motion changes.
+    """
+    expected, first, *_ = pairs[0].scans
+    ahead, *others = INSTANTS
+    result = _best_direction(pairs, ahead)
+    shows_instants = any(name in pair.transforms for pair in pairs for name in HALVES)
+    if result[0] != expected or first not in DIRECTIONS or not shows_instants:
+        return result
+    found = [_best_direction(pairs, instant) for instant in others]
+    scan, shares = max(found, key=lambda each: each[1][each[0]])
+    return (scan, shares) if scan != expected else result
+
+
+def _best_direction(pairs: Sequence[Pair], instant: str) -> tuple[str, dict[str, float]]:
+    """Return the best scan of an instant, one of `INSTANTS`, and the shares of those that were compared.
+
     Points with times may be compensated already, so we move them only if they then fit at least as well. If a direction
     fits better than its opposite, turns may begin behind the vehicle or elsewhere: we choose behind, unless another
     start is clearly better. If the structure is shifted along the path, less of it must be in place: along smooth walls
     this is not so.
     """
     expected, *others = pairs[0].scans
-    of_pairs = [pair.shares_of_scans(pair.scans) for pair in pairs]
+    others = [scan + instant for scan in others]
+    of_pairs = [pair.shares_of_scans((expected, *others)) for pair in pairs]
     shares, clear = _compare(of_pairs, expected)
     if expected == TIMES:
         return max(shares, key=shares.__getitem__), shares  # ties: the times
-    direction, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
-    if direction in DIRECTIONS and shares[direction] >= _TURN * max(shares[scan] for scan in opposite):
-        starts = [direction + start for start in STARTS]
+    best, *opposite = sorted(others, key=shares.__getitem__, reverse=True)
+    if best in SCANS and shares[best] >= _TURN * max(shares[scan] for scan in opposite):
+        starts = [scan for scan in SCANS if SCANS[scan][::2] == SCANS[best][::2]]
         # A start that is clearly better is so in each pair, so the first pair rules out most.
         of_first = pairs[0].shares_of_scans(starts)
-        starts = [start for start in starts if start == direction or of_first[start] > of_first[direction]]
+        starts = [start for start in starts if start == best or of_first[start] > of_first[best]]
         of_pairs = [{**pair.shares_of_scans(starts), **each} for pair, each in zip(pairs, of_pairs)]
         of_starts, clear = _compare(of_pairs, expected)
-        _, better = _compare([{start: each[start] for start in starts} for each in of_pairs], direction)
-        clear = clear[:1] if direction not in clear else [*better, direction]
+        _, better = _compare([{start: each[start] for start in starts} for each in of_pairs], best)
+        clear = clear[:1] if best not in clear else [*better, best]
         shares.update({scan: of_starts[scan] for scan in clear[:1]})
     if not clear:
         return expected, shares

@@ -28,12 +28,19 @@ from cflow_torch.windows.stillness import Structure, static_rows, thinned_rows
 LIDAR = PROFILES["demo"].units[0]
 
 
-def make(speed: float = 14.0, is_deskewed: bool = False, num_sweeps: int = 8, **lidar: Any) -> Drive:
+def make(
+    speed: float = 14.0,
+    is_deskewed: bool = False,
+    num_sweeps: int = 8,
+    reference: float = 0.5,
+    seed: int = 1,
+    **lidar: Any,
+) -> Drive:
     """Drive past houses; the LiDAR turns clockwise, from behind, and the instant of a sweep is when it looks ahead."""
-    scene = build_street(np.random.default_rng([1, 0]))
+    scene = build_street(np.random.default_rng([seed, 0]))
     scene = replace(scene, ego=replace(scene.ego, speed=speed))
-    profile = replace(PROFILES["demo"], units=(replace(LIDAR, **lidar),), reference=0.5)
-    return Drive(scene, replace(profile, is_rolling=True, is_deskewed=is_deskewed), 1, num_sweeps, "drive")
+    profile = replace(PROFILES["demo"], units=(replace(LIDAR, **lidar),), reference=reference)
+    return Drive(scene, replace(profile, is_rolling=True, is_deskewed=is_deskewed), seed, num_sweeps, "drive")
 
 
 class Untimed(LogWrapper):
@@ -120,6 +127,26 @@ def test_a_direction_is_found_where_turns_do_not_begin_behind(start: float, span
     """The seam of the turn hides the direction, if we only compare turns that begin behind."""
     log = DeskewedLog(Untimed(make(speed=15.0, num_sweeps=10, start=start, span=span)))
     assert log.scan == reading
+
+
+@pytest.mark.parametrize(("reference", "reading"), [(0.0, "clockwise_at_start"), (1.0, "clockwise_at_end")])
+def test_the_instant_of_a_sweep_may_be_the_start_or_the_end_of_its_turn(reference: float, reading: str) -> None:
+    """Drivers stamp the start or the end of a turn. This shows where the vehicle begins to turn."""
+    raw, truth = (make(10.0, each, reference=reference, seed=2) for each in (False, True))
+    log = DeskewedLog(Untimed(raw))
+    assert log.scan == reading and f"data.deskew={reading}" in log.findings()[-1].text
+    assert max(largest_error(log, truth, index) for index in (2, 6)) < 0.015
+    assert np.abs(log.sweep(3).point_times - raw.sweep(3).point_times).max() < 2e-4
+
+
+@pytest.mark.parametrize("constant", [0.0, 0.04])
+def test_times_that_are_all_equal_do_not_say_anything(raw: Drive, constant: float) -> None:
+    class Equal(Untimed):
+        def sweep(self, index: int) -> Sweep:
+            sweep = self.log.sweep(index)
+            return replace(sweep, point_times=np.full(len(sweep.points), constant, np.float32))
+
+    assert DeskewedLog(Equal(raw)).scan == "clockwise"
 
 
 @pytest.mark.parametrize("case", ["compensated", "slow"])

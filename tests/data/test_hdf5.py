@@ -65,6 +65,18 @@ def test_a_scene_without_poses_uses_its_ego_motion(drive, tmp_path):
         assert unposed.sweep(1).pose is None
 
 
+def test_poses_may_be_the_upper_three_rows(drive, tmp_path):
+    write_hdf5_scene(drive, tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as scene:
+        for group in scene.values():
+            rows = group["pose"][:3]
+            del group["pose"]
+            group["pose"] = rows
+    with HDF5Log(tmp_path / "a.h5") as log:
+        assert np.allclose(log.sweep(1).pose, drive.poses[1], atol=1e-6)
+        assert np.allclose(log.poses, drive.poses, atol=1e-6)
+
+
 def test_data_of_other_files_are_never_read(tmp_path):
     """Links, external storage and virtual datasets refer to other files, which may be any file."""
     other, secret = write_scene(tmp_path / "other.h5"), tmp_path / "secret"

@@ -15,7 +15,7 @@ from cflow_torch import CFlowError, Sweep
 from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
-from cflow_torch.data.log import CachedLog, Log, LogWrapper
+from cflow_torch.data.log import CachedLog, Log, LogWrapper, poses_beyond
 from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
 from cflow_torch.data.log_motion import find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
@@ -167,6 +167,7 @@ POSES = {
     "mirrored": mirrored(np.diag([1, -1, 1])),
     "mirrored_back": mirrored(np.diag([-1, 1, 1])),
     "swapped": mirrored(np.eye(3)[[1, 0, 2]]),
+    "swapped_back": mirrored(np.array([[0, -1, 0], [-1, 0, 0], [0, 0, 1]])),
     "transposed": lambda pose: as_matrix(pose[:3, :3].T, pose[:3, 3]),
     "compass": lambda pose: as_matrix(pose[:3, :3].T @ AXES["left"], pose[:3, 3]),
 }
@@ -210,9 +211,9 @@ def test_wrong_poses_are_named_and_the_reading_undoes_them(reading, source, requ
     assert np.allclose(true, read, atol=0.01 if is_half else 1e-6), "the motion between the sweeps is the true one"
 
 
-@pytest.mark.parametrize("name", ["mirrored", "swapped"])
+@pytest.mark.parametrize("name", ["mirrored", "swapped", "swapped_back"])
 def test_mirrored_clouds_are_named_and_no_pose_is_blamed(drive, name):
-    axes = {"mirrored": np.diag([1, -1, 1]), "swapped": np.eye(3)[[1, 0, 2]]}[name]
+    axes = AXES[name]  # its own inverse
     (problem,) = find_problems(Wrong(drive, points=lambda points, _: points @ axes))
     assert "(left-handed)" in problem and f"data.read_as={name}" in problem
 
@@ -543,14 +544,19 @@ def spherical(unit):
         (lambda points, _: points @ AXES["down"], "data.read_as=points_upside_down"),
         (camera_points, "data.read_as=points_camera"),
         (lambda points, _: points @ AXES["opengl"], "data.read_as=points_opengl"),
+        (lambda points, _: points / 0.0254, "data.read_as=points_inches"),
+        (lambda points, _: points[:, [2, 0, 1]], "data.read_as=points_z_first"),
         (spherical(1.0), "data.read_as=points_spherical"),
         (spherical(np.pi / 180), "data.read_as=points_spherical"),
         (lambda points, _: points @ rotations_about(1, 0.5), "about y): give points with z up"),
         (lambda points, _: points @ rotations_about(0, -0.4), "data.ego_T_lidar"),
+        (lambda points, _: points @ rotations_about(1, np.radians(8)), "8 degrees (turn it by +8 about y)"),
+        (lambda points, _: points @ rotations_about(0, np.radians(-12)), "12 degrees (turn it by -12 about x)"),
+        (lambda points, _: points @ rotations_about(1, 0.1) @ rotations_about(0, 0.15), "+6 about y and +9 about x"),
     ],
     ids=[
-        *("millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera", "y up"),
-        *("radians", "degrees", "pitch", "roll"),
+        *("millimetres", "centimetres", "kilometres", "elsewhere", "z down", "camera", "y up", "inches"),
+        *("z first", "radians", "degrees", "pitch", "roll", "slight pitch", "slight roll", "both"),
     ],
 )
 @pytest.mark.parametrize("source", ["drive", pytest.param("real", marks=pytest.mark.slow)])
@@ -563,7 +569,7 @@ def test_wrong_units_and_axes_are_recognised(source, change, found, request):
     masks = {"masks": False}
     (text,) = [text for text in find_problems(Wrong(good, points=with_strays, **masks)) if "sweep" in text][:1]
     assert found in text
-    if "about y" in found:
+    if found.startswith("about y"):
         told = float(re.findall(r"turn it by \+(\d+)", text)[0])
         assert abs(told - np.degrees(0.5)) < 3
     if "read_as=points" in found:
@@ -606,6 +612,40 @@ def test_sweeps_that_measure_parts_of_a_turn_are_told(drive, has_poses):
 
     texts = find_problems(Part(drive, poses=None if has_poses else lambda _: None))
     assert any("share 0 % of the directions" in text or "share 4 %" in text for text in texts), texts
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.6])
+def test_two_sensors_in_turns_are_told_and_nothing_else(drive, angle):
+    T_points_second = np.linalg.inv(as_matrix(rotations_about(2, angle), (-1.5, 0, 0.4)))
+
+    class InTurns(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index)
+            points = sweep.points if index % 2 == 0 else transform_points(sweep.points, T_points_second)
+            return replace(sweep, points=points.astype(np.float32))
+
+    wrong = [finding for finding in examine(InTurns(drive)) if finding.status == WRONG]
+    assert [finding.topic for finding in wrong] == ["sweeps"] and "two sensors in turns" in wrong[0].text
+
+
+def test_the_poses_of_a_trajectory_go_on_beyond_the_sweeps(drive):
+    """Sweeps 4 to 9 have the poses of two sweeps earlier; the trajectory has those after the last sweep, too."""
+
+    class Part(Wrong):
+        def __init__(self, log):
+            super().__init__(log)
+            self.timestamps = log.timestamps[2:8]
+            self.poses = self.true[2:8]
+            self.trajectory = np.array(log.timestamps, np.int64), self.true
+
+        def sweep(self, index):
+            sweep = self.log.sweep(index + 4)
+            return replace(sweep, pose=self.poses[index], timestamp_ns=self.timestamps[index])
+
+    extended, num_before = poses_beyond(Part(drive), Part(drive).poses, 10)
+    assert num_before == 2 and np.allclose(extended, Part(drive).true, atol=1e-6)
+    again = read_as(Part(drive), "late_2")
+    assert np.allclose(again.sweep(5).pose, drive.sweep(9).pose, atol=1e-6), "not extrapolated"
 
 
 def test_points_in_the_world_without_poses_are_told_by_the_last_sweep(drive):
@@ -683,12 +723,16 @@ def test_the_page_names_sweeps_with_few_points(whole):
         ([0, 1, 2, 3, 4, 5, 11, 7, 8, 9, 10, 11], "sweep 6 does not fit those around"),
         ([9, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11], "sweep 0 does not fit those around"),
         ([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 2], "sweep 11 does not fit those around"),
+        (
+            [0, 1, 2, 3, 4, 4, 6, 7, 8, 9, 10, 11],
+            "1 of them repeat the points of the sweep before, the first is sweep 5",
+        ),
     ],
-    ids=["dropped", "interchanged", "foreign", "first", "last"],
+    ids=["dropped", "interchanged", "foreign", "first", "last", "middle"],
 )
 def test_the_page_names_sweeps_that_are_repeated_or_misplaced(drive, order, told):
-    texts = [one.text for one in examine(Wrong(drive, order=order)) if one.topic == "sweeps"]
-    assert len(texts) == 1 and texts[0].startswith(told)
+    wrong = [one for one in examine(Wrong(drive, order=order)) if one.status == WRONG]
+    assert [one.topic for one in wrong] == ["sweeps"] and wrong[0].text.startswith(told)
 
 
 @pytest.mark.parametrize(

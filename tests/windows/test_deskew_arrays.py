@@ -64,6 +64,10 @@ def test_a_turn_may_begin_elsewhere():
         "clockwise_right": [0, -80, -100, -170, -190, -260, 80, 10],
         "counterclockwise_left": [0, 80, -260, -190, -170, -100, -80, -10],
         "counterclockwise_right": [0, 80, 100, 170, 190, 260, -80, -10],
+        "clockwise_at_start": [180, 100, 80, 10, 350, 280, 260, 190],
+        "clockwise_at_end": [-180, -260, -280, -350, -10, -80, -100, -170],
+        "clockwise_left_at_start": [90, 10, 350, 280, 260, 190, 170, 100],
+        "counterclockwise_right_at_end": [-270, -190, -170, -100, -80, -10, -350, -280],
     }
     for name, expected in degrees.items():
         assert np.allclose(360 * scan_fractions(points, name), expected), name

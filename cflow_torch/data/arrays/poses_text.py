@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from decimal import Decimal
 from pathlib import Path
 from typing import Mapping, Sequence
@@ -29,6 +30,7 @@ _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four ar
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz")
 """Suffixes of files whose values have names or nest, see `tables_of_values`."""
 _NAMES = "write all digits, and name the sweeps in the order of their times"
+_OF_POSES = "pose|traj|odom"  # in names of files whose lines of three numbers are x, y, yaw
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
 
@@ -40,7 +42,8 @@ def read_poses(path: PathLike) -> Trajectory:
             folder with a file per pose. A line of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM:
             time in seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows, or
             by columns), or 13 or 17 (a time before the matrix). 7 numbers without a quaternion are a time, x y z, roll
-            pitch yaw; 6 have no time. Four lines may have a matrix, below a line of three numbers (Open3D). Of a g2o
+            pitch yaw; 6 have no time. 3 numbers are x y yaw, if the name of the file says that
+            it has poses. Four lines may have a matrix, below a line of three numbers (Open3D). Of a g2o
             graph, vertices are read. If a line before the numbers names the columns (timestamp, x, qw, ...), they may
             have any order, and roll, pitch and yaw may replace the quaternion. Other columns, empty lines and lines
             that begin with `#` are ignored. Times: `nanoseconds_of_numbers`.
@@ -96,6 +99,8 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     unnamed = _UNNAMED.get(words.shape[1], ())
     if words.shape[1] in (6, 7) and not names and not _end_in_quaternions(words):
         unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
+    if words.shape[1] == 3 and not names and re.search(_OF_POSES, path.stem.lower()):
+        unnamed = ("x", "y", "yaw")
     if words.shape[1] in (16, 17) and not names:
         words = _by_rows(words)
     if not roles and (not names or len(unnamed) > 8 or len(names) == len(_TUM)):

@@ -45,6 +45,7 @@ _POSE_TYPES = ("nav_msgs/msg/Odometry", *(f"geometry_msgs/msg/Pose{name}Stamped"
 _OTHER_POSES = ("nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped")  # used if there are no others
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
+_LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 
@@ -318,7 +319,12 @@ class BagLog(Log):
         """Shift the times of clouds to the clock of the poses, by the times of arrival, if the two do not overlap."""
         first, last = self.timestamps[0], self.timestamps[-1]
         shift = _middle([arrived - time for time, arrived in self._arrival.items()]) - _middle(self._pose_delays)
-        if (last >= pose_times[0] and first <= pose_times[-1]) or abs(shift) < _ANOTHER_CLOCK:
+        if last >= pose_times[0] and first <= pose_times[-1]:
+            if abs(shift) >= _LARGEST_DELAY:
+                seconds = f"{shift * 1e-9:+.2g} s by the times of arrival"
+                self._note(f"clocks of its clouds and poses differ by {seconds}: if static points move, correct one")
+            return
+        if abs(shift) < _ANOTHER_CLOCK:
             return
         self._shift = shift
         self._arrival = {time + shift: arrived for time, arrived in self._arrival.items()}

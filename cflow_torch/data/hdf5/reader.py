@@ -153,13 +153,21 @@ class HDF5Log(Log):
         with np.errstate(all="ignore"):  # NaN stays NaN
             return stored @ self.ego_T_lidar
 
+    def _matrix(self, index: int, key: str, dtype: Any) -> np.ndarray | None:
+        """Read a rigid transform, (4, 4); a file may have only its upper three rows."""
+        matrix = self._values(index, key, None, dtype)
+        if matrix is not None and matrix.shape == (3, 4):
+            return np.concatenate([matrix, np.eye(4, dtype=matrix.dtype)[3:]])
+        is_square = matrix is None or matrix.shape == (4, 4)
+        return matrix if is_square else self._values(index, key, (4, 4), dtype)  # raises the error
+
     def _stored_pose(self, index: int, dtype: Any = np.float64) -> Any:
         """Read a pose, or compute it from earlier ego motions. Without any, return None unless poses are needed."""
-        pose = self._values(index, "pose", (4, 4), dtype)
+        pose = self._matrix(index, "pose", dtype)
         if pose is not None:
             return pose
         while len(self._chain) <= max(index, 1):
-            motion = self._values(len(self._chain) - 1, "ego_motion", (4, 4), np.float64)
+            motion = self._matrix(len(self._chain) - 1, "ego_motion", np.float64)
             if motion is None:
                 break
             name = f"ego_motion of sweep {self.timestamps[len(self._chain) - 1]} in {self.file}"
