@@ -152,9 +152,9 @@ def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
     return result
 
 
-def _nothing_is_slow(sweeps: HeightSlicedSweeps, objects: Objects, may_be_slow: torch.Tensor) -> torch.Tensor:
+def _nothing_is_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: torch.Tensor, _: object) -> torch.Tensor:
     """No motion, instead of `find_slow`."""
-    return torch.zeros((objects.count, 2), dtype=torch.float64)
+    return torch.zeros_like(flow)
 
 
 def assert_same_bits(a: FlowResult, b: FlowResult) -> None:

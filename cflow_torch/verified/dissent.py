@@ -13,6 +13,8 @@ A component of changed pixels is in no other node, but its pixels may take the m
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -24,64 +26,49 @@ from cflow_torch.verified.paired_test import NEAR_Z, Counts, Verdict, count_wins
 
 _DISSENT_Z = 4.0  # factor of z for nodes that dissent
 # Finest pixels per sweep interval, between the motions of a winner and of a node that dissents. Changed pixels are
-# often the outline of an object, which tells its motion less well than the whole object.
+# often the outline of an object, which tells its motion less well than the whole object, so theirs differs by more.
 _LEAST_DIFFERENCE = 1.0
-_LEAST_DIFFERENCE_OF_CHANGED = 2.0
+_LEAST_OF_CHANGED = 2.0
+
+
+class Dissent(NamedTuple):
+    """The motions of N nodes after dissent."""
+
+    taken: Tensor  # (N,) int64, the node whose motion each node of the levels takes; N = it is static
+    left: Tensor  # (N,) int64, the winner from which each node dissents; -1 = it does not
 
 
 def with_dissent(
     sweeps: HeightSlicedSweeps, tree: Tree, verdict: Verdict, winner: Tensor, significance: float, price: int
-) -> Tensor:
-    """Return the node whose motion each node takes, (N,) int64; N = it is static.
+) -> Dissent:
+    """Find the nodes that do not move with the winner around them.
 
-    `winner` is (N,) int64, the coarsest winner among each node and those that contain it; N = none. A node dissents if
-    it gains more than `price`, in units of `PER_SLICE`.
+    `winner` is (N,) int64, the winner among each node and those around it; N = none. Fast objects and those under
+    overhangs have no node around them. A node dissents if it gains more than `price`, in units of `PER_SLICE`.
     """
     none = tree.count
     node = torch.arange(none, device=winner.device)
+    motion = verdict.motion
+    motion_around = Groups(winner, none).spread(motion)  # [N, 2]
+    moves = motion.any(1)
+    is_whole = tree.kind != NodeKind.CHANGED
     has_history = sweeps.has_history.index_select(0, tree.window)
-    is_inside = (tree.kind < tree.num_levels) & (winner < none) & (winner != node) & has_history
-    dissents = _dissent(sweeps, tree, verdict, is_inside, winner, _LEAST_DIFFERENCE, significance, price)
-    own = torch.where(verdict.motion.any(1), node, none)
+    # Changed pixels without a motion of their own move with the winner.
+    is_inside = (winner < none) & (winner != node) & (is_whole | moves) & has_history
+    least = torch.where(is_whole, _LEAST_DIFFERENCE, _LEAST_OF_CHANGED)
+    differs = (motion - motion_around).abs().amax(1) >= least
+    inside = flat_nonzero(is_inside & differs)
+    left = torch.full_like(winner, -1)
+    if len(inside) == 0:
+        return Dissent(winner, left)
+    dissents = torch.zeros_like(is_inside)
+    dissents[inside] = _gain(sweeps, tree, inside, motion, motion_around, _DISSENT_Z * significance) > price
+    own = torch.where(moves, node, none)
     taken = winner
     for level in range(1, tree.num_levels):
         of_level = torch.where(dissents, own, tree.by_parent.spread(taken, none=none))
         taken = torch.where(is_inside & (tree.kind == level), of_level, taken)
-    return taken
-
-
-def changed_dissent(
-    sweeps: HeightSlicedSweeps, tree: Tree, verdict: Verdict, of_pixel: Tensor, significance: float, price: int
-) -> Tensor:
-    """Tell which nodes of changed pixels do not move with the winner around them, (N,) bool.
-
-    `of_pixel` is (P',) int64, the node of the levels whose motion each pixel takes; N = none. If the pixels of a node
-    take several motions, the node is compared with the first of these nodes, the coarsest.
-    """
-    winner = tree.members.min(of_pixel.index_select(0, tree.pixel), empty=tree.count)
-    is_inside = (tree.kind == NodeKind.CHANGED) & (winner < tree.count) & verdict.motion.any(1)
-    return _dissent(sweeps, tree, verdict, is_inside, winner, _LEAST_DIFFERENCE_OF_CHANGED, significance, price)
-
-
-def _dissent(
-    sweeps: HeightSlicedSweeps,
-    tree: Tree,
-    verdict: Verdict,
-    is_inside: Tensor,
-    winner: Tensor,
-    least_difference: float,
-    significance: float,
-    price: int,
-) -> Tensor:
-    """Tell which nodes inside a winner dissent, (N,) bool. `is_inside` is (N,) bool, `winner` (N,) int64."""
-    motion = verdict.motion
-    motion_around = Groups(winner, tree.count).spread(motion)  # [N, 2]
-    differs = ((motion - motion_around).abs() >= least_difference).any(1)
-    inside = flat_nonzero(is_inside & differs)
-    dissents = torch.zeros_like(is_inside)
-    if len(inside) > 0:
-        dissents[inside] = _gain(sweeps, tree, inside, motion, motion_around, _DISSENT_Z * significance) > price
-    return dissents
+    return Dissent(taken, torch.where(dissents, winner, left))
 
 
 def _gain(sweeps: HeightSlicedSweeps, tree: Tree, node: Tensor, motion: Tensor, other: Tensor, z: float) -> Tensor:

@@ -23,7 +23,6 @@ covariance of the voxels around both ends.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Callable, Iterator
 
@@ -87,10 +86,8 @@ def refine(
         slow: finds the objects of pairs that may move by less than a pixel.
         num_iterations: of registration.
     """
-    length = objects.length_at_newest(sweeps)
     flow = motion.flip(1) * sweeps.grid.pixel_size  # [G, 2], x and y, metres per sweep interval
-    may_be_slow = ~flow.any(1) & (length <= (math.inf if longest is None else longest))
-    of_slow = slow(sweeps, objects, may_be_slow)
+    of_slow = slow(sweeps, objects, flow, longest)
     start = flow + of_slow
     points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
     return register_deskewed(points, sweeps, start, of_slow.any(1), num_iterations)

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import flat_nonzero
-from cflow_torch.verified.component_tree import Components, Tree, corners_at_newest, longer_side
-from cflow_torch.verified.dissent import changed_dissent, with_dissent
+from cflow_torch.verified.component_tree import Components, NodeKind, Tree, corners_at_newest, longer_side
+from cflow_torch.verified.dissent import Dissent, with_dissent
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import PER_SLICE, Verdict
 
@@ -52,8 +52,7 @@ def select_objects(
     verdict: Verdict,
     significance: float,
     price: int = PRICE,
-    dissent: Callable[..., Tensor] = with_dissent,
-    dissent_of_changed: Callable[..., Tensor] = changed_dissent,
+    dissent: Callable[..., Dissent] = with_dissent,
 ) -> Objects:
     """Select objects from the leaves up, then let nodes inside the winners dissent.
 
@@ -63,12 +62,11 @@ def select_objects(
         significance: z of the paired test. For a node against the winner around it, z is four times as large.
         price: of an object, in units of `PER_SLICE`.
         dissent: finds the nodes inside a winner that do not move with it.
-        dissent_of_changed: finds the nodes of changed pixels that do not move with the winner around them.
 
     Returns:
         The objects. A pixel belongs to the first of these that exists:
         1. the node whose motion the finest of its nodes of the levels takes, or a node of another kind, if that has
-           more evidence or dissents; of several, the one with the most evidence;
+           more evidence, or dissents from this one; of several, the one with the most evidence;
         2. its plain component, if that is linked. Then it is static.
         Otherwise it is static and belongs to no object.
 
@@ -84,15 +82,14 @@ def select_objects(
     none = tree.count
     node = torch.arange(none, device=verdict.evidence.device)
     winner = _winners(tree, node, verdict.evidence, price)
-    taken = dissent(sweeps, tree, verdict, winner, significance, price)
-    by_pixel = Groups(tree.pixel, sweeps.num_pixels)  # the members
-    of_level = _nodes_of_levels(tree, by_pixel, taken)
-    dissents = dissent_of_changed(sweeps, tree, verdict, of_level, significance, price)
-    moving = _moving_nodes(tree, of_level, verdict.evidence, dissents)
+    finest = _finest_of_levels(tree, sweeps.num_pixels)  # [P']
+    around = _around_changed(tree, winner, finest)
+    taken, left = dissent(sweeps, tree, verdict, around, significance, price)
+    moving = _moving_nodes(tree, _of_finest(taken, finest), verdict.evidence, left)
 
     # The key of an object is the number of its node, else N plus the number of its component.
     plain_node = torch.where(tree.kind == tree.num_levels - 1, node, none)
-    static = by_pixel.min(tree.members.spread(plain_node, none=none), empty=none)  # [P']
+    static = Groups(tree.pixel, sweeps.num_pixels).min(tree.members.spread(plain_node, none=none), empty=none)  # [P']
     key = _keys_of_components(components, none, sweeps.num_pixels)
     key = torch.where(static < none, static, key)
     key = torch.where(moving < none, moving, key)
@@ -117,32 +114,43 @@ def _winners(tree: Tree, node: Tensor, evidence: Tensor, price: int) -> Tensor:
     return winner
 
 
-def _nodes_of_levels(tree: Tree, by_pixel: Groups, taken: Tensor) -> Tensor:
-    """Return the moving node of the levels of each pixel, (P',) int64, N = none.
-
-    `by_pixel` groups the members by pixel, `taken` is the result of `with_dissent`.
-    """
-    none = tree.count
-    node = torch.arange(none, device=taken.device)
+def _finest_of_levels(tree: Tree, num_pixels: int) -> Tensor:
+    """Return the number of the finest node of the levels of each pixel, (P',) int64, from 1 on; 0 = none."""
+    number = torch.arange(1, tree.count + 1, device=tree.pixel.device)
     # Nodes are listed level by level, so the finest node of a pixel has the largest number.
-    of_level = torch.where(tree.kind < tree.num_levels, node, -1)
-    finest = by_pixel.max(tree.members.spread(of_level, none=-1), empty=-1)  # [P']
-    return torch.where(finest >= 0, F.pad(taken, (0, 1), value=none).index_select(0, finest.clamp(min=0)), none)
+    of_level = torch.where(tree.kind < tree.num_levels, number, 0)
+    return Groups(tree.pixel, num_pixels).max(tree.members.spread(of_level, none=0), empty=0)
 
 
-def _moving_nodes(tree: Tree, of_level: Tensor, evidence: Tensor, dissents: Tensor) -> Tensor:
-    """Return the moving node of each pixel, (P',) int64, N = none; see `select_objects`.
+def _of_finest(node: Tensor, finest: Tensor) -> Tensor:
+    """Return what each of N nodes has, (N,) int64, for the finest nodes of K pixels, (K,) int64; N for 0 = none."""
+    return F.pad(node, (1, 0), value=len(node)).index_select(0, finest)
 
-    `of_level` is (P',) int64, that of the levels. `dissents`, (N,) bool, tells which nodes of changed pixels do.
+
+def _around_changed(tree: Tree, winner: Tensor, finest: Tensor) -> Tensor:
+    """Return the winners, but for nodes of changed pixels the winner around their pixels, (N,) int64; N = none.
+
+    If their pixels have several winners, it is the first, the coarsest. `finest` is the result of `_finest_of_levels`.
+    """
+    around = tree.members.min(_of_finest(winner, finest.index_select(0, tree.pixel)), empty=tree.count)
+    return torch.where(tree.kind == NodeKind.CHANGED, around, winner)
+
+
+def _moving_nodes(tree: Tree, of_level: Tensor, evidence: Tensor, left: Tensor) -> Tensor:
+    """Return the moving node of each pixel, (P',) int64; N = none; see `select_objects`.
+
+    Args:
+        of_level: (P',) int64, the node whose motion the finest node of the levels takes; N = none.
+        left: (N,) int64, see `Dissent`.
     """
     none = tree.count
-    is_other = (tree.kind >= tree.num_levels) & (evidence > 0)
-    member = flat_nonzero(tree.members.spread(is_other))
+    member = flat_nonzero(tree.members.spread(tree.kind >= tree.num_levels))
     node = tree.members.of_item.index_select(0, member)
     pixel = tree.pixel.index_select(0, member)
+    rival = of_level.index_select(0, pixel)
     own = evidence.index_select(0, node)
-    rival = F.pad(evidence, (0, 1)).index_select(0, of_level.index_select(0, pixel))  # of none, 0
-    wins = (own > rival) | dissents.index_select(0, node)
+    has_more = own > F.pad(evidence, (0, 1)).index_select(0, rival)  # of none, 0
+    wins = has_more | (left.index_select(0, node) == rival)
     # The largest key is that of the node with the most evidence. Ties: the first.
     key = torch.where(wins, (own + 1) * none - 1 - node, -1)
     key = Groups(pixel, len(of_level)).max(key, empty=-1)  # [P']

@@ -21,24 +21,27 @@ _LEAST_BIAS = 0.1
 _AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))  # rows and columns of a pixel ahead, in four directions
 
 
-def find_slow(sweeps: HeightSlicedSweeps, objects: Objects, may_be_slow: Tensor) -> Tensor:
+def find_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: Tensor, longest: float | None) -> Tensor:
     """Return a motion of one pixel for biased objects of pairs, (G, 2) float64, x and y, metres per sweep interval.
 
-    It is 0 for other objects, and in windows with history.
+    It is 0 for other objects, for those that move, and in windows with history.
 
     Args:
-        may_be_slow: (G,) bool, the static objects to ask.
+        flow: (G, 2) float64, x and y, metres per sweep interval; 0 = static.
+        longest: metres; static objects that are longer at t+1 stay static. None = no bound.
 
     Convention: of the slices of both sweeps, a are matched only ahead and b only behind. An object is biased if, in one
         of four directions, (a - b)^2 >= z^2 (a + b), and |a - b| is at least a tenth of its slices. Of several
         directions, the one with the largest |a - b| counts. Ties: the first.
 
-    Cost: eight lookups for each pixel of these objects.
+    Cost: eight lookups for each pixel of static objects of pairs.
     """
-    window = sweeps.pixels.window[objects.first]
-    asked = may_be_slow & ~sweeps.has_history.index_select(0, window)
     if not sweeps.batch.has_pairs:
-        return torch.zeros((objects.count, 2), dtype=torch.float64, device=asked.device)
+        return torch.zeros_like(flow)
+    window = sweeps.pixels.window[objects.first]
+    asked = ~(flow.any(1) | sweeps.has_history.index_select(0, window))
+    if longest is not None:
+        asked &= objects.length_at_newest(sweeps) <= longest
     only_ahead, only_behind, total = _matched_slices(sweeps, objects, asked)
     bias = only_ahead - only_behind  # [4, G]
     is_significant = bias * bias >= _BIAS_Z**2 * (only_ahead + only_behind)

@@ -153,10 +153,10 @@ class _Map:
 
     def contains(self, centre: Tensor) -> Tensor:
         """Tell which places, (2, ...), finest pixels, are in the region, a cell or more from its border, (...) bool."""
-        row, col = (centre / self._cell).floor_()
-        last_row = self._height - 2 * _REACH - 1
-        last_col = self._width - 2 * _REACH - 1
-        return (row >= 1) & (row < last_row) & (col >= 1) & (col < last_col)
+        cell = (centre / self._cell).floor_()
+        last = (self._height - 2 * _REACH - 2, self._width - 2 * _REACH - 2)
+        last = constant(last, cell.dtype, cell.device).view(2, *[1] * (cell.ndim - 1))
+        return (cell == torch.minimum(cell.clamp(min=1), last)).all(0)
 
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
 from cflow_torch.verified import changed_pixels, component_tree, confidence, paired_test, refinement, selection
+from cflow_torch.verified.dissent import Dissent
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.spacing import Spacing
 
@@ -44,8 +45,8 @@ def _nothing_slides(sweeps: Any, pixels: Any, groups: Any, motions: Tensor) -> T
     return torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
 
 
-def _nothing_is_slow(sweeps: Any, objects: Any, may_be_slow: Tensor) -> Tensor:
-    return torch.zeros((len(may_be_slow), 2), dtype=torch.float64, device=may_be_slow.device)
+def _nothing_is_slow(sweeps: Any, objects: Any, flow: Tensor, longest: float | None) -> Tensor:
+    return torch.zeros_like(flow)
 
 
 def _no_ends_move(sweeps: Any, pixels: Any, groups: Groups) -> Tensor:
@@ -60,15 +61,10 @@ def _without_coverage(batch: Any, *given: Any) -> HeightSlicedSweeps:
     return HeightSlicedSweeps.of(replace(batch, coverage=None), *given)
 
 
-def _no_dissent(sweeps: Any, tree: Any, verdict: Any, winner: Tensor, significance: float, price: int) -> Tensor:
-    return winner
+def _no_dissent(sweeps: Any, tree: Any, verdict: Any, winner: Tensor, significance: float, price: int) -> Dissent:
+    return Dissent(winner, torch.full_like(winner, -1))
 
 
-def _no_changed_dissent(sweeps: Any, tree: Any, verdict: Any, *given: Any) -> Tensor:
-    return torch.zeros_like(verdict.evidence, dtype=torch.bool)
-
-
-_WITHOUT_DISSENT = partial(selection.select_objects, dissent=_no_dissent, dissent_of_changed=_no_changed_dissent)
 # For each row of the table, the steps of `VerifiedFlow` that it replaces.
 STEPS: dict[str, dict[str, Any]] = {
     "all steps": {},
@@ -82,7 +78,7 @@ STEPS: dict[str, dict[str, Any]] = {
     "no aperture test": {"verify": partial(paired_test.verify, slides=_nothing_slides)},
     "no least gain": {"verify": partial(paired_test.verify, pixels_per_slice=math.inf)},
     "no price of an object": {"select_objects": partial(selection.select_objects, price=0)},
-    "no dissent": {"select_objects": _WITHOUT_DISSENT},
+    "no dissent": {"select_objects": partial(selection.select_objects, dissent=_no_dissent)},
     "no margin": {"motion_margin": _without_margin},
     "no registration": {"refine": partial(refinement.refine, num_iterations=0)},
     "no slow objects of pairs": {"refine": partial(refinement.refine, slow=_nothing_is_slow)},

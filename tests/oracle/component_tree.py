@@ -120,16 +120,16 @@ def dissent(sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], winner:
 
 
 def changed_dissents(
-    sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], number: int, around: np.ndarray, z: float
+    sweeps: SlicedSweeps, tree: Tree, motions: Sequence[Vector], number: int, around: int, z: float
 ) -> bool:
-    """Does a node of changed pixels not move with the first of the nodes whose motions its pixels take, `around`?
+    """Does a node of changed pixels not move with the winner `around` it, -1 = none?
 
     The motions differ by two pixels in y or in x, and its own one gains more than `PRICE`.
     """
-    node, winners = tree.nodes[number], around[around >= 0]
-    if node.level != len(tree.levels) or not any(motions[number]) or not len(winners):
+    node = tree.nodes[number]
+    if node.level != len(tree.levels) or not any(motions[number]) or around < 0 or not sweeps.has_history:
         return False
-    other = motions[winners.min()]
+    other = motions[around]
     differs = max(abs(a - b) for a, b in zip(motions[number], other)) >= 2
     return differs and gain(sweeps, node.members, motions[number], other, z) > PRICE
 
@@ -152,27 +152,31 @@ def select_objects(
     of each object; -1 = none.
 
     A pixel moves with the node whose motion its finest node in the tree takes; but with its first node of changed
-    pixels or of a fast object, if that has more evidence, or if the changed pixels dissent. Else it is static with its
-    plain component, if that is linked.
+    pixels or of a fast object, if that has more evidence, or if the changed pixels dissent from it. Else it is static
+    with its plain component, if that is linked.
     """
     nodes, num_levels, plain = tree.nodes, len(tree.levels), tree.levels[-1]
-    name, moving = np.full((2, len(plain)), -1)
+    name, moving, winner_of = np.full((3, len(plain)), -1)
     for label in np.unique(plain):
         if is_linked(sweeps, np.flatnonzero(plain == label)):
             name[plain == label] = len(nodes) + label
-    taken = dissent(sweeps, tree, motions, cut(nodes, evidence), z)
-    for i, (node, winner) in enumerate(zip(nodes, taken)):
+    winners = cut(nodes, evidence)
+    taken = dissent(sweeps, tree, motions, winners, z)
+    for i, node in enumerate(nodes):
         if node.level < num_levels:
-            moving[node.members] = winner
+            moving[node.members] = taken[i]
+            winner_of[node.members] = winners[i]
         if node.level == num_levels - 1:
             name[node.members] = i
     name = np.where(moving >= 0, moving, name)
     most = np.zeros(len(plain), dtype=int)  # evidence of the best other node
     for i, node in enumerate(nodes):
         if node.level >= num_levels and evidence[i] > 0:
-            around = moving[node.members]
-            rivals = np.array([evidence[number] if number >= 0 else 0 for number in around.tolist()])
-            wins = (evidence[i] > rivals) | changed_dissents(sweeps, tree, motions, i, around, z)
+            there = moving[node.members]
+            rivals = np.array([evidence[number] if number >= 0 else 0 for number in there.tolist()])
+            around = min((number for number in winner_of[node.members].tolist() if number >= 0), default=-1)
+            leaves = changed_dissents(sweeps, tree, motions, i, around, z) & (there == around)
+            wins = (evidence[i] > rivals) | leaves
             gained = node.members[wins & (evidence[i] > most[node.members])]
             most[gained] = evidence[i]
             name[gained] = i

@@ -150,7 +150,7 @@ def slow_start(
             if wanted:
                 images[0, 0, row + sign * side[0], col + sign * side[1]] = slices
     sweeps = from_images(images)
-    (start,) = find_slow(sweeps, number_objects(Groups(sweeps.pixels.window, 1)), torch.tensor([True]))
+    (start,) = find_slow(sweeps, number_objects(Groups(sweeps.pixels.window, 1)), torch.zeros((1, 2)).double(), None)
     return (start.flip(0) / sweeps.grid.pixel_size).tolist()
 
 
