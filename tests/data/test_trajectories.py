@@ -246,14 +246,16 @@ def test_a_plane_pose_and_a_pose_without_a_time(tmp_path) -> None:
     assert np.allclose(untimed.poses[1, :2, 0], (1 - 2 * 0.36, 2 * 0.6 * 0.8))
 
 
-def test_three_numbers_are_a_plane_pose_if_the_name_says_so(tmp_path) -> None:
-    for name in ("poses.txt", "odom.txt", "speeds.txt"):
-        (tmp_path / name).write_text("1 2 0.5\n3 4 0.6\n")
-    pose = poses_text.read_poses(tmp_path / "odom.txt").poses[1]
-    assert np.allclose(pose[:3, 3], (3, 4, 0)) and np.isclose(np.arctan2(pose[1, 0], pose[0, 0]), 0.6)
-    assert np.array_equal(poses_text.read_poses(tmp_path / "poses.txt").poses[1], pose)
-    with pytest.raises(CFlowError, match="3 numbers per line"):
-        poses_text.read_poses(tmp_path / "speeds.txt")
+def test_three_numbers_are_a_plane_pose_if_the_vehicle_drives_where_it_heads(tmp_path) -> None:
+    path = tmp_path / "gps.txt"
+    for unit in (1, 180 / np.pi):
+        path.write_text(f"1 2 {0.8 * unit}\n3 4 {0.9 * unit}\n3 4 {0.5 * unit}\n")
+        pose = poses_text.read_poses(path).poses[1]
+        assert np.allclose(pose[:3, 3], (3, 4, 0)) and np.isclose(np.arctan2(pose[1, 0], pose[0, 0]), 0.9)
+    for positions in ("1 2 0.0\n1 5 0.1\n", "3 2 1.7\n1 2 1.8\n", "1 2 0\n1 2 0\n"):
+        path.write_text(positions)
+        with pytest.raises(CFlowError, match="3 numbers per line"):
+            poses_text.read_poses(path)
 
 
 def test_places_on_the_globe_become_metres(tmp_path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from decimal import Decimal
 from pathlib import Path
 from typing import Mapping, Sequence
@@ -30,7 +29,7 @@ _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four ar
 STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz")
 """Suffixes of files whose values have names or nest, see `tables_of_values`."""
 _NAMES = "write all digits, and name the sweeps in the order of their times"
-_OF_POSES = "pose|traj|odom"  # in names of files whose lines of three numbers are x, y, yaw
+_LEAST_STEP = 0.1  # metres; shorter steps do not tell where the vehicle heads
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
 
 
@@ -42,11 +41,11 @@ def read_poses(path: PathLike) -> Trajectory:
             folder with a file per pose. A line of text has 12 numbers (KITTI: upper three rows of the matrix), 8 (TUM:
             time in seconds, tx ty tz, qx qy qz qw, the scalar LAST), 7 (without the time), 16 (the matrix by rows, or
             by columns), or 13 or 17 (a time before the matrix). 7 numbers without a quaternion are a time, x y z, roll
-            pitch yaw; 6 have no time. 3 numbers are x y yaw, if the name of the file says that
-            it has poses. Four lines may have a matrix, below a line of three numbers (Open3D). Of a g2o
-            graph, vertices are read. If a line before the numbers names the columns (timestamp, x, qw, ...), they may
-            have any order, and roll, pitch and yaw may replace the quaternion. Other columns, empty lines and lines
-            that begin with `#` are ignored. Times: `nanoseconds_of_numbers`.
+            pitch yaw; 6 have no time. 3 numbers are x y yaw, if the vehicle drives where it heads. Four lines may have
+            a matrix, below a line of three numbers (Open3D). Of a g2o graph, vertices are read. If a line before the
+            numbers names the columns (timestamp, x, qw, ...), they may have any order, and roll, pitch and yaw may
+            replace the quaternion. Other columns, empty lines and lines that begin with `#` are ignored. Times:
+            `nanoseconds_of_numbers`.
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
         angles are degrees if their name says so, or one is larger than 2 pi, else radians. A quaternion q0 to q3 has w
@@ -99,7 +98,7 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
     unnamed = _UNNAMED.get(words.shape[1], ())
     if words.shape[1] in (6, 7) and not names and not _end_in_quaternions(words):
         unnamed = _UNNAMED_ANGLES[7 - words.shape[1] :]
-    if words.shape[1] == 3 and not names and re.search(_OF_POSES, path.stem.lower()):
+    if words.shape[1] == 3 and not names and _end_in_headings(words):
         unnamed = ("x", "y", "yaw")
     if words.shape[1] in (16, 17) and not names:
         words = _by_rows(words)
@@ -134,6 +133,18 @@ def _are_homogeneous(rows: np.ndarray) -> bool:
 def _end_in_quaternions(words: np.ndarray) -> bool:
     norms = np.linalg.norm(words[:, -4:].astype(np.float64), axis=1)
     return bool(np.nanmedian(np.abs(norms - 1)) < 0.1)
+
+
+def _end_in_headings(words: np.ndarray) -> bool:
+    """Tell whether lines of three numbers are x, y, yaw: the vehicle drives where it heads. They may be x, y, z."""
+    x, y, yaw = words.astype(np.float64).T
+    if np.nanmax(np.abs(yaw), initial=0) > 2 * np.pi:
+        yaw = np.radians(yaw)
+    step = np.diff(x + 1j * y)
+    heading = np.exp(1j * yaw[:-1])
+    moved = np.abs(step) > _LEAST_STEP
+    ahead = (step * heading.conj()).real[moved]
+    return bool(moved.any() and np.median(ahead / np.abs(step[moved])) > 0.9)
 
 
 def _by_rows(words: np.ndarray) -> np.ndarray:
