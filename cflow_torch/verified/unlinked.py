@@ -154,8 +154,8 @@ class _Map:
     def contains(self, centre: Tensor) -> Tensor:
         """Tell which places, (2, ...), finest pixels, are in the region, a cell or more from its border, (...) bool."""
         cell = (centre / self._cell).floor_()
-        last = (self._height - 2 * _REACH - 2, self._width - 2 * _REACH - 2)
-        last = constant(last, cell.dtype, cell.device).view(2, *[1] * (cell.ndim - 1))
+        last_row_col = (self._height - 2 * _REACH - 2, self._width - 2 * _REACH - 2)
+        last = constant(last_row_col, cell.dtype, cell.device).view(2, *[1] * (cell.ndim - 1))
         return (cell == torch.minimum(cell.clamp(min=1), last)).all(0)
 
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:

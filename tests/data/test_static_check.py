@@ -364,6 +364,7 @@ def test_points_that_are_a_little_too_large_are_no_lidar_elsewhere(source, facto
     assert found and abs(float(found[1]) / factor - 1) < 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["drive", "real"])
 def test_points_and_poses_in_feet_are_told_by_the_height_of_the_sensor(source, request):
     good = request.getfixturevalue(source)
@@ -449,6 +450,7 @@ def test_jumps_of_the_poses_do_not_hide_other_mistakes(drive):
     assert any("data.read_as=inverted" in text for text in problems) and any("jump" in text for text in problems)
 
 
+@pytest.mark.slow
 def test_two_mistakes_are_named_with_one_setting(drive):
     """Points and poses in millimetres; an upside-down sensor that looks backward; a camera's axes."""
     down, back, camera = AXES["down"], AXES["back"], AXES[CAMERA]

@@ -137,14 +137,16 @@ def _end_in_quaternions(words: np.ndarray) -> bool:
 
 def _end_in_headings(words: np.ndarray) -> bool:
     """Tell whether lines of three numbers are x, y, yaw: the vehicle drives where it heads. They may be x, y, z."""
-    x, y, yaw = words.astype(np.float64).T
+    numbers = words.astype(np.float64)
+    way: np.ndarray = numbers[:, 0] + 1j * numbers[:, 1]
+    yaw: np.ndarray = numbers[:, 2]
     if np.nanmax(np.abs(yaw), initial=0) > 2 * np.pi:
         yaw = np.radians(yaw)
-    step = np.diff(x + 1j * y)
+    step = np.diff(way)
     heading = np.exp(1j * yaw[:-1])
-    moved = np.abs(step) > _LEAST_STEP
-    ahead = (step * heading.conj()).real[moved]
-    return bool(moved.any() and np.median(ahead / np.abs(step[moved])) > 0.9)
+    moved = np.flatnonzero(np.abs(step) > _LEAST_STEP)
+    ahead: np.ndarray = np.real(step[moved] * heading[moved].conj()) / np.abs(step[moved])
+    return len(moved) > 0 and bool(np.median(ahead) > 0.9)
 
 
 def _by_rows(words: np.ndarray) -> np.ndarray:
