@@ -119,23 +119,17 @@ def make_model(preset: str | Config = "default", device: Any = "auto", **setting
 
 def _leave_out_missing(window: Window) -> Window:
     """Leave out points that are no returns, and say so."""
-    kept = [without_missing(sweep) for sweep in (window.pc0, window.pc1, *window.pch, *window.pcf)]
+    kept = [without_missing(sweep) for sweep in window.sweeps]
     num_missing = max(count for _, count in kept)
     if num_missing == 0:
         return window
     warn(f"up to {num_missing} {MISSING}, so we leave them out")
-    return _window([sweep for sweep, _ in kept], len(window.pch))
-
-
-def _window(sweeps: Sequence[Sweep], num_history: int) -> Window:
-    """Make a window of sweeps in the order t, t+1, t-1, ..., t+2, ..."""
-    first_future = 2 + num_history
-    return Window(sweeps[0], sweeps[1], tuple(sweeps[2:first_future]), tuple(sweeps[first_future:]))
+    return window.with_sweeps(sweep for sweep, _ in kept)
 
 
 def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
     """Add the missing ground masks."""
-    sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
+    sweeps = list(window.sweeps)
     bare = [index for index, sweep in enumerate(sweeps) if sweep.is_ground is None]
     clouds = [sweeps[index].points for index in bare]
     if ground is None:
@@ -149,7 +143,7 @@ def _find_ground(window: Window, ground: str | None, device: Any) -> Window:
         )
     for index, mask in zip(bare, masks):
         sweeps[index] = replace(sweeps[index], is_ground=mask)
-    return _window(sweeps, len(window.pch))
+    return window.with_sweeps(sweeps)
 
 
 def _sweeps_of_arrays(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.types import Array, CFlowError, Sweep, Window, named_sweeps
+from cflow_torch.types import Array, CFlowError, Sweep, Window
 
 _ALL_ROWS = slice(None)
 # Largest time of a point, seconds from the instant of its sweep. Larger numbers have another unit.
@@ -28,7 +28,7 @@ def choose_device(windows: Sequence[Window], device: Any) -> torch.device:
             reason = str(error).splitlines()[0]
             raise CFlowError(f"device={device!r} cannot be used ({reason}): give 'auto', 'cpu' or 'cuda'") from None
     else:
-        sweeps = [sweep for window in windows for _, sweep in named_sweeps(window)]
+        sweeps = [sweep for window in windows for sweep in window.sweeps]
         arrays = [array for sweep in sweeps for array in (sweep.points, sweep.is_ground, sweep.point_times)]
         found = {array.device for array in arrays if isinstance(array, Tensor)}
         if len(found) > 1:

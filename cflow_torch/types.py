@@ -6,7 +6,7 @@ import zipfile
 from dataclasses import MISSING, dataclass, fields
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Mapping, NamedTuple, Sequence, Union
+from typing import Any, Iterable, Mapping, NamedTuple, Sequence, Union
 
 import numpy as np
 import torch
@@ -23,12 +23,18 @@ MOVING, MIN_MOVING = 0.05, 0.5
 VECTORS = {"flow": "flow", "residual": "residual_flow", "pose": "pose_flow"}
 # No sweep has more columns than this, so a wider array is a transposed one, (3, N) or (4, N).
 _MOST_COLUMNS = 64
+CENTRE, SIZE, VELOCITY = ("x", "y", "z"), ("length", "width", "height"), ("vx", "vy", "vz")  # columns of boxes
 _COLUMNS = {
     "id": "i8",
-    **dict.fromkeys(("x", "y", "z", "length", "width", "height", "vx", "vy", "vz", "heading"), "f8"),
+    **dict.fromkeys((*CENTRE, *SIZE, *VELOCITY, "heading"), "f8"),
     "num_points": "i8",
     **dict.fromkeys(("confidence", "moving"), "f8"),
 }
+
+
+def vectors(table: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
+    """Return columns of a table of boxes as vectors, (R, 3), such as `CENTRE`."""
+    return np.stack([table[name] for name in names], 1)
 
 
 class ObjectRow(np.void):
@@ -207,6 +213,16 @@ class Window:
         for name, sweep in named_sweeps(self):
             if not isinstance(sweep, Sweep):
                 raise CFlowError(f"{name} is {type(sweep).__name__}: give cflow_torch.Sweep(points, ...)")
+
+    @property
+    def sweeps(self) -> tuple[Sweep, ...]:
+        """The sweeps t and t+1, then those of pch, then those of pcf."""
+        return (self.pc0, self.pc1, *self.pch, *self.pcf)
+
+    def with_sweeps(self, sweeps: Iterable[Sweep]) -> Window:
+        """Replace all sweeps. They have the order of `Window.sweeps`."""
+        pc0, pc1, *others = sweeps
+        return Window(pc0, pc1, tuple(others[: len(self.pch)]), tuple(others[len(self.pch) :]))
 
     @classmethod
     def from_dict(cls, sample: Mapping[str, Any]) -> Window:

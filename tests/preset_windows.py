@@ -30,7 +30,7 @@ def windows_for(config: Config, number: int = 1) -> list[Window]:
 
 
 def changed(window: Window, change: Callable[[Sweep], Sweep]) -> Window:
-    return Window(*map(change, (window.pc0, window.pc1)), *(tuple(map(change, s)) for s in (window.pch, window.pcf)))
+    return window.with_sweeps(map(change, window.sweeps))
 
 
 def untimed(window: Window) -> Window:

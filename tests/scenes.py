@@ -115,14 +115,12 @@ def sweeps_of(windows: list[Window], settings: VerifiedConfig) -> HeightSlicedSw
 def reordered(window: Window, seed: int = 0) -> tuple[Window, np.ndarray]:
     """Points of every sweep in another order, and the order of those of pc0."""
     rng = np.random.default_rng(seed)
-    sweeps = [window.pc0, window.pc1, *window.pch, *window.pcf]
-    orders = [rng.permutation(len(sweep.points)) for sweep in sweeps]
+    orders = [rng.permutation(len(sweep.points)) for sweep in window.sweeps]
     mixed = []
-    for sweep, order in zip(sweeps, orders):
+    for sweep, order in zip(window.sweeps, orders):
         columns = {name: getattr(sweep, name) for name in ("points", "is_ground", "point_times")}
         mixed.append(replace(sweep, **{k: None if column is None else column[order] for k, column in columns.items()}))
-    first_future = 2 + len(window.pch)
-    return Window(mixed[0], mixed[1], tuple(mixed[2:first_future]), tuple(mixed[first_future:])), orders[0]
+    return window.with_sweeps(mixed), orders[0]
 
 
 def rows_of(result: FlowResult, rows: np.ndarray) -> FlowResult:

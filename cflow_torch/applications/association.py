@@ -43,10 +43,10 @@ def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> Mo
     seems to move, and the track would follow this piece. We recognise a piece by the box of the object: it holds more
     than half of the points of the group, and more static points than the group has points.
     """
-    moves = groups.group >= 0
     is_inside = box >= 0
-    num_static = torch.bincount(box[is_inside & ~moves], minlength=num_boxes)
-    group, box, _, count = unique_pairs(groups.group[is_inside & moves], box[is_inside & moves])
+    num_static = torch.bincount(box[is_inside & ~groups.moves], minlength=num_boxes)
+    moves_inside = is_inside & groups.moves
+    group, box, _, count = unique_pairs(groups.group[moves_inside], box[moves_inside])
     size = groups.count[group]
     is_piece = (count > size / 2) & (size < num_static[box])
     return groups.divide(torch.where(torch.isin(groups.group, group[is_piece]), -1, 0))
@@ -58,14 +58,13 @@ def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGrou
     An object of `num_points` points claims a group if its box holds at least half as many points of the group. If
     several objects claim a group, we give the points in their boxes to them, and the other points to the last of them.
     """
-    moves = groups.group >= 0
-    group, box, pair_of_point, count = unique_pairs(groups.group[moves], box[moves])
+    group, box, pair_of_point, count = unique_pairs(groups.group[groups.moves], box[groups.moves])
     claims = count >= _value_of_box(_MIN_CLAIM * num_points, box, torch.inf)
     piece = torch.where(claims, box + 1, 0)
     last = torch.zeros_like(groups.count).scatter_reduce(0, group, piece, "amax")
     is_divided = torch.bincount(group[claims], minlength=len(groups.count)) > 1
     piece = torch.where(is_divided[group], torch.where(claims, piece, last[group]), 0)
-    return groups.divide(torch.zeros_like(groups.group).masked_scatter(moves, piece[pair_of_point]))
+    return groups.divide(torch.zeros_like(groups.group).masked_scatter(groups.moves, piece[pair_of_point]))
 
 
 def _value_of_box(values: Tensor, box: Tensor, outside: float) -> Tensor:
@@ -75,13 +74,12 @@ def _value_of_box(values: Tensor, box: Tensor, outside: float) -> Tensor:
 
 def match(tracks: TrackStates, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> TrackMatches:
     """Match tracks with a sweep, given the predicted points (P, 3) of the tracks and the track of each point."""
-    moves = groups.group >= 0
-    track, group = link(points, track_of_point, groups.point[moves], groups.group[moves], _MIN_OVERLAP)
+    track, group = link(points, track_of_point, *groups.moving, _MIN_OVERLAP)
     may_have_stopped = tracks.is_confirmed.clone()
     may_have_stopped[track] = False
     candidate = may_have_stopped.nonzero()[:, 0]
     candidates = tracks.take(candidate)
-    box = box_of_point(groups.point[~moves], candidates.box, candidates.size + _MARGIN, candidates.heading)
+    box = box_of_point(groups.point[~groups.moves], candidates.box, candidates.size + _MARGIN, candidates.heading)
     count = torch.bincount(box[box >= 0], minlength=len(candidate))
     has_stopped = count >= (MIN_STOPPED_SHARE * candidates.num_points).clamp(min=MIN_POINTS)
     return TrackMatches(

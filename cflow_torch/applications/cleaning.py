@@ -18,7 +18,7 @@ from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.transforms import transform_points
-from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_array
+from cflow_torch.types import CENTRE, SIZE, CFlowError, FlowResult, Sweep, as_numpy, check_array, vectors
 
 _MARGIN = 0.2  # metres, added to the sides of the box around the visible part of an object
 _SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
@@ -183,9 +183,8 @@ class CleanLog(MaskedLog):
         x, y = pose_of(sweep)[:2, 3]
         is_near = np.hypot(start["x"] - x, start["y"] - y) < _MAX_DISTANCE
         waiting = {name: values[is_near & (start["sweep"] > index)] for name, values in start.items()}
-        centre = np.stack([waiting[name] for name in "xyz"], 1)
-        size = np.stack([waiting[name] for name in ("length", "width", "height")], 1)
-        return _inside(sweep, *map(torch.from_numpy, (centre, size, waiting["heading"])))
+        boxes = (vectors(waiting, CENTRE), vectors(waiting, SIZE), waiting["heading"])
+        return _inside(sweep, *map(torch.from_numpy, boxes))
 
 
 def _slow_starts(tracks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ from cflow_torch.applications.track_state import Times
 from cflow_torch.applications.track_table import Table
 from cflow_torch.applications.whole_boxes import KINDS, Sightings, whole_boxes
 from cflow_torch.transforms import transform_points
-from cflow_torch.types import FlowResult, Window, as_numpy
+from cflow_torch.types import CENTRE, SIZE, VELOCITY, FlowResult, Window, as_numpy, vectors
 
 
 class TrackedPoints(NamedTuple):
@@ -94,10 +94,10 @@ def complete(table: Table, seen: Sequence[TrackedPoints]) -> Table:
     deviation = boxes.motion.covariance[:, 1, 1].sqrt().numpy()[rank]
     return {
         **table,
-        **dict(zip("xyz", position.T)),
-        **dict(zip(("vx", "vy", "vz"), velocity.T)),
+        **dict(zip(CENTRE, position.T)),
+        **dict(zip(VELOCITY, velocity.T)),
         "velocity_std": deviation,
-        **dict(zip(("length", "width", "height"), size.T)),
+        **dict(zip(SIZE, size.T)),
         "heading": boxes.heading.numpy()[rank],
         "class": np.array(KINDS)[boxes.kind.numpy()[rank]],
         "age": seconds - begin[sightings.track.numpy()[rank]],
@@ -110,6 +110,7 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
     seconds = np.zeros(len(order))
     sensor = np.zeros((len(order), 3))
     floor = np.zeros(len(order))
+    centre = vectors(table, CENTRE)
     points = []
     velocities = []
     rows = []
@@ -124,7 +125,7 @@ def _sightings(table: Table, order: np.ndarray, rank: np.ndarray, seen: Sequence
         rows.append(row)
         seconds[rank[now]] = each.seconds
         sensor[rank[now]] = each.sensor
-        floor[rank[now]] = each.floor.below(np.stack([table[axis][now] for axis in "xyz"], 1))
+        floor[rank[now]] = each.floor.below(centre[now])
     row_of_point = np.concatenate(rows)
     moves = table["is_moving"][order]
     columns = (

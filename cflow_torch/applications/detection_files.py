@@ -12,6 +12,7 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
+from cflow_torch.types import CENTRE, SIZE, vectors
 
 DETECTIONS_FILE = "nuscenes_detection.json"
 TRACKING_FILE = "nuscenes_tracking.json"
@@ -44,7 +45,7 @@ def write_nuscenes(folder: PathLike, table: Table, log: Log) -> None:
     Source: results formats of the detection and the tracking task of nuScenes.
     """
     folder = as_path(folder)
-    tokens = sample_tokens(log)
+    tokens = log.sample_tokens
     score = score_of(table)
     detections: dict[str, list[Any]] = {token: [] for token in tokens if token is not None}
     trackings: dict[str, list[Any]] = {token: [] for token in tokens if token is not None}
@@ -63,19 +64,11 @@ def write_nuscenes(folder: PathLike, table: Table, log: Log) -> None:
     write_json(folder / TRACKING_FILE, {"meta": _MODALITIES, "results": trackings})
 
 
-def sample_tokens(log: Log) -> list[str | None]:
-    """Return the name of each sweep in the files of nuScenes; None = it is not a key frame, so it has no name."""
-    tokens = getattr(log, "sample_tokens", None)
-    if tokens is None:
-        return [f"{log.log_id}_{timestamp}" for timestamp in log.timestamps]
-    return list(tokens)
-
-
 def _nuscenes_box(table: Table, row: int, token: str) -> dict[str, Any]:
     half = table["heading"][row] / 2
     return {
         "sample_token": token,
-        "translation": [float(table[name][row]) for name in ("x", "y", "z")],
+        "translation": [float(table[name][row]) for name in CENTRE],
         "size": [float(table[name][row]) for name in ("width", "length", "height")],
         "rotation": [float(np.cos(half)), 0.0, 0.0, float(np.sin(half))],
         "velocity": [float(table[name][row]) for name in ("vx", "vy")],
@@ -92,8 +85,7 @@ def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
     """
     names = list(KITTI_NAMES)
     centre, heading = boxes_in_sweeps(table, log)
-    size = np.stack([table[name] for name in ("length", "width", "height")], 1)
-    box = np.concatenate([centre, size, heading[:, None]], 1).astype(np.float32)
+    box = np.concatenate([centre, vectors(table, SIZE), heading[:, None]], 1).astype(np.float32)
     score = score_of(table).astype(np.float32)
     label = np.array([1 + names.index(class_of(table, row)) for row in range(len(score))], np.int64)
     kitti_name = np.array([KITTI_NAMES[names[number - 1]] for number in label.tolist()], "<U10")

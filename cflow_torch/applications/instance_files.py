@@ -11,6 +11,7 @@ from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.transforms import upright_poses
+from cflow_torch.types import CENTRE, SIZE, vectors
 
 INSTANCES_FILE = "instances_info.json"
 FRAMES_FILE = "frame_instances.json"
@@ -48,8 +49,8 @@ def write_drivestudio(
     """
     folder = as_path(folder)
     ids, instance = np.unique(table["id"], return_inverse=True)
-    boxes = upright_poses(np.stack([table["heading"], table["x"], table["y"], table["z"]], 1))
-    sizes = np.stack([table["length"], table["width"], table["height"]], 1)
+    boxes = upright_poses(vectors(table, ("heading", *CENTRE)))
+    sizes = vectors(table, SIZE)
     infos: dict[str, Any] = {}
     for number, track_id in enumerate(ids.tolist()):
         rows = np.flatnonzero(instance == number)

@@ -11,6 +11,7 @@ from cflow_torch.data.atomic import write_text
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.transforms import transform_points
+from cflow_torch.types import SIZE, vectors
 
 _AHEAD = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _ANNOTATED_CAMERA = "image_02"
@@ -41,7 +42,7 @@ def write_kitti(path: PathLike, table: Table, log: Log) -> None:
 
     Source: development kit of the KITTI tracking benchmark (2012).
     """
-    size = np.stack([table[name] for name in ("length", "width", "height")], 1)
+    size = vectors(table, SIZE)
     boxes = _seen_by_camera(table, log, size)
     alpha = _wrapped(boxes.turn - np.arctan2(boxes.position[:, 0], boxes.position[:, 2]))
     columns = (alpha, boxes.rectangle, size[:, ::-1], boxes.position, boxes.turn, score_of(table))
@@ -57,14 +58,13 @@ def write_kitti(path: PathLike, table: Table, log: Log) -> None:
 def _seen_by_camera(table: Table, log: Log, size: np.ndarray) -> _Boxes:
     """Convert boxes of (R, 3) size to the frame of the camera."""
     centre, heading = boxes_in_sweeps(table, log)
-    T_camera0_lidar = getattr(log, "T_camera0_lidar", None)
-    T_camera_ego = _AHEAD if T_camera0_lidar is None else T_camera0_lidar
+    T_camera_ego = _AHEAD if log.T_camera0_lidar is None else log.T_camera0_lidar
     foot = centre - size * (0, 0, 0.5)
     ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))], 1) @ T_camera_ego[:3, :3].T
     turn = np.arctan2(-ahead[:, 2], ahead[:, 0])
     rectangle = np.full((len(centre), 4), -1.0)
     is_seen: Any = np.ones(len(centre), bool)
-    if T_camera0_lidar is not None:
+    if log.T_camera0_lidar is not None:
         rectangle = _rectangles(log, box_corners(centre, heading, size))
         is_seen = np.all(rectangle[:, 2:] > rectangle[:, :2], axis=1)
     return _Boxes(transform_points(foot, T_camera_ego), turn, rectangle, is_seen)

@@ -13,7 +13,7 @@ from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
-from cflow_torch.types import CFlowError, FlowResult, as_numpy
+from cflow_torch.types import SIZE, VELOCITY, CFlowError, FlowResult, as_numpy, vectors
 
 DYNAMIC, STATIC = 255, 0  # values of pixels
 _RADIUS = 0.15  # metres around a moving point
@@ -116,9 +116,8 @@ def _corners(log: Log, rows: Table) -> tuple[np.ndarray, np.ndarray]:
     if not len(rows["sweep"]):
         return np.zeros((0, 8, 3)), np.zeros((0, 3))
     centre, heading = boxes_in_sweeps(rows, log)
-    size = np.stack([rows[name] for name in ("length", "width", "height")], 1) + 2 * _MARGIN
-    velocity = np.stack([rows[name] for name in ("vx", "vy", "vz")], 1)
-    return box_corners(centre, heading, size), velocity @ pose_of(log.sweep(int(rows["sweep"][0])))[:3, :3]
+    corners = box_corners(centre, heading, vectors(rows, SIZE) + 2 * _MARGIN)
+    return corners, vectors(rows, VELOCITY) @ pose_of(log.sweep(int(rows["sweep"][0])))[:3, :3]
 
 
 _NEEDS_PILLOW = "masks need Pillow (extra viz): pip install Pillow"

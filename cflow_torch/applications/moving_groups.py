@@ -54,9 +54,19 @@ class MovingGroups:
         groups = cls(row, point, step, group, cluster[is_large], count[is_large], count)
         return replace(groups, confidence=groups.mean(confidence[row][:, None])[:, 0])
 
+    @property
+    def moves(self) -> Tensor:
+        """(M,) bool, points of moving groups."""
+        return self.group >= 0
+
+    @property
+    def moving(self) -> tuple[Tensor, Tensor]:
+        """Positions, (P, 3), and groups, (P,), of the points of moving groups."""
+        return self.point[self.moves], self.group[self.moves]
+
     def divide(self, piece: Tensor) -> MovingGroups:
         """Divide groups by the piece of each point, (M,) int64, -1 = now static. Pieces keep cluster and confidence."""
-        moves = (self.group >= 0) & (piece >= 0)
+        moves = self.moves & (piece >= 0)
         origin, _, index, count = unique_pairs(self.group[moves], piece[moves])
         group = torch.full_like(self.group, -1).masked_scatter(moves, index)
         confidence = self.confidence[origin]
@@ -64,9 +74,8 @@ class MovingGroups:
 
     def mean(self, values: Tensor) -> Tensor:
         """Return the (G, C) means of the (M, C) values of points over each group."""
-        moves = self.group >= 0
-        total = values.new_zeros(len(self.count), values.shape[1]).index_add_(0, self.group[moves], values[moves])
-        return total / self.count[:, None]
+        total = values.new_zeros(len(self.count), values.shape[1])
+        return total.index_add_(0, self.group[self.moves], values[self.moves]) / self.count[:, None]
 
 
 def pose_of(sweep: Sweep) -> np.ndarray:

@@ -14,6 +14,7 @@ from cflow_torch.applications.track_table import Table
 from cflow_torch.applications.whole_boxes import RUNNING, turned
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.nearest import nearest_set_pixel
+from cflow_torch.types import CENTRE
 
 _REACH = 3.0  # metres from the middle of the group; strays are farther
 _CELL = 0.15  # metres
@@ -52,7 +53,7 @@ def divide_people(sweeps: Sequence[SweepTracks], table: Table) -> bool:
 def _in_box(sweep: SweepTracks, table: Table, row: int) -> Tensor:
     """Return the points of a track along the axes of its box, (P, 3) metres from its centre."""
     position, _ = sweep.points.of_track(int(table["id"][row]))
-    offset = position - [table[axis][row] for axis in "xyz"]
+    offset = position - [table[axis][row] for axis in CENTRE]
     return turned(torch.from_numpy(offset), torch.full((len(offset),), -table["heading"][row], dtype=torch.float64))
 
 

@@ -15,11 +15,12 @@ from cflow_torch.data.file_errors import check_columns, file_errors
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.transforms import transform_each, transform_points, upright_poses
+from cflow_torch.types import CENTRE, SIZE, VELOCITY, vectors
 
 Table = Dict[str, np.ndarray]
 TRACKS_FILE = "tracks.parquet"  # next to the flow files of a log
 _INTEGERS = ("sweep", "timestamp_ns", "id", "num_moving", "cluster_id", "num_points")
-_FLOATS = ("x", "y", "z", "vx", "vy", "vz", "velocity_std", "length", "width", "height", "heading", "age", "confidence")
+_FLOATS = (*CENTRE, *VELOCITY, "velocity_std", *SIZE, "heading", "age", "confidence")
 COLUMNS = {
     **dict.fromkeys(_INTEGERS, np.int64),
     **dict.fromkeys(_FLOATS, np.float64),
@@ -98,10 +99,9 @@ def boxes_in_sweeps(table: Table, log: Log) -> tuple[np.ndarray, np.ndarray]:
     sweeps, row = np.unique(table["sweep"], return_inverse=True)
     poses = [np.linalg.inv(pose_of(log.sweep(sweep))) for sweep in sweeps.tolist()]
     T_ego_world = np.reshape(poses, (-1, 4, 4))[row]
-    centre = np.stack([table["x"], table["y"], table["z"]], 1)
     direction = np.stack([np.cos(table["heading"]), np.sin(table["heading"])], 1)
     ahead = np.einsum("nij,nj->ni", T_ego_world[:, :2, :2], direction)
-    return transform_each(centre, T_ego_world), np.arctan2(ahead[:, 1], ahead[:, 0])
+    return transform_each(vectors(table, CENTRE), T_ego_world), np.arctan2(ahead[:, 1], ahead[:, 0])
 
 
 def box_corners(centre: np.ndarray, heading: np.ndarray, size: np.ndarray) -> np.ndarray:

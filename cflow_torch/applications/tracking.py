@@ -22,7 +22,7 @@ from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, window, windows
 from cflow_torch.estimate import make_model
-from cflow_torch.types import CFlowError, FlowResult, Sweep, Window
+from cflow_torch.types import CENTRE, SIZE, VELOCITY, CFlowError, FlowResult, Sweep, Window
 
 _MAX_MISSED = 3  # sweeps that a track survives unseen
 _REST_NOISE = 0.1  # metres, standard deviation of the place of a stopped object
@@ -191,8 +191,7 @@ class Tracker:
         heading = torch.atan2(flow[:, 1], flow[:, 0])
         track_heading = torch.atan2(velocity[:, 1], velocity[:, 0])
         heading[matches.group] = torch.where(is_fast, track_heading, tracks.heading[matches.track])
-        moves = groups.group >= 0
-        box, size = enclosing_boxes(groups.point[moves], groups.group[moves], heading)
+        box, size = enclosing_boxes(*groups.moving, heading)
 
         is_new = torch.ones_like(groups.count, dtype=torch.bool)
         is_new[matches.group] = False
@@ -232,9 +231,8 @@ class Tracker:
     ) -> None:
         """Update the whole boxes of moving tracks by the visible edges and the mean velocity (G, 3) of their groups."""
         heading = tracks.heading[track_of_group]
-        moves = groups.group >= 0
         height = torch.from_numpy(self.floor.below(tracks.box[track_of_group].cpu().numpy())).to(heading.device)
-        edges = Edges.of(groups.point[moves], groups.group[moves], sensor.expand_as(velocity), heading, height)
+        edges = Edges.of(*groups.moving, sensor.expand_as(velocity), heading, height)
         kind, whole = self._whole_sizes(tracks, track_of_group, edges, velocity)
         centre, deviation = edges.anchor(whole, kind)
         measured = torch.stack([turned(centre, heading), velocity], 1)
@@ -262,10 +260,10 @@ class Tracker:
             "sweep": np.full(len(rows.id), self._num_sweeps),
             "timestamp_ns": np.full(len(rows.id), self._num_sweeps if stamp is None else stamp),
             "id": rows.id,
-            **dict(zip("xyz", rows.state[:, 0].T)),
-            **dict(zip(("vx", "vy", "vz"), rows.state[:, 1].T)),
+            **dict(zip(CENTRE, rows.state[:, 0].T)),
+            **dict(zip(VELOCITY, rows.state[:, 1].T)),
             "velocity_std": np.sqrt(rows.covariance[:, 1, 1]),
-            **dict(zip(("length", "width", "height"), rows.whole.T)),
+            **dict(zip(SIZE, rows.whole.T)),
             "heading": rows.heading,
             "class": np.array(KINDS)[rows.kind],
             "age": now - rows.begin,
@@ -280,10 +278,9 @@ class Tracker:
 
 def _track_of_point(groups: MovingGroups, matches: TrackMatches, track_of_group: Tensor) -> Tensor:
     """Return the track of each point that moves or lies in the box of a stopped object, (P,) int64; -1 = none."""
-    moves = groups.group >= 0
     track = torch.full_like(groups.group, -1)
-    track[moves] = track_of_group[groups.group[moves]]
-    track[~moves] = matches.track_of_static
+    track[groups.moves] = track_of_group[groups.group[groups.moves]]
+    track[~groups.moves] = matches.track_of_static
     return track
 
 
@@ -298,7 +295,7 @@ def _seen_points(groups: MovingGroups, track_of_point: Tensor, step: Tensor) -> 
     """Move moving points by their own flow, and all others by the steps of their tracks, (K, 3) metres."""
     has_track = track_of_point >= 0
     track = track_of_point[has_track]
-    moves = groups.group[has_track, None] >= 0
+    moves = groups.moves[has_track, None]
     return _TrackPoints(groups.point[has_track] + torch.where(moves, groups.step[has_track], step[track]), track)
 
 

@@ -60,7 +60,7 @@ def measure(
             of_batch([windows[i % len(windows)] for i in range(size)])
         median = of_batch.report()["median"]
         throughput[size] = {"median": median, "windows_per_s": size / median}
-    sweeps = [sweep for each in windows for sweep in (each.pc0, each.pc1, *each.pch, *each.pcf)]
+    sweeps = [sweep for each in windows for sweep in each.sweeps]
     return {
         "points": sum(len(sweep.points) for sweep in sweeps) / len(sweeps),
         "windows": len(windows),

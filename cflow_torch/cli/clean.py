@@ -13,9 +13,9 @@ from cflow_torch.applications.clean_files import own_suffix, stored_masks, write
 from cflow_torch.applications.cleaning import CleanLog, MaskedLog, static_map_with_intensity
 from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
-from cflow_torch.cli.flows import method_of_flow, stored_flow
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import local_folder, settings_record, versions, write_config
+from cflow_torch.cli.stored_flow import method_of_flow, stored_flow
 from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud

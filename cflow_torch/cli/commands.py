@@ -108,7 +108,7 @@ class Ray(Engine):
 ENGINES: dict[str, type[Engine]] = {"local": Local, "ray": Ray}
 
 
-class Words:
+class WordCommand:
     """A command that takes words instead of settings."""
 
     SUMMARY: ClassVar[str]
@@ -560,7 +560,7 @@ class Bench(Command):
     )
 
 
-class ListSettings(Words):
+class ListSettings(WordCommand):
     """Prints all settings as a Markdown page: of the methods, then of the commands, data sets and other groups.
 
     With names, it prints only these: a setting, a preset, a command, a group or one of its choices.
@@ -576,7 +576,7 @@ class ListSettings(Words):
     SUMMARY: ClassVar[str] = "list all settings with defaults and explanations"
 
 
-class Info(Words):
+class Info(WordCommand):
     """Prints the versions of cflow_torch and of the packages that it uses, the system, the processor and the GPUs.
 
     The last line names the optional packages that are not installed. If the bug is one of a GPU, please add the output
@@ -591,7 +591,7 @@ class Info(Words):
 
 
 # In the order of the help. The key is also the module of the command.
-COMMANDS: dict[str, type[Command] | type[Words]] = {
+COMMANDS: dict[str, type[Command] | type[WordCommand]] = {
     "demo": Demo,
     "check": Check,
     "flow": Flow,

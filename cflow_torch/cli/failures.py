@@ -35,17 +35,19 @@ def collect_failures(failures: Failures, name: str) -> Iterator[None]:
 
 
 def finish(failures: Failures) -> None:
-    """Print the failures, and exit with status 1 if there are any.
-
-    A job of a parameter sweep raises `UnfinishedJob`, so that Hydra runs the other jobs before it exits with status 1.
-    """
+    """Print the failures, and end the command unfinished if there are any."""
     if failures:
         print(f"{len(failures)} failed:", file=sys.stderr)
         for frame, message in failures:
             print(f"  {frame}: {message}", file=sys.stderr)
-        if is_sweep():
-            raise UnfinishedJob(f"{len(failures)} failed in a job, listed above")
-        raise SystemExit(1)
+        end_unfinished(f"{len(failures)} failed in a job, listed above")
+
+
+def end_unfinished(message: str, status: int = 1) -> None:
+    """Exit with a status. A job of a parameter sweep raises `UnfinishedJob`, so Hydra first runs the other jobs."""
+    if is_sweep():
+        raise UnfinishedJob(message)
+    raise SystemExit(status)
 
 
 def exit_wrong(message: object) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 from tqdm import tqdm
@@ -12,16 +11,25 @@ from tqdm import tqdm
 from cflow_torch.applications.labels import find_labels
 from cflow_torch.cli.commands import Label
 from cflow_torch.cli.failures import Failures, collect_failures
-from cflow_torch.cli.flow import FlowRun, compute
+from cflow_torch.cli.flow_run import FlowRun
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
 from cflow_torch.data.json_file import write_json
-from cflow_torch.data.paths import as_path
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.machine import choose_layout
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.types import CFlowError
+
+
+def task(cfg: Label) -> None:
+    run = FlowRun(cfg, _contents(cfg))
+    if cfg.dry_run:
+        print(run.forecast())
+        return
+    _check(cfg, run)
+    report = run.compute()
+    run.finish(report, [] if report["stopped_by"] else _label(cfg, run, report))
 
 
 def _contents(cfg: Label) -> tuple[str, ...]:
@@ -34,44 +42,41 @@ def _contents(cfg: Label) -> tuple[str, ...]:
     return "residual", "cluster_id", "confidence"
 
 
-def _check(cfg: Label, flow: FlowRun) -> None:
-    for scene in flow.logs.sources:
+def _check(cfg: Label, run: FlowRun) -> None:
+    for scene in run.logs.sources:
         check_writable(scene)
         maker = None
         with suppress(CFlowError):  # a scene that cannot be read is reported later
             maker = labelled_by(scene)
-        if maker not in (None, flow.job.identity["hash"]) and not cfg.overwrite:
+        if maker not in (None, run.job.identity["hash"]) and not cfg.overwrite:
             why = "labels of other settings or of another program"
             raise CFlowError(f"{scene} has {why}: give overwrite=true, or label a copy")
 
 
-def _label(cfg: Label, flow: FlowRun, report: dict[str, Any]) -> Failures:
+def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
     """Label the scenes of a shard whose flow is complete. If one cannot be written, it stays as it was."""
     failures: Failures = []
     labelled: list[str] = []
     waiting: list[str] = []
     model = make_model(cfg.model, cfg.device)
     workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
-    scenes = [part.source for part in flow.parts]
+    scenes = [part.source for part in run.parts]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
-        folder = as_path(flow.job.output) / scene.stem
+        folder = run.output / scene.stem
         with collect_failures(failures, scene.stem):
-            if labelled_by(scene) == flow.job.identity["hash"] and not flow.job.redo:
+            if labelled_by(scene) == run.job.identity["hash"] and not run.job.redo:
                 continue
-            log = flow.logs.open(scene)
+            log = run.logs.open(scene)
             stamps = log.timestamps[:-1]
             if not set(stamps) <= complete_frames(folder):
                 waiting.append(scene.name)  # failed frames are in the report; others belong to another shard
                 continue
             flows = (read_flow(frame_file(folder, stamp)) for stamp in stamps)
             labels = find_labels(log, flows, model, workers)
-            write_hdf5_labels(scene, labels, flow.job.identity["hash"], overwrite=flow.job.redo)
+            write_hdf5_labels(scene, labels, run.job.identity["hash"], overwrite=run.job.redo)
             labelled.append(scene.name)
     print(f"scenes labelled: {len(labelled)}, scenes without complete flow yet: {len(waiting)}")
-    file = scenes[0].parent / f"cflow_label-{flow.shard.index}-of-{flow.shard.count}.json"
+    file = scenes[0].parent / f"cflow_label-{run.shard.index}-of-{run.shard.count}.json"
     write_json(file, {**report, "labelled": labelled, "waiting": waiting, "not_labelled": failures})
     print(f"report: {file}")
     return failures
-
-
-task = partial(compute, contents=_contents, check=_check, use=_label)

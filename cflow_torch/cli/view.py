@@ -12,9 +12,9 @@ from cflow_torch.applications.track_table import TRACKS_FILE, Table, read_tracks
 from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.cli.commands import View
 from cflow_torch.cli.failures import Failures, collect_failures, finish
-from cflow_torch.cli.flows import method_of_flow, stored_flow
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import chosen_preset, local_folder, write_config
+from cflow_torch.cli.stored_flow import method_of_flow, stored_flow
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.paths import as_path

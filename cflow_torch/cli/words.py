@@ -30,7 +30,7 @@ _SYNTAX = re.compile(
 )
 
 
-class Words(NamedTuple):
+class Call(NamedTuple):
     """The words of a call. A word without "=" is a path."""
 
     settings: list[str]
@@ -56,9 +56,9 @@ def read_call(words: list[str], command: str) -> tuple[list[str], list[str]]:
     return hydra_overrides(kind, call), call.options
 
 
-def split(words: list[str]) -> Words:
+def split(words: list[str]) -> Call:
     """Split the words of a call. Hydra accepts no option, such as `-m`, between two settings."""
-    call = Words([], [], [])
+    call = Call([], [], [])
     for before, word in zip(["", *words], words):
         if word.startswith("-") or before in _WITH_VALUE:
             call.options.append(word)
@@ -162,7 +162,7 @@ def _is_for_hydra(key: str) -> bool:
     return key.startswith(("+", "~", "hydra")) or "@" in key
 
 
-def hydra_overrides(command: type[Command], call: Words) -> list[str]:
+def hydra_overrides(command: type[Command], call: Call) -> list[str]:
     """Return the settings of a call as Hydra reads them: text in quotes where needed, paths as data.root."""
     texts = set(_PATHS)
     for name, owners in known_settings(command).items():

@@ -159,6 +159,16 @@ class Log(ABC):
         self._timestamp(index)
         return ()
 
+    @property
+    def T_camera0_lidar(self) -> np.ndarray | None:
+        """(4, 4) float64, from the LiDAR to KITTI's rectified camera 0; None = the log has no such camera."""
+        return None
+
+    @cached_property
+    def sample_tokens(self) -> Sequence[str | None]:
+        """Names of the sweeps in files of nuScenes; None = the sweep of a scene of nuScenes is not a key frame."""
+        return [f"{self.log_id}_{timestamp}" for timestamp in self.timestamps]
+
     def windows(self, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
         """Iterate over the windows of all pairs, in order; each sweep is read once. See `window`."""
         return windows(self, num_history, num_future)
@@ -373,7 +383,8 @@ class _OfLog:
 
 for _name in (
     *("labels", "columns", "cameras", "poses", "trajectory", "readings", "surrounds_poses", "judgement", "findings"),
-    *("eval_mask", "stored_motion", "moving", "units", "boxes", "notes", "_note", "close", "unwrapped"),
+    *("eval_mask", "stored_motion", "moving", "units", "boxes", "T_camera0_lidar", "sample_tokens"),
+    *("notes", "_note", "close", "unwrapped"),
 ):
     setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has
 

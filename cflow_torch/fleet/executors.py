@@ -15,16 +15,12 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.stop_signal import SIGNALS
 
 
-class CannotStart(CFlowError):
-    """The object of an executor could not be made, so no call can succeed."""
-
-
 class Executor(ABC):
     """Holds one object. A call makes it if there is none yet, or if it was lost."""
 
     @abstractmethod
     def call(self, method: str, *arguments: Any) -> Any:
-        """Call a method of the object. `BrokenExecutor` if the object is lost, `CannotStart` if it cannot be made."""
+        """Call a method of the object. `BrokenExecutor` if the object is lost, `CFlowError` if it cannot be made."""
 
     @abstractmethod
     def close(self) -> None:
@@ -43,7 +39,7 @@ class InlineExecutor(Executor):
             try:
                 self._held = self._make()
             except Exception as error:
-                raise CannotStart(describe_error(error)) from error
+                raise CFlowError(describe_error(error)) from error
         try:
             return getattr(self._held, method)(*arguments)
         except BrokenExecutor:

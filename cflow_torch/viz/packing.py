@@ -11,7 +11,7 @@ from typing import Any, Mapping, Sequence
 
 import numpy as np
 
-from cflow_torch.types import MIN_MOVING, CFlowError
+from cflow_torch.types import MIN_MOVING, SIZE, CFlowError, vectors
 from cflow_torch.viz.clusters import PALETTE, cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, MAX_ERROR, MIN_ERROR, has_flow
 from cflow_torch.viz.scene import ViewedPair, ViewerFrame
@@ -127,7 +127,7 @@ class PackedDrive:
             columns = {
                 "id": rows["id"].tolist(),
                 "centre": _rounded(centre),
-                "size": _rounded(np.stack([rows[name] for name in ("length", "width", "height")], 1)),
+                "size": _rounded(vectors(rows, SIZE)),
                 "heading": np.round(heading, 3).tolist(),
                 "speed": np.round(np.hypot(rows["vx"], rows["vy"]), 1).tolist(),
                 "points": rows["num_points"].tolist(),

@@ -12,7 +12,7 @@ import numpy as np
 from cflow_torch.data.atomic import atomic_name
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
-from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
+from cflow_torch.types import SIZE, CFlowError, FlowResult, Sweep, as_numpy, vectors
 from cflow_torch.viz.clusters import cluster_colors
 from cflow_torch.viz.panel import ARROW_STEPS, EGO_OUTLINE, has_flow
 from cflow_torch.viz.scene import MAX_FLOW, ViewedPair, ViewerFrame
@@ -152,7 +152,7 @@ class _Drive:
         rotation[:, 2], rotation[:, 3] = np.sin(heading / 2), np.cos(heading / 2)
         boxes = self.rr.Boxes3D(
             centers=centre,
-            half_sizes=np.stack([rows[name] for name in ("length", "width", "height")], 1) / 2,
+            half_sizes=vectors(rows, SIZE) / 2,
             quaternions=rotation,
             colors=cluster_colors(centre, rows["id"], _NO_CLUSTER),
             labels=[f"{n}: {np.hypot(x, y):.1f} m/s" for n, x, y in zip(rows["id"], rows["vx"], rows["vy"])],

@@ -8,7 +8,7 @@ from typing import Any, Mapping
 import numpy as np
 
 from cflow_torch.data.log import FlowLabels
-from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy
+from cflow_torch.types import CENTRE, CFlowError, FlowResult, Sweep, as_numpy, vectors
 from cflow_torch.viz.panel import MIN_ARROW_POINTS, group_medians
 from cflow_torch.viz.style import SWEEP_RATE
 
@@ -90,5 +90,5 @@ class ViewerFrame:
     def boxes(self, tracks: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Return centres (K, 3), metres, and headings (K,), radians, of rows of a table of `cflow_torch.track`."""
         T_viewer_world = np.eye(4) if self.T_world_viewer is None else np.linalg.inv(self.T_world_viewer)
-        centre = np.stack([tracks[axis] for axis in "xyz"], 1) @ T_viewer_world[:3, :3].T + T_viewer_world[:3, 3]
+        centre = vectors(tracks, CENTRE) @ T_viewer_world[:3, :3].T + T_viewer_world[:3, 3]
         return centre, tracks["heading"] + np.arctan2(T_viewer_world[1, 0], T_viewer_world[0, 0])

@@ -105,7 +105,7 @@ def split_windows(
         max_memory = _BYTES_ON_CPU
     used = 0
     for window in windows:
-        sweeps = (window.pc1, window.pc0, *window.pch, *window.pcf)
+        sweeps = window.sweeps
         points = sum(sweep.points.shape[0] for sweep in sweeps)
         needed = bytes_per_point * points + (_BYTES_PER_PIXEL * len(sweeps) + 30) * grid.height * grid.width
         require_memory(

@@ -116,7 +116,7 @@ def source_sweeps(window: Window, config: Config) -> list[SourceSweep]:
             f"the window has {len(window.pcf)} future sweeps but num_future={config.num_future}: raise num_future, or "
             "pass fewer sweeps"
         )
-    has_pose = [sweep.pose is not None for _, sweep in named_sweeps(window)]
+    has_pose = [sweep.pose is not None for sweep in window.sweeps]
     if any(has_pose) and not all(has_pose):
         raise CFlowError(
             "some sweeps of the window have a pose and some do not: give the pose of every sweep, or of none "
@@ -146,7 +146,7 @@ def elapsed_times(window: Window, sources: Sequence[SourceSweep], config: Config
 
     We take the time from the time stamps if all sweeps have one, otherwise from `sweep_interval`.
     """
-    if any(sweep.timestamp_ns is None for _, sweep in named_sweeps(window)):
+    if any(sweep.timestamp_ns is None for sweep in window.sweeps):
         return [(float(source.intervals), source.intervals * config.sweep_interval) for source in sources]
     newest = _nanoseconds(window.pc1, "pc1")
     gaps = [newest - _nanoseconds(source.sweep, source.name) for source in sources]

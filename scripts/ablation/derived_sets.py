@@ -137,7 +137,7 @@ def with_noisy_poses(given: Window, seed: int) -> Window:
         error[:2, 3] = rng.normal(0, 0.02, 2)
         return replace(sweep, pose=sweep.pose @ error)
 
-    return Window(noisy(given.pc0), noisy(given.pc1), tuple(noisy(sweep) for sweep in given.pch))
+    return given.with_sweeps(map(noisy, given.sweeps))
 
 
 def with_refined_poses(given: Window) -> Window:

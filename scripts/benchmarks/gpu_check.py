@@ -111,7 +111,7 @@ def on_device(sweeps: Window, device: str) -> Window:
         points, is_ground = (torch.from_numpy(values).to(device) for values in (sweep.points, sweep.is_ground))
         return replace(sweep, points=points, is_ground=is_ground)
 
-    return Window(uploaded(sweeps.pc0), uploaded(sweeps.pc1), tuple(map(uploaded, sweeps.pch)))
+    return sweeps.with_sweeps(map(uploaded, sweeps.sweeps))
 
 
 def count_launches(device: str) -> Rows:

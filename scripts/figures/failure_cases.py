@@ -24,7 +24,7 @@ import numpy as np
 from drives import PAIR, Staged, body_of
 from PIL import Image
 
-from cflow_torch import Sweep, Window, make_config, make_model
+from cflow_torch import Sweep, make_config, make_model
 from cflow_torch.data.log import window
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.ground import find_ground
@@ -66,8 +66,7 @@ def by(
     def attempt(staged: Staged) -> Attempt:
         config, drive = make_config(preset, **overrides), staged.drive
         given = window(drive, PAIR, config.num_history, config.num_future)
-        past, future = (tuple(map(change, sweeps)) for sweeps in (given.pch, given.pcf))
-        (result,) = make_model(config)([Window(change(given.pc0), change(given.pc1), past, future)])
+        (result,) = make_model(config)([given.with_sweeps(map(change, given.sweeps))])
         is_scored = np.isin(body_of(drive), list(staged.bodies))
         residual, truth = (residual_of(flow, drive) for flow in (result.flow.numpy(), drive.labels(PAIR).flow))
         error = np.linalg.norm(residual - truth, axis=1)[is_scored].mean()

@@ -22,7 +22,7 @@ from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import LogWrapper
 from cflow_torch.fleet import parallel, work
-from cflow_torch.fleet.executors import CannotStart, Executor, InlineExecutor, ProcessExecutor
+from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
 from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.parallel import run_parallel
@@ -297,7 +297,7 @@ def test_a_process_passes_answers_and_errors():
     with pytest.raises(BrokenExecutor, match="closed"):
         executor.call("pop")
     executor = ProcessExecutor(partial(eval, "1 / 0"))
-    with pytest.raises(CannotStart, match="ZeroDivisionError"):
+    with pytest.raises(CFlowError, match="ZeroDivisionError"):
         executor.call("pop")
     executor.close()
 

@@ -18,7 +18,7 @@ from small_logs import make_small_drive
 from cflow_torch import CFlowError
 from cflow_torch.cli import plot as plot_command
 from cflow_torch.cli import view as view_command
-from cflow_torch.cli.flows import method_of_flow
+from cflow_torch.cli.stored_flow import method_of_flow
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import window
 from cflow_torch.fleet.changes import nearest_preset

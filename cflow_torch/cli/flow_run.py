@@ -1,0 +1,124 @@
+"""A run of a command that writes flow files, `cflow flow` or `cflow label`: its logs, its report, its exit status."""
+
+from __future__ import annotations
+
+import os
+import sys
+from contextlib import suppress
+from dataclasses import asdict
+from time import perf_counter
+from typing import Any, Callable, Iterator, Sequence
+
+from cflow_torch.cli.commands import FlowFiles
+from cflow_torch.cli.failures import Failures, end_unfinished
+from cflow_torch.cli.logs import find_logs
+from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config
+from cflow_torch.data.atomic import ensure_writable
+from cflow_torch.data.catalog import source_name
+from cflow_torch.data.json_file import write_json
+from cflow_torch.data.log import Log
+from cflow_torch.fleet.job import Job, Part, find_shard
+from cflow_torch.fleet.machine import Layout, choose_layout, frames_per_worker
+from cflow_torch.fleet.manifest import check_logs, clear_log, make_identity
+from cflow_torch.fleet.parallel import local_executors
+from cflow_torch.fleet.ray_engine import ray_executors
+from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
+from cflow_torch.fleet.work import open_quickly
+from cflow_torch.setting import AUTO
+
+_ENGINES: dict[str, Callable[..., Any]] = {"local": local_executors, "ray": ray_executors}
+
+
+class FlowRun:
+    """The logs, the job and this process's share of a run.
+
+    Args:
+        cfg: settings of the command.
+        contents: the columns of a flow file.
+    """
+
+    def __init__(self, cfg: FlowFiles, contents: Sequence[str]) -> None:
+        self._cfg = cfg
+        self._layout = choose_layout(cfg.device, cfg.engine.workers, cfg.engine.batch, os.environ)
+        self.logs = find_logs(cfg.data)
+        self.output = output_folder(cfg)
+        self.job = Job(
+            config=cfg.model,
+            identity=make_identity(cfg.model, self.logs.name, self.logs.settings, contents),
+            reader=self.logs.name,
+            settings=dict(self.logs.settings),
+            output=str(self.output),
+            contents=tuple(contents),
+            batch=self._layout.batch,
+            redo=cfg.overwrite,
+        )
+        self.shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
+
+    @property
+    def parts(self) -> list[Part]:
+        """The logs of this shard, or the parts of them that are its own."""
+        return self.shard.parts(self.logs.sources)
+
+    def open_logs(self) -> Iterator[Log]:
+        """Open the logs of this shard one by one, without what takes time."""
+        for part in self.parts:
+            with suppress(Exception), open_quickly(self.job, part.source) as log:  # the worker reports the error
+                yield log
+
+    def forecast(self) -> str:
+        """Count the frames that `compute` would compute, and write nothing."""
+        self._check_output()
+        return forecast(self.job, self.parts)
+
+    def compute(self) -> dict[str, Any]:
+        """Write the flow files of this shard, and return the report of `run_fleet`."""
+        ensure_writable(self.output)
+        self._check_output()
+        if self._cfg.overwrite and self.shard.count == 1:
+            for log in self.open_logs():
+                clear_log(self.output / log.log_id)
+        write_config(self._cfg, self.output)
+        layout = self._useful_workers()
+        settings = asdict(self._cfg.engine)
+        name = settings.pop("name")
+        own = {key: value for key, value in settings.items() if key not in ("workers", "batch")}
+        self._begin = perf_counter()
+        with _ENGINES[name](self.job, layout, **own) as executors:
+            parts = self.shard.parts(self.logs.sources, len(layout.devices))
+            about = {"config": settings_record(self._cfg), "versions": versions()}
+            return run_fleet(executors, parts, layout, self.shard, self.job.output, name, about)
+
+    def finish(self, report: dict[str, Any], failures: Failures) -> None:
+        """Print the report and what is missing, and exit with the status of the run unless it is complete.
+
+        `failures` is what failed when the flow was used, after `compute`.
+        """
+        file = report_file(self.job.output, self.shard)
+        if not report["stopped_by"]:  # a signal leaves no time for this
+            report["seconds"] = perf_counter() - self._begin
+            with suppress(OSError):  # the run has reported it
+                write_json(file, report)
+        print(f"{format_report(report)}\nflow files in {self.job.output}, report in {file}")
+        status = report["exit_status"] or int(bool(failures))
+        if status:
+            missing = format_missing(report) + "".join(f"\n  {name}: {message}" for name, message in failures)
+            print(f"missing:\n{missing}", file=sys.stderr)
+            end_unfinished(f"some frames are missing: see {file}", status)
+
+    def _check_output(self) -> None:
+        """Make sure that the results may be added to the output."""
+        names = [source_name(part.source) for part in self.parts]
+        check_logs(self.output, names, self.job.identity, self._cfg.overwrite, self.shard.count == 1)
+
+    def _useful_workers(self) -> Layout:
+        """Leave out workers that would not save time, because few frames are left to do."""
+        layout, engine = self._layout, self._cfg.engine
+        if engine.name != "local" or engine.workers != AUTO or layout.devices[0] != "cpu":
+            return layout
+        least = frames_per_worker(self._cfg.model)
+        count = 0
+        for _, _, todo in count_frames(self.job, self.parts):  # opens a log after the other
+            count += todo
+            if count >= least * len(layout.devices):
+                break
+        return layout._replace(devices=layout.devices[: max(1, count // least)])
