@@ -5,8 +5,6 @@ STAMP=test EXTRAS=dev,ray,rerun,video
 . "$(dirname "${BASH_SOURCE[0]}")/install.sh"
 cd "$ROOT"
 if [ $# -eq 0 ]; then
-  # One thread each, because threads of several processes on the same cores mostly wait for each other.
-  export OMP_NUM_THREADS="${OMP_NUM_THREADS:-1}"
   # Files in the order of their names: by their number of tests, the notebooks would come last and keep one core waiting.
   set -- -m "not slow" --dist loadfile --no-loadscope-reorder -n "$("$PYTHON" -c 'import os; print(min(4, os.cpu_count() or 1))')"
 fi

@@ -25,6 +25,8 @@ if sys.dont_write_bytecode:
     os.environ.update(PYTHONDONTWRITEBYTECODE="", PYTHONPYCACHEPREFIX=sys.pycache_prefix)
 
 
+# Threads of torch mostly wait for each other where several processes share the cores: tests, and what they start.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.fsync = lambda _: None  # files of tests need not outlive a power cut
 
 

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch import make_config
-from cflow_torch.cli.choices import FOLDER, choices, help_of, names_in, read_settings
+from cflow_torch.cli.choices import FOLDER, choices, help_of, read_settings
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
 from cflow_torch.cli.main import HELP
 from cflow_torch.cli.words import hydra_overrides, read_call, split
@@ -52,11 +52,6 @@ def test_examples_use_existing_settings_and_choices():
             call = split([word for word in words if word != "..."])
             read_call([*call.settings, *call.options], command)
             OverridesParser.create().parse_overrides(hydra_overrides(WITH_SETTINGS[command], call))
-
-
-def test_names_of_data_settings_are_those_in_yaml():
-    for file in FOLDER.glob("data/*.yaml"):
-        assert set(names_in(file)) == set(read_settings(file)), file
 
 
 @pytest.mark.parametrize(

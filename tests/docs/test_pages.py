@@ -186,7 +186,7 @@ SOURCES = [path for name in ("cflow_torch", "configs", "scripts", "tests") for p
 # Words of other programs and placeholders that our files do not contain.
 OF_OTHERS = {
     *("TOPIC", "NEW", "aws", "gcloud", "anon", "FSSPEC_S3", "analytics", "load_frame_list", "relative_to_idx"),
-    *("res_name", "run_cflow", "test_pl", "_calib", "counterclockwise_", "submitit_slurm"),
+    *("res_name", "run_cflow", "test_pl", "_calib", "counterclockwise_", "submitit_slurm", "export"),
 }
 
 

@@ -180,7 +180,7 @@ def drive_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     drive, model = make_small_drive(num_sweeps=4), make_model(make_config(num_history=2))
     results = [(i, model([window(drive, i, model.config.num_history)])[0]) for i in range(3)]
     table, path = track(drive, results), tmp_path_factory.mktemp("drive") / "drive.html"
-    save_page(drive, results, path, tracks=lambda: table, preset="default")
+    save_page(drive, results, path, tracks=lambda: table, preset="default", voxel=0.4)
     assert path.stat().st_size < 3e6
     return path
 
@@ -323,7 +323,23 @@ def test_an_object_that_is_clicked_is_described_and_followed(browser: Any, drive
     context.close()
 
 
-def test_a_phone_shows_all_controls(browser: Any, drive_page: Path) -> None:
+# Number of labels that a panel covers in part.
+NUM_CUT = """[...document.querySelectorAll("#labels span:not([hidden])")].map(e => e.getBoundingClientRect()).filter(
+  a => ["head", "objects", "side", "time"].map(id => document.getElementById(id).getBoundingClientRect()).some(
+    b => a.right > b.left && a.left < b.right && a.bottom > b.top && a.top < b.bottom)).length"""
+
+
+# What is drawn at the middle of the label of the chosen object.
+COVER = """(() => {
+  const {x, y, width, height} = document.querySelector("#labels .chosen:not([hidden])").getBoundingClientRect();
+  return document.elementFromPoint(x + width / 2, y + height / 2).tagName;
+})()"""
+
+
+@pytest.mark.parametrize("size", [pytest.param((390, 760), marks=pytest.mark.slow), (360, 640)])
+def test_a_phone_shows_all_controls_and_the_object_that_it_follows_beside_its_panel(
+    browser: Any, drive_page: Path, size: tuple[int, int]
+) -> None:
     context = browser.new_context(viewport={"width": 390, "height": 700}, has_touch=True, color_scheme="light")
     tab = context.new_page()
     tab.goto(drive_page.as_uri())
@@ -339,30 +355,8 @@ def test_a_phone_shows_all_controls(browser: Any, drive_page: Path) -> None:
     assert tab.locator("#list tbody tr").first.is_visible() and tab.evaluate(LIST_FITS), "no column is cut off"
     labels = tab.locator("#labels span:not(.ring)").all_inner_texts()
     assert labels and all(re.fullmatch(r"#\d+", text) for text in labels), "ids only"
-    context.close()
 
-
-# Number of labels that a panel covers in part.
-NUM_CUT = """[...document.querySelectorAll("#labels span:not([hidden])")].map(e => e.getBoundingClientRect()).filter(
-  a => ["head", "objects", "side", "time"].map(id => document.getElementById(id).getBoundingClientRect()).some(
-    b => a.right > b.left && a.left < b.right && a.bottom > b.top && a.top < b.bottom)).length"""
-
-
-# What is drawn at the middle of the label of the chosen object.
-COVER = """(() => {
-  const {x, y, width, height} = document.querySelector("#labels .chosen:not([hidden])").getBoundingClientRect();
-  return document.elementFromPoint(x + width / 2, y + height / 2).tagName;
-})()"""
-
-
-@pytest.mark.parametrize("size", [pytest.param((390, 760), marks=pytest.mark.slow), (360, 640)])
-def test_a_phone_shows_the_object_that_it_follows_beside_its_panel(
-    browser: Any, drive_page: Path, size: tuple[int, int]
-) -> None:
-    context = browser.new_context(viewport={"width": size[0], "height": size[1]}, has_touch=True)
-    tab = context.new_page()
-    tab.goto(drive_page.as_uri())
-    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+    tab.set_viewport_size({"width": size[0], "height": size[1]})
     boxes = content_of(drive_page.read_text(encoding="utf-8"))["frames"][0]["boxes"]
     for box in boxes[:3]:
         tab.evaluate("id => viewer.choose(id)", box["id"])
@@ -453,8 +447,9 @@ def test_every_key_and_control_does_what_it_says(browser: Any, drive_page: Path)
     context.close()
 
 
-def test_a_notebook_shows_the_page_inline(browser: Any) -> None:
+def test_a_notebook_shows_the_page_inline(browser: Any, tmp_path: Path) -> None:
     tab = browser.new_page()
-    tab.set_content(show(window(Street(), 0), result_of())._repr_html_())
+    (tmp_path / "cell.html").write_text(show(window(Street(), 0), result_of())._repr_html_(), encoding="utf-8")
+    tab.goto((tmp_path / "cell.html").as_uri())
     tab.frame_locator("iframe").locator("#now:has-text('sweep 0 of 0')").wait_for(timeout=60_000)
     tab.close()
