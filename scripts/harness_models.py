@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import fields
 from pathlib import Path
 
-from cflow_torch.cli.commands import as_yaml
+from cflow_torch.cli.settings import as_yaml
 from cflow_torch.config import PRESETS, WINDOW
 from cflow_torch.setting import describe_limits
 

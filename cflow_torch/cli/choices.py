@@ -1,22 +1,12 @@
-"""The settings of each command with their limits, its help, and the choices of each group."""
+"""The choices of each group, and the settings of each command with their limits."""
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
 from typing import Any, Dict, Iterable, Iterator, Mapping, Optional, Tuple
 
 import cflow_torch.configs
-from cflow_torch.cli.commands import (
-    COMMANDS,
-    DATA_SETTINGS,
-    ENGINES,
-    PICTURES,
-    Command,
-    Plot,
-    own_fields,
-    setting_lines,
-)
+from cflow_torch.cli.commands import DATA_SETTINGS, ENGINES, PICTURES, Command, own_fields
 from cflow_torch.config import PRESETS
 from cflow_torch.setting import Settings
 
@@ -26,22 +16,6 @@ Limits = Optional[Mapping[str, Any]]  # see `setting.bounds`; None = only a read
 _Named = Tuple[str, Limits]  # name of a setting, and its limits
 # Dotted name -> limits by choice, such as "data=av2", that has the setting; "" = the command itself has it.
 Known = Dict[str, Dict[str, Limits]]
-
-
-def help_of(name: str) -> str:
-    """Return what a command does, and its settings with the choices of its groups, if it has settings."""
-    kind = COMMANDS[name]
-    text = f"cflow {name}: {kind.SUMMARY}\n\n{inspect.cleandoc(kind.__doc__ or '')}\n"
-    if not issubclass(kind, Command):
-        return text
-    of_groups = [f"{group}={'|'.join(choices(group))}" for group in kind.groups()]
-    lines = [*setting_lines(kind), *of_groups]
-    for picture, own in PICTURES.items() if kind is Plot else ():
-        preset = f" (model={own.PRESET})" if own.PRESET else ""
-        lines.append(f"picture={picture}:  # {str(own.__doc__).partition(chr(10))[0]}{preset}")
-        lines += [f"  {line}" for line in setting_lines(own, Plot)]
-    lines.append("data.NAME, model.NAME, ...: `cflow settings` lists them")
-    return "\n  ".join([f"{text}\nsettings:", *lines]) + "\n"
 
 
 def choices(group: str) -> list[str]:

@@ -7,7 +7,7 @@ neither torch nor Hydra here, so that help costs little.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, Iterator
+from typing import Any, ClassVar
 
 from cflow_torch.config import Config
 from cflow_torch.setting import AUTO, Settings, bounds, checked, setting
@@ -612,25 +612,3 @@ WITH_SETTINGS: dict[str, type[Command]] = {name: kind for name, kind in COMMANDS
 def own_fields(kind: type[Settings]) -> list[Any]:
     """Return the settings of a class that are not groups."""
     return [f for f in fields(kind) if "kind" in f.metadata and "group" not in f.metadata]  # type: ignore[arg-type]
-
-
-def setting_lines(kind: type[Settings], base: type[Settings] | None = None) -> Iterator[str]:
-    """Yield a line for each setting of a class that is not in `base`: "name: default  # meaning"."""
-    known = {f.name for f in fields(base)} if base is not None else set()  # type: ignore[arg-type]
-    for f in own_fields(kind):
-        if f.name in known:
-            continue
-        if issubclass(f.metadata["kind"], Settings):
-            yield f"{f.name}:  # {f.metadata['help']}"
-            yield from (f"  {line}" for line in setting_lines(f.metadata["kind"]))
-        else:
-            yield f"{f.name}: {as_yaml(f.default)}  # {f.metadata['help']}"
-
-
-def as_yaml(value: Any) -> str:
-    """Return a default on one line, as YAML writes it."""
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(as_yaml, value))}]"
-    if isinstance(value, float) and value in (float("inf"), float("-inf")):
-        return ".inf" if value > 0 else "-.inf"
-    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

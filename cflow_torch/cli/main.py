@@ -6,9 +6,9 @@ import sys
 from importlib import import_module
 
 from cflow_torch import __version__
-from cflow_torch.cli.choices import help_of
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS
 from cflow_torch.cli.failures import UnfinishedJob, exit_if_refused, exit_wrong
+from cflow_torch.cli.settings import help_of
 from cflow_torch.cli.words import read_call
 from cflow_torch.errors import CFlowError, near
 

@@ -1,17 +1,18 @@
-"""List all settings, or write them for OpenSceneFlow: `cflow settings`."""
+"""All help: of each command, and `cflow settings`, which lists all settings."""
 
 from __future__ import annotations
 
+import inspect
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import Iterator, NamedTuple
+from typing import Any, Iterator, NamedTuple
 
-from cflow_torch.cli.choices import files, known_settings
-from cflow_torch.cli.commands import ENGINES, PICTURES, WITH_SETTINGS, Plot, as_yaml, setting_lines
+from cflow_torch.cli.choices import choices, files, known_settings
+from cflow_torch.cli.commands import COMMANDS, ENGINES, PICTURES, WITH_SETTINGS, Command, Plot, own_fields
 from cflow_torch.config import METHODS, PRESETS
 from cflow_torch.errors import CFlowError, near
-from cflow_torch.setting import describe_limits
+from cflow_torch.setting import Settings, describe_limits
 
 _PAGE = """# Settings
 
@@ -29,6 +30,44 @@ def task(arguments: list[str]) -> None:
         raise CFlowError(f"settings takes names, got {' '.join(arguments)}")
     else:
         print("\n\n".join(text for name in arguments for text in _about(name)))
+
+
+def help_of(name: str) -> str:
+    """Return what a command does, and its settings with the choices of its groups, if it has settings."""
+    kind = COMMANDS[name]
+    text = f"cflow {name}: {kind.SUMMARY}\n\n{inspect.cleandoc(kind.__doc__ or '')}\n"
+    if not issubclass(kind, Command):
+        return text
+    of_groups = [f"{group}={'|'.join(choices(group))}" for group in kind.groups()]
+    lines = [*setting_lines(kind), *of_groups]
+    for picture, own in PICTURES.items() if kind is Plot else ():
+        preset = f" (model={own.PRESET})" if own.PRESET else ""
+        lines.append(f"picture={picture}:  # {str(own.__doc__).partition(chr(10))[0]}{preset}")
+        lines += [f"  {line}" for line in setting_lines(own, Plot)]
+    lines.append("data.NAME, model.NAME, ...: `cflow settings` lists them")
+    return "\n  ".join([f"{text}\nsettings:", *lines]) + "\n"
+
+
+def setting_lines(kind: type[Settings], base: type[Settings] | None = None) -> Iterator[str]:
+    """Yield a line for each setting of a class that is not in `base`: "name: default  # meaning"."""
+    known = {f.name for f in fields(base)} if base is not None else set()  # type: ignore[arg-type]
+    for f in own_fields(kind):
+        if f.name in known:
+            continue
+        if issubclass(f.metadata["kind"], Settings):
+            yield f"{f.name}:  # {f.metadata['help']}"
+            yield from (f"  {line}" for line in setting_lines(f.metadata["kind"]))
+        else:
+            yield f"{f.name}: {as_yaml(f.default)}  # {f.metadata['help']}"
+
+
+def as_yaml(value: Any) -> str:
+    """Return a default on one line, as YAML writes it."""
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(as_yaml, value))}]"
+    if isinstance(value, float) and value in (float("inf"), float("-inf")):
+        return ".inf" if value > 0 else "-.inf"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 class Section(NamedTuple):

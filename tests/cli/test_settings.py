@@ -12,9 +12,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cflow_torch import make_config
-from cflow_torch.cli.choices import FOLDER, choices, help_of, read_settings
+from cflow_torch.cli.choices import FOLDER, choices, read_settings
 from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
 from cflow_torch.cli.main import HELP
+from cflow_torch.cli.settings import help_of
 from cflow_torch.cli.words import hydra_overrides, read_call, split
 from cflow_torch.config import METHODS, PRESETS, Config
 from cflow_torch.data.catalog import DATA_SETS
