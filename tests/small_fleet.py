@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Sequence
 
 from command_line import cflow
 
 from cflow_torch import make_config
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.fleet.job import Job, Shard
-from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import check_logs, clear_log, make_identity
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
@@ -22,9 +21,8 @@ PAIRS = sum(SWEEPS) - len(SWEEPS)
 CONFIG = make_config("paper", pixel_size=0.4, num_history=1)
 # The same settings for the command.
 COMMAND = ["flow", "data=av2", "model=paper", "model.pixel_sizes=[0.4]", "model.num_history=1", "data.check=false"]
-ONE = Layout(("cpu",), 2)
 ENGINES: dict[str, Any] = {"local": local_executors, "ray": ray_executors}
-TWO = Layout(("cpu", "cpu"), 2)
+ONE, TWO = ("cpu",), ("cpu", "cpu")  # devices
 
 
 def make_job(output: Path, **settings: Any) -> Job:
@@ -37,7 +35,8 @@ def make_job(output: Path, **settings: Any) -> Job:
 def run(
     root: Path,
     output: Path,
-    layout: Layout = ONE,
+    devices: Sequence[str] = ONE,
+    batch: int = 2,
     shard: Shard = Shard(),  # noqa: B008 (immutable)
     engine: str = "local",
     overwrite: bool = False,
@@ -45,15 +44,15 @@ def run(
     **engine_settings: Any,
 ) -> dict[str, Any]:
     """Run `cflow flow` without the command line; returns the report. `settings` replace those of `make_job`."""
-    job = make_job(output, batch=layout.batch, redo=overwrite, **settings)
+    job = make_job(output, batch=batch, redo=overwrite, **settings)
     sources = find_sources("av2", root)
     names = [source.name for source in sources]
     check_logs(output, names, job.identity, overwrite, shard.count == 1)
     for name in names if overwrite and shard.count == 1 else ():
         clear_log(output / name)
-    with ENGINES[engine](job, layout, **engine_settings) as executors:
-        parts = shard.parts(sources, len(layout.devices))
-        return run_fleet(executors, parts, layout, shard, job.output, engine)
+    with ENGINES[engine](job, devices, **engine_settings) as executors:
+        parts = shard.parts(sources, len(devices))
+        return run_fleet(executors, parts, job, devices, shard, engine)
 
 
 def command(*arguments: Any) -> int:

@@ -18,7 +18,7 @@ from cflow_torch.data.catalog import source_name
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.fleet.job import Job, Part, find_shard
-from cflow_torch.fleet.machine import Layout, choose_layout, frames_per_worker
+from cflow_torch.fleet.machine import choose_batch, choose_devices, frames_per_worker
 from cflow_torch.fleet.manifest import check_logs, clear_log, make_identity
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
@@ -39,7 +39,7 @@ class FlowRun:
 
     def __init__(self, cfg: FlowFiles, contents: Sequence[str]) -> None:
         self._cfg = cfg
-        self._layout = choose_layout(cfg.device, cfg.engine.workers, cfg.engine.batch, os.environ)
+        self._devices = choose_devices(cfg.device, cfg.engine.workers, os.environ)
         self.logs = find_logs(cfg.data)
         self.output = output_folder(cfg)
         self.job = Job(
@@ -49,7 +49,7 @@ class FlowRun:
             settings=dict(self.logs.settings),
             output=str(self.output),
             contents=tuple(contents),
-            batch=self._layout.batch,
+            batch=choose_batch(cfg.engine.batch, self._devices[0]),
             redo=cfg.overwrite,
         )
         self.shard = find_shard(cfg.shard.index, cfg.shard.count, os.environ)
@@ -78,15 +78,15 @@ class FlowRun:
             for log in self.open_logs():
                 clear_log(self.output / log.log_id)
         write_config(self._cfg, self.output)
-        layout = self._useful_workers()
+        devices = self._useful_devices()
         settings = asdict(self._cfg.engine)
         name = settings.pop("name")
         own = {key: value for key, value in settings.items() if key not in ("workers", "batch")}
         self._begin = perf_counter()
-        with _ENGINES[name](self.job, layout, **own) as executors:
-            parts = self.shard.parts(self.logs.sources, len(layout.devices))
+        with _ENGINES[name](self.job, devices, **own) as executors:
+            parts = self.shard.parts(self.logs.sources, len(devices))
             about = {"config": settings_record(self._cfg), "versions": versions()}
-            return run_fleet(executors, parts, layout, self.shard, self.job.output, name, about)
+            return run_fleet(executors, parts, self.job, devices, self.shard, name, about)
 
     def finish(self, report: dict[str, Any], failures: Failures) -> None:
         """Print the report and what is missing, and exit with the status of the run unless it is complete.
@@ -110,15 +110,15 @@ class FlowRun:
         names = [source_name(part.source) for part in self.parts]
         check_logs(self.output, names, self.job.identity, self._cfg.overwrite, self.shard.count == 1)
 
-    def _useful_workers(self) -> Layout:
+    def _useful_devices(self) -> Sequence[str]:
         """Leave out workers that would not save time, because few frames are left to do."""
-        layout, engine = self._layout, self._cfg.engine
-        if engine.name != "local" or engine.workers != AUTO or layout.devices[0] != "cpu":
-            return layout
+        engine = self._cfg.engine
+        if engine.name != "local" or engine.workers != AUTO or self._devices[0] != "cpu":
+            return self._devices
         least = frames_per_worker(self._cfg.model)
         count = 0
         for _, _, todo in count_frames(self.job, self.parts):  # opens a log after the other
             count += todo
-            if count >= least * len(layout.devices):
+            if count >= least * len(self._devices):
                 break
-        return layout._replace(devices=layout.devices[: max(1, count // least)])
+        return self._devices[: max(1, count // least)]

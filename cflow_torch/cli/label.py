@@ -17,7 +17,7 @@ from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5
 from cflow_torch.data.json_file import write_json
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.machine import choose_layout
+from cflow_torch.fleet.machine import choose_devices
 from cflow_torch.fleet.manifest import complete_frames, frame_file
 from cflow_torch.types import CFlowError
 
@@ -59,7 +59,7 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
     labelled: list[str] = []
     waiting: list[str] = []
     model = make_model(cfg.model, cfg.device)
-    workers = len(choose_layout(cfg.device, cfg.engine.workers, 1, os.environ).devices)
+    workers = len(choose_devices(cfg.device, cfg.engine.workers, os.environ))
     scenes = [part.source for part in run.parts]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
         folder = run.output / scene.stem

@@ -19,7 +19,7 @@ from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.fleet.executors import ProcessExecutor
-from cflow_torch.fleet.machine import choose_layout, frames_per_worker
+from cflow_torch.fleet.machine import choose_devices, frames_per_worker
 from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
 from cflow_torch.fleet.work import run_ahead
 from cflow_torch.model import SceneFlowModel
@@ -53,7 +53,7 @@ def for_each_pair(
 def _answers(pairs: Sequence[LogPair], model: TimedModel) -> Iterator[tuple[LogPair, Answer]]:
     """Yield each pair and a function that returns its window and flow, or raises the error of that pair."""
     method: Any = model.model
-    devices = choose_layout(method.device, AUTO, AUTO, os.environ).devices
+    devices = choose_devices(method.device, AUTO, os.environ)
     count = min(len(devices), len(pairs) // frames_per_worker(method.config)) if devices[0] == "cpu" else 1
     windows = _windows(pairs, method.config)
     if count < 2:

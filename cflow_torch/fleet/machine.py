@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from typing import Any, Mapping, NamedTuple
+from typing import Any, Mapping
 
 import torch
 
@@ -20,13 +20,6 @@ WORKER_MEMORY = 1_500_000_000
 CPU_BATCH, GPU_BATCH = 4, 32
 
 
-class Layout(NamedTuple):
-    """How a run uses this machine."""
-
-    devices: tuple[str, ...]  # one per worker
-    batch: int  # windows that are computed together
-
-
 def frames_per_worker(config: Config) -> int:
     """Return the least number of frames for which another worker on a CPU saves time.
 
@@ -35,13 +28,12 @@ def frames_per_worker(config: Config) -> int:
     return 20 if config.method == "verified" else 100
 
 
-def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, str]) -> Layout:
-    """Replace "auto" by numbers and devices.
+def choose_devices(device: str, workers: Any, environ: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the device of each worker.
 
     Args:
         device: "auto", "cpu", "cuda" or "cuda:2".
         workers: processes; "auto" = on a CPU one per core, as far as memory allows, on GPUs one per GPU.
-        batch: windows, or "auto".
         environ: environment variables. LOCAL_RANK or SLURM_LOCALID choose the GPU where several processes share a
             machine; LOCAL_WORLD_SIZE and SLURM_CPUS_PER_TASK limit the cores.
     """
@@ -54,9 +46,12 @@ def choose_layout(device: str, workers: Any, batch: Any, environ: Mapping[str, s
         count, memory = usable_cores(environ), available_memory(environ)
         if memory is not None:
             count = max(1, min(count, memory // WORKER_MEMORY))
-    size = (GPU_BATCH if gpus else CPU_BATCH) if batch == AUTO else batch
-    devices = tuple(gpus[k % len(gpus)] for k in range(count)) if gpus else ("cpu",) * count
-    return Layout(devices, size)
+    return tuple(gpus[k % len(gpus)] for k in range(count)) if gpus else ("cpu",) * count
+
+
+def choose_batch(batch: Any, device: str) -> int:
+    """Return the number of windows that a worker on this device computes together."""
+    return (CPU_BATCH if device == "cpu" else GPU_BATCH) if batch == AUTO else int(batch)
 
 
 def _gpus(device: str, environ: Mapping[str, str]) -> list[str]:

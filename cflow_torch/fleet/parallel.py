@@ -16,7 +16,6 @@ from typing import Any, Callable, Generator, Iterator, Sequence
 from cflow_torch.data.catalog import source_name
 from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
-from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.work import Worker, make_worker
 
 Events = Generator[Event, None, None]
@@ -27,16 +26,16 @@ _REMEDY = "if memory is short, give fewer engine.workers"
 
 @contextmanager
 def local_executors(
-    job: Job, layout: Layout, timeout: float = 600.0, memory: float | None = None
+    job: Job, devices: Sequence[str], timeout: float = 600.0, memory: float | None = None
 ) -> Iterator[list[Executor]]:
     """Engine `local`: a process of this machine per device; `cli.commands.Local` explains the settings.
 
     A single worker without a memory limit runs in this process.
     """
-    if len(layout.devices) == 1 and memory is None:
-        yield [InlineExecutor(partial(Worker, job, layout.devices[0]))]
+    if len(devices) == 1 and memory is None:
+        yield [InlineExecutor(partial(Worker, job, devices[0]))]
     else:
-        yield [ProcessExecutor(partial(make_worker, job, device, memory), timeout) for device in layout.devices]
+        yield [ProcessExecutor(partial(make_worker, job, device, memory), timeout) for device in devices]
 
 
 def run_parallel(executors: Sequence[Executor], parts: Sequence[Part], stop: Callable[[], bool]) -> Events:

@@ -11,13 +11,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from types import ModuleType
-from typing import Any, Callable, Iterator
+from typing import Any, Callable, Iterator, Sequence
 
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.fleet.executors import Executor, InlineExecutor, describe_error
 from cflow_torch.fleet.job import Job
-from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import make_identity
 from cflow_torch.fleet.work import Worker, make_worker
 from cflow_torch.setting import AUTO
@@ -27,7 +26,7 @@ _OBJECT_STORE_BYTES = 200 * 2**20  # it holds names and events only; Ray's defau
 
 @contextmanager
 def ray_executors(
-    job: Job, layout: Layout, address: str | None = None, num_cpus: Any = AUTO, num_gpus: Any = AUTO
+    job: Job, devices: Sequence[str], address: str | None = None, num_cpus: Any = AUTO, num_gpus: Any = AUTO
 ) -> Iterator[list[Executor]]:
     """Engine `ray`: an actor per device, see `local_executors`.
 
@@ -37,14 +36,14 @@ def ray_executors(
     the cluster start when there is room. Ray chooses the GPUs. `cli.commands.Ray` explains the settings.
     """
     ray = import_optional("ray", "engine=ray needs Ray (extra ray): pip install ray")
-    is_gpu = layout.devices[0].startswith("cuda")
+    is_gpu = devices[0].startswith("cuda")
     needs = {
         "CPU": int(not is_gpu) if num_cpus == AUTO else num_cpus,
         "GPU": int(is_gpu) if num_gpus == AUTO else num_gpus,
     }
     if not is_remote(as_path(job.output)):  # workers may run in another folder
         job = replace(job, output=str(as_path(job.output).absolute()))
-    used = sorted(set(layout.devices)) if is_gpu else []
+    used = sorted(set(devices)) if is_gpu else []
     if address is None and used != [f"cuda:{k}" for k in range(len(used))]:
         # Ray hands out the GPUs of a machine in order, from the first one.
         raise CFlowError(f"engine=ray cannot choose {', '.join(used)}: set CUDA_VISIBLE_DEVICES, and give device=cuda")
@@ -53,7 +52,7 @@ def ray_executors(
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no reports to Ray's authors
         settings = {
             "address": "local",
-            "num_cpus": max(1, math.ceil(len(layout.devices) * needs["CPU"])),
+            "num_cpus": max(1, math.ceil(len(devices) * needs["CPU"])),
             "num_gpus": len(used),
             "object_store_memory": _OBJECT_STORE_BYTES,
             "include_dashboard": False,
@@ -64,7 +63,7 @@ def ray_executors(
         actor = ray.remote(InlineExecutor).options(num_cpus=needs["CPU"], num_gpus=needs["GPU"])
         # A worker sees only the GPUs that Ray gives it.
         make = partial(make_worker_on_node, os.getcwd(), job, "cuda" if is_gpu else "cpu")
-        yield [RayExecutor(ray, actor, make) for _ in layout.devices]
+        yield [RayExecutor(ray, actor, make) for _ in devices]
     finally:
         ray.shutdown()  # this also ends a cluster that `ray.init` has started
 

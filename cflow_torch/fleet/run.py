@@ -15,7 +15,6 @@ from cflow_torch.data.json_file import write_json
 from cflow_torch.data.paths import as_path
 from cflow_torch.fleet.executors import Executor, describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
-from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.manifest import complete_frames
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.progress import Progress, log_line
@@ -30,9 +29,9 @@ _SHOWN_FAILURES = 20  # that are listed at the end; the report has them all
 def run_fleet(
     executors: Sequence[Executor],
     parts: Sequence[Part],
-    layout: Layout,
+    job: Job,
+    devices: Sequence[str],
     shard: Shard,
-    output: str,
     engine: str,
     about: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -41,8 +40,7 @@ def run_fleet(
     Call `manifest.check_logs` first.
 
     Args:
-        executors: of `Worker` objects of one job.
-        output: of that job.
+        executors: of `Worker` objects of the job, one per device.
         engine: name of what made the executors, for the report.
 
     Returns:
@@ -63,10 +61,18 @@ def run_fleet(
             log_line(f"ended early: {error}")
         ended_by = 0 if counters.is_complete else stop.received or 0
         name = signal.Signals(ended_by).name if ended_by else ""
-        report = {**counters.report(time.perf_counter() - start, layout, shard, engine, name), **(about or {})}
+        report = {
+            **counters.report(time.perf_counter() - start, name),
+            "engine": engine,
+            "shard": {"index": shard.index, "count": shard.count},
+            "devices": list(devices),
+            "batch": job.batch,
+            "machine": platform.platform(),
+            **(about or {}),
+        }
         report["exit_status"] = 128 + ended_by if ended_by else 0 if counters.is_complete else 1
         try:
-            file = report_file(output, shard)
+            file = report_file(job.output, shard)
             remove_stale(file.parent)
             write_json(file, report)
         except OSError as error:
@@ -156,7 +162,7 @@ class Counters:
             self.failures.append((event.name, event.message))
             self.num_failed += event.timestamp is not None
 
-    def report(self, seconds: float, layout: Layout, shard: Shard, engine: str, signal_name: str) -> dict[str, Any]:
+    def report(self, seconds: float, signal_name: str) -> dict[str, Any]:
         """Return all figures of a run that took `seconds`. `signal_name` is the signal that stopped it, "" = none.
 
         Returns:
@@ -170,11 +176,6 @@ class Counters:
         return {
             "status": "interrupted" if signal_name else "complete" if self.is_complete else "incomplete",
             "stopped_by": signal_name or None,
-            "engine": engine,
-            "shard": {"index": shard.index, "count": shard.count},
-            "devices": list(layout.devices),
-            "batch": layout.batch,
-            "machine": platform.platform(),
             "frames": {
                 "total": self.total,
                 "complete_before": self.num_before,

@@ -23,7 +23,6 @@ from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.eval import objective
 from cflow_torch.config import Config
 from cflow_torch.data.av2 import AV2Log
-from cflow_torch.fleet.machine import Layout
 from cflow_torch.viz import page
 from cflow_torch.windows import memory
 
@@ -181,7 +180,7 @@ def test_worker_processes_give_the_results_of_one_process(log_folder, tmp_path, 
     sorted(root.glob("sensors/lidar/*"))[0].write_bytes(b"broken")
     records = []
     for name, workers in (("one", 1), ("two", 2)):
-        monkeypatch.setattr(pairs, "choose_layout", lambda *_, count=workers: Layout(("cpu",) * count, 1))
+        monkeypatch.setattr(pairs, "choose_devices", lambda *_, count=workers: ("cpu",) * count)
         monkeypatch.setattr(pairs, "frames_per_worker", lambda config: 1)
         assert evaluate(f"data.root={root}", f"output={tmp_path / name}") == 1
         records.append(results_of(tmp_path / name))
@@ -204,7 +203,7 @@ class DeadlyEstimator(pairs._Estimator):
 
 @pytest.mark.slow
 def test_a_pair_whose_process_dies_is_tried_once_more_then_reported(log_folder, tmp_path, evaluate, monkeypatch):
-    monkeypatch.setattr(pairs, "choose_layout", lambda *_: Layout(("cpu",) * 2, 1))
+    monkeypatch.setattr(pairs, "choose_devices", lambda *_: ("cpu", "cpu"))
     monkeypatch.setattr(pairs, "frames_per_worker", lambda config: 1)
     monkeypatch.setattr(pairs, "_Estimator", DeadlyEstimator)
     monkeypatch.setenv("CFLOW_TEST_DEADLY", str(tmp_path))

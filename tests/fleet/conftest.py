@@ -8,7 +8,6 @@ import pytest
 from small_fleet import SWEEPS, run, tree
 from small_logs import make_small_drive
 
-from cflow_torch.fleet.machine import Layout
 from cflow_torch.simulator.writers.av2 import write_av2_log
 
 
@@ -25,7 +24,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def single_run(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output of one worker, one window at a time; read only."""
     output = tmp_path_factory.mktemp("single") / "flow"
-    assert run(fleet, output, Layout(("cpu",), batch=1))["status"] == "complete"
+    assert run(fleet, output, batch=1)["status"] == "complete"
     return output
 
 

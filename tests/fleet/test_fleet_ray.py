@@ -7,7 +7,7 @@ import signal
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Sequence
 
 import pytest
 from small_fleet import PAIRS, TWO, make_job, run, tree
@@ -15,7 +15,6 @@ from small_fleet import PAIRS, TWO, make_job, run, tree
 from cflow_torch import CFlowError
 from cflow_torch.fleet import ray_engine
 from cflow_torch.fleet.job import Job, Part
-from cflow_torch.fleet.machine import Layout
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.work import Worker
@@ -68,19 +67,19 @@ def test_a_killed_worker_is_replaced_and_a_part_that_always_kills_is_reported(fl
     assert tree(tmp_path / "out").items() <= single.items()
 
 
-def start(layout: Layout, **settings: Any) -> None:
-    with ray_executors(make_job(Path("nowhere")), layout, **settings) as executors:
+def start(devices: Sequence[str], **settings: Any) -> None:
+    with ray_executors(make_job(Path("nowhere")), devices, **settings) as executors:
         next(run_parallel(executors, [Part(0, "nothing")], lambda: False))
 
 
 def test_ray_does_not_choose_a_gpu():
     with pytest.raises(CFlowError, match="CUDA_VISIBLE_DEVICES"):
-        start(Layout(("cuda:1",), 1))
+        start(["cuda:1"])
 
 
 @pytest.mark.slow
 def test_a_cluster_without_room_and_a_node_that_does_not_see_the_output():
     with pytest.raises(CFlowError, match="no node of the Ray cluster has room for a worker of 0 CPU, 3 GPU"):
-        start(Layout(("cuda:0",), 1), num_gpus=3)
+        start(["cuda:0"], num_gpus=3)
     with pytest.raises(CFlowError, match="does not see .*nowhere: all nodes must reach the output"):
         start(TWO)

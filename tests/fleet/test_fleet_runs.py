@@ -21,7 +21,6 @@ from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.log import window
 from cflow_torch.fleet import work
 from cflow_torch.fleet.job import Shard, find_shard
-from cflow_torch.fleet.machine import Layout
 
 OTHER = {"config": make_config("paper", pixel_size=0.8)}  # settings of another run
 
@@ -47,7 +46,7 @@ def test_files_contain_the_results_and_their_origin(fleet, single_run):
 
 
 def test_a_batch_changes_no_byte(fleet, single, tmp_path):
-    report = run(fleet, tmp_path, Layout(("cpu",), batch=4))
+    report = run(fleet, tmp_path, batch=4)
     assert tree(tmp_path) == single
     assert (report["status"], report["exit_status"]) == ("complete", 0)
     assert list(report["frames"].values()) == [PAIRS, 0, PAIRS, 0, 0, 0, 0]
@@ -205,7 +204,7 @@ def test_a_signal_lets_frames_in_hand_be_finished(fleet, single, tmp_path, monke
         write(*arguments)
 
     monkeypatch.setattr(work, "write_flow", stop_at_the_second)
-    report = run(fleet, tmp_path, Layout(("cpu",), 1))
+    report = run(fleet, tmp_path, batch=1)
     assert (report["status"], report["stopped_by"], report["exit_status"]) == ("interrupted", "SIGTERM", 143)
     assert report["frames"]["computed"] == len(frames(tmp_path)) < PAIRS and report["frames"]["unopened_parts"]
     assert tree(tmp_path).items() <= single.items()

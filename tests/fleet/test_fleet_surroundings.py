@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from cflow_torch import CFlowError, make_config
 from cflow_torch.fleet import machine, progress
 from cflow_torch.fleet.job import Shard, find_shard
-from cflow_torch.fleet.machine import Layout, choose_layout, usable_cores
+from cflow_torch.fleet.machine import choose_batch, choose_devices, usable_cores
 from cflow_torch.fleet.progress import Progress, log_line
 from cflow_torch.fleet.stop_signal import StopSignal
 
@@ -85,25 +85,26 @@ def test_a_contradictory_shard_is_an_error(given_: Any, environ: dict[str, str],
         find_shard(*given_, environ)
 
 
-def test_layout_is_chosen_from_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_and_batch_are_chosen_from_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "usable_cores", lambda environ: 16)
     monkeypatch.setattr(machine, "available_memory", lambda environ: 10 * machine.WORKER_MEMORY + 1)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert choose_layout("auto", "auto", "auto", {}) == Layout(("cpu",) * 10, machine.CPU_BATCH)
-    assert choose_layout("cpu", 3, 7, {}) == Layout(("cpu",) * 3, 7)
+    assert choose_devices("auto", "auto", {}) == ("cpu",) * 10
+    assert choose_devices("cpu", 3, {}) == ("cpu",) * 3
+    assert [choose_batch(*given) for given in ((7, "cpu"), ("auto", "cpu"), ("auto", "cuda:0"))] == [7, 4, 32]
     assert machine.frames_per_worker(make_config("paper")) > machine.frames_per_worker(make_config("default"))
     monkeypatch.setattr(machine, "available_memory", lambda environ: 1)
-    assert choose_layout("cpu", "auto", "auto", {}).devices == ("cpu",)
+    assert choose_devices("cpu", "auto", {}) == ("cpu",)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert choose_layout("auto", "auto", "auto", {}) == Layout(("cuda:0", "cuda:1"), machine.GPU_BATCH)
-    assert choose_layout("cuda", 3, 1, {}) == Layout(("cuda:0", "cuda:1", "cuda:0"), 1)
-    assert choose_layout("auto", "auto", 1, {"LOCAL_RANK": "3"}).devices == ("cuda:1",)
-    assert choose_layout("auto", "auto", 1, {"SLURM_LOCALID": "0"}).devices == ("cuda:0",)
-    assert choose_layout("cuda:1", "auto", 1, {"LOCAL_RANK": "0"}).devices == ("cuda:1",)
+    assert choose_devices("auto", "auto", {}) == ("cuda:0", "cuda:1")
+    assert choose_devices("cuda", 3, {}) == ("cuda:0", "cuda:1", "cuda:0")
+    assert choose_devices("auto", "auto", {"LOCAL_RANK": "3"}) == ("cuda:1",)
+    assert choose_devices("auto", "auto", {"SLURM_LOCALID": "0"}) == ("cuda:0",)
+    assert choose_devices("cuda:1", "auto", {"LOCAL_RANK": "0"}) == ("cuda:1",)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     with pytest.raises(CFlowError, match="finds no GPU"):
-        choose_layout("cuda", "auto", 1, {})
+        choose_devices("cuda", "auto", {})
 
 
 def test_the_job_limits_the_cores() -> None:

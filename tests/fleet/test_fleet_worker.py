@@ -23,8 +23,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import LogWrapper
 from cflow_torch.fleet import parallel, work
 from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, Shard
-from cflow_torch.fleet.machine import Layout
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.run import Counters, format_missing, format_report
 from cflow_torch.fleet.work import Worker
@@ -358,7 +357,8 @@ def test_the_report_lists_what_is_missing():
     for event in [*events, Failed(1, "b", "no log"), *(Noted(2, name, "odd") for name in "cca")]:
         counters.add(event)
     assert counters.times_noted("odd") == 3 and len(counters.waiting) == 28
-    report = counters.report(4.0, Layout(("cpu",), 1), Shard(), "local", "SIGTERM")
+    about = {"engine": "local", "shard": {"index": 0, "count": 1}, "devices": ["cpu"]}
+    report = {**counters.report(4.0, "SIGTERM"), **about}
     assert report["status"] == "interrupted" and report["stopped_by"] == "SIGTERM"
     assert list(report["frames"].values()) == [40, 10, 1, 1, 1, 28, 1]
     assert report["notes"] == [["c", "odd", 2], ["a", "odd", 1]] and "warnings" in format_report(report)
