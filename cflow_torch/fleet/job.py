@@ -34,12 +34,11 @@ class Job:
 class Part:
     """Consecutive frames of one log: the work that a worker gets at once."""
 
-    number: int  # index among the parts of a run
     source: Any  # its log, one of `catalog.find_sources`
     begin: int = 0  # the frames lie between begin / of and end / of of the log
     end: int = 1
     of: int = 1
-    only: int | None = None  # time stamp of the only frame to do; None = all of them
+    only: str | None = None  # name of the only frame to do; None = all of them
 
     def frames(self, num_pairs: int) -> range:
         """Indices of the sweeps t, in a log of `num_pairs` pairs."""
@@ -47,39 +46,40 @@ class Part:
 
     def stamps(self, log: Log) -> dict[int, int]:
         """Return the time stamp of each sweep t by its index; the pair over a gap of the log is not a frame."""
-        return {i: int(log.timestamps[i]) for i in self.frames(len(log.timestamps) - 1) if i not in log.gaps}
+        stamps = {i: int(log.timestamps[i]) for i in self.frames(len(log.timestamps) - 1) if i not in log.gaps}
+        return {i: stamp for i, stamp in stamps.items() if self.only in (None, frame_name(log, stamp))}
+
+
+def frame_name(log: Log, timestamp: int) -> str:
+    """Return the name of a frame in events and reports."""
+    return f"{log.log_id}/{timestamp}"
 
 
 class Opened(NamedTuple):
-    """A part has begun. `frames` are the time stamps of its frames, `todo` the time stamps of incomplete frames."""
+    """The log of a part is open."""
 
-    part: int
-    log_id: str
-    frames: tuple[int, ...]
-    todo: tuple[int, ...]
+    source: str  # `source_name` of the log
+    num_frames: int  # of the part
+    todo: tuple[str, ...]  # names of its incomplete frames
 
 
 class Done(NamedTuple):
     """A frame is on disk. `seconds` by stage; "compute" is the time of its batch, divided by the number of frames."""
 
-    part: int
-    timestamp: int
+    name: str
     seconds: dict[str, float]
 
 
 class Failed(NamedTuple):
-    """A frame has no result. If `timestamp` is None, the part or the rest of it has none."""
+    """A frame has no result, or a log cannot be opened."""
 
-    part: int
-    name: str
+    name: str  # of the frame, or `source_name` of the log
     message: str
-    timestamp: int | None = None
 
 
 class Noted(NamedTuple):
     """Something that a user should know about a log, or about a worker."""
 
-    part: int
     name: str
     message: str
 
@@ -99,7 +99,7 @@ class Shard:
             raise CFlowError(f"shard.index={self.index} of shard.count={self.count}: give 0 ... count - 1")
 
     def parts(self, sources: Sequence[Any], workers: int = 1) -> list[Part]:
-        """Divide this shard's share of the logs into parts, numbered from 0, enough of them for all workers.
+        """Divide this shard's share of the logs into parts, enough of them for all workers.
 
         The sequence of all logs is divided into `count` shares of equal length. So a shard opens only its own logs, and
         shares at most the first and the last of them with a neighbour.
@@ -114,7 +114,7 @@ class Shard:
             last = min(end - log * self.count, self.count)
             edges = [first * pieces + (last - first) * k for k in range(pieces + 1)]
             for left, right in zip(edges, edges[1:]):
-                parts.append(Part(len(parts), sources[log], left, right, self.count * pieces))
+                parts.append(Part(sources[log], left, right, self.count * pieces))
         return parts
 
 

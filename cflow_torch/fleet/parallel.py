@@ -45,7 +45,7 @@ def run_parallel(executors: Sequence[Executor], parts: Sequence[Part], stop: Cal
 
     Args:
         executors: of `Worker` objects.
-        parts: numbered from 0.
+        parts: of logs.
         stop: called often. Once it returns True, frames that have begun are finished and no others begin.
     """
     todo: SimpleQueue[Part] = SimpleQueue()
@@ -103,38 +103,38 @@ def _do(executor: Executor, part: Part, stop: Callable[[], bool]) -> Iterator[Ev
 
     If the log did not open, we try the part once more.
     """
-    name = source_name(part.source)  # of the log
-    missing: set[int] | None = None  # time stamps of frames without a result; None = the log is not open
+    name = source_name(part.source)
+    left = {name}
     try:
-        for event in _events(executor, part, stop):
-            if isinstance(event, Opened):
-                name = event.log_id
-                missing = set(event.todo)
-            elif missing is not None and isinstance(event, (Done, Failed)):
-                missing.discard(event.timestamp)  # type: ignore[arg-type]
-            yield event
+        yield from _events(executor, part, stop, left)
         return
     except BrokenExecutor as error:
         if stop():
             return
-        yield Noted(part.number, name, f"a worker died ({error}): its frames are tried again, one by one")
-    for stamp in [None] if missing is None else sorted(missing):
+        yield Noted(name, f"a worker died ({error}): its frames are tried again, one by one")
+    for each in sorted(left):
         if stop():
             return
+        again = {each}
         try:
-            for event in _events(executor, replace(part, only=stamp), stop):
-                if stamp is None or not isinstance(event, Opened):
+            for event in _events(executor, part if each == name else replace(part, only=each), stop, again):
+                if each == name or not isinstance(event, Opened):
                     yield event
                 elif not event.todo:  # its file was written just before the first worker died
-                    yield Done(part.number, stamp, {})
+                    yield Done(each, {})
         except BrokenExecutor as error:
-            of_frame = name if stamp is None else f"{name}/{stamp}"
-            yield Failed(part.number, of_frame, f"its worker died again ({error}): {_REMEDY}", stamp)
+            for lost in sorted(again):
+                yield Failed(lost, f"its worker died again ({error}): {_REMEDY}")
 
 
-def _events(executor: Executor, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
-    """Yield the events of a part."""
+def _events(executor: Executor, part: Part, stop: Callable[[], bool], left: set[str]) -> Iterator[Event]:
+    """Yield the events of a part. `left` has the names of what has no result: the log until it is open, then frames."""
     event = executor.call("next_event", part, stop())
     while event is not None:
+        if isinstance(event, Opened):
+            left.clear()
+            left.update(event.todo)
+        elif not isinstance(event, Noted):
+            left.discard(event.name)
         yield event
         event = executor.call("next_event", None, stop())

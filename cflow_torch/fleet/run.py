@@ -96,7 +96,7 @@ def _follow(events: Iterator[Event], counters: Counters, num_parts: int) -> None
                 log_line(f"failed: {event.name}: {event.message}")
             elif isinstance(event, Noted) and counters.times_noted(event.message) <= _SHOWN_NOTES:
                 log_line(f"warning: {event.name}: {event.message}")
-            progress.update(counters.total - len(counters.waiting) - progress.n)
+            progress.update(counters.total - counters.num_waiting - progress.n)
         progress.total = progress.n
 
 
@@ -130,15 +130,16 @@ class Counters:
     def __init__(self, parts: Sequence[Part]) -> None:
         self.failures: list[tuple[str, str]] = []  # (frame or log, message)
         self.notes: Counter[tuple[str, str]] = Counter()  # (log, message)
-        self.num_opened = self.total = self.num_before = self.num_failed = 0  # num_opened: parts; others: frames
-        # (part number, time stamp) -> name of a frame that is neither on disk nor failed, of opened parts
-        self.waiting: dict[tuple[int, int | None], str] = {}
-        self._unopened = {part.number for part in parts}
+        self.num_opened = 0  # parts
+        self.total = self.num_before = self.num_computed = self.num_failed = 0  # frames of opened parts
+        # Names of what is neither done nor failed: logs of parts that are not open, and frames of those that are.
+        self._unopened = Counter(source_name(part.source) for part in parts)
+        self.waiting: Counter[str] = Counter()
         self._seconds: Counter[str] = Counter()  # by stage, of all workers together
 
     @property
     def is_complete(self) -> bool:
-        return not (self.failures or self._unopened or self.waiting)
+        return not (self.failures or +self._unopened or +self.waiting)
 
     def times_noted(self, message: str) -> int:
         """Count how often a message was noted, for any log."""
@@ -147,20 +148,26 @@ class Counters:
     def add(self, event: Event) -> None:
         if isinstance(event, Noted):
             self.notes[event.name, event.message] += 1
-            return
-        self._unopened.discard(event.part)
-        if isinstance(event, Opened):
+        elif isinstance(event, Opened):
             self.num_opened += 1
-            self.total += len(event.frames)
-            self.num_before += len(event.frames) - len(event.todo)
-            self.waiting.update({(event.part, stamp): f"{event.log_id}/{stamp}" for stamp in event.todo})
-            return
-        self.waiting.pop((event.part, event.timestamp), None)
-        if isinstance(event, Done):
+            self.total += event.num_frames
+            self.num_before += event.num_frames - len(event.todo)
+            self._unopened[event.source] -= 1
+            self.waiting.update(event.todo)
+        elif isinstance(event, Done):
+            self.num_computed += 1
+            self.waiting[event.name] -= 1
             self._seconds.update(event.seconds)
         else:
             self.failures.append((event.name, event.message))
-            self.num_failed += event.timestamp is not None
+            is_frame = self.waiting[event.name] > 0
+            self.num_failed += is_frame
+            (self.waiting if is_frame else self._unopened)[event.name] -= 1
+
+    @property
+    def num_waiting(self) -> int:
+        """Number of frames of opened parts that are neither on disk nor failed."""
+        return self.total - self.num_before - self.num_computed - self.num_failed
 
     def report(self, seconds: float, signal_name: str) -> dict[str, Any]:
         """Return all figures of a run that took `seconds`. `signal_name` is the signal that stopped it, "" = none.
@@ -172,24 +179,23 @@ class Counters:
             "frames_per_s": computed frames. "stages": seconds per computed frame, summed over all workers.
             "failures": frame or log, and message. "waiting": frames. "notes": log, message and how often.
         """
-        computed = self.total - self.num_before - self.num_failed - len(self.waiting)
         return {
             "status": "interrupted" if signal_name else "complete" if self.is_complete else "incomplete",
             "stopped_by": signal_name or None,
             "frames": {
                 "total": self.total,
                 "complete_before": self.num_before,
-                "computed": computed,
+                "computed": self.num_computed,
                 "failed": self.num_failed,
                 "failed_logs": len(self.failures) - self.num_failed,
-                "waiting": len(self.waiting),
-                "unopened_parts": len(self._unopened),
+                "waiting": self.num_waiting,
+                "unopened_parts": sum((+self._unopened).values()),
             },
             "seconds": seconds,
-            "frames_per_s": computed / seconds if seconds > 0 else 0.0,
-            "stages": {name: total / max(1, computed) for name, total in self._seconds.items()},
+            "frames_per_s": self.num_computed / seconds if seconds > 0 else 0.0,
+            "stages": {name: total / max(1, self.num_computed) for name, total in self._seconds.items()},
             "failures": self.failures,
-            "waiting": [name for _, name in sorted(self.waiting.items())],
+            "waiting": sorted(self.waiting.elements()),
             "notes": [[*note, count] for note, count in self.notes.items()],
         }
 

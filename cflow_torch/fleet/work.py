@@ -23,7 +23,7 @@ from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.paths import as_path, safe_name
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.executors import describe_error
-from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
+from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, frame_name
 from cflow_torch.fleet.manifest import checked_manifest, claim_log, complete_frames, frame_file
 from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
@@ -76,37 +76,40 @@ class Worker:
 
         Yields:
             `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something other than a
-            frame fails, `Failed` has no time stamp.
+            frame fails, all frames without a result fail, or the log if it is not open.
         """
+        left = {source_name(part.source)}
         try:
             log = self._open(part.source)
             folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
             stamps = part.stamps(log)
-            if part.only is not None:
-                stamps = {i: stamp for i, stamp in stamps.items() if stamp == part.only}
             complete = set() if self._job.redo else complete_frames(folder)
             todo = {i: stamp for i, stamp in stamps.items() if stamp not in complete}
             manifest: Any = checked_manifest(folder, log, self._job.identity) if todo or complete else None
             remove_stale(folder)
-            yield Opened(part.number, log.log_id, tuple(stamps.values()), tuple(todo.values()))
+            names = [frame_name(log, stamp) for stamp in todo.values()]
+            yield Opened(source_name(part.source), len(stamps), tuple(names))
+            left = set(names)
             checks = bool(self._job.settings.get("check", True))
             if checks and 0 in todo:
                 with suppress(Exception):  # if a sweep cannot be read, its frames fail below
                     for text in find_problems(log):
-                        yield Noted(part.number, log.log_id, text)
+                        yield Noted(log.log_id, text)
             claim = lru_cache(partial(claim_log, folder, manifest))  # once, before the first frame
             for frame in self._pass(log, partial(self._write, folder, claim), todo):
-                name = f"{log.log_id}/{frame.timestamp}"
+                name = frame_name(log, frame.timestamp)
+                left.remove(name)
                 if checks and frame.is_repetition:
-                    yield Noted(part.number, name, "the next sweep has the same points")
+                    yield Noted(name, "the next sweep has the same points")
                 if isinstance(frame.content, Exception):
-                    yield Failed(part.number, name, describe_error(frame.content), frame.timestamp)
+                    yield Failed(name, describe_error(frame.content))
                 else:
-                    yield Done(part.number, frame.timestamp, frame.seconds)
+                    yield Done(name, frame.seconds)
         except BrokenExecutor:
             raise
         except Exception as error:
-            yield Failed(part.number, source_name(part.source), describe_error(error))
+            for name in sorted(left):
+                yield Failed(name, describe_error(error))
 
     def close(self) -> None:
         """Close the log. We do not wait for reads and writes that hang."""

@@ -36,7 +36,7 @@ class LethalWorker(Worker):
     """A worker whose process is killed at each part that still has a file next to the output."""
 
     def run(self, part: Part) -> Any:
-        file = Path(self._job.output).parent / f"kills-{part.number}"
+        file = Path(self._job.output).parent / f"kills-{Path(part.source).name}-{part.begin}"
         count = int(file.read_text()) if file.exists() else 0
         if count > 0:
             file.write_text(str(count - 1))
@@ -55,13 +55,14 @@ def test_a_killed_worker_is_replaced_and_a_part_that_always_kills_is_reported(fl
     monkeypatch.setattr(ray_engine, "make_worker_on_node", make_lethal_worker)
     this = sys.modules[__name__]
     cloudpickle.register_pickle_by_value(this)  # Ray's processes cannot import a test
-    (tmp_path / "kills-0").write_text("1")
-    (tmp_path / "kills-2").write_text("1000")
+    first, second, _ = (tmp_path / f"kills-{folder.name}-0" for folder in sorted(fleet.iterdir()))
+    first.write_text("1")
+    second.write_text("1000")
     try:
         report = run(fleet, tmp_path / "out", TWO, engine="ray")
     finally:
         cloudpickle.unregister_pickle_by_value(this)
-    assert (tmp_path / "kills-0").read_text() == "0" and (tmp_path / "kills-2").read_text() == "998"
+    assert first.read_text() == "0" and second.read_text() == "998"
     ((_, message),) = report["failures"]
     assert "its worker died again" in message and 0 < report["frames"]["computed"] < PAIRS
     assert tree(tmp_path / "out").items() <= single.items()
@@ -69,7 +70,7 @@ def test_a_killed_worker_is_replaced_and_a_part_that_always_kills_is_reported(fl
 
 def start(devices: Sequence[str], **settings: Any) -> None:
     with ray_executors(make_job(Path("nowhere")), devices, **settings) as executors:
-        next(run_parallel(executors, [Part(0, "nothing")], lambda: False))
+        next(run_parallel(executors, [Part("nothing")], lambda: False))
 
 
 def test_ray_does_not_choose_a_gpu():

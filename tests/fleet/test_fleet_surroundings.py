@@ -31,7 +31,6 @@ def test_shards_and_parts_cover_every_frame_once(lengths: list[int], count: int,
     seen: list[tuple[int, int]] = []
     for index in range(count):
         parts = Shard(index, count).parts(list(range(len(lengths))), workers)
-        assert [part.number for part in parts] == list(range(len(parts)))
         seen += [(part.source, frame) for part in parts for frame in part.frames(lengths[part.source])]
     assert sorted(seen) == [(log, frame) for log, length in enumerate(lengths) for frame in range(length)]
 

@@ -53,11 +53,13 @@ def test_a_bad_frame_does_not_spoil_its_batch(source, single, tmp_path, error):
     stamps = AV2Log(source).timestamps
     worker = Worker(make_job(tmp_path, batch=3), "cpu")
     worker._model = FailingModel([stamps[1], stamps[3]], lambda: error)
-    events = list(worker.run(Part(0, source)))
+    events = list(worker.run(Part(source)))
     failed = [event for event in events if isinstance(event, Failed)]
-    assert [event.timestamp for event in failed] == [stamps[1], stamps[3]]
+    assert [event.name for event in failed] == [f"{source.name}/{stamps[i]}" for i in (1, 3)]
     assert all(type(error).__name__ in event.message or "too odd" in event.message for event in failed)
-    assert [event.timestamp for event in events if isinstance(event, Done)] == [stamps[i] for i in (0, 2, 4)]
+    assert [event.name for event in events if isinstance(event, Done)] == [
+        f"{source.name}/{stamps[i]}" for i in (0, 2, 4)
+    ]
     assert len(flow_files(tmp_path)) == 3 and flow_files(tmp_path).items() <= single.items()
 
 
@@ -80,13 +82,14 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
             return Odd(drive)
 
     job = make_job(tmp_path, config=make_config("paper"), settings={}, batch=4)
-    events = list(Opener(job, "cpu").run(Part(0, "odd")))
+    events = list(Opener(job, "cpu").run(Part("odd")))
     (failed,) = [event for event in events if isinstance(event, Failed)]
     count = len(drive.sweep(1).points)
-    assert failed.timestamp == drive.timestamps[1] and f"none of the {count} points of pc0 is active" in failed.message
-    assert [event.timestamp for event in events if isinstance(event, Done)] == [drive.timestamps[i] for i in (0, 2, 3)]
+    names = [f"{drive.log_id}/{stamp}" for stamp in drive.timestamps]
+    assert failed.name == names[1] and f"none of the {count} points of pc0 is active" in failed.message
+    assert [event.name for event in events if isinstance(event, Done)] == [names[i] for i in (0, 2, 3)]
     notes = [(event.name, event.message) for event in events if isinstance(event, Noted)]
-    assert notes[-1] == (f"{drive.log_id}/{drive.timestamps[3]}", "the next sweep has the same points")
+    assert notes[-1] == (names[3], "the next sweep has the same points")
     assert any("the sensor moves" in text for _, text in notes), "the log is checked by the part of its first frame"
 
 
@@ -94,10 +97,10 @@ def test_a_log_whose_frames_all_fail_leaves_no_files(source, tmp_path):
     stamps = AV2Log(source).timestamps
     worker = Worker(make_job(tmp_path), "cpu")
     model, worker._model = worker._model, FailingModel(stamps, lambda: ValueError("odd"))
-    events = list(worker.run(Part(0, source)))
+    events = list(worker.run(Part(source)))
     assert [type(event) for event in events[-5:]] == [Failed] * 5 and not any(tmp_path.iterdir())
     worker._model = model
-    assert isinstance(list(worker.run(Part(0, source)))[-1], Done) and len(flow_files(tmp_path)) == 5
+    assert isinstance(list(worker.run(Part(source)))[-1], Done) and len(flow_files(tmp_path)) == 5
 
 
 def test_a_lost_gpu_ends_its_worker(source, tmp_path, monkeypatch):
@@ -109,7 +112,7 @@ def test_a_lost_gpu_ends_its_worker(source, tmp_path, monkeypatch):
 
     monkeypatch.setattr("cflow_torch.fleet.work.torch.zeros", refuse)
     with pytest.raises(BrokenExecutor, match="can no longer be used: .*device-side assert"):
-        list(worker.run(Part(0, source)))
+        list(worker.run(Part(source)))
 
 
 # Several workers, which live in the thread of their caller
@@ -157,7 +160,7 @@ class HereExecutor(Executor):
 
 
 def parts_of(sources: Sequence[Any]) -> list[Part]:
-    return [Part(number, source) for number, source in enumerate(sources)]
+    return [Part(source) for source in sources]
 
 
 def never() -> bool:
@@ -190,7 +193,7 @@ def test_when_a_worker_dies_each_of_its_frames_is_tried_by_itself(fleet, single,
     counters = count(run_parallel(executors, parts, never), parts)
     assert deadly == {names[3]: 999, names[1]: 0}, "the part dies on its frame 1, then frame 3 by itself"
     assert counters.failures == [(names[3], AGAIN_DIED)]
-    assert (counters.total, counters.waiting) == (PAIRS, {})
+    assert (counters.total, counters.num_waiting) == (PAIRS, 0)
     assert counters.times_noted(AGAIN) == 1
     assert tree(tmp_path) == {name: content for name, content in single.items() if name != f"{names[3]}.feather"}
     assert all(executor.worker is None for executor in executors), "they are closed"
@@ -214,8 +217,8 @@ def test_a_log_that_cannot_be_opened_alive_is_left(source, tmp_path):
             raise BrokenExecutor("SIGSEGV")
 
     died, failed = run_parallel([Deadly(make_job(tmp_path))], parts_of([source]), never)
-    assert died == Noted(0, source.name, AGAIN)
-    assert failed == Failed(0, source.name, AGAIN_DIED)
+    assert died == Noted(source.name, AGAIN)
+    assert failed == Failed(source.name, AGAIN_DIED)
 
 
 def test_workers_that_die_at_their_start_are_started_twice_for_each_log(fleet, tmp_path):
@@ -238,7 +241,7 @@ def test_a_worker_that_cannot_start_ends_the_run(fleet, tmp_path):
         list(run_parallel([Gone(make_job(tmp_path)), HereExecutor(make_job(tmp_path))], parts, never))
 
 
-def test_an_error_outside_of_frames_fails_only_its_part(fleet, single, tmp_path, monkeypatch):
+def test_an_error_outside_of_frames_fails_only_the_frames_of_its_part(fleet, single, tmp_path, monkeypatch):
     """For example if there is no memory for another thread."""
     first, *others = sorted(fleet.iterdir())
     real = Worker._pass
@@ -252,7 +255,8 @@ def test_an_error_outside_of_frames_fails_only_its_part(fleet, single, tmp_path,
     executors = [HereExecutor(make_job(tmp_path)) for _ in range(2)]
     events = run_parallel(executors, parts_of([first, *others]), never)
     failed = [(e.name, e.message) for e in events if isinstance(e, Failed)]
-    assert failed == [(first.name, "RuntimeError: can't start new thread")]
+    lost = [f"{first.name}/{stamp}" for stamp in AV2Log(first).timestamps[:-1]]
+    assert failed == [(name, "RuntimeError: can't start new thread") for name in lost]
     assert len(flow_files(tmp_path)) == PAIRS - 3 and flow_files(tmp_path).items() <= single.items()
 
 
@@ -352,11 +356,11 @@ def test_a_close_ends_a_call_of_another_thread():
 
 def test_the_report_lists_what_is_missing():
     counters = Counters(parts_of(["a", "b", "c"]))
-    stamps = tuple(range(40))
-    events = [Opened(0, "a", stamps, stamps[10:]), Done(0, 10, {"read": 2.0}), Failed(0, "a/11", "odd", 11)]
-    for event in [*events, Failed(1, "b", "no log"), *(Noted(2, name, "odd") for name in "cca")]:
+    names = tuple(f"a/{stamp}" for stamp in range(40))
+    events = [Opened("a", 40, names[10:]), Done("a/10", {"read": 2.0}), Failed("a/11", "odd")]
+    for event in [*events, Failed("b", "no log"), *(Noted(name, "odd") for name in "cca")]:
         counters.add(event)
-    assert counters.times_noted("odd") == 3 and len(counters.waiting) == 28
+    assert counters.times_noted("odd") == 3 and counters.num_waiting == 28
     about = {"engine": "local", "shard": {"index": 0, "count": 1}, "devices": ["cpu"]}
     report = {**counters.report(4.0, "SIGTERM"), **about}
     assert report["status"] == "interrupted" and report["stopped_by"] == "SIGTERM"
@@ -373,4 +377,4 @@ def test_a_stop_lets_started_frames_finish(fleet, tmp_path):
     executors = [HereExecutor(job), HereExecutor(job)]
     counters = count(run_parallel(executors, parts, lambda: any(tmp_path.rglob("*.feather"))), parts)
     assert 0 < len(flow_files(tmp_path)) < PAIRS
-    assert len(counters.waiting) + len(flow_files(tmp_path)) == counters.total
+    assert counters.num_waiting + len(flow_files(tmp_path)) == counters.total
