@@ -22,6 +22,7 @@ from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, window, windows
 from cflow_torch.estimate import make_model
+from cflow_torch.ops.threads import one_thread
 from cflow_torch.types import CENTRE, SIZE, VELOCITY, CFlowError, FlowResult, Sweep, Window
 
 _MAX_MISSED = 3  # sweeps that a track survives unseen
@@ -103,6 +104,7 @@ class Tracker:
         # Points of the tracks, at their predicted positions in the next sweep.
         self._points = _TrackPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64))
 
+    @one_thread()
     def push(self, sweeps: Window | tuple[Sweep, Sweep], result: FlowResult) -> Tracked:
         """Continue the tracks by one sweep.
 
@@ -335,6 +337,8 @@ def track(
 
     Raises:
         CFlowError: a sweep cannot be read, or a result does not belong to its sweep.
+
+    Cost: one CPU thread. More threads take longer, because the work is many small operations.
     """
     return track_points(log, results, sweep_interval)[0]
 
@@ -398,6 +402,7 @@ class LogTracker:
         """The points of the tracks of each sweep that was pushed."""
         return [each.points for each in self._sweeps]
 
+    @one_thread()
     def table(self) -> dict[str, np.ndarray]:
         """Return the table of `track`."""
         self._take_out_static_points()

@@ -16,6 +16,7 @@ from small_logs import make_small_drive
 from staged_cars import SIZE, Staged, straight
 
 from cflow_torch import CFlowError, FlowResult, Sweep, Tracker, Window, make_config, make_model, track
+from cflow_torch.applications import tracking
 from cflow_torch.applications.association import VOXELS, box_of_point, enclosing_boxes, link
 from cflow_torch.applications.instance_files import write_drivestudio
 from cflow_torch.applications.kitti_tracks import write_kitti
@@ -304,6 +305,26 @@ def test_ids_survive_empty_sweeps_and_missing_frames() -> None:
     assert len(set(ids)) == 1
     assert len(set(track(log, [pair for pair in log.results() if pair[0] not in (4, 5)])["id"])) == 1
     assert all(len(values) == 0 for values in track(log, []).values())
+
+
+def test_tracking_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With two threads next to other work, it took two to three times as long."""
+    seen: list[int] = []
+
+    def spied(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *given: (seen.append(torch.get_num_threads()), function(*given))[1]
+
+    monkeypatch.setattr(tracking, "match", spied(tracking.match))
+    monkeypatch.setattr(tracking, "complete", spied(tracking.complete))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        log = Staged([straight((0, 0), (0.9, 0.0), 4)])
+        track(log, log.results())
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1, 1, 1, 1], "three sweeps, then the boxes"
 
 
 def test_wrong_inputs_are_one_clear_error() -> None:
