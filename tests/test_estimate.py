@@ -76,7 +76,7 @@ def test_estimate_flow_equals_the_module(method, num_future):
     names = ["0", "1", *(f"h{k}" for k in range(1, 1 + len(window.pch))), *(f"f{k}" for k in range(1, 1 + num_future))]
     columns = {"pc": "points", "gm": "is_ground", "pose": "pose", "dt": "point_times"}
     sample = {"scene_id": "a", "pc3": P0, "pch9": P0}  # others are ignored
-    for name, sweep in zip(names, (window.pc0, window.pc1, *window.pch, *window.pcf)):
+    for name, sweep in zip(names, window.sweeps):
         sample.update({f"{prefix}{name}": getattr(sweep, column) for prefix, column in columns.items()})
     (expected,) = make_model(settings)([window])
     assert_same_bits(make_model(settings)([Window.from_dict(sample)])[0], expected)

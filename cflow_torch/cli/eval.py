@@ -70,8 +70,9 @@ class Scores:
         labels = log.labels(index)
         if labels is None:
             return
-        wanted = ("eval_mask", "stored_motion") if self.metrics.definition.ego_motion == "stored" else ("eval_mask",)
-        parts = {name: getattr(log, name)(index) for name in wanted}
+        parts: dict[str, Any] = {"eval_mask": log.eval_mask(index)}
+        if self.metrics.definition.ego_motion == "stored":
+            parts["stored_motion"] = log.stored_motion(index)
         if self.metrics.definition.truth == "motion":
             parts["moving"] = log.moving(index)
         self.metrics.update(EvalFrame.from_result(sweeps, result, labels, **parts))

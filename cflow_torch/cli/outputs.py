@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from cflow_torch import __version__
-from cflow_torch.cli.commands import Command
+from cflow_torch.cli.commands import Command, Submit
 from cflow_torch.cli.failures import is_sweep
 from cflow_torch.cli.info import processor
 from cflow_torch.data.atomic import ensure_writable, write_text
@@ -75,13 +75,13 @@ def write_config(cfg: Command, folder: Path) -> None:
     write_text(folder / "config.yaml", OmegaConf.to_yaml(_config(cfg)))
 
 
-def claim_output(cfg: Command, folder: Path, ignored: Sequence[str]) -> None:
+def claim_output(cfg: Submit, folder: Path, ignored: Sequence[str]) -> None:
     """Reject a folder whose config.yaml has other settings or versions, unless `cfg.overwrite`; write config.yaml.
 
     The settings `ignored` may differ, because files do not depend on them.
     """
     file = ensure_writable(folder) / "config.yaml"
-    if file.exists() and not getattr(cfg, "overwrite", False):
+    if file.exists() and not cfg.overwrite:
         before = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
         now = OmegaConf.to_container(_config(cfg))
         check_same_run(folder, before, now, ("output", "overwrite", *ignored))

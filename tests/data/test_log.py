@@ -32,7 +32,7 @@ def result(drive: Drive) -> FlowResult:
 
 
 def points_of(windows: Sequence[Window]) -> list:
-    return [[sweep.points for sweep in (w.pc0, w.pc1, *w.pch, *w.pcf)] for w in windows]
+    return [[sweep.points for sweep in w.sweeps] for w in windows]
 
 
 def test_logs_and_wrappers_are_sequences(drive):

@@ -163,13 +163,13 @@ def test_results_do_not_depend_on_the_form_of_arrays():
     assert num_moving(expected) > 100
     for form in FORMS.values():
         given = changed(plain, lambda sweep, form=form: replace(sweep, points=form(sweep.points)))
-        before = [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch, *given.pcf)]
+        before = [as_bytes(sweep.points) for sweep in given.sweeps]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             result = cflow(given, settings)
         assert_same_bits(result, expected)
         assert not result.flow.requires_grad
-        assert [as_bytes(sweep.points) for sweep in (given.pc0, given.pc1, *given.pch, *given.pcf)] == before
+        assert [as_bytes(sweep.points) for sweep in given.sweeps] == before
 
 
 def test_results_share_no_memory_with_the_input():
