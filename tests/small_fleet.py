@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -11,7 +10,7 @@ from command_line import cflow
 from cflow_torch import make_config
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.fleet.job import Job, Shard
-from cflow_torch.fleet.manifest import check_logs, clear_log, make_identity
+from cflow_torch.fleet.manifest import check_logs, clear_log
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import run_fleet
@@ -28,8 +27,7 @@ ONE, TWO = ("cpu",), ("cpu", "cpu")  # devices
 def make_job(output: Path, **settings: Any) -> Job:
     """A job with `CONFIG` on Argoverse 2 logs."""
     values: dict[str, Any] = {"config": CONFIG, "settings": {"check": False}, "batch": 2, **settings}
-    job = Job(identity={}, reader="av2", output=str(output), **values)
-    return replace(job, identity=make_identity(job.config, job.reader, job.settings, job.contents))
+    return Job(reader="av2", output=str(output), **values)
 
 
 def run(

@@ -19,7 +19,7 @@ from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.fleet.job import Job, Part, find_shard
 from cflow_torch.fleet.machine import choose_batch, choose_devices, frames_per_worker
-from cflow_torch.fleet.manifest import check_logs, clear_log, make_identity
+from cflow_torch.fleet.manifest import check_logs, clear_log
 from cflow_torch.fleet.parallel import local_executors
 from cflow_torch.fleet.ray_engine import ray_executors
 from cflow_torch.fleet.run import count_frames, forecast, format_missing, format_report, report_file, run_fleet
@@ -44,7 +44,6 @@ class FlowRun:
         self.output = output_folder(cfg)
         self.job = Job(
             config=cfg.model,
-            identity=make_identity(cfg.model, self.logs.name, self.logs.settings, contents),
             reader=self.logs.name,
             settings=dict(self.logs.settings),
             output=str(self.output),

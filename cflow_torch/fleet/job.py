@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Mapping, NamedTuple, Sequence, Union
 
 from cflow_torch.config import Config
 from cflow_torch.data.flow_file import CONTENTS
 from cflow_torch.data.log import Log
+from cflow_torch.fleet.manifest import make_identity
 from cflow_torch.setting import AUTO
 from cflow_torch.types import CFlowError
 
@@ -21,13 +22,17 @@ class Job:
     """The settings of a run, which every worker gets. The parts are sent separately."""
 
     config: Config  # settings of the method
-    identity: dict[str, Any]  # method, data settings and versions, see `make_identity`
     reader: str  # data set, a key of `catalog.DATA_SETS`
     settings: dict[str, Any]  # of its reader
     output: str  # folder of the results; a path, or the address of an object store
     contents: tuple[str, ...] = CONTENTS  # what a flow file has: names in `flow_file.CONTENTS` and `ON_REQUEST`
     batch: int = 1  # windows that are computed together
     redo: bool = False  # compute frames again that exist already
+    identity: dict[str, Any] = field(init=False)  # method, data settings and versions, see `make_identity`
+
+    def __post_init__(self) -> None:
+        identity = make_identity(self.config, self.reader, self.settings, self.contents)
+        object.__setattr__(self, "identity", identity)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.errors import CFlowError, import_optional
 from cflow_torch.fleet.executors import Executor, InlineExecutor, describe_error
 from cflow_torch.fleet.job import Job
-from cflow_torch.fleet.manifest import make_identity
 from cflow_torch.fleet.work import Worker, make_worker
 from cflow_torch.setting import AUTO
 
@@ -73,7 +72,7 @@ def make_worker_on_node(folder: str, job: Job, device: str) -> Worker:
     import ray
 
     node = ray.util.get_node_ip_address()
-    if make_identity(job.config, job.reader, job.settings, job.contents) != job.identity:
+    if replace(job).identity != job.identity:  # a copy has the versions of this node
         raise CFlowError(f"node {node} has other versions of cflow_torch, torch or numpy than the driver")
     if not as_path(job.output).is_dir():
         raise CFlowError(f"node {node} does not see {job.output}: all nodes must reach the output")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import sys
 from importlib.util import find_spec
@@ -13,10 +14,10 @@ import pytest
 from small_fleet import PAIRS, TWO, make_job, run, tree
 
 from cflow_torch import CFlowError
-from cflow_torch.fleet import ray_engine
+from cflow_torch.fleet import manifest, ray_engine
 from cflow_torch.fleet.job import Job, Part
 from cflow_torch.fleet.parallel import run_parallel
-from cflow_torch.fleet.ray_engine import ray_executors
+from cflow_torch.fleet.ray_engine import make_worker_on_node, ray_executors
 from cflow_torch.fleet.work import Worker
 
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install ray")
@@ -76,6 +77,18 @@ def start(devices: Sequence[str], **settings: Any) -> None:
 def test_ray_does_not_choose_a_gpu():
     with pytest.raises(CFlowError, match="CUDA_VISIBLE_DEVICES"):
         start(["cuda:1"])
+
+
+def test_a_node_with_other_versions_is_refused(tmp_path, monkeypatch):
+    from ray import util
+
+    monkeypatch.setattr(util, "get_node_ip_address", lambda: "10.0.0.7")
+    job = make_job(tmp_path)
+    sent = pickle.loads(pickle.dumps(job))  # to the node
+    make_worker_on_node(os.getcwd(), sent, "cpu").close()
+    monkeypatch.setattr(manifest, "__version__", "0.0.1")  # of the node
+    with pytest.raises(CFlowError, match="node 10.0.0.7 has other versions of cflow_torch"):
+        make_worker_on_node(os.getcwd(), sent, "cpu")
 
 
 @pytest.mark.slow
