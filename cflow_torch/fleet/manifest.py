@@ -84,19 +84,24 @@ def checked_manifest(folder: Path, log: Log, identity: Mapping[str, Any]) -> dic
     A log that has changed since, or another log of its name, is a `CFlowError`. Cost: reads three sweeps.
     """
     manifest = {"run": dict(identity), **describe_log(log)}
-    before = _read(folder / MANIFEST)
-    if before is not None and (before.get("run") == identity or complete_frames(folder)):
-        _check_manifest(folder, before, manifest)
+    _is_claimed(folder, manifest)
     return manifest
 
 
 def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written."""
+    if not _is_claimed(folder, manifest):
+        write_json(folder / MANIFEST, manifest)
+        _check_manifest(folder, _read(folder / MANIFEST) or {}, manifest)  # another process may have been quicker
+
+
+def _is_claimed(folder: Path, manifest: Mapping[str, Any]) -> bool:
+    """Test whether a folder has a manifest, which must be this one; one of another run without frames is replaced."""
     before = _read(folder / MANIFEST)
     if before is None or (before.get("run") != manifest["run"] and not complete_frames(folder)):
-        write_json(folder / MANIFEST, manifest)
-        before = _read(folder / MANIFEST)  # another process may have been quicker
-    _check_manifest(folder, before or {}, manifest)
+        return False
+    _check_manifest(folder, before, manifest)
+    return True
 
 
 def _check_manifest(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
