@@ -81,11 +81,12 @@ class FlowRun:
         settings = asdict(self._cfg.engine)
         name = settings.pop("name")
         own = {key: value for key, value in settings.items() if key not in ("workers", "batch")}
-        self._begin = perf_counter()
         with _ENGINES[name](self.job, devices, **own) as executors:
             parts = self.shard.parts(self.logs.sources, len(devices))
             about = {"config": settings_record(self._cfg), "versions": versions()}
-            return run_fleet(executors, parts, self.job, devices, self.shard, name, about)
+            report = run_fleet(executors, parts, self.job, devices, self.shard, name, about)
+        self._computed = perf_counter()
+        return report
 
     def finish(self, report: dict[str, Any], failures: Failures) -> None:
         """Print the report and what is missing, and exit with the status of the run unless it is complete.
@@ -94,7 +95,7 @@ class FlowRun:
         """
         file = report_file(self.job.output, self.shard)
         if not report["stopped_by"]:  # a signal leaves no time for this
-            report["seconds"] = perf_counter() - self._begin
+            report["seconds"] += perf_counter() - self._computed
             with suppress(OSError):  # the run has reported it
                 write_json(file, report)
         print(f"{format_report(report)}\nflow files in {self.job.output}, report in {file}")
