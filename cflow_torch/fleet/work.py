@@ -78,7 +78,8 @@ class Worker:
             `Opened` once, then `Done` and `Failed` in the order of the log, and `Noted`. If something other than a
             frame fails, all frames without a result fail, or the log if it is not open.
         """
-        left = {source_name(part.source)}
+        source = source_name(part.source)
+        left = {source}  # what has no result: the log until it is open, then its frames
         try:
             log = self._open(part.source)
             folder = as_path(self._job.output) / safe_name(log.log_id, "the log")
@@ -88,7 +89,7 @@ class Worker:
             manifest: Any = checked_manifest(folder, log, self._job.identity) if todo or complete else None
             remove_stale(folder)
             names = [frame_name(log, stamp) for stamp in todo.values()]
-            yield Opened(source_name(part.source), len(stamps), tuple(names))
+            yield Opened(source, len(stamps), tuple(names))
             left = set(names)
             checks = bool(self._job.settings.get("check", True))
             if checks and 0 in todo:
@@ -98,7 +99,7 @@ class Worker:
             claim = lru_cache(partial(claim_log, folder, manifest))  # once, before the first frame
             for frame in self._pass(log, partial(self._write, folder, claim), todo):
                 name = frame_name(log, frame.timestamp)
-                left.remove(name)
+                left.discard(name)
                 if checks and frame.is_repetition:
                     yield Noted(name, "the next sweep has the same points")
                 if isinstance(frame.content, Exception):
