@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Dict, Iterable, Iterator, Mapping, Optional, Tuple
 
@@ -58,7 +59,8 @@ def _of_choices() -> Iterator[tuple[str, Iterable[_Named]]]:
         yield f"data={file.stem}", [(f"data.{name}", DATA_SETTINGS.get(name)) for name in read_settings(file)]
 
 
-def read_settings(file: Path) -> dict[str, Any]:
+@lru_cache(maxsize=None)
+def read_settings(file: Path) -> Mapping[str, Any]:
     """Return the settings in the YAML file of a data set, and in the files that it extends, with their defaults."""
     import yaml  # type: ignore[import-untyped]  # takes 40 ms, which help does not need
 
