@@ -107,7 +107,6 @@ def test_a_killed_run_is_resumed_and_its_workers_end(many, expected, tmp_path, s
     process = subprocess.Popen(
         [sys.executable, "-m", "cflow_torch.cli.main", *COMMAND, *settings],
         start_new_session=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     wait_for(lambda: len(frames(tmp_path)) > 3)
     children = workers(process)
