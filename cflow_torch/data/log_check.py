@@ -179,23 +179,30 @@ def _motion(log: Log, reading: str) -> list[Finding]:
         fix += "that the poses belong to this log, their times, units and quaternions" if has_poses else "pass poses"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
-        why += _shift_of_clocks(log, judgement)
         fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
         fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
+        shifts = _shifts_of_clocks(log, judgement)
+        if shifts:
+            why += f" the clocks of sweeps and poses may differ by {_span(shifts.values())} s, because"
+        if len(shifts) > 1:
+            fix = f"correct the times of one, or try data.read_as={_span(shifts)}"
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
 
 
-def _shift_of_clocks(log: Log, judgement: Judgement) -> str:
-    """Return what poses of another time mean if they have times, with all shifts that fit as well; "" = nothing."""
+def _shifts_of_clocks(log: Log, judgement: Judgement) -> dict[str, str]:
+    """Return what poses of another time mean if they have times: the readings that fit as well, and their seconds."""
     best, interval = judgement.best[0], intervals_of(log)
     if best not in TIMES_OF_POSES or log.trajectory is None or interval is None:
-        return ""
+        return {}
     least = EQUAL * judgement.shares[best]
     kind = best.partition("_")[0]
     equal = [name for name, share in judgement.shares.items() if name.startswith(kind) and share >= least]
-    seconds = [_NUM_SWEEPS[name] * float(np.median(interval)) for name in equal]
-    shift = f"{min(seconds):.2g}" + (f" to {max(seconds):.2g}" if len(seconds) > 1 else "")
-    return f" the clocks of sweeps and poses may differ by {shift} s, because"
+    return {name: f"{_NUM_SWEEPS[name] * float(np.median(interval)):.2g}" for name in equal}
+
+
+def _span(names: Iterable[str]) -> str:
+    first, *others = names
+    return " to ".join([first, *others[-1:]])
 
 
 def _setting(log: Log, reading: str) -> str:

@@ -133,15 +133,28 @@ def test_other_clocks_are_named_and_late_poses_counted(tmp_path) -> None:
 
 
 def test_clouds_of_another_clock_are_shifted_by_the_times_of_arrival(tmp_path) -> None:
-    """A LiDAR that counts from its start: the bag knows when each message arrived."""
-    bag = Recorder(tmp_path / "boot")
+    """A LiDAR that counts from its start, or is ahead: the bag knows when each message arrived."""
+    for name, lag in (("boot", lambda start: 55 * 10**9 - start), ("ahead", lambda _: 800_000_000)):
+        bag = Recorder(tmp_path / name)
+        bag.mount()
+        bag.drive()
+        ahead = lag(bag.stamps[0])
+        bag.clouds(stamp=lambda stamp, ahead=ahead: stamp + ahead)
+        path = bag.close()
+        with pytest.warns(CFlowWarning, match="different clocks .* by the times of arrival"):
+            log = BagLog(path)
+        assert list(log.timestamps) == list(bag.stamps) and world(log, bag.recording) < 5e-3
+
+
+def test_clouds_that_arrive_late_keep_their_times(tmp_path) -> None:
+    """A message may arrive long after its measurement, but not before it."""
+    bag = Recorder(tmp_path)
     bag.mount()
     bag.drive()
-    bag.clouds(stamp=lambda stamp: stamp - bag.stamps[0] + 55 * 10**9)
+    bag.clouds(stamp=lambda stamp: stamp - 800_000_000)
     path = bag.close()
-    with pytest.warns(CFlowWarning, match="different clocks .* by the times of arrival"):
-        log = BagLog(path)
-    assert list(log.timestamps) == list(bag.stamps) and world(log, bag.recording) < 5e-3
+    with pytest.warns(CFlowWarning, match=r"differ by \+0.8 s by the times of arrival: if static points move"):
+        BagLog(path)
 
 
 def test_repeated_stamps_are_named(tmp_path) -> None:

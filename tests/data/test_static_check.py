@@ -314,9 +314,21 @@ def test_poses_of_another_log_are_named(drive):
 @pytest.mark.parametrize("source", ["drive", "real"])
 def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, request):
     mixed = Wrong(request.getfixturevalue(source), poses=each(lambda pose: pose @ np.linalg.inv(MOUNTING)))
-    x, y = map(float, judge_log(mixed).best[0].split()[1:])
-    assert np.hypot(x - 1.35, y) < 0.4
-    assert "data.ego_T_lidar" in find_problems(mixed)[0]
+    (place,) = re.findall(
+        r"data.ego_T_lidar with a position of about x = (.*) m and y = (.*) m", find_problems(mixed)[0]
+    )
+    assert np.hypot(float(place[0]) - 1.35, float(place[1])) < 0.4
+
+
+def test_a_lidar_that_is_turned_and_elsewhere_is_located(turning):
+    """A bag without a transform to the LiDAR: "left" and "mount" fit only together."""
+    ego_T_lidar = as_matrix(rotations_about(2, np.radians(90)), (2, 0, 0.3))
+    mixed = Wrong(turning, points=lambda points, _: transform_points(points, np.linalg.inv(ego_T_lidar)), masks=False)
+    (problem,) = [text for text in find_problems(mixed) if "ground" not in text]
+    found = re.search(
+        r"a rotation of about 90 degrees about z and a position of about x = (.*) m and y = (.*) m", problem
+    )
+    assert found and np.hypot(float(found[1]) - 2, float(found[2])) < 0.5
 
 
 @pytest.mark.parametrize(

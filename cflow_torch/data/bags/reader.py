@@ -46,6 +46,7 @@ _OTHER_POSES = ("nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped")  # us
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
+_EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 
@@ -316,22 +317,28 @@ class BagLog(Log):
         return dict(reversed(stamps))
 
     def _set_clock(self, pose_times: np.ndarray) -> None:
-        """Shift the times of clouds to the clock of the poses, by the times of arrival, if the two do not overlap."""
+        """Shift the times of clouds to the clock of the poses, by the times of arrival, if the clocks surely differ.
+
+        They do if the times do not overlap, or if messages of one kind only arrive before their time. Otherwise poses
+        may arrive late, because they take long to compute.
+        """
         first, last = self.timestamps[0], self.timestamps[-1]
-        shift = _middle([arrived - time for time, arrived in self._arrival.items()]) - _middle(self._pose_delays)
-        if last >= pose_times[0] and first <= pose_times[-1]:
-            if abs(shift) >= _LARGEST_DELAY:
-                seconds = f"{shift * 1e-9:+.2g} s by the times of arrival"
-                self._note(f"clocks of its clouds and poses differ by {seconds}: if static points move, correct one")
+        delays = [arrived - time for time, arrived in self._arrival.items()], self._pose_delays
+        shift = _middle(delays[0]) - _middle(delays[1])
+        do_overlap = last >= pose_times[0] and first <= pose_times[-1]
+        if abs(shift) < (_LARGEST_DELAY if do_overlap else _ANOTHER_CLOCK):
             return
-        if abs(shift) < _ANOTHER_CLOCK:
+        seconds = f"{shift * 1e-9:+.6g} s by the times of arrival"
+        are_early = [sorted(each)[len(each) * 9 // 10] < -_EARLY for each in delays if each]
+        if do_overlap and sum(are_early) != 1:
+            self._note(f"clocks of its clouds and poses differ by {seconds}: if static points move, correct one")
             return
         self._shift = shift
         self._arrival = {time + shift: arrived for time, arrived in self._arrival.items()}
         self.timestamps = sorted(self._arrival)
         self._note(
-            f"the times of its clouds and of its poses have different clocks ({shift * 1e-9:+.6g} s by the times of "
-            "arrival), so we shift those of the clouds"
+            f"the times of its clouds and of its poses have different clocks ({seconds}), so we shift those of the "
+            "clouds"
         )
 
     def _find_trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:
