@@ -134,8 +134,9 @@ def find_all_sources(name: str, paths: Sequence[Any]) -> list[Any]:
 
 _CONVERSIONS = {
     **dict.fromkeys((".las", ".laz"), "convert them with pdal translate IN.las OUT.ply"),
-    **dict.fromkeys((".xyz", ".txt", ".asc", ".pts"), "convert them with numpy.save(OUT, numpy.loadtxt(IN))"),
-    ".csv": 'convert them with numpy.save(OUT, numpy.loadtxt(IN, delimiter=",", skiprows=1)), x, y, z first',
+    **dict.fromkeys(
+        (".xyz", ".txt", ".asc", ".pts", ".csv"), "clouds have lines of three numbers or more, x, y, z first"
+    ),
     **dict.fromkeys((".pcap", ".pcapng"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"),
     **dict.fromkeys((".e57", ".drc", ".rcp"), "convert them to .ply"),
     **dict.fromkeys((".gz", ".zip", ".tar", ".tgz", ".7z", ".zst", ".bz2"), "unpack them"),

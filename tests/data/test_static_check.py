@@ -31,7 +31,7 @@ from cflow_torch.transforms import (
     transform_points,
 )
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.conventions import AXES, CAMERA, WORLD
+from cflow_torch.windows.conventions import AXES, CAMERA, UNITS, WORLD
 from cflow_torch.windows.readings import GIVEN, NO_READING, UNKNOWN, _compare
 
 MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
@@ -378,20 +378,21 @@ def test_points_that_are_a_little_too_large_are_no_lidar_elsewhere(source, facto
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["drive", "real"])
-def test_points_and_poses_in_feet_are_told_by_the_height_of_the_sensor(source, request):
+@pytest.mark.parametrize("unit", ["feet", "inches", "centimetres"])
+def test_units_of_points_and_poses_are_told_by_the_height_of_the_sensor(source, unit, request):
     good = request.getfixturevalue(source)
     is_made = source == "drive"  # its frame is on the ground
     shift = as_matrix(np.eye(3), (0, 0, 1.7 if is_made else 0))
-    feet = Wrong(
+    wrong = Wrong(
         good,
-        lambda points, _: (points - shift[:3, 3]) / 0.3048,
-        lambda poses: scaled(1 / 0.3048)(poses @ shift),
+        lambda points, _: (points - shift[:3, 3]) / UNITS[unit],
+        lambda poses: scaled(1 / UNITS[unit])(poses @ shift),
         masks=False,
     )
-    texts = find_problems(feet)
-    assert any("below the sensor" in text and "data.read_as=points_feet" in text for text in texts)
-    assert any("data.read_as=[points_feet,feet]" in text for text in texts)
-    assert find_problems(read_as(feet, ["points_feet", "feet"])) == []
+    texts = find_problems(wrong)
+    assert any(unit in text and f"data.read_as=points_{unit}" in text for text in texts)
+    assert any(f"data.read_as=[points_{unit},{unit}]" in text for text in texts)
+    assert find_problems(read_as(wrong, [f"points_{unit}", unit])) == []
 
 
 class Accumulated(Wrong):

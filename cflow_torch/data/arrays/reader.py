@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import in_single, matrices_in, read_columns, read_table
+from cflow_torch.data.arrays.cloud_file import in_single, matrices_in, read_columns, read_table, stem_of, suffix_of
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
     POSE_FILES,
@@ -134,7 +134,7 @@ class ArraysLog(Log):
             points = np.where(is_missing[:, None], np.float32(np.nan), points)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = transform_points(points, self.ego_T_lidar)
-        is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
+        is_ground = None if self._ground is None else _read_mask(self._ground, stem_of(self.files[index]), len(points))
         pose = None if self.poses is None else self.poses[index].copy()
         seconds = None if times is None else times.seconds
         return Sweep(in_single(points), is_ground, pose, time, seconds)
@@ -147,7 +147,7 @@ class ArraysLog(Log):
     def _find_bin_layout(self, columns: Any) -> BinLayout | None:
         """Return the layout of `.bin` files; None = the files have another suffix. We say if it is not KITTI's."""
         first = self.files[0]
-        if first.suffix.lower() != ".bin":
+        if suffix_of(first) != ".bin":
             return None
         with file_errors(first):
             layout = find_bin_layout(read_bytes(first), None if columns == "auto" else columns)
@@ -164,7 +164,7 @@ class ArraysLog(Log):
         if file is None and poses == "auto":
             found = [
                 path
-                for path in find_tables(self.folder)[0]
+                for path in find_tables(self.folder, self.files)[0]
                 if path.suffix.lower() not in poses_text.STRUCTURED or self._fits(path)
             ]
             file = only_one(found, self.folder, "poses")
@@ -193,9 +193,9 @@ class ArraysLog(Log):
 
     def _viewpoints(self) -> Trajectory | None:
         """Read the poses in VIEWPOINT of `.pcd` files, or in an array of `.npz` files; None if no file has one."""
-        if self.files[0].suffix.lower() == ".npz":
+        if suffix_of(self.files[0]) == ".npz":
             return self._poses_in_arrays()
-        if self.files[0].suffix.lower() != ".pcd":
+        if suffix_of(self.files[0]) != ".pcd":
             return None
         numbers = np.tile(np.eye(7)[3], (len(self.files), 1))
         for row, file in zip(numbers, self.files):
@@ -229,12 +229,12 @@ class ArraysLog(Log):
             if rows is None:
                 raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
             return stamps[rows].tolist()  # type: ignore[no-any-return]
-        named = times_of_names([path.stem for path in self.files])
+        named = times_of_names([stem_of(path) for path in self.files])
         if named is not None:
             return named
         if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
             return trajectory.times_ns.tolist()
-        tables = find_tables(self.folder)[1] if times == "auto" else []
+        tables = find_tables(self.folder, self.files)[1] if times == "auto" else []
         file = only_one([table for table in tables if len(poses_text.read_times(table)) == count], self.folder, "times")
         self._note(f"the times of its sweeps are those of {file.name}" if file else "")
         return None if file is None else poses_text.read_times(file).tolist()
@@ -247,9 +247,9 @@ class ArraysLog(Log):
         """
         stems = [Path(label).stem for label in labels]
         row_of = dict(zip(stems, range(len(stems))))
-        if row_of.keys() >= {path.stem for path in self.files}:
-            return np.array([row_of[path.stem] for path in self.files])
-        numbers = [_number_of(path.stem) for path in self.files]
+        if row_of.keys() >= {stem_of(path) for path in self.files}:
+            return np.array([row_of[stem_of(path)] for path in self.files])
+        numbers = [_number_of(stem_of(path)) for path in self.files]
         numbered = dict(zip(map(_number_of, stems), range(len(stems))))
         rows = np.array([numbered.get(number, -1) for number in numbers])
         is_enough = (rows >= 0).mean() > (_LEAST_NAMED if len(stems) != len(self.files) else 1 - 1e-9)
@@ -268,7 +268,7 @@ class ArraysLog(Log):
         labelled = self._labelled_rows(labels) if len(labels) == count else None
         if count == len(self.files) or labelled is not None:
             return np.arange(count) if labelled is None else labelled
-        numbers = np.array([_number_of(path.stem) % 10**9 for path in self.files])
+        numbers = np.array([_number_of(stem_of(path)) % 10**9 for path in self.files])
         fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
         if len(fitting) != 1 or len(set(numbers)) < len(numbers) or fitting[0].max() < _LEAST_REACH * count:
             return None

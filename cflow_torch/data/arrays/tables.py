@@ -45,13 +45,13 @@ def parse_table(content: bytes, path: Path) -> Table:
     with file_errors(path, "every line must have the same number of numbers"):
         lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
         lines = _poses_only(lines)
-        start = next((k for k, line in enumerate(lines) if _is_row(_split(line))), len(lines))
+        start = next((k for k, line in enumerate(lines) if _is_row(split_line(line))), len(lines))
         names = re.split("[,;]", lines[start - 1].lstrip("#")) if start else []
         names = names if len(names) > 1 or not start else lines[start - 1].lstrip("#").split()
-        words = np.array([_split(line) for line in lines[start:] if line[0] != "#"], str)
+        words = np.array([split_line(line) for line in lines[start:] if line[0] != "#"], str)
         if any(line[0] != "#" for line in lines[: max(start - 1, 0)]) or words.ndim != 2 or not start < len(lines):
             raise ValueError("it is empty, or has text before its numbers" if start else "its lines differ in length")
-        columns = [column for column, word in enumerate(words[0]) if _is_number(word)]
+        columns = [column for column, word in enumerate(words[0]) if is_number(word)]
         texts = [words[:, column].tolist() for column in range(words.shape[1]) if column not in columns]
         labels: list[str] = next((column for column in texts if len(set(column)) == len(column)), [])
         names = [names[column] for column in columns] if len(names) == words.shape[1] else []
@@ -69,7 +69,7 @@ def read_numbers(path: Path) -> np.ndarray:
 def _poses_only(lines: list[str]) -> list[str]:
     """Leave out edges of a g2o graph, and the three numbers above each matrix of a trajectory of Open3D."""
     vertices = [line for line in lines if line.startswith("VERTEX_SE3")]
-    counts = [len(_split(line)) for line in lines[:5]]
+    counts = [len(split_line(line)) for line in lines[:5]]
     return vertices or ([line for k, line in enumerate(lines) if k % 5] if counts == [3, 4, 4, 4, 4] else lines)
 
 
@@ -109,7 +109,7 @@ def _as_decimals(value: Any) -> Any:
         return {key: _as_decimals(member) for key, member in value.items()}
     if isinstance(value, list):
         return [_as_decimals(member) for member in value]
-    return Decimal(str(value)) if _is_number(str(value)) else value
+    return Decimal(str(value)) if is_number(str(value)) else value
 
 
 def _series(value: Any) -> Iterator[tuple[list[str], list[Any]]]:
@@ -171,7 +171,7 @@ def _text_of(value: Any) -> str:
     return texts[0] if texts else ""
 
 
-def _split(line: str) -> list[str]:
+def split_line(line: str) -> list[str]:
     decimal = line.replace(",", ".") if ";" in line else line  # as some languages write numbers
     decimal = re.sub(r"[\[\]]", " ", decimal).strip()  # as NumPy prints matrices
     return re.split(r"[\s,;]+", decimal.rstrip(",; "))
@@ -179,11 +179,11 @@ def _split(line: str) -> list[str]:
 
 def _is_row(words: Sequence[str]) -> bool:
     """Test whether words are a row of numbers, or a pose with a few texts."""
-    num_numbers = sum(map(_is_number, words))
+    num_numbers = sum(map(is_number, words))
     return num_numbers == len(words) or num_numbers >= _FEWEST_NUMBERS
 
 
-def _is_number(word: str) -> bool:
+def is_number(word: str) -> bool:
     try:
         float(word)
     except ValueError:
