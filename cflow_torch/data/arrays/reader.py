@@ -67,6 +67,7 @@ class ArraysLog(Log):
             have no `timestamp_ns`.
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep, see `fit_to_sweeps`; None = unknown. Without times, there
             is one pose per sweep, or each sweep takes that of its name or number.
+        trajectory: times and `T_world_ego` of all poses, by which `DeskewedLog` moves points; None = without times.
         bin_layout: numbers of a point of `.bin` files, None for files of another suffix.
         has_viewpoints: whether the poses come from VIEWPOINT or arrays of the clouds. Such clouds are often in the
             world's frame (`read_as`).
@@ -113,9 +114,9 @@ class ArraysLog(Log):
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
         self.gaps = self._with_gaps_in_time() if self._has_times and trajectory is None else frozenset()
+        if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
+            trajectory = trajectory._replace(poses=trajectory.poses @ np.linalg.inv(self.ego_T_lidar))
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
-        if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
-            self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
         self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAY))
         if trajectory is not None and self.has_viewpoints:
             self._note(f"its poses come from {trajectory.source}")
@@ -283,6 +284,7 @@ class ArraysLog(Log):
             poses, is_known, note = fit_to_sweeps(trajectory, stamps)
             self._note(note)
             self.has_sparse_poses = trajectory.is_sparse(stamps)
+            self.trajectory = trajectory.times_ns, trajectory.poses
         else:
             given = self._rows(len(trajectory.poses), f"poses in {source}", trajectory.labels)
             if given is None:
