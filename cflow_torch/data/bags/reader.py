@@ -261,10 +261,16 @@ class BagLog(Log):
                 return moving[0]
         named = [name for name in (_BASE, *self._child.values()) if name and name != lidar]
         for name in named if self._mount is None else []:
-            if len(frames.change_times(name)) > 1 or name in self._child.values():
-                used = "We assume that both are in one place" if name in self._child.values() else "They are not used"
-                text = f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. {used}"
-                self._note(f"{text}; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)", "missing link")
+            is_in_tf = len(frames.change_times(name)) > 1
+            if is_in_tf or name in self._child.values():
+                self._note(
+                    f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. We assume that both are "
+                    "in one place; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)",
+                    "missing link",
+                )
+            if is_in_tf:
+                self._mount = np.eye(4)
+                return name
         return lidar
 
     def _scan(self) -> tuple[dict[int, int], dict[str, list[Any]]]:
