@@ -14,7 +14,7 @@ _ROLES = {
     "time": "t|.*time|.*stamp|(time|timestamp|stamp|t)(s|sec|secs|ns|us|ms|unix)",
     **{
         axis: f"{_POSITION}({axis}|{name}|.*xyz{k})m?"
-        for k, (axis, name) in enumerate(zip("xyz", ("easting", "northing", "alt(itude)?")))
+        for k, (axis, name) in enumerate(zip("xyz", ("east(ing)?", "north(ing)?", "alt(itude)?|up|height")))
     },
     "latitude": ".*lat(itude)?(deg|degrees|rad|radians)?",
     "longitude": ".*(lon|lng|longitude)(deg|degrees|rad|radians)?",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Callable, Iterable, List, Mapping
 
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
-from cflow_torch.data.log_motion import find_lapses, find_missing, judge_log
+from cflow_torch.data.log_motion import Lapse, find_lapses, find_missing, judge_log
 from cflow_torch.data.neighbours import Neighbours, alternate
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
@@ -55,7 +56,22 @@ _TWO_SENSORS = Finding(
     True,
 )
 _NUM_SWEEPS = {name: 0.5 if name in HALVES else int(name.partition("_")[2] or 1) for name in TIMES_OF_POSES}
-_Check = Callable[[Log], List[Finding]]
+
+
+class _CheckedLog(CachedLog):
+    """A log with what several checks ask."""
+
+    @cached_property
+    def misfit(self) -> list[Finding]:
+        """Why neighbouring sweeps do not fit whatever the poses: they measure other directions, or alternate."""
+        return _parts(self) or ([_TWO_SENSORS] if alternate(self) else [])
+
+    @cached_property
+    def lapses(self) -> list[Lapse]:
+        return find_lapses(self)
+
+
+_Check = Callable[[_CheckedLog], List[Finding]]
 
 
 def check_log(log: Log) -> None:
@@ -71,7 +87,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(CachedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _lapses))
+    findings = _collect(_CheckedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -93,12 +109,12 @@ def examine(log: Log) -> list[Finding]:
         _mask,
         _labels,
     )
-    findings = _collect(CachedLog(log, _CACHED), checks, tells_errors=True)
+    findings = _collect(_CheckedLog(log, _CACHED), checks, tells_errors=True)
     # Notes are complete only now, as readers note what they see in the sweeps.
     return [*findings, *(Finding("reader", FOUND, note) for note in log.notes)]
 
 
-def _collect(log: Log, checks: Iterable[_Check], tells_errors: bool = False) -> list[Finding]:
+def _collect(log: _CheckedLog, checks: Iterable[_Check], tells_errors: bool = False) -> list[Finding]:
     """Return what the checks find, by topic. One that cannot read a sweep finds its error, if it `tells_errors`."""
     found: list[Finding] = []
     for check in checks:
@@ -114,7 +130,7 @@ def _found(log: Log) -> list[Finding]:
     return log.findings()
 
 
-def _frame(log: Log) -> list[Finding]:
+def _frame(log: _CheckedLog) -> list[Finding]:
     """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame.
 
     Then check the ego motion in the frame that the points will have.
@@ -151,16 +167,16 @@ def _problem_of(log: Log, index: int) -> tuple[str, str]:
     return reading, problem
 
 
-def _motion(log: Log, reading: str) -> list[Finding]:
+def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     """Check the ego motion of a log whose points are converted by a reading; "" = they are right."""
-    if reading:  # the poses are judged in the frame that the points will have
-        log = ReadAs(log, reading)
+    # The poses are judged in the frame that the points will have.
+    log: Log = ReadAs(checked, reading) if reading else checked
     judgement = judge_log(log) if reading else log.judgement or judge_log(log)
     if not judgement.shares:
         return [Finding("ego motion", RIGHT, "not compared, because the sweeps have too little static structure", True)]
     has_poses = log.sweep(0).pose is not None
-    if has_poses and judgement.best and alternate(log):
-        return [_TWO_SENSORS]
+    if has_poses and judgement.best and checked.misfit:
+        return checked.misfit
     if NO_READING in judgement.best and has_poses:
         fits = {name: judge_log(ReadAs(log, name)) for name in OF_POINTS}
         fitting = [name for name, each in fits.items() if not each.best and each.given >= LEAST_SHARE]
@@ -210,17 +226,16 @@ def _setting(log: Log, reading: str) -> str:
     return f"data.read_as=[{','.join(readings)}]" if len(readings) > 1 else f"data.read_as={reading}"
 
 
-def _lapses(log: Log) -> list[Finding]:
-    lapses = find_lapses(log)
-    if not lapses:
+def _lapses(log: _CheckedLog) -> list[Finding]:
+    if not log.lapses:
         return []
-    if alternate(log):
-        return [_TWO_SENSORS]
+    if log.misfit:
+        return log.misfit
     texts = [
         f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
         if each.is_single
         else f"the poses jump by {each.metres:.1f} m before sweep {each.sweep}"
-        for each in lapses
+        for each in log.lapses
     ]
     fix = "correct it, or remove the sweep; for a jump, give poses of a continuous frame (odometry, not the map)"
     return [Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)]
@@ -256,7 +271,6 @@ def _deskew(log: Log) -> list[Finding]:
 
 
 def _repeated(log: Log) -> list[Finding]:
-    """Compare the first two sweeps and, if they share few directions, also the third one."""
     first = [log.sweep(index) for index in range(2)]
     if repeats(*first):
         return [Finding("sweeps", WRONG, REPEATED, True)]
@@ -265,14 +279,19 @@ def _repeated(log: Log) -> list[Finding]:
         text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
         fix = "give the points that each sweep has measured itself, not a map or sweeps that were added up"
         return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
-    shared = _shared_directions(*first)
-    if shared < _LEAST_SHARED and len(log.timestamps) > 2:
-        shared = max(shared, _shared_directions(first[1], log.sweep(2)))
-    if shared < _LEAST_SHARED:
-        text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
-        fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
-        return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
-    return []
+    return _parts(log)
+
+
+def _parts(log: Log) -> list[Finding]:
+    """Compare the directions of the first two sweeps and, if they share few, also those of the third one."""
+    shared = 0.0
+    for index in range(min(2, len(log) - 1)):
+        shared = max(shared, _shared_directions(log.sweep(index), log.sweep(index + 1)))
+        if shared >= _LEAST_SHARED:
+            return []
+    text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
+    fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
+    return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
 
 
 def _share_again(pc0: Sweep, pc1: Sweep) -> float:
@@ -317,7 +336,7 @@ def _directions(sweep: Sweep) -> np.ndarray:
     return has_points
 
 
-def _each_sweep(log: Log) -> list[Finding]:
+def _each_sweep(log: _CheckedLog) -> list[Finding]:
     """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
     log.sweep(0)  # its error is that of the log
     neighbours = Neighbours()
@@ -350,7 +369,7 @@ def _small(neighbours: Neighbours) -> list[Finding]:
     return [Finding("sweeps", WRONG, f"{text}, while those around it have {small[index]:,}: {fix}")]
 
 
-def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
+def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
     """Find sweeps that repeat the one before, and others that fit neither the sweep before them nor the one after."""
     findings = []
     repeated = [index for index in neighbours.repeated if index > 1]  # `_repeated` tells the first
@@ -362,12 +381,9 @@ def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
         text = f"sweeps seem to be missing before sweep {index}, because the vehicle moves {metres:.1f} m there"
         findings.append(Finding("sweeps", WRONG, f"{text}: give the times of the sweeps"))
     known = (
-        {lapse.sweep for lapse in find_lapses(log)}
-        | set(repeated)
-        | {index for index, _ in missing}
-        | set(neighbours.small)
+        {lapse.sweep for lapse in log.lapses} | set(repeated) | {index for index, _ in missing} | set(neighbours.small)
     )
-    for first, last in [] if alternate(log) else neighbours.misplaced(log):
+    for first, last in [] if log.misfit else neighbours.misplaced(log):
         if not known.isdisjoint(range(first, last + 2)):
             continue
         if last < first:
@@ -377,6 +393,8 @@ def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
             what = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
             what += " not fit those around"
             fix = "has it points or a pose of another time? Correct its files, or leave it out"
+            if log.unwrapped.has_sparse_poses:
+                fix = "its poses are interpolated over several sweeps, which data.odometry=refine corrects"
         findings.append(Finding("sweeps", WRONG, f"{what}: {fix}"))
     return findings
 

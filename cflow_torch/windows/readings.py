@@ -274,6 +274,7 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
     best = [name for name in best if name in (SCALED, TURNED) or _is_small(name) == _is_small(best[0])]
     kinds = (MOUNT, *MOUNTS), TIMES_OF_POSES
     others = [name for kind in kinds for name in [name for name in best if name in kind][1:]]
+    others += [MOUNTED] if len(best) > 1 else []
     return tuple(name for name in best if name not in others)
 
 

@@ -629,6 +629,19 @@ def test_sweeps_that_measure_parts_of_a_turn_are_told(drive, has_poses):
     assert any("share 0 % of the directions" in text or "share 4 %" in text for text in texts), texts
 
 
+def test_sweeps_of_half_a_turn_are_told_once(whole):
+    """Each fits the second next one, as those of two sensors do, but the directions say more."""
+
+    class Half(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index // 2)
+            keep = (sweep.points[:, 1] > 0) == index % 2
+            return replace(sweep, points=sweep.points[keep], is_ground=sweep.is_ground[keep])
+
+    wrong = [finding.text for finding in examine(Half(whole)) if finding.status == WRONG]
+    assert len(wrong) == 1 and "share 0 % of the directions" in wrong[0]
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.6])
 def test_two_sensors_in_turns_are_told_and_nothing_else(drive, angle):
     T_points_second = np.linalg.inv(as_matrix(rotations_about(2, angle), (-1.5, 0, 0.4)))

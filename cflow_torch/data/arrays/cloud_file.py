@@ -92,13 +92,11 @@ def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return kept
 
 
-def matrices_in(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an `.npz` file that may be poses: (4, 4) or (3, 4) numbers."""
+def small_arrays(path: Path) -> dict[str, Any]:
+    """Read the arrays of an `.npz` file that may be a pose or its time: up to 16 numbers, as nested lists."""
     with file_errors(path, _hint(path)):
         arrays = _plain_arrays(read_bytes(path))
-    return {
-        name: array for name, array in arrays.items() if array.shape in ((4, 4), (3, 4)) and array.dtype.kind in "fiu"
-    }
+    return {name: array.tolist() for name, array in arrays.items() if array.size <= 16 and array.dtype.kind in "fiu"}
 
 
 def in_single(points: np.ndarray) -> np.ndarray:

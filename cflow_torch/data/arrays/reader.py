@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import in_single, matrices_in, read_columns, read_table, stem_of, suffix_of
+from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table, small_arrays, stem_of, suffix_of
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
     POSE_FILES,
@@ -35,8 +35,9 @@ from cflow_torch.transforms import poses_from_quaternions, rigid_transform, tran
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 
-_VIEWPOINT, _ARRAY = "VIEWPOINT", "the array"  # sources of poses that come with the clouds
+_VIEWPOINT, _ARRAYS = "VIEWPOINT", "the arrays"  # sources of poses that come with the clouds
 _LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
+_LEAST_USUAL = 2 / 3  # share of steps between the numbers of files that are equal, or the numbers are irregular
 _LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
@@ -47,8 +48,8 @@ class ArraysLog(Log):
         folder: of a log, see `find_array_logs`. Clouds are sorted by the times in their names, else naturally: 2
             before 10.
         poses: "auto" = one of `POSE_FILES` in the folder, or KITTI's ../../poses/<name>.txt, or the only file or
-            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or the only matrix in each
-            `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
+            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or those in arrays of
+            each `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
             sweeps; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
@@ -113,11 +114,12 @@ class ArraysLog(Log):
             self._note(note)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        self.gaps = self._with_gaps_in_time() if self._has_times and trajectory is None else frozenset()
         if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
             trajectory = trajectory._replace(poses=trajectory.poses @ np.linalg.inv(self.ego_T_lidar))
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
-        self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAY))
+        gaps = {*self.gaps, *self._gaps_in_numbers()}
+        self.gaps = self._with_gaps_in_time(sorted(gaps)) if self._has_times else frozenset(gaps)
+        self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
         if trajectory is not None and self.has_viewpoints:
             self._note(f"its poses come from {trajectory.source}")
 
@@ -193,9 +195,10 @@ class ArraysLog(Log):
         return trajectory.times_ns is not None or len(trajectory.poses) == len(self.files) or rows is not None
 
     def _viewpoints(self) -> Trajectory | None:
-        """Read the poses in VIEWPOINT of `.pcd` files, or in an array of `.npz` files; None if no file has one."""
+        """Read the poses in VIEWPOINT of `.pcd` files, or in arrays of `.npz` files; None if no file has one."""
         if suffix_of(self.files[0]) == ".npz":
-            return self._poses_in_arrays()
+            trajectory = poses_text.poses_of_members([small_arrays(file) for file in self.files])
+            return trajectory and trajectory._replace(source=f"{_ARRAYS} {trajectory.source} of its clouds")
         if suffix_of(self.files[0]) != ".pcd":
             return None
         numbers = np.tile(np.eye(7)[3], (len(self.files), 1))
@@ -207,18 +210,6 @@ class ArraysLog(Log):
             return None
         poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
         return Trajectory(poses, None, False, _VIEWPOINT)
-
-    def _poses_in_arrays(self) -> Trajectory | None:
-        """Read the only matrix, (4, 4) or (3, 4), of each `.npz` file."""
-        of_files = [matrices_in(file) for file in self.files[:1]]
-        if len(of_files[0]) != 1:
-            return None
-        (name,) = of_files[0]
-        of_files += [matrices_in(file) for file in self.files[1:]]
-        if any(name not in each for each in of_files):
-            return None
-        poses = checked_poses(np.stack([each[name] for each in of_files]), name)
-        return Trajectory(poses, None, False, f"{_ARRAY} {name} of its clouds")
 
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
@@ -302,9 +293,19 @@ class ArraysLog(Log):
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
         self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
         is_gap = (np.diff(kept) > 1) | (np.diff(rows[kept]) > np.median(np.diff(rows)))
-        gaps = np.flatnonzero(is_gap).tolist()
-        self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
+        self.gaps = frozenset(np.flatnonzero(is_gap).tolist())
         return poses
+
+    def _gaps_in_numbers(self) -> list[int]:
+        """Return the indices of files without times after which others are missing, by the numbers in their names."""
+        steps = np.diff([_number_of(stem_of(path)) for path in self.files])
+        usual = np.median(steps)
+        gaps = np.flatnonzero(steps > usual).tolist()
+        if self._has_times or not gaps or steps.min() <= 0 or (steps == usual).mean() <= _LEAST_USUAL:
+            return []
+        first = self.files[gaps[0]].name
+        self._note(f"sweeps are missing by the numbers of its files, first after {first}; no window reaches over them")
+        return gaps  # type: ignore[no-any-return]
 
 
 def _number_of(stem: str) -> int:
