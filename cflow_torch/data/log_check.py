@@ -18,7 +18,16 @@ from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.conventions import OF_POINTS, READINGS, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import EQUAL, HALVES, LEAST_SHARE, NO_READING, UNKNOWN, Judgement, difference
+from cflow_torch.windows.readings import (
+    EQUAL,
+    HALVES,
+    INACCURATE,
+    LEAST_SHARE,
+    NO_READING,
+    UNKNOWN,
+    Judgement,
+    difference,
+)
 from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite
 
 _CACHED = 12  # sweeps that several checks read
@@ -55,11 +64,17 @@ _TWO_SENSORS = Finding(
     "those of one sensor (data.suffix, data.topic)",
     True,
 )
+_OF_SPARSE_POSES = "its poses are interpolated over several sweeps, which data.odometry=refine corrects"
 _NUM_SWEEPS = {name: 0.5 if name in HALVES else int(name.partition("_")[2] or 1) for name in TIMES_OF_POSES}
 
 
 class _CheckedLog(CachedLog):
     """A log with what several checks ask."""
+
+    @cached_property
+    def motion(self) -> Judgement:
+        """How well readings of the poses fit the points as they are."""
+        return self.judgement or judge_log(self)
 
     @cached_property
     def misfit(self) -> list[Finding]:
@@ -171,7 +186,7 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     """Check the ego motion of a log whose points are converted by a reading; "" = they are right."""
     # The poses are judged in the frame that the points will have.
     log: Log = ReadAs(checked, reading) if reading else checked
-    judgement = judge_log(log) if reading else log.judgement or judge_log(log)
+    judgement = judge_log(log) if reading else checked.motion
     if not judgement.shares:
         return [Finding("ego motion", RIGHT, "not compared, because the sweeps have too little static structure", True)]
     has_poses = log.sweep(0).pose is not None
@@ -190,6 +205,8 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
         fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
+    elif name in (NO_READING, INACCURATE) and log.unwrapped.has_sparse_poses:
+        why, fix = "", _OF_SPARSE_POSES
     elif name == NO_READING:
         why, fix = "", "check that the points are x, y, z in metres, and "
         fix += "that the poses belong to this log, their times, units and quaternions" if has_poses else "pass poses"
@@ -383,7 +400,8 @@ def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
     known = (
         {lapse.sweep for lapse in log.lapses} | set(repeated) | {index for index, _ in missing} | set(neighbours.small)
     )
-    for first, last in [] if log.misfit else neighbours.misplaced(log):
+    is_explained = log.misfit or set(log.motion.best) - {NO_READING}
+    for first, last in [] if is_explained else neighbours.misplaced(log):
         if not known.isdisjoint(range(first, last + 2)):
             continue
         if last < first:
@@ -393,8 +411,7 @@ def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
             what = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
             what += " not fit those around"
             fix = "has it points or a pose of another time? Correct its files, or leave it out"
-            if log.unwrapped.has_sparse_poses:
-                fix = "its poses are interpolated over several sweeps, which data.odometry=refine corrects"
+            fix = _OF_SPARSE_POSES if log.unwrapped.has_sparse_poses else fix
         findings.append(Finding("sweeps", WRONG, f"{what}: {fix}"))
     return findings
 

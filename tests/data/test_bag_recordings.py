@@ -159,14 +159,17 @@ def test_clouds_that_arrive_late_keep_their_times(tmp_path) -> None:
 
 
 def test_repeated_stamps_are_named(tmp_path) -> None:
-    same = Recorder(tmp_path / "same")
-    same.mount()
-    same.drive()
-    same.clouds(stamp=lambda stamp: same.stamps[0])
-    with pytest.warns(CFlowWarning, match="8 clouds have 1 different time stamps, so we use their times of arrival"):
-        log = BagLog(same.close())
-    assert [time - 40_000_000 for time in log.timestamps] == list(same.stamps)
-    assert len({tuple(sweep.points[0]) for sweep in log}) == 8
+    for name in ("same", "zero"):
+        same = Recorder(tmp_path / name)
+        same.mount()
+        same.drive()
+        first = same.stamps[0] if name == "same" else 0
+        same.clouds(stamp=lambda stamp, first=first: first)
+        message = "8 clouds have 1 different time stamps, so we use their times of arrival"
+        with pytest.warns(CFlowWarning, match=message):
+            log = BagLog(same.close())
+        assert [time - 40_000_000 for time in log.timestamps] == list(same.stamps)
+        assert len({tuple(sweep.points[0]) for sweep in log}) == 8
     loop = Recorder(tmp_path / "loop")
     loop.mount()
     loop.drive()

@@ -117,8 +117,9 @@ class ArraysLog(Log):
         if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
             trajectory = trajectory._replace(poses=trajectory.poses @ np.linalg.inv(self.ego_T_lidar))
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
-        gaps = {*self.gaps, *self._gaps_in_numbers()}
-        self.gaps = self._with_gaps_in_time(sorted(gaps)) if self._has_times else frozenset(gaps)
+        if trajectory is None and self._has_times:
+            self.gaps = self._with_gaps_in_time()
+        self.gaps |= frozenset(self._gaps_in_numbers())
         self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
         if trajectory is not None and self.has_viewpoints:
             self._note(f"its poses come from {trajectory.source}")
@@ -293,7 +294,8 @@ class ArraysLog(Log):
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
         self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
         is_gap = (np.diff(kept) > 1) | (np.diff(rows[kept]) > np.median(np.diff(rows)))
-        self.gaps = frozenset(np.flatnonzero(is_gap).tolist())
+        gaps = np.flatnonzero(is_gap).tolist()
+        self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
         return poses
 
     def _gaps_in_numbers(self) -> list[int]:

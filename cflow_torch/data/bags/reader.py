@@ -288,7 +288,7 @@ class BagLog(Log):
         for connection, arrived, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
             if connection.topic == self.topic:
-                stamps.append((_stamp(message, arrived), arrived))
+                stamps.append((_stamp(message, 0), arrived))
                 self._lidar = self._lidar or message.header.frame_id.lstrip("/")
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
@@ -315,8 +315,9 @@ class BagLog(Log):
         if self._use_arrival:
             stamps = [(arrived, arrived) for _, arrived in stamps]
             self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")
-        elif count < len(stamps):
-            repeated = len(stamps) - count
+        stamps = [(stamp or arrived, arrived) for stamp, arrived in stamps]
+        repeated = len(stamps) - len(dict(stamps))
+        if repeated:
             self._note(
                 f"{repeated} clouds repeat the time stamp of an earlier one and are left out; was it played twice?"
             )
