@@ -157,8 +157,10 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
         return [right, *_motion(log, "")]
-    unit = _fitting_unit(log, reading)
-    if unit != reading:
+    units = [f"points_{unit}" for unit in UNITS]
+    # The unit under which the points fit the poses may be another one.
+    unit = _fitting(log, [reading, *units]) if reading in units and known_poses(log) is not None else ""
+    if unit not in ("", reading):
         reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
     wrong = Finding("frame", WRONG, f"in the {where} sweep {problem}{fix}", True)
@@ -166,13 +168,10 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     return [wrong, *(_motion(log, reading) if reading or where == "last" else [])]
 
 
-def _fitting_unit(log: Log, reading: str) -> str:
-    """Return the unit of the points under which they fit the poses, if `reading` is a unit; else `reading`."""
-    units = [f"points_{unit}" for unit in UNITS]
-    if reading not in units or known_poses(log) is None:
-        return reading
-    judged = ((unit, judge_log(ReadAs(log, unit))) for unit in (reading, *units))
-    return next((unit for unit, each in judged if not each.best and each.given >= LEAST_SHARE), reading)
+def _fitting(log: Log, readings: Iterable[str]) -> str:
+    """Return the first of the readings of the points under which they fit the poses; "" = none."""
+    judged = ((name, judge_log(ReadAs(log, name))) for name in readings)
+    return next((name for name, each in judged if not each.best and each.given >= LEAST_SHARE), "")
 
 
 def _problem_of(log: Log, index: int) -> tuple[str, str]:
@@ -193,10 +192,9 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     if has_poses and judgement.best and checked.misfit:
         return checked.misfit
     if NO_READING in judgement.best and has_poses:
-        fits = {name: judge_log(ReadAs(log, name)) for name in OF_POINTS}
-        fitting = [name for name, each in fits.items() if not each.best and each.given >= LEAST_SHARE]
+        fitting = _fitting(log, OF_POINTS)
         if fitting:
-            text = f"{judgement}, unless points are converted: give {_setting(log, fitting[0])}"
+            text = f"{judgement}, unless points are converted: give {_setting(log, fitting)}"
             return [Finding("frame", WRONG, text, True)]
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"

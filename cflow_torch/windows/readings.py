@@ -39,7 +39,7 @@ GIVEN = "as given"
 STEPS = ("steps", "steps_back")
 HALVES = ("half_late", "half_early")
 # Readings that are no conventions: they follow from the points.
-UNKNOWN, TURNED, MOUNTED, SCALED = "unknown", "turned", "mounted", "scaled"
+UNKNOWN, MOUNTED, SCALED = "unknown", "mounted", "scaled"
 INACCURATE, NO_READING = "inaccurate", "none"
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
@@ -270,17 +270,12 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
     if len(named) < len(clear) and shares[INACCURATE] > _EXCUSE * max([shares[name] for name in named], default=0):
         return (INACCURATE,)
     best = [name for name in named if shares[name] >= EQUAL * shares[named[0]]]
-    best.sort(key=_complexity)
-    best = [name for name in best if name in (SCALED, TURNED) or _is_small(name) == _is_small(best[0])]
+    # Right-handed ones first; in turns, a slight rotation is as good as another position.
+    best.sort(key=lambda name: (name in MIRRORED) + 2 * (name == MOUNTED))
+    best = [name for name in best if name in (SCALED, MOUNTED) or _is_small(name) == _is_small(best[0])]
     kinds = (MOUNT, *MOUNTS), TIMES_OF_POSES
     others = [name for kind in kinds for name in [name for name in best if name in kind][1:]]
-    others += [MOUNTED] if len(best) > 1 else []
     return tuple(name for name in best if name not in others)
-
-
-def _complexity(name: str) -> int:
-    """Return a rank by which equal readings are named: in turns, a slight one is as good as another mounting."""
-    return (name in MIRRORED) + 2 * (name == TURNED) + 3 * (name == MOUNTED)
 
 
 def _is_small(name: str) -> bool:
@@ -328,12 +323,11 @@ def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.
     is_slight = abs(turn) > _SLIGHT and bool((turns * np.sign(turn) > abs(turn) / 2).all())  # not only in turns
     quarter = round(turn / (np.pi / 2)) * np.pi / 2
     is_oblique = abs(turn - quarter) > _OBLIQUE
+    turn = turn if is_oblique else quarter or turn
+    place = _place_of(pairs, scan, turn) if is_oblique or quarter else np.zeros(2)
     found = {}
-    if is_oblique or (quarter == 0 and is_slight):
-        found[TURNED] = _mounting(turn)
-    if is_oblique or quarter:
-        turn = turn if is_oblique else quarter
-        found[MOUNTED] = _mounting(turn, *_place_of(pairs, scan, turn))
+    if is_oblique or place.any() or (quarter == 0 and is_slight):  # else the turn has a name
+        found[MOUNTED] = _mounting(turn, *place)
     if quarter == 0 and max(np.abs(fitted - given)) > _SMALLEST_ERROR:
         found[MOUNT] = _mounting(0, *_place_of(pairs, scan, 0))
     if scale > _RESCALED or 1e-9 < scale < 1 / _RESCALED:
@@ -369,8 +363,12 @@ def _seen_from(ego_T_points: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _place_of(pairs: Sequence[Pair], scan: str, turn: float) -> np.ndarray:
-    """Return x and y in the frame of the poses at which the points' origin fits best, if their frame is turned."""
-    places = _PLACES
+    """Return x and y in the frame of the poses at which the points' origin fits best, if their frame is turned.
+
+    0 and 0 if that fits as well, unless the frame is not turned.
+    """
+    origin = np.zeros((1, 2))
+    places = np.concatenate([origin, _PLACES])
     for count in (_FEW_POINTS, _MOST_POINTS, _MOST_POINTS):
         ego_T_points = as_matrix(rotations_about(2, np.full(len(places), turn)))
         ego_T_points[:, :2, 3] = places
@@ -378,9 +376,9 @@ def _place_of(pairs: Sequence[Pair], scan: str, turn: float) -> np.ndarray:
         for pair in pairs:
             steps = _seen_from(ego_T_points, pair.transforms[GIVEN])
             shares += pair.target.structure(scan).shares(pair.source.points(scan)[:count], steps)
-        best = places[np.argsort(-shares, kind="stable")[:_NUM_BEST]]
-        places = best if places is _PLACES else best[0] + _BETWEEN
-    return best[0]  # type: ignore[no-any-return]
+        best = places[1:][np.argsort(-shares[1:], kind="stable")]
+        places = np.concatenate([origin, best[:_NUM_BEST] if len(best) > _NUM_BEST else best[0] + _BETWEEN])
+    return origin[0] if turn and shares[0] >= EQUAL * shares[1:].max() else best[0]  # type: ignore[no-any-return]
 
 
 def _motion_of(pair: Pair, scan: str) -> np.ndarray:

@@ -293,8 +293,7 @@ class ArraysLog(Log):
         kept = np.flatnonzero(is_known)
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
         self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
-        is_gap = (np.diff(kept) > 1) | (np.diff(rows[kept]) > np.median(np.diff(rows)))
-        gaps = np.flatnonzero(is_gap).tolist()
+        gaps = np.flatnonzero(np.diff(kept) > 1).tolist()
         self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
         return poses
 
