@@ -125,6 +125,9 @@ def examine(log: Log) -> list[Finding]:
         _labels,
     )
     findings = _collect(_CheckedLog(log, _CACHED), checks, tells_errors=True)
+    # The error that ended a check is told once, with the count of such sweeps.
+    texts = [finding.text for finding in findings if finding.topic != "log"]
+    findings = [one for one in findings if one.topic != "log" or not any(one.text in text for text in texts)]
     # Notes are complete only now, as readers note what they see in the sweeps.
     return [*findings, *(Finding("reader", FOUND, note) for note in log.notes)]
 
@@ -398,8 +401,10 @@ def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
     known = (
         {lapse.sweep for lapse in log.lapses} | set(repeated) | {index for index, _ in missing} | set(neighbours.small)
     )
-    is_explained = log.misfit or set(log.motion.best) - {NO_READING}
-    for first, last in [] if is_explained else neighbours.misplaced(log):
+    misplaced = neighbours.misplaced(log)
+    if misplaced and (log.misfit or set(log.motion.best) - {NO_READING}):
+        misplaced = []  # they are explained
+    for first, last in misplaced:
         if not known.isdisjoint(range(first, last + 2)):
             continue
         if last < first:

@@ -273,6 +273,8 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
     # Right-handed ones first; in turns, a slight rotation is as good as another position.
     best.sort(key=lambda name: (name in MIRRORED) + 2 * (name == MOUNTED))
     best = [name for name in best if name in (SCALED, MOUNTED) or _is_small(name) == _is_small(best[0])]
+    if any(name in READINGS for name in best):  # a convention says more than a number
+        best = [name for name in best if name not in (SCALED, MOUNTED)]
     kinds = (MOUNT, *MOUNTS), TIMES_OF_POSES
     others = [name for kind in kinds for name in [name for name in best if name in kind][1:]]
     return tuple(name for name in best if name not in others)

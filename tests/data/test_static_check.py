@@ -204,6 +204,7 @@ def test_wrong_poses_are_named_and_the_reading_undoes_them(reading, source, requ
     wrong = Wrong(good, poses=WRONG_POSES[reading])
     (problem,) = [text for text in find_problems(wrong) if "ground masks" not in text]
     assert f"data.read_as={reading}" in problem and "as given" in problem
+    assert "multiplied by" not in problem, "a unit says more than a factor"
     again = read_as(wrong, reading)
     assert find_problems(again) == []
     true, read = (np.linalg.inv(log.poses[2:-1]) @ log.poses[1:-2] for log in (Wrong(good), again))
@@ -723,7 +724,7 @@ def test_the_page_counts_sweeps_that_cannot_be_read(drive):
                 raise MissingFile(f"sweep {index} does not exist")
             return super().sweep(index)
 
-    texts = [one.text for one in examine(Damaged(drive)) if one.status == WRONG and one.topic == "sweeps"]
+    texts = [one.text for one in examine(Damaged(drive)) if one.status == WRONG]
     assert texts == [
         "2 of 12 sweeps cannot be read, the first is sweep 7: sweep 7 does not exist. Their pairs have no flow"
     ]
