@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Callable, Iterable, List, Mapping
+from typing import Callable, Iterable, List
 
 import numpy as np
 
@@ -357,22 +357,16 @@ def _directions(sweep: Sweep) -> np.ndarray:
 def _each_sweep(log: _CheckedLog) -> list[Finding]:
     """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
     log.sweep(0)  # its error is that of the log
-    neighbours = Neighbours()
-    errors: dict[int, Exception] = {}
-    for index in range(len(log.timestamps)):
-        try:
-            neighbours.add(log.sweep(index))
-        except (CFlowError, OSError) as error:
-            neighbours.add(None)
-            errors[index] = error
-    return [*_unreadable(log, errors), *_small(neighbours), *_misplaced(log, neighbours)]
+    neighbours = Neighbours.of(log)
+    return [*_unreadable(neighbours), *_small(neighbours), *_misplaced(log, neighbours)]
 
 
-def _unreadable(log: Log, errors: Mapping[int, Exception]) -> list[Finding]:
+def _unreadable(neighbours: Neighbours) -> list[Finding]:
+    errors = neighbours.errors
     if not errors:
         return []
     first = min(errors)
-    count = f"{len(errors)} of {len(log.timestamps)} sweeps cannot be read"
+    count = f"{len(errors)} of {len(errors) + len(neighbours.num_points)} sweeps cannot be read"
     text = f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow"
     return [Finding("sweeps", WRONG, text)]
 
