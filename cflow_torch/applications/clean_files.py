@@ -9,7 +9,7 @@ import numpy as np
 
 from cflow_torch.applications.cleaning import CleanLog
 from cflow_torch.data.arrays import ArraysLog
-from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows, stem_of
 from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, write_sides, write_sweep
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
@@ -58,7 +58,7 @@ def write_clean_log(clean: CleanLog, log: Log, root: Path, suffix: str | None = 
     with new_folder(root, log.log_id) as folder:
         (folder / REMOVED_FOLDER).mkdir()
         for index in range(len(log.timestamps)):
-            name = own.files[index].stem if isinstance(own, ArraysLog) else f"{index:06d}"
+            name = stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{index:06d}"
             file = folder / POINTS_FOLDER / f"{name}{suffix}"
             removed = clean.removed(index)
             moving = int(clean.moving(index).sum())
@@ -79,9 +79,10 @@ def write_clean_log(clean: CleanLog, log: Log, root: Path, suffix: str | None = 
 
 
 def own_suffix(log: Log) -> str:
-    """Return the suffix of the log's own clouds; `.npy` if it is not a folder of clouds."""
+    """Return the suffix of the log's own clouds; `.npy` if it is not a folder of clouds, or if we only read them."""
     own = log.unwrapped
-    return own.files[0].suffix if isinstance(own, ArraysLog) else ".npy"
+    suffix = own.files[0].suffix if isinstance(own, ArraysLog) else ".npy"
+    return suffix if suffix.lower() in SUFFIXES else ".npy"
 
 
 def stored_masks(folder: Path, log: Log) -> Callable[[int], np.ndarray]:
@@ -89,7 +90,7 @@ def stored_masks(folder: Path, log: Log) -> Callable[[int], np.ndarray]:
     own = log.unwrapped
 
     def read(index: int) -> np.ndarray:
-        name = own.files[index].stem if isinstance(own, ArraysLog) else f"{index:06d}"
+        name = stem_of(own.files[index]) if isinstance(own, ArraysLog) else f"{index:06d}"
         file = folder / REMOVED_FOLDER / f"{name}.npy"
         rows = len(log.sweep(index).points)
         mask = read_npy(file, _WRITE_AGAIN)

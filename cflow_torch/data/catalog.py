@@ -14,7 +14,7 @@ from typing import Any, Iterator, Mapping, NamedTuple, Sequence, overload
 from cflow_torch.data.deskewing import DeskewedLog, check_deskew
 from cflow_torch.data.file_errors import shortened
 from cflow_torch.data.finding import FOUND, Finding
-from cflow_torch.data.folders import find_folders, visible
+from cflow_torch.data.folders import distinct_names, find_folders, visible
 from cflow_torch.data.log import CachedLog, Log, LogWrapper
 from cflow_torch.data.log_check import check_log
 from cflow_torch.data.own_vehicle import OwnVehicleLog
@@ -62,6 +62,7 @@ DATA_SETS: dict[str, DataSet] = {
     "kiss_icp": DataSet("KissICPLog", "data for a loader of KISS-ICP"),
     "arrays": DataSet("ArraysLog", "folder of point clouds", (), "find_array_logs"),  # tried if no mark is found
 }
+_NAMED_BY_PATH = ("arrays", "bags", "pandaset")  # logs that have the names of their files or folders
 _DEEPEST = 6  # levels below the root that are searched for a mark
 
 
@@ -70,6 +71,16 @@ class UserSource(NamedTuple):
 
     name: str  # "package.module.name[number]"
     number: int  # index among these logs
+
+
+class RenamedSource(NamedTuple):
+    """A file or folder of a log whose name others have, too."""
+
+    path: Path
+    name: str
+
+    def __str__(self) -> str:
+        return str(self.path)
 
 
 def recognise(root: Any) -> str:
@@ -129,13 +140,22 @@ def find_all_sources(name: str, paths: Sequence[Any]) -> list[Any]:
     found: dict[str, Any] = {}
     for path in paths:
         found.update({str(source): source for source in find_sources(name, path)})
-    return list(found.values())
+    return _with_distinct_names(list(found.values())) if name in _NAMED_BY_PATH else list(found.values())
+
+
+def _with_distinct_names(sources: Sequence[Path]) -> list[Any]:
+    """Rename logs of equal names, as results of both would be in one folder."""
+    names = [source.name if source.is_dir() else source.stem for source in sources]
+    distinct = distinct_names(names, [source.absolute().parts[1:-1][::-1] for source in sources])
+    renamed = zip(sources, names, distinct)
+    return [source if name == other else RenamedSource(source, other) for source, name, other in renamed]
 
 
 _CONVERSIONS = {
     **dict.fromkeys((".las", ".laz"), "convert them with pdal translate IN.las OUT.ply"),
-    **dict.fromkeys((".xyz", ".txt", ".asc", ".pts"), "convert them with numpy.save(OUT, numpy.loadtxt(IN))"),
-    ".csv": 'convert them with numpy.save(OUT, numpy.loadtxt(IN, delimiter=",", skiprows=1)), x, y, z first',
+    **dict.fromkeys(
+        (".xyz", ".txt", ".asc", ".pts", ".csv"), "clouds have lines of three numbers or more, x, y, z first"
+    ),
     **dict.fromkeys((".pcap", ".pcapng"), "convert the packets with the tool of the sensor's maker to .pcd or a bag"),
     **dict.fromkeys((".e57", ".drc", ".rcp"), "convert them to .ply"),
     **dict.fromkeys((".gz", ".zip", ".tar", ".tgz", ".7z", ".zst", ".bz2"), "unpack them"),
@@ -273,6 +293,8 @@ def open_log(
             raise CFlowError(f"{setting}={value!r}: choose one of {', '.join(words)}")
     if odometry and name == "hdf5":
         settings = {"needs_poses": False, **settings}
+    new_name = source.name if isinstance(source, RenamedSource) else ""
+    source = source.path if isinstance(source, RenamedSource) else source
     if isinstance(source, UserSource):
         log = _user_logs(name, settings)[source.number]
     else:
@@ -280,6 +302,7 @@ def open_log(
         moves = "deskew" in inspect.signature(reader.__init__).parameters  # by more poses than one per sweep
         log = _open(name, source, {**settings, "deskew": deskew in ("auto", "times")} if moves else settings)
         deskew = "off" if moves and deskew == "times" and log.is_compensated else deskew  # the reader did it
+    log.log_id = new_name or log.log_id
     safe_name(log.log_id, f"{source}: the log")  # names the folder of its results
     if odometry:
         from cflow_torch.data.odometry import with_poses

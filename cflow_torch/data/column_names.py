@@ -12,7 +12,10 @@ _ROLES = {
     "sec": "(.*stamp)?secs?",
     "nsec": "(.*stamp)?(nsecs?|nanosec)",
     "time": "t|.*time|.*stamp|(time|timestamp|stamp|t)(s|sec|secs|ns|us|ms|unix)",
-    **{axis: f"{_POSITION}({axis}|{name})m?" for axis, name in zip("xyz", ("easting", "northing", "alt(itude)?"))},
+    **{
+        axis: f"{_POSITION}({axis}|{name}|.*xyz{k})m?"
+        for k, (axis, name) in enumerate(zip("xyz", ("east(ing)?", "north(ing)?", "alt(itude)?|up|height")))
+    },
     "latitude": ".*lat(itude)?(deg|degrees|rad|radians)?",
     "longitude": ".*(lon|lng|longitude)(deg|degrees|rad|radians)?",
     **{f"q{axis}": _ROTATION + axis for axis in "wxyz0123"},

@@ -138,7 +138,7 @@ class DeskewedLog(LogWrapper):
 
     def move(self, points: np.ndarray, seconds: np.ndarray, index: int, reading: str) -> np.ndarray:
         """Move points of sweep `index`, (N, 3+), by the ego motion in the (N,) `seconds` to their measurement."""
-        if reading == "times" and self.trajectory is not None:
+        if self.trajectory is not None:
             return self._move_along(self.trajectory, points, seconds, index)
         before = max(index - 1, 0)
         after = min(index, len(self) - 2)

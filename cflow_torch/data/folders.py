@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any, Callable, Sequence, TypeVar
 
@@ -48,3 +49,14 @@ def visible(folder: Path) -> list[Path]:
 def natural_key(name: str) -> tuple[Any, ...]:
     """Return a key for sorting that compares digits in names as numbers: 2 before 10."""
     return tuple((0, int(run), run) if run.isdecimal() else (1, 0, run) for run in re.findall(r"\d+|\D+", name))
+
+
+def distinct_names(names: Sequence[str], above: Sequence[Sequence[str]]) -> list[str]:
+    """Put names of parent folders (`above`, nearest first) in front of equal names, as many as it needs."""
+    found = list(names)
+    for depth in range(1, 1 + max(map(len, above), default=0)):
+        counts = Counter(found)
+        for k, parents in enumerate(above):
+            if counts[found[k]] > 1:
+                found[k] = "-".join([*parents[:depth][::-1], names[k]])
+    return found

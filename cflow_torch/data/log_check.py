@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Callable, Iterable, List, Mapping
+from functools import cached_property
+from typing import Callable, Iterable, List
 
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
-from cflow_torch.data.log_motion import find_lapses, find_missing, judge_log
+from cflow_torch.data.log_motion import Lapse, find_lapses, find_missing, judge_log
 from cflow_torch.data.neighbours import Neighbours, alternate
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
@@ -17,7 +18,16 @@ from cflow_torch.types import Sweep, as_numpy
 from cflow_torch.windows.conventions import OF_POINTS, READINGS, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import EQUAL, HALVES, LEAST_SHARE, NO_READING, UNKNOWN, Judgement, difference
+from cflow_torch.windows.readings import (
+    EQUAL,
+    HALVES,
+    INACCURATE,
+    LEAST_SHARE,
+    NO_READING,
+    UNKNOWN,
+    Judgement,
+    difference,
+)
 from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite
 
 _CACHED = 12  # sweeps that several checks read
@@ -54,8 +64,29 @@ _TWO_SENSORS = Finding(
     "those of one sensor (data.suffix, data.topic)",
     True,
 )
+_OF_SPARSE_POSES = "its poses are interpolated over several sweeps, which data.odometry=refine corrects"
 _NUM_SWEEPS = {name: 0.5 if name in HALVES else int(name.partition("_")[2] or 1) for name in TIMES_OF_POSES}
-_Check = Callable[[Log], List[Finding]]
+
+
+class _CheckedLog(CachedLog):
+    """A log with what several checks ask."""
+
+    @cached_property
+    def motion(self) -> Judgement:
+        """How well readings of the poses fit the points as they are."""
+        return self.judgement or judge_log(self)
+
+    @cached_property
+    def misfit(self) -> list[Finding]:
+        """Why neighbouring sweeps do not fit whatever the poses: they measure other directions, or alternate."""
+        return _parts(self) or ([_TWO_SENSORS] if alternate(self) else [])
+
+    @cached_property
+    def lapses(self) -> list[Lapse]:
+        return find_lapses(self)
+
+
+_Check = Callable[[_CheckedLog], List[Finding]]
 
 
 def check_log(log: Log) -> None:
@@ -71,7 +102,7 @@ def find_problems(log: Log) -> list[str]:
 
     Cost: reads up to eight sweeps; about 0.4 s.
     """
-    findings = _collect(CachedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _lapses))
+    findings = _collect(_CheckedLog(log, _CACHED), (_found, _frame, _mask, _repeated, _lapses))
     return [finding.text for finding in findings if finding.status != RIGHT and finding.is_quick]
 
 
@@ -93,12 +124,15 @@ def examine(log: Log) -> list[Finding]:
         _mask,
         _labels,
     )
-    findings = _collect(CachedLog(log, _CACHED), checks, tells_errors=True)
+    findings = _collect(_CheckedLog(log, _CACHED), checks, tells_errors=True)
+    # The error that ended a check is told once, with the count of such sweeps.
+    texts = [finding.text for finding in findings if finding.topic != "log"]
+    findings = [one for one in findings if one.topic != "log" or not any(one.text in text for text in texts)]
     # Notes are complete only now, as readers note what they see in the sweeps.
     return [*findings, *(Finding("reader", FOUND, note) for note in log.notes)]
 
 
-def _collect(log: Log, checks: Iterable[_Check], tells_errors: bool = False) -> list[Finding]:
+def _collect(log: _CheckedLog, checks: Iterable[_Check], tells_errors: bool = False) -> list[Finding]:
     """Return what the checks find, by topic. One that cannot read a sweep finds its error, if it `tells_errors`."""
     found: list[Finding] = []
     for check in checks:
@@ -114,7 +148,7 @@ def _found(log: Log) -> list[Finding]:
     return log.findings()
 
 
-def _frame(log: Log) -> list[Finding]:
+def _frame(log: _CheckedLog) -> list[Finding]:
     """Check the first sweep; without poses also the last one, which is far away if points are in the world's frame.
 
     Then check the ego motion in the frame that the points will have.
@@ -126,8 +160,10 @@ def _frame(log: Log) -> list[Finding]:
     if not problem:
         right = Finding("frame", RIGHT, "metres, around the vehicle, z up", True)
         return [right, *_motion(log, "")]
-    unit = _fitting_unit(log, reading)
-    if unit != reading:
+    units = [f"points_{unit}" for unit in UNITS]
+    # The unit under which the points fit the poses may be another one.
+    unit = _fitting(log, [reading, *units]) if reading in units and known_poses(log) is not None else ""
+    if unit not in ("", reading):
         reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
     wrong = Finding("frame", WRONG, f"in the {where} sweep {problem}{fix}", True)
@@ -135,13 +171,10 @@ def _frame(log: Log) -> list[Finding]:
     return [wrong, *(_motion(log, reading) if reading or where == "last" else [])]
 
 
-def _fitting_unit(log: Log, reading: str) -> str:
-    """Return the unit of the points under which they fit the poses, if `reading` is a unit; else `reading`."""
-    units = [f"points_{unit}" for unit in UNITS]
-    if reading not in units or known_poses(log) is None:
-        return reading
-    judged = ((unit, judge_log(ReadAs(log, unit))) for unit in (reading, *units))
-    return next((unit for unit, each in judged if not each.best and each.given >= LEAST_SHARE), reading)
+def _fitting(log: Log, readings: Iterable[str]) -> str:
+    """Return the first of the readings of the points under which they fit the poses; "" = none."""
+    judged = ((name, judge_log(ReadAs(log, name))) for name in readings)
+    return next((name for name, each in judged if not each.best and each.given >= LEAST_SHARE), "")
 
 
 def _problem_of(log: Log, index: int) -> tuple[str, str]:
@@ -151,21 +184,20 @@ def _problem_of(log: Log, index: int) -> tuple[str, str]:
     return reading, problem
 
 
-def _motion(log: Log, reading: str) -> list[Finding]:
+def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     """Check the ego motion of a log whose points are converted by a reading; "" = they are right."""
-    if reading:  # the poses are judged in the frame that the points will have
-        log = ReadAs(log, reading)
-    judgement = judge_log(log) if reading else log.judgement or judge_log(log)
+    # The poses are judged in the frame that the points will have.
+    log: Log = ReadAs(checked, reading) if reading else checked
+    judgement = judge_log(log) if reading else checked.motion
     if not judgement.shares:
         return [Finding("ego motion", RIGHT, "not compared, because the sweeps have too little static structure", True)]
     has_poses = log.sweep(0).pose is not None
-    if has_poses and judgement.best and alternate(log):
-        return [_TWO_SENSORS]
+    if has_poses and judgement.best and checked.misfit:
+        return checked.misfit
     if NO_READING in judgement.best and has_poses:
-        fits = {name: judge_log(ReadAs(log, name)) for name in OF_POINTS}
-        fitting = [name for name, each in fits.items() if not each.best and each.given >= LEAST_SHARE]
+        fitting = _fitting(log, OF_POINTS)
         if fitting:
-            text = f"{judgement}, unless points are converted: give {_setting(log, fitting[0])}"
+            text = f"{judgement}, unless points are converted: give {_setting(log, fitting)}"
             return [Finding("frame", WRONG, text, True)]
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
@@ -174,28 +206,37 @@ def _motion(log: Log, reading: str) -> list[Finding]:
     if name == UNKNOWN:
         why = "there are no poses, but" if not has_poses else "the poses hardly move, but"
         fix = "pass poses, or set data.odometry=true (in Python `with_poses` of cflow_torch.data.odometry)"
+    elif name in (NO_READING, INACCURATE) and log.unwrapped.has_sparse_poses:
+        why, fix = "", _OF_SPARSE_POSES
     elif name == NO_READING:
         why, fix = "", "check that the points are x, y, z in metres, and "
         fix += "that the poses belong to this log, their times, units and quaternions" if has_poses else "pass poses"
     else:
         why = "the static world moves under the poses:" if name != WORLD else ""
-        why += _shift_of_clocks(log, judgement)
         fix = " or ".join(judgement.reading(each).fix or _setting(log, each) for each in judgement.best)
         fix = f"give {fix}" + (", or pass no poses" if name == STILL else "")
+        shifts = _shifts_of_clocks(log, judgement)
+        if shifts:
+            why += f" the clocks of sweeps and poses may differ by {_span(shifts.values())} s, because"
+        if len(shifts) > 1:
+            fix = f"correct the times of one, or try data.read_as={_span(shifts)}"
     return [Finding("ego motion", WRONG, f"{why} {judgement}: {fix}".strip(), True)]
 
 
-def _shift_of_clocks(log: Log, judgement: Judgement) -> str:
-    """Return what poses of another time mean if they have times, with all shifts that fit as well; "" = nothing."""
+def _shifts_of_clocks(log: Log, judgement: Judgement) -> dict[str, str]:
+    """Return what poses of another time mean if they have times: the readings that fit as well, and their seconds."""
     best, interval = judgement.best[0], intervals_of(log)
     if best not in TIMES_OF_POSES or log.trajectory is None or interval is None:
-        return ""
+        return {}
     least = EQUAL * judgement.shares[best]
     kind = best.partition("_")[0]
     equal = [name for name, share in judgement.shares.items() if name.startswith(kind) and share >= least]
-    seconds = [_NUM_SWEEPS[name] * float(np.median(interval)) for name in equal]
-    shift = f"{min(seconds):.2g}" + (f" to {max(seconds):.2g}" if len(seconds) > 1 else "")
-    return f" the clocks of sweeps and poses may differ by {shift} s, because"
+    return {name: f"{_NUM_SWEEPS[name] * float(np.median(interval)):.2g}" for name in equal}
+
+
+def _span(names: Iterable[str]) -> str:
+    first, *others = names
+    return " to ".join([first, *others[-1:]])
 
 
 def _setting(log: Log, reading: str) -> str:
@@ -203,17 +244,16 @@ def _setting(log: Log, reading: str) -> str:
     return f"data.read_as=[{','.join(readings)}]" if len(readings) > 1 else f"data.read_as={reading}"
 
 
-def _lapses(log: Log) -> list[Finding]:
-    lapses = find_lapses(log)
-    if not lapses:
+def _lapses(log: _CheckedLog) -> list[Finding]:
+    if not log.lapses:
         return []
-    if alternate(log):
-        return [_TWO_SENSORS]
+    if log.misfit:
+        return log.misfit
     texts = [
         f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
         if each.is_single
         else f"the poses jump by {each.metres:.1f} m before sweep {each.sweep}"
-        for each in lapses
+        for each in log.lapses
     ]
     fix = "correct it, or remove the sweep; for a jump, give poses of a continuous frame (odometry, not the map)"
     return [Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)]
@@ -249,7 +289,6 @@ def _deskew(log: Log) -> list[Finding]:
 
 
 def _repeated(log: Log) -> list[Finding]:
-    """Compare the first two sweeps and, if they share few directions, also the third one."""
     first = [log.sweep(index) for index in range(2)]
     if repeats(*first):
         return [Finding("sweeps", WRONG, REPEATED, True)]
@@ -258,14 +297,19 @@ def _repeated(log: Log) -> list[Finding]:
         text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
         fix = "give the points that each sweep has measured itself, not a map or sweeps that were added up"
         return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
-    shared = _shared_directions(*first)
-    if shared < _LEAST_SHARED and len(log.timestamps) > 2:
-        shared = max(shared, _shared_directions(first[1], log.sweep(2)))
-    if shared < _LEAST_SHARED:
-        text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
-        fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
-        return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
-    return []
+    return _parts(log)
+
+
+def _parts(log: Log) -> list[Finding]:
+    """Compare the directions of the first two sweeps and, if they share few, also those of the third one."""
+    shared = 0.0
+    for index in range(min(2, len(log) - 1)):
+        shared = max(shared, _shared_directions(log.sweep(index), log.sweep(index + 1)))
+        if shared >= _LEAST_SHARED:
+            return []
+    text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
+    fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
+    return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
 
 
 def _share_again(pc0: Sweep, pc1: Sweep) -> float:
@@ -310,25 +354,19 @@ def _directions(sweep: Sweep) -> np.ndarray:
     return has_points
 
 
-def _each_sweep(log: Log) -> list[Finding]:
+def _each_sweep(log: _CheckedLog) -> list[Finding]:
     """Read every sweep: find those that cannot be read, have few points, repeat the one before, or are misplaced."""
     log.sweep(0)  # its error is that of the log
-    neighbours = Neighbours()
-    errors: dict[int, Exception] = {}
-    for index in range(len(log.timestamps)):
-        try:
-            neighbours.add(log.sweep(index))
-        except (CFlowError, OSError) as error:
-            neighbours.add(None)
-            errors[index] = error
-    return [*_unreadable(log, errors), *_small(neighbours), *_misplaced(log, neighbours)]
+    neighbours = Neighbours.of(log)
+    return [*_unreadable(neighbours), *_small(neighbours), *_misplaced(log, neighbours)]
 
 
-def _unreadable(log: Log, errors: Mapping[int, Exception]) -> list[Finding]:
+def _unreadable(neighbours: Neighbours) -> list[Finding]:
+    errors = neighbours.errors
     if not errors:
         return []
     first = min(errors)
-    count = f"{len(errors)} of {len(log.timestamps)} sweeps cannot be read"
+    count = f"{len(errors)} of {len(errors) + len(neighbours.num_points)} sweeps cannot be read"
     text = f"{count}, the first is sweep {first}: {errors[first]}. Their pairs have no flow"
     return [Finding("sweeps", WRONG, text)]
 
@@ -343,7 +381,7 @@ def _small(neighbours: Neighbours) -> list[Finding]:
     return [Finding("sweeps", WRONG, f"{text}, while those around it have {small[index]:,}: {fix}")]
 
 
-def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
+def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
     """Find sweeps that repeat the one before, and others that fit neither the sweep before them nor the one after."""
     findings = []
     repeated = [index for index in neighbours.repeated if index > 1]  # `_repeated` tells the first
@@ -355,12 +393,12 @@ def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
         text = f"sweeps seem to be missing before sweep {index}, because the vehicle moves {metres:.1f} m there"
         findings.append(Finding("sweeps", WRONG, f"{text}: give the times of the sweeps"))
     known = (
-        {lapse.sweep for lapse in find_lapses(log)}
-        | set(repeated)
-        | {index for index, _ in missing}
-        | set(neighbours.small)
+        {lapse.sweep for lapse in log.lapses} | set(repeated) | {index for index, _ in missing} | set(neighbours.small)
     )
-    for first, last in [] if alternate(log) else neighbours.misplaced(log):
+    misplaced = neighbours.misplaced(log)
+    if misplaced and (log.misfit or set(log.motion.best) - {NO_READING}):
+        misplaced = []  # they are explained
+    for first, last in misplaced:
         if not known.isdisjoint(range(first, last + 2)):
             continue
         if last < first:
@@ -370,6 +408,7 @@ def _misplaced(log: Log, neighbours: Neighbours) -> list[Finding]:
             what = f"sweep {first} does" if first == last else f"sweeps {first} to {last} do"
             what += " not fit those around"
             fix = "has it points or a pose of another time? Correct its files, or leave it out"
+            fix = _OF_SPARSE_POSES if log.unwrapped.has_sparse_poses else fix
         findings.append(Finding("sweeps", WRONG, f"{what}: {fix}"))
     return findings
 

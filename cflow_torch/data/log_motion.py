@@ -252,7 +252,8 @@ def find_missing(log: Log) -> list[tuple[int, float]]:
     if steps is None:
         return []
     lengths, usual = (np.linalg.norm(each[:, :3, 3], axis=1) for each in (steps.given, steps.usual))
-    long = [k for k in steps.suspects if lengths[k] > _LONG * usual[k] and usual[k] > _LEAST_MOTION]
+    unknown = [k for k in steps.suspects if k not in log.gaps]
+    long = [k for k in unknown if lengths[k] > _LONG * usual[k] and usual[k] > _LEAST_MOTION]
     confirmed = sorted(k for k in long if _contradicted(log, k, steps.usual[k], steps.given[k]))
     return [(k + 1, float(lengths[k])) for k in confirmed]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from cflow_torch.data.log import Log
@@ -18,34 +20,33 @@ _MISPLACED = 0.5  # part of the usual share, below which sweeps do not fit
 _FEW = 0.5  # part of the usual number of points, below which a sweep has few
 
 
-class Neighbours:
-    """Compares each sweep with the one before it: `add` all sweeps of a log in order, None = it cannot be read.
+class Neighbours(NamedTuple):
+    """What is found of the sweeps of a log, one by one, and of each with the one before it."""
 
-    Attributes:
-        num_points: number of the finite points of each sweep that could be read.
-        repeated: indices of the sweeps that have the points of the sweep before.
-        shares: share of the static structure of each sweep that is in place in the next one; NaN = unknown.
-    """
+    errors: dict[int, Exception]  # of the sweeps that cannot be read
+    num_points: dict[int, int]  # number of the finite points of each other sweep
+    repeated: list[int]  # indices of the sweeps that have the points of the sweep before
+    shares: list[float]  # share of the static structure of each sweep that is in place in the next one; NaN = unknown
 
-    def __init__(self) -> None:
-        self.num_points: dict[int, int] = {}
-        self.repeated: list[int] = []
-        self.shares: list[float] = []
-        self._count = 0
-        self._last: Sweep | None = None
-        self._structure: np.ndarray = np.zeros((0, 3))
-
-    def add(self, sweep: Sweep | None) -> None:
-        index = self._count
-        structure = _structure(sweep)
-        if sweep is not None:
-            self.num_points[index] = int(are_finite(as_numpy(sweep.points)).sum())
-        if self._last is not None and sweep is not None and repeats(self._last, sweep):
-            self.repeated.append(index)
-        if index:
-            self.shares.append(_share_in_place(self._last, self._structure, sweep, structure))
-        self._count += 1
-        self._last, self._structure = sweep, structure
+    @staticmethod
+    def of(log: Log) -> Neighbours:
+        """Compare all neighbouring sweeps of a log. Cost: 20 ms a sweep."""
+        result = Neighbours({}, {}, [], [])
+        last, last_structure = None, np.zeros((0, 3))
+        for index in range(len(log)):
+            sweep, structure = None, np.zeros((0, 3))
+            try:
+                sweep = log.sweep(index)
+                structure = _structure(sweep)
+                result.num_points[index] = int(are_finite(as_numpy(sweep.points)).sum())
+            except (CFlowError, OSError) as error:
+                result.errors[index] = error
+            if index:
+                result.shares.append(_share_in_place(last, last_structure, sweep, structure))
+            if last is not None and sweep is not None and repeats(last, sweep):
+                result.repeated.append(index)
+            last, last_structure = sweep, structure
+        return result
 
     @property
     def small(self) -> dict[int, int]:
@@ -99,10 +100,8 @@ def alternate(log: Log) -> bool:
     return max(second) >= LEAST_SHARE and max(near) < _MISPLACED * max(second)
 
 
-def _structure(sweep: Sweep | None) -> np.ndarray:
-    """Return the points of the static structure of a sweep, (K, 3) float64; None = it has none."""
-    if sweep is None:
-        return np.zeros((0, 3))
+def _structure(sweep: Sweep) -> np.ndarray:
+    """Return the points of the static structure of a sweep, (K, 3) float64."""
     return as_numpy(sweep.points)[structure_rows(sweep), :3].astype(np.float64)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +20,6 @@ from cflow_torch.data.pickles import load_columns
 from cflow_torch.transforms import poses_from_json, transform_points, upright_poses
 from cflow_torch.types import CFlowError, Sweep
 
-_GZIP = b"\x1f\x8b"  # first bytes of a compressed file
 _IMAGE_SIZE = (1920, 1080)  # width, height of all cameras
 _LIDARS = (0, 1)  # Pandar64, which rotates, and PandarGT, which looks forward
 _EVERY_LIDAR = -1  # sensor_id of a cuboid for both LiDARs; an object may instead have one cuboid for each
@@ -204,9 +202,7 @@ class PandaSetLog(Log):
 def _columns(file: Path, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
     """Read columns of a pickled data frame; None = all."""
     with file_errors(file):
-        content = read_bytes(file)
-        is_compressed = content.startswith(_GZIP)  # copies of the data set hold the files without compression
-        columns = load_columns(io.BytesIO(gzip.decompress(content) if is_compressed else content))
+        columns = load_columns(io.BytesIO(read_bytes(file)))
         names = list(columns) if names is None else names
         check_columns(file, list(columns), names)
         return {name: columns[name] for name in names}

@@ -6,6 +6,7 @@ of pathlib and the functions below.
 
 from __future__ import annotations
 
+import gzip
 import mmap
 import re
 import shutil
@@ -21,6 +22,7 @@ import pyarrow as pa
 from cflow_torch.errors import CFlowError
 
 PathLike = Union[str, Path]
+GZ = ".gz"
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
 _BLOCK = 1 << 20  # bytes; smaller blocks need more requests, because metadata of HDF5 is scattered and arrays are long
 _KEPT_BLOCKS = 32  # of each open file: 32 MiB
@@ -100,16 +102,18 @@ def forget_listings(path: Any) -> None:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a file, in one request if it is remote.
+    """Read a file, in one request if it is remote, and decompress it if it is called `.gz`.
 
     A missing file, a device, a pipe and an unreachable file system raise an OSError, a git-lfs pointer a `CFlowError`.
     """
     if not is_remote(path):
         check_file(path)
-        return path.read_bytes()
-    remote: Any = path
-    with remote_errors(path):
-        return bytes(remote.fs.cat_file(remote.path))  # pathlib's interface would ask for the size first
+        content = path.read_bytes()
+    else:
+        remote: Any = path
+        with remote_errors(path):
+            content = bytes(remote.fs.cat_file(remote.path))  # pathlib's interface would ask for the size first
+    return gzip.decompress(content) if path.suffix.lower() == GZ else content
 
 
 def read_start(path: Path, count: int) -> bytes:
@@ -117,7 +121,7 @@ def read_start(path: Path, count: int) -> bytes:
     if is_remote(path):
         return read_bytes(path)[:count]
     check_file(path)
-    with open(path, "rb") as file:
+    with gzip.open(path) if path.suffix.lower() == GZ else open(path, "rb") as file:
         return file.read(count)
 
 

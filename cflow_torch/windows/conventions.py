@@ -32,13 +32,13 @@ AXES = {  # ego_T_stored of frames with other axes: x, y and z of the stored fra
     "back": np.diag([-1.0, -1.0, 1.0]),
     "right": np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], float),
     "down": np.diag([1.0, -1.0, -1.0]),  # x forward, y right, z down, as of inertial units
-    # left-handed
     "mirrored": np.diag([1.0, -1.0, 1.0]),
     "mirrored_back": np.diag([-1.0, 1.0, 1.0]),
     "swapped": np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1]], float),
     "swapped_back": np.array([[0, -1, 0], [-1, 0, 0], [0, 0, 1]], float),
     "z_first": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], float),  # z, x, y
 }
+MIRRORED = ("mirrored", "mirrored_back", "swapped", "swapped_back")  # left-handed
 UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
 
 _Convert = Callable[[np.ndarray], np.ndarray]
@@ -152,19 +152,15 @@ def _times_of_poses() -> dict[str, Reading]:
 
 
 def _mounts() -> dict[str, Reading]:
-    """Return the readings of points whose origin is elsewhere in the frame of the poses, up to 4 m away."""
+    """Return the readings of points whose origin is elsewhere in the frame of the poses, up to 4 m away.
+
+    They show that it is. Where it is follows from the points.
+    """
     readings = {}
     for size in (0.7, 1.4, 2.7, 4.0):
-        for axis, side in (("x", ("ahead of", "behind")), ("y", ("beside", "beside"))):
-            for sign in (1, -1):
-                x, y = (sign * size, 0) if axis == "x" else (0, sign * size)
-                readings[f"{MOUNT} {x:g} {y:g}"] = Reading(
-                    f"the points' origin is about {size:g} m {side[sign < 0]} that of the poses",
-                    _mounted(x, y),
-                    margin=_SMALL,
-                    opposite=f"{MOUNT} {0 - x:g} {0 - y:g}",
-                    fix=f"data.ego_T_lidar with about {axis} = {sign * size:g} m (data=arrays, hdf5 or bags)",
-                )
+        for x, y in ((size, 0), (-size, 0), (0, size), (0, -size)):
+            name, opposite = (f"{MOUNT} {sign * x:g} {sign * y:g}" for sign in (1, -1))
+            readings[name] = Reading("", _mounted(x, y), margin=_SMALL, opposite=opposite)
     return readings
 
 

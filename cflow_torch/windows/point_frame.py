@@ -7,7 +7,7 @@ import numpy as np
 from cflow_torch.ground.segmentation import find_ground, ground_side, has_ground
 from cflow_torch.transforms import rotations_about
 from cflow_torch.types import Array, as_numpy
-from cflow_torch.windows.conventions import READINGS
+from cflow_torch.windows.conventions import READINGS, UNITS
 
 _FEWEST = 100  # points
 # Extent of the middle nine tenths of the points, in the units of the points. Clouds in metres have 5 to 200.
@@ -15,8 +15,8 @@ _SMALLEST, _LARGEST, _MILLIMETRES = 2.0, 1000.0, 10_000.0
 _FAR = 50.0  # metres; a LiDAR has more than a twentieth of its points nearer than this
 _MOST_POINTS = 20_000
 _NEAR = 30.0  # metres
-# Metres of a sensor above the ground: trucks have up to 4. In feet, cars have 4.5 to 8.
-_HIGHEST_SENSOR, _HIGHEST_IN_FEET = 4.3, 9.0
+# Metres of a sensor above the ground: cars have 1.5 to 2, trucks up to 4. In feet, cars have 4.5 to 8.
+_LOWEST_SENSOR, _HIGHEST_SENSOR, _HIGHEST_IN_FEET = 1.1, 4.3, 9.0
 _FLAT = 0.6  # of a cloud with z up, the extent in z is less than this part of that in x or y
 _TALL = {  # readings of clouds that are flat in y or x, not in z
     "points_camera": "a camera's axes (x right, y down, z forward)",
@@ -45,8 +45,8 @@ def frame_problem(points: Array) -> tuple[str, str]:
     nearest = float(np.quantile(np.hypot(positions[:, 0], positions[:, 1]), 0.05))
     spans = f"nine tenths of the points span {widest:.4g} m"
     if widest >= _LARGEST:
-        unit = "millimetres" if widest >= _MILLIMETRES else "centimetres"
-        return f"points_{unit}", f"{spans}: they seem to be in {unit}, give points in metres"
+        unit, why = ("millimetres", "") if widest >= _MILLIMETRES else _small_unit(positions)
+        return f"points_{unit}", f"{spans}: they seem to be in {unit}{why}, give points in metres"
     if max(widest, farthest) < _SMALLEST:
         return "", f"{spans}: are they in metres?"
     if _is_spherical(positions):
@@ -67,6 +67,15 @@ def frame_problem(points: Array) -> tuple[str, str]:
             return reading, f"the points seem to have {axes}: {_UP}"
     tilt = _tilt_of(positions)
     return "", f"the sensor seems to be tilted by about {tilt}: {_UP} (data.ego_T_lidar)" if tilt else ""
+
+
+def _small_unit(positions: np.ndarray) -> tuple[str, str]:
+    """Return "centimetres" or "inches", by which the sensor is as high above the ground as on a vehicle, and why."""
+    height = -_height_of_ground(UNITS["centimetres"] * positions)
+    in_inches = UNITS["inches"] / UNITS["centimetres"] * height
+    if not height < _LOWEST_SENSOR < in_inches:
+        return "centimetres", ""
+    return "inches", f" (the sensor is then {in_inches:.1f} m above the ground, in centimetres {height:.1f} m)"
 
 
 def _height_of_ground(positions: np.ndarray) -> float:

@@ -8,7 +8,7 @@ the structure that is in place. (4) Name the reading that is clearly best, unles
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -18,6 +18,8 @@ from torch import Tensor
 from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
 from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.conventions import (
+    MIRRORED,
+    MOUNT,
     MOUNTS,
     OFF,
     READINGS,
@@ -37,7 +39,8 @@ GIVEN = "as given"
 STEPS = ("steps", "steps_back")
 HALVES = ("half_late", "half_early")
 # Readings that are no conventions: they follow from the points.
-UNKNOWN, TURNED, SCALED, INACCURATE, NO_READING = "unknown", "turned", "scaled", "inaccurate", "none"
+UNKNOWN, MOUNTED, SCALED = "unknown", "mounted", "scaled"
+INACCURATE, NO_READING = "inaccurate", "none"
 
 _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse than as given are compared by the most
 _MOST_AROUND = 5000  # points that tell what they lie around
@@ -71,6 +74,9 @@ _TURNS = np.radians([-4, -2.5, -1.2, -0.5, 0, 0.5, 1.2, 2.5, 4]).tolist()
 _WITHIN_CELL = np.array([(x, y) for x in (0, -0.5, 0.5) for y in (0, -0.5, 0.5)]) * _CELL
 _SMALL_TURNS = np.radians([0, -0.5, 0.5, -1, 1]).tolist()
 _FARTHEST_SHIFT = 7.0  # metres
+_PLACES = 0.4 * np.array([(x, y) for x in range(-10, 11) for y in range(-10, 11) if x or y])  # metres, of the LiDAR
+_NUM_BEST = 30  # places that are compared by the most points
+_BETWEEN = 0.2 * np.array([(x, y) for x in range(-1, 2) for y in range(-1, 2)])
 
 
 _OF_POSES = {name: reading.of_poses for name, reading in {**READINGS, **MOUNTS}.items() if reading.of_poses}
@@ -245,7 +251,9 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     if WORLD in clear:  # two signs agree: the points lie around the poses, and stand still without them
         return replace(judgement, best=(WORLD,))
     if clear or shares[GIVEN] >= _HOPELESS:
-        return replace(judgement, best=_equals(clear, shares))
+        best = _equals(clear, shares)
+        elsewhere = {name: _mounting(0, *_place_of(moving, scan, 0)) for name in best if name in MOUNTS}
+        return replace(judgement, best=best, found={**found, **elsewhere})
     if any(pair.is_sparse for pair in moving):
         return Judgement({})
     # Two clouds that stand still under no motion at all may have no static structure, so they do not show anything.
@@ -262,21 +270,25 @@ def _equals(clear: Sequence[str], shares: Mapping[str, float]) -> tuple[str, ...
     if len(named) < len(clear) and shares[INACCURATE] > _EXCUSE * max([shares[name] for name in named], default=0):
         return (INACCURATE,)
     best = [name for name in named if shares[name] >= EQUAL * shares[named[0]]]
-    best.sort(key=lambda name: name == TURNED)  # in turns, a slight one is as good as another mounting
-    best = [name for name in best if name in (SCALED, TURNED) or _is_small(name) == _is_small(best[0])]
-    others = [name for kind in (MOUNTS, TIMES_OF_POSES) for name in [name for name in best if name in kind][1:]]
+    # Right-handed ones first; in turns, a slight rotation is as good as another position.
+    best.sort(key=lambda name: (name in MIRRORED) + 2 * (name == MOUNTED))
+    best = [name for name in best if name in (SCALED, MOUNTED) or _is_small(name) == _is_small(best[0])]
+    if any(name in READINGS for name in best):  # a convention says more than a number
+        best = [name for name in best if name not in (SCALED, MOUNTED)]
+    kinds = (MOUNT, *MOUNTS), TIMES_OF_POSES
+    others = [name for kind in kinds for name in [name for name in best if name in kind][1:]]
     return tuple(name for name in best if name not in others)
 
 
 def _is_small(name: str) -> bool:
-    return name in _COMPARED and _COMPARED[name].opposite != ""
+    return name == MOUNT or (name in _COMPARED and _COMPARED[name].opposite != "")
 
 
 def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Reading], list[dict[str, float]]]:
     """Compare the motions of the poses with those under which the points fit.
 
-    They may be turned by an angle, or longer or shorter; turns by nearly a multiple of 90 degrees are left out, because
-    such readings have names. Or each pair has another small error.
+    They may be turned by an angle, also if the LiDAR is elsewhere; turns by nearly a multiple of 90 degrees alone are
+    left out, because such readings have names. They may be longer or shorter. Or each pair has another small error.
 
     Returns:
         These readings, and for each pair the shares under those of them that it shows.
@@ -284,7 +296,11 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
     motions = [_motion_of(pair, scan) for pair in pairs]
     steps = [pair.transforms[GIVEN] for pair in pairs]
     errors = [float(np.linalg.norm((motion - step)[:2, 3])) for motion, step in zip(motions, steps)]
-    found = _readings_of_motions(steps, motions, max(errors))
+    found = _readings_of_motions(pairs, scan, motions)
+    found[INACCURATE] = Reading(
+        f"the poses are off, by up to {max(errors):.1f} m between two sweeps",
+        fix="exact poses and times, or data.odometry=refine if they are noisy",
+    )
     of_pairs = []
     for pair, step, motion, error in zip(pairs, steps, motions, errors):
         read = {name: reading.of_poses(step) for name, reading in found.items() if reading.of_poses}
@@ -299,36 +315,72 @@ def _compare_motions(pairs: Sequence[Pair], scan: str) -> tuple[dict[str, Readin
     return found, of_pairs
 
 
-def _readings_of_motions(
-    steps: Sequence[np.ndarray], motions: Sequence[np.ndarray], largest_error: float
-) -> dict[str, Reading]:
-    """Return how motions of the poses may differ from those of the points, (4, 4) each: turned, scaled, or inexact."""
+def _readings_of_motions(pairs: Sequence[Pair], scan: str, motions: Sequence[np.ndarray]) -> dict[str, Reading]:
+    """Return how motions of the poses may differ from those of the points, (4, 4) each: turned, or scaled."""
+    steps = [pair.transforms[GIVEN] for pair in pairs]
     given, fitted = (np.array([complex(*T[:2, 3]) for T in each]) for each in (steps, motions))
     product = complex(given @ fitted.conj())
     turn, scale = float(np.angle(product)), float(abs(product) / max(np.sum(np.abs(given) ** 2), 1e-9))
-    degrees = np.degrees(turn)
-    Y = as_matrix(rotations_about(2, turn))
-    found = {}
     turns = np.angle(given * fitted.conj())
     is_slight = abs(turn) > _SLIGHT and bool((turns * np.sign(turn) > abs(turn) / 2).all())  # not only in turns
-    if abs((turn + np.pi / 4) % (np.pi / 2) - np.pi / 4) > _OBLIQUE or (abs(turn) < np.pi / 4 and is_slight):
-        side = "left" if turn > 0 else "right"
-        found[TURNED] = Reading(
-            f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'",
-            lambda T: Y.T @ T @ Y,
-            fix=f"data.ego_T_lidar with a rotation of about {degrees:.0f} degrees about z (data=arrays, hdf5 or bags)",
-        )
+    quarter = round(turn / (np.pi / 2)) * np.pi / 2
+    is_oblique = abs(turn - quarter) > _OBLIQUE
+    turn = turn if is_oblique else quarter or turn
+    place = _place_of(pairs, scan, turn) if is_oblique or quarter else np.zeros(2)
+    found = {}
+    if is_oblique or place.any() or (quarter == 0 and is_slight):  # else the turn has a name
+        found[MOUNTED] = _mounting(turn, *place)
+    if quarter == 0 and max(np.abs(fitted - given)) > _SMALLEST_ERROR:
+        found[MOUNT] = _mounting(0, *_place_of(pairs, scan, 0))
     if scale > _RESCALED or 1e-9 < scale < 1 / _RESCALED:
         found[SCALED] = Reading(
             f"the positions of the poses are {1 / scale:.3g} times as long as the motion of the points",
             scaled(scale),
             fix=f"positions multiplied by {scale:.3g}, unless the points have another unit (feet)",
         )
-    found[INACCURATE] = Reading(
-        f"the poses are off, by up to {largest_error:.1f} m between two sweeps",
-        fix="exact poses and times, or data.odometry=refine if they are noisy",
-    )
     return found
+
+
+def _mounting(turn: float, x: float = 0.0, y: float = 0.0) -> Reading:
+    """Return the reading of points whose frame is turned about z, radians, and lies at (x, y) in that of the poses."""
+    causes = []
+    fixes = []
+    if turn:
+        degrees = np.degrees(turn)
+        side = "left" if turn > 0 else "right"
+        causes.append(f"the points' x axis points about {abs(degrees):.0f} degrees to the {side} of the poses'")
+        fixes.append(f"a rotation of about {degrees:.0f} degrees about z")
+    if x or y:
+        place = f"x = {x:.1f} m and y = {y:.1f} m"
+        causes.append(f"the points' origin is at about {place} in the frame of the poses")
+        fixes.append(f"a position of about {place}")
+    ego_T_points = as_matrix(rotations_about(2, turn), (x, y, 0))
+    fix = f"data.ego_T_lidar with {' and '.join(fixes)} (data=arrays, hdf5 or bags)"
+    return Reading(", and ".join(causes), partial(_seen_from, ego_T_points), fix=fix)
+
+
+def _seen_from(ego_T_points: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Convert motions of the vehicle, (..., 4, 4), to those of the points' frame."""
+    return np.linalg.inv(ego_T_points) @ steps @ ego_T_points  # type: ignore[no-any-return]
+
+
+def _place_of(pairs: Sequence[Pair], scan: str, turn: float) -> np.ndarray:
+    """Return x and y in the frame of the poses at which the points' origin fits best, if their frame is turned.
+
+    0 and 0 if that fits as well, unless the frame is not turned.
+    """
+    origin = np.zeros((1, 2))
+    places = np.concatenate([origin, _PLACES])
+    for count in (_FEW_POINTS, _MOST_POINTS, _MOST_POINTS):
+        ego_T_points = as_matrix(rotations_about(2, np.full(len(places), turn)))
+        ego_T_points[:, :2, 3] = places
+        shares = np.zeros(len(places))
+        for pair in pairs:
+            steps = _seen_from(ego_T_points, pair.transforms[GIVEN])
+            shares += pair.target.structure(scan).shares(pair.source.points(scan)[:count], steps)
+        best = places[1:][np.argsort(-shares[1:], kind="stable")]
+        places = np.concatenate([origin, best[:_NUM_BEST] if len(best) > _NUM_BEST else best[0] + _BETWEEN])
+    return origin[0] if turn and shares[0] >= EQUAL * shares[1:].max() else best[0]  # type: ignore[no-any-return]
 
 
 def _motion_of(pair: Pair, scan: str) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,66 @@ def test_clouds_come_back_from_every_suffix(tmp_path, suffix):
             read_cloud(file)
     with pytest.raises(CFlowError, match="missing"):
         read_cloud(tmp_path / f"missing{suffix}")
+
+
+def lines(numbers, mark=" ", ending="\n"):
+    return "".join(mark.join(f"{number:.6f}" for number in row) + ending for row in numbers)
+
+
+TEXTS = {
+    ".csv": lambda table: "x,y,z,t\n" + lines(table, ","),
+    ".CSV": lambda table: '"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","t"\n' + lines(table, ","),
+    "_.csv": lambda table: "t;Z;Y;X\n" + lines(table[:, ::-1], ";").replace(".", ","),
+    "_t.csv": lambda table: "class,x,y,z,t\n,,,,\n"
+    + "".join("car," + row for row in lines(table, ",").splitlines(True)),
+    ".txt": lambda table: lines(table),
+    "_3.txt": lambda table: "  " + lines(table[:, :3], "   ", "  \r\n  ").rstrip(),
+    "_6.txt": lambda table: "# from a scanner\n" + lines(np.column_stack([table, table[:, :2]])),
+    ".pts": lambda table: f"{len(table)}\n" + lines(table),
+    ".asc": lambda table: "# X Y Z t\n" + lines(table),
+    ".xyz": lambda table: "//x\ty\tz\tt\n" + lines(table, "\t"),
+}
+
+
+@pytest.mark.parametrize("suffix", TEXTS)
+def test_clouds_are_read_from_texts(tmp_path, suffix):
+    tables = np.random.default_rng(0).normal(0, 30, (3, 40, 4)).round(6)
+    np.savetxt(tmp_path / "poses.txt", np.tile(np.eye(4)[:3].ravel(), (3, 1)))
+    (tmp_path / "a.txt").write_text("a note")
+    for number, table in enumerate(tables):
+        (tmp_path / f"{number:06d}{suffix}").write_bytes(TEXTS[suffix](table).encode())
+    log = ArraysLog(tmp_path)
+    assert len(log) == 3 and len(log.poses) == 3
+    has_empty_row = suffix == "_t.csv"
+    assert np.array_equal(log.sweep(1).points[has_empty_row:], tables[1, :, :3].astype(np.float32))
+    if suffix in (".csv", ".CSV", "_.csv", ".asc", ".xyz"):
+        assert np.array_equal(log.columns(1)["t"], tables[1, :, 3])
+
+
+def test_texts_that_are_no_clouds_stay_tables(tmp_path):
+    """Two trajectories have names of one pattern, too."""
+    t = np.arange(60.0)
+    for number in range(2):
+        np.savetxt(tmp_path / f"run{number}.txt", np.column_stack([t, t, 0 * t, 0 * t, 0 * t, 0 * t, 0 * t, 0 * t + 1]))
+        np.savetxt(tmp_path / f"short{number}.csv", np.zeros((10, 3)), delimiter=",")
+    assert find_array_logs(tmp_path) == []
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, ".csv"])
+def test_clouds_may_be_compressed(tmp_path, suffix):
+    log = ArraysLog(write_array_log(SmallLog(times=False), tmp_path, ".npy" if suffix == ".csv" else suffix))
+    for index, file in enumerate(log.files):
+        content = file.read_bytes()
+        if suffix == ".csv":
+            content = TEXTS[".csv"](np.pad(log.sweep(index).points, ((0, 0), (0, 1)))).encode()
+        file.with_name(f"{file.stem}{suffix}.gz").write_bytes(gzip.compress(content))
+        file.unlink()
+    again = ArraysLog(log.folder)
+    assert np.allclose(again.sweep(1).points, SmallLog().sweep(1).points, atol=1e-6)
+    assert np.array_equal(again.sweep(1).is_ground, SmallLog().sweep(1).is_ground)
+    again.files[1].write_bytes(again.files[1].read_bytes()[:40])
+    with pytest.raises(CFlowError, match=again.files[1].name):
+        again.sweep(1)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -16,7 +16,7 @@ from writers import FORMATS
 
 import cflow_torch
 from cflow_torch.data.arrays import write_array_log
-from cflow_torch.data.catalog import GroundSegmentedLog, Logs, find_sources, open_log, recognise
+from cflow_torch.data.catalog import GroundSegmentedLog, Logs, find_sources, open_log, recognise, source_name
 from cflow_torch.data.log import Log, window
 from cflow_torch.simulator import Drive
 from cflow_torch.simulator.benchmark import benchmark_logs
@@ -173,3 +173,15 @@ def test_the_name_open_does_not_hide_that_of_python() -> None:
     names: dict[str, Any] = {}
     exec("from cflow_torch import *", names)
     assert "open" not in names and "estimate_flow" in names and "open" in dir(cflow_torch)
+
+
+def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    """Else the results of the second one would be taken for those of the first."""
+    for place in ("monday/run", "tuesday/run", "tuesday/walk"):
+        (tmp_path / place).mkdir(parents=True)
+        for number in range(2):
+            np.save(tmp_path / place / f"{number}.npy", np.ones((5, 3)))
+    logs: Any = cflow_torch.open(tmp_path, check=False)
+    assert [log.log_id for log in logs] == ["monday-run", "tuesday-run", "walk"]
+    assert [source_name(source) for source in logs.sources] == ["monday-run", "tuesday-run", "walk"]
+    assert cflow_torch.open(tmp_path / "monday", check=False).log_id == "run"

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import cflow
+from scipy.spatial.transform import Rotation
 
+from cflow_torch.data.arrays import ArraysLog, write_array_log
 from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
 from cflow_torch.data.catalog import open_log
@@ -325,6 +327,28 @@ class InBag(Untimed):
 
     def sweep(self, index: int) -> Sweep:
         return self.log.sweep(index)
+
+
+@pytest.mark.parametrize("form", ["bag", "folder"])
+def test_the_azimuth_and_all_poses_move_points(form: str, raw: Drive, truth: Drive, tmp_path: Path) -> None:
+    """The vehicle begins to turn in the first sweeps, so its motion changes between the poses of two sweeps."""
+    log: Any = InBag(raw)
+    times = np.arange(raw.timestamps[0] - 10**8, raw.timestamps[-1] + 10**8, 10**7)
+    log.trajectory = times, np.concatenate([raw.poses_at(0, np.array([time - raw.timestamps[0]])) for time in times])
+    if form == "folder":
+        folder = write_array_log(Untimed(raw), tmp_path)
+        times, poses = log.trajectory
+        rows = np.column_stack([times * 1e-9, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+        (folder / "poses.txt").unlink()
+        np.savetxt(folder / "poses.txt", rows, "%.9f")
+        log = ArraysLog(folder, ground=None)
+    coarse = InBag(raw)
+    coarse.trajectory = None
+    errors = [
+        max(largest_error(DeskewedLog(each, "clockwise"), truth, index) for index in range(8)) for each in (log, coarse)
+    ]
+    assert errors[0] < (0.03 if form == "bag" else 0.15), "a folder does not know the place of the LiDAR"
+    assert errors[1] > 1
 
 
 @pytest.mark.parametrize(("case", "reading"), [("raw", "times"), ("truth", "off")])

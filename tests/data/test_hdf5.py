@@ -27,7 +27,7 @@ def test_another_process_opens_the_file_itself(tmp_path):
 @pytest.mark.parametrize(
     ("replaced", "complaint"),
     [
-        ({"lidar": None}, "lidar"),
+        ({"lidar": None, "points": np.zeros((50, 3), np.float32)}, "has no lidar, .*it has .*points"),
         ({"pose": None}, "no pose"),
         ({"lidar": np.zeros((50, 2), np.float32)}, "lidar.*N, 3"),
         ({"lidar": ["a", "b"]}, "lidar is not an array of bool, integers or floats"),

@@ -31,7 +31,7 @@ from cflow_torch.transforms import (
     transform_points,
 )
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.conventions import AXES, CAMERA, WORLD
+from cflow_torch.windows.conventions import AXES, CAMERA, UNITS, WORLD
 from cflow_torch.windows.readings import GIVEN, NO_READING, UNKNOWN, _compare
 
 MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
@@ -204,6 +204,7 @@ def test_wrong_poses_are_named_and_the_reading_undoes_them(reading, source, requ
     wrong = Wrong(good, poses=WRONG_POSES[reading])
     (problem,) = [text for text in find_problems(wrong) if "ground masks" not in text]
     assert f"data.read_as={reading}" in problem and "as given" in problem
+    assert "multiplied by" not in problem, "a unit says more than a factor"
     again = read_as(wrong, reading)
     assert find_problems(again) == []
     true, read = (np.linalg.inv(log.poses[2:-1]) @ log.poses[1:-2] for log in (Wrong(good), again))
@@ -314,9 +315,21 @@ def test_poses_of_another_log_are_named(drive):
 @pytest.mark.parametrize("source", ["drive", "real"])
 def test_a_lidar_elsewhere_on_the_vehicle_shows_in_turns(source, request):
     mixed = Wrong(request.getfixturevalue(source), poses=each(lambda pose: pose @ np.linalg.inv(MOUNTING)))
-    x, y = map(float, judge_log(mixed).best[0].split()[1:])
-    assert np.hypot(x - 1.35, y) < 0.4
-    assert "data.ego_T_lidar" in find_problems(mixed)[0]
+    (place,) = re.findall(
+        r"data.ego_T_lidar with a position of about x = (.*) m and y = (.*) m", find_problems(mixed)[0]
+    )
+    assert np.hypot(float(place[0]) - 1.35, float(place[1])) < 0.4
+
+
+def test_a_lidar_that_is_turned_and_elsewhere_is_located(turning):
+    """A bag without a transform to the LiDAR: "left" and "mount" fit only together."""
+    ego_T_lidar = as_matrix(rotations_about(2, np.radians(90)), (2, 0, 0.3))
+    mixed = Wrong(turning, points=lambda points, _: transform_points(points, np.linalg.inv(ego_T_lidar)), masks=False)
+    (problem,) = [text for text in find_problems(mixed) if "ground" not in text]
+    found = re.search(
+        r"a rotation of about 90 degrees about z and a position of about x = (.*) m and y = (.*) m", problem
+    )
+    assert found and np.hypot(float(found[1]) - 2, float(found[2])) < 0.5
 
 
 @pytest.mark.parametrize(
@@ -366,20 +379,21 @@ def test_points_that_are_a_little_too_large_are_no_lidar_elsewhere(source, facto
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["drive", "real"])
-def test_points_and_poses_in_feet_are_told_by_the_height_of_the_sensor(source, request):
+@pytest.mark.parametrize("unit", ["feet", "inches", "centimetres"])
+def test_units_of_points_and_poses_are_told_by_the_height_of_the_sensor(source, unit, request):
     good = request.getfixturevalue(source)
     is_made = source == "drive"  # its frame is on the ground
     shift = as_matrix(np.eye(3), (0, 0, 1.7 if is_made else 0))
-    feet = Wrong(
+    wrong = Wrong(
         good,
-        lambda points, _: (points - shift[:3, 3]) / 0.3048,
-        lambda poses: scaled(1 / 0.3048)(poses @ shift),
+        lambda points, _: (points - shift[:3, 3]) / UNITS[unit],
+        lambda poses: scaled(1 / UNITS[unit])(poses @ shift),
         masks=False,
     )
-    texts = find_problems(feet)
-    assert any("below the sensor" in text and "data.read_as=points_feet" in text for text in texts)
-    assert any("data.read_as=[points_feet,feet]" in text for text in texts)
-    assert find_problems(read_as(feet, ["points_feet", "feet"])) == []
+    texts = find_problems(wrong)
+    assert any(unit in text and f"data.read_as=points_{unit}" in text for text in texts)
+    assert any(f"data.read_as=[points_{unit},{unit}]" in text for text in texts)
+    assert find_problems(read_as(wrong, [f"points_{unit}", unit])) == []
 
 
 class Accumulated(Wrong):
@@ -616,6 +630,19 @@ def test_sweeps_that_measure_parts_of_a_turn_are_told(drive, has_poses):
     assert any("share 0 % of the directions" in text or "share 4 %" in text for text in texts), texts
 
 
+def test_sweeps_of_half_a_turn_are_told_once(whole):
+    """Each fits the second next one, as those of two sensors do, but the directions say more."""
+
+    class Half(Wrong):
+        def sweep(self, index):
+            sweep = super().sweep(index // 2)
+            keep = (sweep.points[:, 1] > 0) == index % 2
+            return replace(sweep, points=sweep.points[keep], is_ground=sweep.is_ground[keep])
+
+    wrong = [finding.text for finding in examine(Half(whole)) if finding.status == WRONG]
+    assert len(wrong) == 1 and "share 0 % of the directions" in wrong[0]
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.6])
 def test_two_sensors_in_turns_are_told_and_nothing_else(drive, angle):
     T_points_second = np.linalg.inv(as_matrix(rotations_about(2, angle), (-1.5, 0, 0.4)))
@@ -697,7 +724,7 @@ def test_the_page_counts_sweeps_that_cannot_be_read(drive):
                 raise MissingFile(f"sweep {index} does not exist")
             return super().sweep(index)
 
-    texts = [one.text for one in examine(Damaged(drive)) if one.status == WRONG and one.topic == "sweeps"]
+    texts = [one.text for one in examine(Damaged(drive)) if one.status == WRONG]
     assert texts == [
         "2 of 12 sweeps cannot be read, the first is sweep 7: sweep 7 does not exist. Their pairs have no flow"
     ]

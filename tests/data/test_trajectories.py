@@ -110,6 +110,7 @@ def test_other_clocks_are_named(tmp_path) -> None:
             ",",
             10**9,
         ),
+        ("poses.csv", "time,north,east,up,qx,qy,qz,qw", "t y x z qx qy qz qw", ",", 1),
         ("trajectory.txt", "", "t x y z qx qy qz qw", " ", 1),
         ("trajectory.txt", "", "t x y z qx qy qz qw", " ", 1000),
     ],
@@ -377,11 +378,38 @@ def test_poses_near_a_folder_are_those_at_its_times(tmp_path) -> None:
 
 
 def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
-    for k, pose in enumerate(POSES):
-        np.savez(tmp_path / f"{k}.npz", points=np.ones((5, 3)), pose=pose, stamp=0.1 * k)
-    with pytest.warns(CFlowWarning, match="its poses come from the array pose"):
-        log: Any = ArraysLog(tmp_path)
-    assert np.array_equal(log.poses, POSES) and log.has_viewpoints
+    """A matrix, or a position and a quaternion; and a time, unless it is not in the order of the names."""
+    quaternions = to_quaternions(POSES[:, :3, :3])[:, (1, 2, 3, 0)]
+    forms = {
+        "pose, stamp": lambda k: {"pose": POSES[k], "stamp": 0.1 * k},
+        "stamp, translation, rotation": lambda k: {
+            "stamp": START + k * 10**8,
+            "translation": POSES[k, :3, 3],
+            "rotation": quaternions[k],
+        },
+        "pose": lambda k: {"pose": POSES[k], "stamp": -k},
+    }
+    for number, (name, arrays) in enumerate(forms.items()):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        for k in range(len(POSES)):
+            np.savez(folder / f"{k}.npz", points=np.ones((5, 3)), **arrays(k))
+        with pytest.warns(CFlowWarning, match=f"its poses come from the arrays {name} of its clouds"):
+            log: Any = ArraysLog(folder)
+        assert np.allclose(log.poses, POSES, atol=1e-9) and log.has_viewpoints
+        assert np.diff(log.timestamps).tolist() == [10**8 if "stamp" in name else 1] * (len(POSES) - 1)
+
+
+def test_numbers_of_files_tell_missing_sweeps(tmp_path) -> None:
+    """Without times, a gap is found by the numbers, unless they are irregular."""
+    for name, numbers, gaps in (
+        ("missing", (0, 2, 4, 8, 10, 12, 14), {2}),
+        ("whole", range(5, 12), set()),
+        ("irregular", (0, 1, 3, 4, 6, 9, 10), set()),
+    ):
+        log = ArraysLog(clouds(tmp_path / name, numbers))
+        assert log.gaps == gaps, name
+        assert len(log.notes) == len(gaps)
 
 
 def test_numbers_of_sweeps_are_no_times(tmp_path) -> None:

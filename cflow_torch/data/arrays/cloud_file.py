@@ -12,16 +12,18 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import feather, parquet
 
+from cflow_torch.data.arrays import cloud_text
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS, BinLayout, find_bin_layout
 from cflow_torch.data.arrays.pcd import pcd_fields, pcd_viewpoint, pypcd4
 from cflow_torch.data.arrays.ply import ply_bytes, ply_fields
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.file_errors import file_errors, shortened
-from cflow_torch.data.paths import PathLike, as_path, read_bytes
+from cflow_torch.data.paths import GZ, PathLike, as_path, read_bytes
 from cflow_torch.tensors import resolution
 from cflow_torch.types import CFlowError, check_array
 
 SUFFIXES = (".npy", ".npz", ".bin", ".pcd", ".ply", ".feather", ".parquet")
+"""Suffixes of clouds that are read and written. Texts (`cloud_text.SUFFIXES`), and `.gz` after any, are only read."""
 _AXES = ("x", "y", "z")
 _COARSEST = 1e-3  # metres
 _MOST_COLUMNS = 64  # of a cloud with fewer points than columns; more are those of a cloud that is transposed
@@ -50,6 +52,8 @@ def read_cloud(path: PathLike, bin_columns: int | BinLayout | None = None) -> np
         - `.bin`: little-endian float32 or float64, `bin_columns` per point.
         - `.pcd` (extra `clouds`), `.ply`: fields x, y, z.
         - `.feather`, `.parquet`: columns x, y, z; without these names, the first three.
+        - `.csv`, `.txt`, `.xyz`, `.pts`, `.asc`: a point per line, see `text_columns`.
+        - any of these, compressed, with `.gz` after its suffix.
         Nothing is unpickled. `read_columns` reads the other columns.
 
     Raises:
@@ -88,13 +92,11 @@ def _other_columns(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return kept
 
 
-def matrices_in(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an `.npz` file that may be poses: (4, 4) or (3, 4) numbers."""
+def small_arrays(path: Path) -> dict[str, Any]:
+    """Read the arrays of an `.npz` file that may be a pose or its time: up to 16 numbers, as nested lists."""
     with file_errors(path, _hint(path)):
         arrays = _plain_arrays(read_bytes(path))
-    return {
-        name: array for name, array in arrays.items() if array.shape in ((4, 4), (3, 4)) and array.dtype.kind in "fiu"
-    }
+    return {name: array.tolist() for name, array in arrays.items() if array.size <= 16 and array.dtype.kind in "fiu"}
 
 
 def in_single(points: np.ndarray) -> np.ndarray:
@@ -208,10 +210,20 @@ def _write_pcd(file: Any, fields: Mapping[str, np.ndarray], viewpoint: Any) -> N
     cloud.save(file, pcd.Encoding.BINARY)
 
 
-def _suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(SUFFIXES)}")
+def suffix_of(path: Path) -> str:
+    """Return the suffix of a cloud's format, without `.gz`, in lower case."""
+    return (path.with_suffix("") if path.suffix.lower() == GZ else path).suffix.lower()
+
+
+def stem_of(path: Path) -> str:
+    """Return the name of a cloud without its suffixes."""
+    return (path.with_suffix("") if path.suffix.lower() == GZ else path).stem
+
+
+def _suffix(path: Path, allowed: Sequence[str] = SUFFIXES) -> str:
+    suffix = path.suffix.lower() if allowed == SUFFIXES else suffix_of(path)
+    if suffix not in allowed:
+        raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(allowed)}")
     return suffix
 
 
@@ -241,7 +253,9 @@ def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:
 
 def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.ndarray]:
     """Read all columns by name; those without a name are x, y, z, column_3, ..."""
-    suffix, content = _suffix(path), read_bytes(path)
+    suffix, content = _suffix(path, (*SUFFIXES, *cloud_text.SUFFIXES)), read_bytes(path)
+    if suffix in cloud_text.SUFFIXES:
+        return cloud_text.text_columns(content)
     if suffix in (".pcd", ".ply"):
         return (pcd_fields if suffix == ".pcd" else ply_fields)(content)
     if suffix in (".feather", ".parquet"):

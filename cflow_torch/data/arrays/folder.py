@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from itertools import islice
 from pathlib import Path
-from typing import Any, Callable, Sequence
+from typing import Any, Callable, Container, Sequence
 
 import numpy as np
 
-from cflow_torch.data.arrays.cloud_file import SUFFIXES
+from cflow_torch.data.arrays import cloud_text
+from cflow_torch.data.arrays.cloud_file import SUFFIXES, stem_of, suffix_of
 from cflow_torch.data.arrays.poses_text import STRUCTURED, files_of_poses, parse_poses, parse_times, read_poses
 from cflow_torch.data.arrays.stamps import times_of_names
 from cflow_torch.data.folders import find_folders, natural_key, visible
@@ -30,6 +32,7 @@ _TABLES = (".txt", ".csv", ".tum", ".log", ".g2o", ".json", ".jsonl", ".yaml", "
 _NEAR_TABLES = (".txt", ".csv", ".tum")  # suffixes of files that we test in other folders
 _FIRST_UNIX, _MOST = 10**17, 50  # nanoseconds in 1973; files or folders
 _TESTED = 8192  # bytes of a file that tell what it holds
+_FEWEST_POINTS = 20  # lines at the start of a text that may be a cloud
 _LARGEST = 1 << 24  # bytes; structured files must be whole to be read, and poses take less
 
 
@@ -75,22 +78,53 @@ def other_folders(folder: Path, parent: Path) -> list[str]:
 def _kinds(folder: Path) -> dict[str, list[Path]]:
     """Return the clouds in a folder, of each suffix that has two or more, or of each pattern of names.
 
-    Clouds have several patterns if their names differ only by what is not a number: front_001.pcd, rear_001.pcd.
+    Texts count if there are no other clouds, if several have names of one pattern, and if the first one is a cloud.
+    """
+    files = [path for path in visible(folder) if stem_of(path).lower() not in _OTHER_STEMS]
+    kinds = _alike([path for path in files if suffix_of(path) in SUFFIXES])
+    texts = [path for path in files if suffix_of(path) in cloud_text.SUFFIXES]
+    counts = Counter(map(_pattern, texts))
+    texts = [] if kinds else [path for path in texts if counts[_pattern(path)] > 1]
+    return kinds or {kind: same for kind, same in _alike(texts).items() if _is_text_cloud(min(same))}
+
+
+def _alike(files: Sequence[Path]) -> dict[str, list[Path]]:
+    """Return the files of each suffix that has two or more, or of each pattern of names.
+
+    They have several patterns if their names differ only by what is not a number: front_001.pcd, rear_001.pcd.
     """
     suffixes: dict[str, list[Path]] = {}
-    for path in visible(folder):
-        if path.suffix.lower() in SUFFIXES and path.stem.lower() not in _OTHER_STEMS:
-            suffixes.setdefault(path.suffix.lower(), []).append(path)
+    for path in files:
+        suffixes.setdefault(path.name[len(stem_of(path)) :].lower(), []).append(path)
     kinds: dict[str, list[Path]] = {}
-    for suffix, files in suffixes.items():
+    for suffix, same in suffixes.items():
         patterns: dict[str, list[Path]] = {}
-        for path in files:
-            patterns.setdefault(re.sub(r"\d+", "*", path.stem) + suffix, []).append(path)
+        for path in same:
+            patterns.setdefault(_pattern(path), []).append(path)
         numbers = {
-            tuple(sorted("-".join(re.findall(r"\d+", path.stem)) for path in same)) for same in patterns.values()
+            tuple(sorted("-".join(re.findall(r"\d+", stem_of(path))) for path in each)) for each in patterns.values()
         }
-        kinds.update(patterns if len(numbers) == 1 < len(patterns) < len(files) else {suffix: files})
-    return {kind: files for kind, files in kinds.items() if len(files) > 1}
+        kinds.update(patterns if len(numbers) == 1 < len(patterns) < len(same) else {suffix: same})
+    return {kind: same for kind, same in kinds.items() if len(same) > 1}
+
+
+def _pattern(path: Path) -> str:
+    stem = stem_of(path)
+    return re.sub(r"\d+", "*", stem) + path.name[len(stem) :].lower()
+
+
+def _is_text_cloud(path: Path) -> bool:
+    """Test whether a text holds many points, and no poses. Lines of 3 or 6 numbers may be either: they are points."""
+    try:
+        start = read_start(path, _TESTED)
+        columns = cloud_text.text_columns(start[: start.rfind(b"\n") + 1])
+    except (CFlowError, OSError, EOFError, ValueError):
+        return False
+    numbers = np.column_stack(list(columns.values()))
+    are_poses = _start_of(path, parse_poses) is not None and numbers.shape[1] not in (3, 6)
+    if numbers.shape[1] == 7:
+        are_poses &= bool(np.abs(np.linalg.norm(numbers[:, 3:], axis=1) - 1).max() < 0.1)
+    return len(numbers) >= _FEWEST_POINTS and not are_poses
 
 
 def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
@@ -104,12 +138,12 @@ def find_clouds(folder: Path, suffix: str | None) -> list[Path]:
     if not kinds:
         raise CFlowError(
             f"{folder} and its subfolders {', '.join(POINT_FOLDERS)} have fewer than two point clouds "
-            f"({suffix or ', '.join(SUFFIXES)}); scene flow needs two or more"
+            f"({suffix or ', '.join((*SUFFIXES, *cloud_text.SUFFIXES))}); scene flow needs two or more"
         )
     if len(kinds) > 1:
         raise CFlowError(f"{parent} has several kinds of clouds, {', '.join(sorted(kinds))}: choose one by suffix=...")
-    files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(path.stem))
-    stamps = times_of_names([path.stem for path in files])
+    files = sorted(next(iter(kinds.values())), key=lambda path: natural_key(stem_of(path)))
+    stamps = times_of_names([stem_of(path) for path in files])
     return files if stamps is None else [files[k] for k in np.argsort(stamps, kind="stable")]
 
 
@@ -135,12 +169,13 @@ def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:
     return found[0] if found else None
 
 
-def find_tables(folder: Path) -> tuple[list[Path], list[Path]]:
+def find_tables(folder: Path, clouds: Container[Path] = ()) -> tuple[list[Path], list[Path]]:
     """Find what holds poses in a folder, files or folders with a file per pose, and files of times, by their contents.
 
+    `clouds` are no tables.
     Files of times also say so in their name, because a column of numbers may be anything. We read the start of each.
     """
-    tables = sorted(path for path in folder.iterdir() if path.suffix.lower() in _TABLES and path.name[0] != ".")
+    tables = sorted(path for path in visible(folder) if path.suffix.lower() in _TABLES and path not in clouds)
     folders = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
     starts = {path: _start_of(path, parse_poses) for path in tables}
     poses = [path for path, start in starts.items() if start is not None and len(start.poses) > 1]

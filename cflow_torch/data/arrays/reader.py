@@ -10,7 +10,7 @@ import numpy as np
 
 from cflow_torch.data.arrays import poses_text
 from cflow_torch.data.arrays.bin_layout import BinLayout, find_bin_layout
-from cflow_torch.data.arrays.cloud_file import in_single, matrices_in, read_columns, read_table
+from cflow_torch.data.arrays.cloud_file import in_single, read_columns, read_table, small_arrays, stem_of, suffix_of
 from cflow_torch.data.arrays.folder import (
     GROUND_FOLDER,
     POSE_FILES,
@@ -35,8 +35,9 @@ from cflow_torch.transforms import poses_from_quaternions, rigid_transform, tran
 from cflow_torch.types import CFlowError, Sweep
 from cflow_torch.windows.returns import missing_returns
 
-_VIEWPOINT, _ARRAY = "VIEWPOINT", "the array"  # sources of poses that come with the clouds
+_VIEWPOINT, _ARRAYS = "VIEWPOINT", "the arrays"  # sources of poses that come with the clouds
 _LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
+_LEAST_USUAL = 2 / 3  # share of steps between the numbers of files that are equal, or the numbers are irregular
 _LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
@@ -47,8 +48,8 @@ class ArraysLog(Log):
         folder: of a log, see `find_array_logs`. Clouds are sorted by the times in their names, else naturally: 2
             before 10.
         poses: "auto" = one of `POSE_FILES` in the folder, or KITTI's ../../poses/<name>.txt, or the only file or
-            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or the only matrix in each
-            `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
+            folder there whose contents are poses, or VIEWPOINT of `.pcd` files if it is set, or those in arrays of
+            each `.npz` file, or the only file of text in a folder near this one that has poses at the unix times of the
             sweeps; None = no poses; or a file (see `read_poses`); or a (K, 4, 4) array.
         poses_of: "ego" or "lidar", the frame whose poses these are.
         calibration: "auto" = `calib.txt` in the folder, if the poses are KITTI's 12 numbers; None = none; or a file. It
@@ -67,6 +68,7 @@ class ArraysLog(Log):
             have no `timestamp_ns`.
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep, see `fit_to_sweeps`; None = unknown. Without times, there
             is one pose per sweep, or each sweep takes that of its name or number.
+        trajectory: times and `T_world_ego` of all poses, by which `DeskewedLog` moves points; None = without times.
         bin_layout: numbers of a point of `.bin` files, None for files of another suffix.
         has_viewpoints: whether the poses come from VIEWPOINT or arrays of the clouds. Such clouds are often in the
             world's frame (`read_as`).
@@ -112,11 +114,13 @@ class ArraysLog(Log):
             self._note(note)
         self._has_times = stamps is not None
         self.timestamps: Sequence[int] = list(range(len(self.files))) if stamps is None else stamps
-        self.gaps = self._with_gaps_in_time() if self._has_times and trajectory is None else frozenset()
+        if trajectory is not None and (are_of_lidar or poses_of == "lidar"):
+            trajectory = trajectory._replace(poses=trajectory.poses @ np.linalg.inv(self.ego_T_lidar))
         self.poses = None if trajectory is None else self._pose_per_sweep(trajectory, stamps)
-        if self.poses is not None and (are_of_lidar or poses_of == "lidar"):
-            self.poses = self.poses @ np.linalg.inv(self.ego_T_lidar)
-        self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAY))
+        if trajectory is None and self._has_times:
+            self.gaps = self._with_gaps_in_time()
+        self.gaps |= frozenset(self._gaps_in_numbers())
+        self.has_viewpoints = trajectory is not None and trajectory.source.startswith((_VIEWPOINT, _ARRAYS))
         if trajectory is not None and self.has_viewpoints:
             self._note(f"its poses come from {trajectory.source}")
 
@@ -134,7 +138,7 @@ class ArraysLog(Log):
             points = np.where(is_missing[:, None], np.float32(np.nan), points)
         if not np.array_equal(self.ego_T_lidar, np.eye(4)):
             points = transform_points(points, self.ego_T_lidar)
-        is_ground = None if self._ground is None else _read_mask(self._ground, self.files[index].stem, len(points))
+        is_ground = None if self._ground is None else _read_mask(self._ground, stem_of(self.files[index]), len(points))
         pose = None if self.poses is None else self.poses[index].copy()
         seconds = None if times is None else times.seconds
         return Sweep(in_single(points), is_ground, pose, time, seconds)
@@ -147,7 +151,7 @@ class ArraysLog(Log):
     def _find_bin_layout(self, columns: Any) -> BinLayout | None:
         """Return the layout of `.bin` files; None = the files have another suffix. We say if it is not KITTI's."""
         first = self.files[0]
-        if first.suffix.lower() != ".bin":
+        if suffix_of(first) != ".bin":
             return None
         with file_errors(first):
             layout = find_bin_layout(read_bytes(first), None if columns == "auto" else columns)
@@ -164,7 +168,7 @@ class ArraysLog(Log):
         if file is None and poses == "auto":
             found = [
                 path
-                for path in find_tables(self.folder)[0]
+                for path in find_tables(self.folder, self.files)[0]
                 if path.suffix.lower() not in poses_text.STRUCTURED or self._fits(path)
             ]
             file = only_one(found, self.folder, "poses")
@@ -192,10 +196,11 @@ class ArraysLog(Log):
         return trajectory.times_ns is not None or len(trajectory.poses) == len(self.files) or rows is not None
 
     def _viewpoints(self) -> Trajectory | None:
-        """Read the poses in VIEWPOINT of `.pcd` files, or in an array of `.npz` files; None if no file has one."""
-        if self.files[0].suffix.lower() == ".npz":
-            return self._poses_in_arrays()
-        if self.files[0].suffix.lower() != ".pcd":
+        """Read the poses in VIEWPOINT of `.pcd` files, or in arrays of `.npz` files; None if no file has one."""
+        if suffix_of(self.files[0]) == ".npz":
+            trajectory = poses_text.poses_of_members([small_arrays(file) for file in self.files])
+            return trajectory and trajectory._replace(source=f"{_ARRAYS} {trajectory.source} of its clouds")
+        if suffix_of(self.files[0]) != ".pcd":
             return None
         numbers = np.tile(np.eye(7)[3], (len(self.files), 1))
         for row, file in zip(numbers, self.files):
@@ -207,18 +212,6 @@ class ArraysLog(Log):
         poses = poses_from_quaternions(numbers[:, :3], numbers[:, 3:], lambda k: f"{self.files[k]}: VIEWPOINT")
         return Trajectory(poses, None, False, _VIEWPOINT)
 
-    def _poses_in_arrays(self) -> Trajectory | None:
-        """Read the only matrix, (4, 4) or (3, 4), of each `.npz` file."""
-        of_files = [matrices_in(file) for file in self.files[:1]]
-        if len(of_files[0]) != 1:
-            return None
-        (name,) = of_files[0]
-        of_files += [matrices_in(file) for file in self.files[1:]]
-        if any(name not in each for each in of_files):
-            return None
-        poses = checked_poses(np.stack([each[name] for each in of_files]), name)
-        return Trajectory(poses, None, False, f"{_ARRAY} {name} of its clouds")
-
     def _times(self, times: Any, trajectory: Trajectory | None) -> list[int] | None:
         """Return the nanoseconds of each sweep; None = unknown."""
         count = len(self.files)
@@ -229,12 +222,12 @@ class ArraysLog(Log):
             if rows is None:
                 raise CFlowError(f"{file} has {len(stamps)} times for {count} sweeps; it needs one each")
             return stamps[rows].tolist()  # type: ignore[no-any-return]
-        named = times_of_names([path.stem for path in self.files])
+        named = times_of_names([stem_of(path) for path in self.files])
         if named is not None:
             return named
         if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
             return trajectory.times_ns.tolist()
-        tables = find_tables(self.folder)[1] if times == "auto" else []
+        tables = find_tables(self.folder, self.files)[1] if times == "auto" else []
         file = only_one([table for table in tables if len(poses_text.read_times(table)) == count], self.folder, "times")
         self._note(f"the times of its sweeps are those of {file.name}" if file else "")
         return None if file is None else poses_text.read_times(file).tolist()
@@ -247,9 +240,9 @@ class ArraysLog(Log):
         """
         stems = [Path(label).stem for label in labels]
         row_of = dict(zip(stems, range(len(stems))))
-        if row_of.keys() >= {path.stem for path in self.files}:
-            return np.array([row_of[path.stem] for path in self.files])
-        numbers = [_number_of(path.stem) for path in self.files]
+        if row_of.keys() >= {stem_of(path) for path in self.files}:
+            return np.array([row_of[stem_of(path)] for path in self.files])
+        numbers = [_number_of(stem_of(path)) for path in self.files]
         numbered = dict(zip(map(_number_of, stems), range(len(stems))))
         rows = np.array([numbered.get(number, -1) for number in numbers])
         is_enough = (rows >= 0).mean() > (_LEAST_NAMED if len(stems) != len(self.files) else 1 - 1e-9)
@@ -268,7 +261,7 @@ class ArraysLog(Log):
         labelled = self._labelled_rows(labels) if len(labels) == count else None
         if count == len(self.files) or labelled is not None:
             return np.arange(count) if labelled is None else labelled
-        numbers = np.array([_number_of(path.stem) % 10**9 for path in self.files])
+        numbers = np.array([_number_of(stem_of(path)) % 10**9 for path in self.files])
         fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
         if len(fitting) != 1 or len(set(numbers)) < len(numbers) or fitting[0].max() < _LEAST_REACH * count:
             return None
@@ -283,6 +276,7 @@ class ArraysLog(Log):
             poses, is_known, note = fit_to_sweeps(trajectory, stamps)
             self._note(note)
             self.has_sparse_poses = trajectory.is_sparse(stamps)
+            self.trajectory = trajectory.times_ns, trajectory.poses
         else:
             given = self._rows(len(trajectory.poses), f"poses in {source}", trajectory.labels)
             if given is None:
@@ -299,10 +293,20 @@ class ArraysLog(Log):
         kept = np.flatnonzero(is_known)
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
         self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
-        is_gap = (np.diff(kept) > 1) | (np.diff(rows[kept]) > np.median(np.diff(rows)))
-        gaps = np.flatnonzero(is_gap).tolist()
+        gaps = np.flatnonzero(np.diff(kept) > 1).tolist()
         self.gaps = self._with_gaps_in_time(gaps) if self._has_times else frozenset(gaps)
         return poses
+
+    def _gaps_in_numbers(self) -> list[int]:
+        """Return the indices of files without times after which others are missing, by the numbers in their names."""
+        steps = np.diff([_number_of(stem_of(path)) for path in self.files])
+        usual = np.median(steps)
+        gaps = np.flatnonzero(steps > usual).tolist()
+        if self._has_times or not gaps or steps.min() <= 0 or (steps == usual).mean() <= _LEAST_USUAL:
+            return []
+        first = self.files[gaps[0]].name
+        self._note(f"sweeps are missing by the numbers of its files, first after {first}; no window reaches over them")
+        return gaps  # type: ignore[no-any-return]
 
 
 def _number_of(stem: str) -> int:

@@ -45,13 +45,13 @@ def parse_table(content: bytes, path: Path) -> Table:
     with file_errors(path, "every line must have the same number of numbers"):
         lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
         lines = _poses_only(lines)
-        start = next((k for k, line in enumerate(lines) if _is_row(_split(line))), len(lines))
+        start = next((k for k, line in enumerate(lines) if _is_row(split_line(line))), len(lines))
         names = re.split("[,;]", lines[start - 1].lstrip("#")) if start else []
         names = names if len(names) > 1 or not start else lines[start - 1].lstrip("#").split()
-        words = np.array([_split(line) for line in lines[start:] if line[0] != "#"], str)
+        words = np.array([split_line(line) for line in lines[start:] if line[0] != "#"], str)
         if any(line[0] != "#" for line in lines[: max(start - 1, 0)]) or words.ndim != 2 or not start < len(lines):
             raise ValueError("it is empty, or has text before its numbers" if start else "its lines differ in length")
-        columns = [column for column, word in enumerate(words[0]) if _is_number(word)]
+        columns = [column for column, word in enumerate(words[0]) if is_number(word)]
         texts = [words[:, column].tolist() for column in range(words.shape[1]) if column not in columns]
         labels: list[str] = next((column for column in texts if len(set(column)) == len(column)), [])
         names = [names[column] for column in columns] if len(names) == words.shape[1] else []
@@ -69,7 +69,7 @@ def read_numbers(path: Path) -> np.ndarray:
 def _poses_only(lines: list[str]) -> list[str]:
     """Leave out edges of a g2o graph, and the three numbers above each matrix of a trajectory of Open3D."""
     vertices = [line for line in lines if line.startswith("VERTEX_SE3")]
-    counts = [len(_split(line)) for line in lines[:5]]
+    counts = [len(split_line(line)) for line in lines[:5]]
     return vertices or ([line for k, line in enumerate(lines) if k % 5] if counts == [3, 4, 4, 4, 4] else lines)
 
 
@@ -81,12 +81,20 @@ def tables_of_values(content: bytes, path: Path) -> Iterator[Table]:
     """
     value = _value_of(content, path)
     for labels, members in (*_series(value), ([], [value])):
-        rows = [dict(_numbers_of(member, "")) for member in members]
-        names = max(rows, key=len, default={}).keys()
-        if names and sum(row.keys() == names for row in rows) > len(rows) / 2:
-            texts = labels or [_text_of(member) for member in members]
-            words = [[row.get(name, "nan") for name in names] for row in rows]
-            yield Table(list(names), np.array(words, str), texts if len({*texts, ""}) > len(texts) else [])
+        table = table_of(members, labels)
+        if table is not None:
+            yield table
+
+
+def table_of(members: Sequence[Any], labels: Sequence[str] = ()) -> Table | None:
+    """Return the table whose rows are members that are mostly alike, see `tables_of_values`; None = they are not."""
+    rows = [dict(_numbers_of(member, "")) for member in members]
+    names = max(rows, key=len, default={}).keys()
+    if not names or 2 * sum(row.keys() == names for row in rows) <= len(rows):
+        return None
+    texts = list(labels) or [_text_of(member) for member in members]
+    words = [[row.get(name, "nan") for name in names] for row in rows]
+    return Table(list(names), np.array(words, str), texts if len({*texts, ""}) > len(texts) else [])
 
 
 def _value_of(content: bytes, path: Path) -> Any:
@@ -95,21 +103,22 @@ def _value_of(content: bytes, path: Path) -> Any:
     with file_errors(f"{path} as {kind[1:]}"):
         if kind == ".npz":
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                return {name: _as_decimals(archive[name].tolist()) for name in archive.files}
+                return {name: as_decimals(archive[name].tolist()) for name in archive.files}
         text = content.decode("utf-8-sig")
         if kind in (".yaml", ".yml"):
             documents = list(yaml.load_all(text, getattr(yaml, "CBaseLoader", yaml.BaseLoader)))
-            return _as_decimals(documents[0] if len(documents) == 1 else documents)
+            return as_decimals(documents[0] if len(documents) == 1 else documents)
         parse = partial(json.loads, parse_float=Decimal, parse_int=Decimal)
         return list(map(parse, text.splitlines())) if kind == ".jsonl" else parse(text)
 
 
-def _as_decimals(value: Any) -> Any:
+def as_decimals(value: Any) -> Any:
+    """Return nested lists and dictionaries with Decimals in place of numbers and their texts."""
     if isinstance(value, dict):
-        return {key: _as_decimals(member) for key, member in value.items()}
+        return {key: as_decimals(member) for key, member in value.items()}
     if isinstance(value, list):
-        return [_as_decimals(member) for member in value]
-    return Decimal(str(value)) if _is_number(str(value)) else value
+        return [as_decimals(member) for member in value]
+    return Decimal(str(value)) if is_number(str(value)) else value
 
 
 def _series(value: Any) -> Iterator[tuple[list[str], list[Any]]]:
@@ -171,7 +180,7 @@ def _text_of(value: Any) -> str:
     return texts[0] if texts else ""
 
 
-def _split(line: str) -> list[str]:
+def split_line(line: str) -> list[str]:
     decimal = line.replace(",", ".") if ";" in line else line  # as some languages write numbers
     decimal = re.sub(r"[\[\]]", " ", decimal).strip()  # as NumPy prints matrices
     return re.split(r"[\s,;]+", decimal.rstrip(",; "))
@@ -179,11 +188,11 @@ def _split(line: str) -> list[str]:
 
 def _is_row(words: Sequence[str]) -> bool:
     """Test whether words are a row of numbers, or a pose with a few texts."""
-    num_numbers = sum(map(_is_number, words))
+    num_numbers = sum(map(is_number, words))
     return num_numbers == len(words) or num_numbers >= _FEWEST_NUMBERS
 
 
-def _is_number(word: str) -> bool:
+def is_number(word: str) -> bool:
     try:
         float(word)
     except ValueError:

@@ -46,6 +46,7 @@ _OTHER_POSES = ("nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped")  # us
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by less
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
+_EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 
@@ -260,10 +261,16 @@ class BagLog(Log):
                 return moving[0]
         named = [name for name in (_BASE, *self._child.values()) if name and name != lidar]
         for name in named if self._mount is None else []:
-            if len(frames.change_times(name)) > 1 or name in self._child.values():
-                used = "We assume that both are in one place" if name in self._child.values() else "They are not used"
-                text = f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. {used}"
-                self._note(f"{text}; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)", "missing link")
+            is_in_tf = len(frames.change_times(name)) > 1
+            if is_in_tf or name in self._child.values():
+                self._note(
+                    f"no transform connects its LiDAR ({lidar}) to {name}, whose poses it has. We assume that both are "
+                    "in one place; pass the mounting of the LiDAR, ego_T_lidar (data.ego_T_lidar)",
+                    "missing link",
+                )
+            if is_in_tf:
+                self._mount = np.eye(4)
+                return name
         return lidar
 
     def _scan(self) -> tuple[dict[int, int], dict[str, list[Any]]]:
@@ -281,7 +288,7 @@ class BagLog(Log):
         for connection, arrived, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
             if connection.topic == self.topic:
-                stamps.append((_stamp(message, arrived), arrived))
+                stamps.append((_stamp(message, 0), arrived))
                 self._lidar = self._lidar or message.header.frame_id.lstrip("/")
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
@@ -308,30 +315,37 @@ class BagLog(Log):
         if self._use_arrival:
             stamps = [(arrived, arrived) for _, arrived in stamps]
             self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")
-        elif count < len(stamps):
-            repeated = len(stamps) - count
+        stamps = [(stamp or arrived, arrived) for stamp, arrived in stamps]
+        repeated = len(stamps) - len(dict(stamps))
+        if repeated:
             self._note(
                 f"{repeated} clouds repeat the time stamp of an earlier one and are left out; was it played twice?"
             )
         return dict(reversed(stamps))
 
     def _set_clock(self, pose_times: np.ndarray) -> None:
-        """Shift the times of clouds to the clock of the poses, by the times of arrival, if the two do not overlap."""
+        """Shift the times of clouds to the clock of the poses, by the times of arrival, if the clocks surely differ.
+
+        They do if the times do not overlap, or if messages of one kind only arrive before their time. Otherwise poses
+        may arrive late, because they take long to compute.
+        """
         first, last = self.timestamps[0], self.timestamps[-1]
-        shift = _middle([arrived - time for time, arrived in self._arrival.items()]) - _middle(self._pose_delays)
-        if last >= pose_times[0] and first <= pose_times[-1]:
-            if abs(shift) >= _LARGEST_DELAY:
-                seconds = f"{shift * 1e-9:+.2g} s by the times of arrival"
-                self._note(f"clocks of its clouds and poses differ by {seconds}: if static points move, correct one")
+        delays = [arrived - time for time, arrived in self._arrival.items()], self._pose_delays
+        shift = _middle(delays[0]) - _middle(delays[1])
+        do_overlap = last >= pose_times[0] and first <= pose_times[-1]
+        if abs(shift) < (_LARGEST_DELAY if do_overlap else _ANOTHER_CLOCK):
             return
-        if abs(shift) < _ANOTHER_CLOCK:
+        seconds = f"{shift * 1e-9:+.6g} s by the times of arrival"
+        are_early = [sorted(each)[len(each) * 9 // 10] < -_EARLY for each in delays if each]
+        if do_overlap and sum(are_early) != 1:
+            self._note(f"clocks of its clouds and poses differ by {seconds}: if static points move, correct one")
             return
         self._shift = shift
         self._arrival = {time + shift: arrived for time, arrived in self._arrival.items()}
         self.timestamps = sorted(self._arrival)
         self._note(
-            f"the times of its clouds and of its poses have different clocks ({shift * 1e-9:+.6g} s by the times of "
-            "arrival), so we shift those of the clouds"
+            f"the times of its clouds and of its poses have different clocks ({seconds}), so we shift those of the "
+            "clouds"
         )
 
     def _find_trajectory(self, poses: str, tracks: dict[str, list[Any]]) -> tuple[np.ndarray, np.ndarray]:

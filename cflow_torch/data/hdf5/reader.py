@@ -197,11 +197,15 @@ class HDF5Log(Log):
 
     def _rows(self, index: int) -> tuple[int]:
         """Return the number of points of a sweep without reading them, as the shape of a column."""
-        stored = member(self._group(index), "lidar", f"{self.file}: sweep {self.timestamps[index]}")
-        shape: tuple[int, ...] = () if stored is None else stored.shape
-        if len(shape) != 2 or shape[1] < 3:
-            raise CFlowError(f"{self.file}: lidar of sweep {self.timestamps[index]} has shape {shape}, not (N, 3+)")
-        return (shape[0],)
+        where = f"{self.file}: sweep {self._timestamp(index)}"
+        stored = member(self._group(index), "lidar", where)
+        if stored is None:
+            raise CFlowError(
+                f"{where} has no lidar, its (N, 3+) points; it has {', '.join(self.keys(index)) or 'nothing'}"
+            )
+        if len(stored.shape) != 2 or stored.shape[1] < 3:
+            raise CFlowError(f"{where}: lidar has shape {stored.shape}, not (N, 3+)")
+        return (stored.shape[0],)
 
     def _values(self, index: int, key: str, shape: tuple[int, ...] | None = None, dtype: Any = None) -> Any:
         """Read the array of a key, None if there is none. Its stored shape may have one more axis, of length 1."""

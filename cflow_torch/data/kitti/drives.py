@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cflow_torch.data.folders import search
+from cflow_torch.data.folders import distinct_names, search
 from cflow_torch.data.paths import PathLike, as_path
 
 _DEEPEST = 6  # levels below the root; <root>/kitti/raw/<date>/<drive> has four
@@ -69,18 +68,10 @@ def _has_clouds(folder: Path) -> bool:
 
 
 def _with_distinct_names(drives: list[KITTIDrive]) -> list[KITTIDrive]:
-    named = []
+    above = []
     for drive in drives:
         # Folder names above the drive, nearest first, without those that belong to the layout.
         parents: Any = drive.root.resolve() if drive.layout == "tracking" else drive.root.resolve().parent
-        above = [part for part in parents.parts[1:] if part not in ("sequences", "dataset")]
-        named.append((drive, above[::-1]))
-    result = [drive for drive, _ in named]
-    for depth in range(1, 1 + max((len(above) for _, above in named), default=0)):
-        counts = Counter(drive.name for drive in result)
-        if max(counts.values()) == 1:
-            break
-        for k, (drive, above) in enumerate(named):
-            if counts[result[k].name] > 1:
-                result[k] = drive._replace(name="-".join([*above[:depth][::-1], drive.name]))
-    return result
+        above.append([part for part in parents.parts[1:] if part not in ("sequences", "dataset")][::-1])
+    names = distinct_names([drive.name for drive in drives], above)
+    return [drive._replace(name=name) for drive, name in zip(drives, names)]

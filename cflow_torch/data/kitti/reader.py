@@ -90,6 +90,9 @@ class KITTILog(ArraysLog):
         elif is_auto and not is_sequence:
             self.poses = self._poses_from_oxts()
 
+    def _gaps_in_numbers(self) -> list[int]:
+        return [] if self.drive.layout == "raw" else super()._gaps_in_numbers()  # raw drives have times
+
     def sweep(self, index: int) -> Sweep:
         sweep = super().sweep(index)
         if self._label_files is None or sweep.is_ground is not None:
