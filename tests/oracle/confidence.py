@@ -20,17 +20,18 @@ TABLE: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
 DISPLACEMENT, BLOCK = 0.4, 1.6  # metres per interval; metres
 
 
-def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tuple[float, bool]:
-    """What an object's motion loses by being displaced by 0.4 m per interval, the best of four displacements, in
-    standard deviations of what it finds; and whether it is dynamic. 0 for a static object.
+def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tuple[int, bool]:
+    """The bin of an object with a motion, counted from the first one of such objects, and whether it is dynamic.
 
-    An object that moves by 0.05 m and loses at least one standard deviation is dynamic, if its window has history, or
-    it is within 35 m, moves by two pixels or finds more than half as much where it moves to as in place. So is one that
-    is not a line and is found less in place than where it moves to, if it loses something or moves at least twice as
-    far as it is displaced.
+    The bin depends on what the motion loses by being displaced by 0.4 m per interval, the best of four displacements,
+    in standard deviations of what it finds. An object is static if fewer than one in 30 of its bin move. Otherwise, if
+    it moves by 0.05 m and loses at least one standard deviation, it is dynamic, if its window has history, or it is
+    within 35 m, moves by two pixels or finds more than half as much where it moves to as in place. So is one that is
+    not a line and is found less in place than where it moves to, if it loses something or moves at least twice as far
+    as it is displaced.
     """
     if not any(rigid.flow):
-        return 0.0, False
+        return 0, False
     off, motion = DISPLACEMENT / sweeps.size, motion_of_pixels(sweeps, members, rigid)
     displaced = [motion + shift for shift in ((0, 0), (off, 0), (-off, 0), (0, off), (0, -off))]
     is_alone, is_wide = (motion != np.array(rigid.flow)[::-1] / sweeps.size).any(1), are_wide(sweeps, members)
@@ -43,7 +44,11 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     is_told = sweeps.has_history or speed >= 2 * sweeps.size or math.hypot(*rigid.centre) < 35
     is_sure = z >= 1 and (is_told or 2 * surplus > stays)
     leaves = (gain > 0 or speed >= 2 * DISPLACEMENT) and surplus > stays and not is_line
-    return z, bool(speed >= 0.05 and (is_sure or leaves))
+    is_fast, is_far = speed >= TABLE["fast"], np.square(rigid.centre).sum() >= TABLE["far"] ** 2
+    num_margins = 1 + len(TABLE["margin"])
+    number = (4 * sweeps.has_history + 2 * is_far + is_fast) * num_margins + (z >= np.array(TABLE["margin"])).sum()
+    is_likely = TABLE["moving"][len(TABLE["moving"]) - 8 * num_margins + number] >= 1 / 30
+    return int(number), bool(speed >= 0.05 and is_likely and (is_sure or leaves))
 
 
 def surplus_of(sweeps: SlicedSweeps, members: np.ndarray, motion: np.ndarray, is_wide: np.ndarray) -> int:
@@ -91,21 +96,21 @@ def probabilities(
     sweeps: SlicedSweeps,
     object_of: np.ndarray,
     rigid: Sequence[RigidMotion],
-    margins: Sequence[float],
+    bins_of_objects: Sequence[int],
     is_missing: np.ndarray,
     scales: Sequence[np.ndarray],
 ) -> np.ndarray:
     """(2, P): of every pixel, that its motion is right, and that it moves; undefined for those of sweeps other than t.
-    Given are the object of each pixel, the motion of each object and its margin, the missing pixels, and the dilated
-    component of each pixel at the second finest scale, then at the finest.
+    Given are the object of each pixel, the motion of each object and the result of `margin`, the missing pixels, and
+    the dilated component of each pixel at the second finest scale, then at the finest.
 
     The bins of the table: left out; static in a pair and biased; static in an unmatched component, by its size; static,
-    by the share of the slices in the block around that is found; static beside something that moves; moving, by the
-    margin. Each but the first two has rows, for pairs, then with history: one if unmatched, two if static, not missing
-    and missing, and four if it moves, near slow, near fast, far slow, far fast. A block is 1.6 m wide, and its slices
-    are found if t+1 has them where they move to. A pixel is unmatched if t+1 lacks a slice around it. In pairs it is
-    then missing. A component is unmatched if less than an eighth of its size is matched, the sum of the reach of its
-    pixels of t. A missing pixel in one has a bin of that kind.
+    by the share of the slices in the block around that is found; static beside an object with a motion; of such an
+    object, see `margin`. Each but the first two has rows, for pairs, then with history: one if unmatched, two if
+    static, not missing and missing, and four of objects, near slow, near fast, far slow, far fast. A block is 1.6 m
+    wide, and its slices are found if t+1 has them where they move to. A pixel is unmatched if t+1 lacks a slice around
+    it. In pairs it is then missing. A component is unmatched if less than an eighth of its size is matched, the sum of
+    the reach of its pixels of t. A missing pixel in one has a bin of that kind.
     """
     motion = np.array([*(each.flow[::-1] for each in rigid), (0.0, 0.0)])[object_of] / sweeps.size
     step, row, col = sweeps.pixels.T
@@ -116,7 +121,7 @@ def probabilities(
     for of_block, of_pixel in zip(counts, (COUNT[sweeps.slices], found)):
         np.add.at(of_block, (row // side, col // side), np.where(step == 1, of_pixel, 0))
     total, found = counts[:, row // side, col // side]
-    sizes, share, bounds = (np.array(TABLE[name]) for name in ("size", "share", "margin"))
+    sizes, share = (np.array(TABLE[name]) for name in ("size", "share"))
     biased = 2
     unmatched = biased + len(TABLE["bias"])
     static = unmatched + 2 * (1 + len(sizes))
@@ -142,10 +147,6 @@ def probabilities(
                 lost = members[is_missing[members]]
                 bins[lost] = unmatched + sweeps.has_history * (1 + len(sizes)) + (reach.sum() >= sizes).sum()
 
-    is_far = (sweeps.middle(sweeps.pixels) ** 2).sum(1) >= TABLE["far"] ** 2
-    is_fast = np.array([*(each.flow[0] ** 2 + each.flow[1] ** 2 >= TABLE["fast"] ** 2 for each in rigid), False])
-    reached = (np.array([*margins, 0.0])[object_of, None] >= bounds).sum(1)
-    kind = 4 * sweeps.has_history + 2 * is_far + is_fast[object_of]
-    moving = beside + 4 + kind * (1 + len(bounds)) + reached
+    moving = beside + 4 + np.array([*bins_of_objects, 0])[object_of]
     table = np.array([TABLE["probabilities"], TABLE["moving"]])
     return table[:, np.where(moves, moving, bins)]

@@ -66,7 +66,8 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     size, members = sweeps.size, [np.flatnonzero(object_of == i) for i in range(len(chosen))]
     rigid = register(sweeps, object_of, [(x * size, y * size) for y, x in motions])
     margins = [margin(sweeps, *given) for given in zip(members, rigid)]
-    of_pixels = probabilities(sweeps, object_of, rigid, [z for z, _ in margins], change[0], tree.levels[:-1][-2:])
+    bins = [number for number, _ in margins]
+    of_pixels = probabilities(sweeps, object_of, rigid, bins, change[0], tree.levels[:-1][-2:])
 
     flow, ids = np.zeros(points.shape), np.full(len(points), -1, dtype=np.int64)
     score, confidence, moving = (
