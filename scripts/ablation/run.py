@@ -4,6 +4,7 @@
   python scripts/ablation/run.py --presets paper default --sets real merged
   python scripts/ablation/run.py --set --set significance=3 --set num_history=0    `default`, and two changes of it
   python scripts/ablation/run.py --sets scenes "kitti h=4"                         single sets by their names
+  python scripts/ablation/run.py --far --sets real                                 points 35 to 70 m away
 
 Sets: real (CFLOW_DATA, else ../shared/data), odd (the other windows of the same KITTI drive), merged (a car under a
 tree crown, a later part of KITTI), pandaset, scenes (small simulated drives, a window for each of five seeds), sim
@@ -15,8 +16,8 @@ changes them; scenes have the region of the preset.
 Columns: end-point errors in metres over all points within 35 m ("border": 76.8 m) without ground; for scenes, means
 over the drives. dynamic: objects that move by at least 0.05 m per sweep; in a scene, its scored objects. pedestrian:
 error divided by speed. static: background. near, far: dynamic bucket-normalised error, mean over the classes, 0-35 m
-and 35-70 m. missed: share of moving points whose flow is less than half of the true one. moving: number of moving
-points.
+and 35-70 m. missed: share of moving points whose flow is less than half of the true one. false: share of static points
+that move. moving: number of moving points.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from typing import Any, Callable, Dict, Mapping, Sequence
 import numpy as np
 import torch
 from omegaconf import OmegaConf
-from sets import NEAR, ScoredSet, make_sets
+from sets import NEAR, REGION, ScoredSet, make_sets
 
 from cflow_torch import make_config, make_model
 from cflow_torch.applications.moving_groups import MOVING
@@ -43,7 +44,7 @@ from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.scored_points import score_points
 from cflow_torch.types import CFlowError
 
-COLUMNS = ("dynamic", "pedestrian", "static", "near", "far", "missed", "moving")
+COLUMNS = ("dynamic", "pedestrian", "static", "near", "far", "missed", "false", "moving")
 RANGES = {"near": "0-35", "far": "35-70"}
 Figures = Dict[str, float]
 
@@ -52,6 +53,7 @@ def main() -> None:
     parser = make_parser(__doc__, ["real", "odd", "merged"], range(100, 104))
     parser.add_argument("--presets", nargs="+", default=["default"])
     parser.add_argument("--set", nargs="*", action="append", metavar="NAME=VALUE", help="once a setting")
+    parser.add_argument("--far", action="store_true", help="score points 35 to 70 m away")
     given = parser.parse_args()
     settings = {}
     for preset in given.presets:
@@ -59,7 +61,10 @@ def main() -> None:
             name = " ".join([preset, *(f"{key}={value}" for key, value in changes.items())])
             settings[name] = partial(score_preset, preset=preset, changes=changes)
     try:
-        print_table(make_sets(given.sets, given.seeds), settings)
+        sets = make_sets(given.sets, given.seeds)
+        if given.far:
+            sets = [replace(scored, half_side=REGION, reach=REGION, nearest=NEAR) for scored in sets]
+        print_table(sets, settings)
     except CFlowError as error:
         sys.exit(f"error: {error}")
 
@@ -119,32 +124,35 @@ def score_preset(scored: ScoredSet, preset: str, changes: dict[str, Any], steps:
         (result,) = model([replace(window, pcf=window.pcf[: config.num_future])])
         frames.append(replace(frame, residual_flow=result.residual_flow))
     if scored.group == "scenes":
-        return mean_figures([pooled_figures([frame], reach=scored.reach) for frame in frames])
-    figures = pooled_figures(frames, scored.step, scored.reach)
+        return mean_figures([pooled_figures([frame], 1, scored.reach, scored.nearest) for frame in frames])
+    figures = pooled_figures(frames, scored.step, scored.reach, scored.nearest)
     return {**figures, **range_figures(frames)} if scored.mean else figures
 
 
-def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NEAR) -> Figures:
-    """Errors over all points of a set in a square box around the sensor; NaN without such points.
+def pooled_figures(frames: Sequence[EvalFrame], step: int = 1, reach: float = NEAR, nearest: float = 0.0) -> Figures:
+    """Errors over all points of a set in a square box around the sensor, without a smaller box; NaN without points.
 
     "dynamic", "static": end-point error in metres of dynamic objects and of the static background; "ratio",
     "pedestrian": mean of error divided by speed of dynamic objects and of those that are pedestrians; "missed": share
-    of the points of dynamic objects whose flow is less than half of the true one; "moving": their number. With `step`
-    sweeps from t to t+1, a point is dynamic from 0.05 m per sweep on.
+    of the points of dynamic objects whose flow is less than half of the true one; "moving": their number; "false":
+    share of the points of the static background that move. With `step` sweeps from t to t+1, a point is dynamic from
+    0.05 m per sweep on.
     """
     scored = {"region": "box", "max_range": reach, "dynamic_threshold": MOVING * step, "three_way_flow": "residual"}
     definition = Definition("pooled", ("three_way",), **scored)
     of_frames: list[tuple[np.ndarray, ...]] = []
     for frame in frames:
         points = score_points(frame, definition)
-        moves = points.in_region & points.is_dynamic & (points.category > 0)
+        is_inside = points.in_region & (points.reach >= nearest)
+        moves = is_inside & points.is_dynamic & (points.category > 0)
         walks = moves & (points.category == CATEGORY_INDEX["PEDESTRIAN"])
-        static = points.in_region & ~points.is_dynamic & (points.category == 0)
+        static = is_inside & ~points.is_dynamic & (points.category == 0)
         is_missed = np.linalg.norm(points.predicted_flow, axis=1) < 0.5 * points.speed
         ratios = (points.error[chosen] / points.speed[chosen] for chosen in (moves, walks))
-        of_frames.append((points.error[moves], *ratios, points.error[static], is_missed[moves]))
+        is_false = points.predicted_dynamic[static]
+        of_frames.append((points.error[moves], *ratios, points.error[static], is_missed[moves], is_false))
     pooled = [np.concatenate(values) for values in zip(*of_frames)]
-    names = ("dynamic", "ratio", "pedestrian", "static", "missed")
+    names = ("dynamic", "ratio", "pedestrian", "static", "missed", "false")
     return {**dict(zip(names, map(mean_of_present, pooled))), "moving": float(len(pooled[0]))}
 
 

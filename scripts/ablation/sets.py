@@ -66,6 +66,7 @@ class ScoredSet:
     half_side: float | None = NEAR  # metres, of the region of the estimate; None = that of the preset
     step: int = 1  # sweeps of the recording from t to t+1
     reach: float = NEAR  # metres, half side of the scored box
+    nearest: float = 0.0  # metres, half side of a box in it that is not scored
     mean: str = ""  # name of the mean over the sensors to which the set belongs, "" = none
 
     @cached_property
