@@ -118,13 +118,16 @@ def test_poses_of_a_bag_may_lie_next_to_it(recording: TinyRecording, tmp_path: P
 def test_missing_times_of_points_are_on_the_page(recording: TinyRecording, tmp_path: Path) -> None:
     """They are no mistake: many clouds are compensated already."""
     path = write_bag(tmp_path, "ros1", recording)
-    page = {finding.topic: finding.text for finding in examine(BagLog(path))}
+    with BagLog(path) as log:
+        page = {finding.topic: finding.text for finding in examine(log)}
     assert "points have times over" in page["de-skewing"]
     path.write_bytes(path.read_bytes().replace(b"\x01\x00\x00\x00t", b"\x01\x00\x00\x00u"))
     with warnings.catch_warnings():
         warnings.simplefilter("error", CFlowWarning)
-        check_log(BagLog(path))
-    page = {finding.topic: finding.text for finding in examine(BagLog(path))}
+        with BagLog(path) as log:
+            check_log(log)
+    with BagLog(path) as log:
+        page = {finding.topic: finding.text for finding in examine(log)}
     assert "no times of points" in page["de-skewing"]
 
 

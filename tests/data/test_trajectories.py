@@ -63,7 +63,8 @@ def test_sweeps_without_a_pose_are_left_out_and_counted(tmp_path, recwarn, lines
     log = ArraysLog(tmp_path)
     assert [sweep.points[0, 0] - 1 for sweep in log] == list(kept) and log.gaps == set(gaps)
     assert np.allclose(log.poses[:, 0, 3], list(kept), atol=1e-5)
-    texts = [str(warning.message) for warning in recwarn.list]
+    # A file that a test before left open would be another warning.
+    texts = [str(warning.message) for warning in recwarn.list if issubclass(warning.category, CFlowWarning)]
     assert len(texts) == bool(note) and log.notes == [text.partition(": ")[2] for text in texts]
     if note:
         with pytest.warns(CFlowWarning, match=note):
