@@ -58,15 +58,23 @@ def frame_problem(points: Array) -> tuple[str, str]:
     if side < 0:
         return "points_upside_down", "z seems to point down, because nearly all points lie below the ground: " + _UP
     is_tall = extent[2] > _FLAT * max(extent[0], extent[1]) and min(extent[:2]) < _FLAT * extent[2]
-    height = -_height_of_ground(positions) if side > 0 and low[2] < -_HIGHEST_SENSOR else 0.0
-    if _HIGHEST_SENSOR < height < _HIGHEST_IN_FEET:
-        feet = f"the ground lies {height:.1f} m below the sensor, or {0.3048 * height:.1f} m if the points are in feet"
-        return "points_feet", f"{feet}: give points in metres"
+    in_feet = _in_feet(positions) if side > 0 and low[2] < -_HIGHEST_SENSOR else ""
+    if in_feet:
+        return "points_feet", in_feet
     for reading, axes in _TALL.items() if is_tall and side == 0 else ():
         if _has_ground_as(reading, positions):
             return reading, f"the points seem to have {axes}: {_UP}"
     tilt = _tilt_of(positions)
     return "", f"the sensor seems to be tilted by about {tilt}: {_UP} (data.ego_T_lidar)" if tilt else ""
+
+
+def _in_feet(positions: np.ndarray) -> str:
+    """Return what is wrong if the sensor is as high above the ground, in feet, as on a vehicle; "" otherwise."""
+    height = -_height_of_ground(positions)
+    if not _HIGHEST_SENSOR < height < _HIGHEST_IN_FEET:
+        return ""
+    lower = f"{UNITS['feet'] * height:.1f} m if the points are in feet"
+    return f"the ground lies {height:.1f} m below the sensor, or {lower}: give points in metres"
 
 
 def _small_unit(positions: np.ndarray) -> tuple[str, str]:

@@ -220,8 +220,12 @@ def stem_of(path: Path) -> str:
     return (path.with_suffix("") if path.suffix.lower() == GZ else path).stem
 
 
-def _suffix(path: Path, allowed: Sequence[str] = SUFFIXES) -> str:
-    suffix = path.suffix.lower() if allowed == SUFFIXES else suffix_of(path)
+def _suffix(path: Path) -> str:
+    """Return the suffix of a cloud to write."""
+    return _checked_suffix(path, path.suffix.lower(), SUFFIXES)
+
+
+def _checked_suffix(path: Path, suffix: str, allowed: Sequence[str]) -> str:
     if suffix not in allowed:
         raise CFlowError(f"{path} has suffix {suffix!r}; clouds are {', '.join(allowed)}")
     return suffix
@@ -253,7 +257,8 @@ def _positions(fields: Mapping[str, np.ndarray]) -> list[np.ndarray]:
 
 def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.ndarray]:
     """Read all columns by name; those without a name are x, y, z, column_3, ..."""
-    suffix, content = _suffix(path, (*SUFFIXES, *cloud_text.SUFFIXES)), read_bytes(path)
+    suffix = _checked_suffix(path, suffix_of(path), (*SUFFIXES, *cloud_text.SUFFIXES))
+    content = read_bytes(path)
     if suffix in cloud_text.SUFFIXES:
         return cloud_text.text_columns(content)
     if suffix in (".pcd", ".ply"):

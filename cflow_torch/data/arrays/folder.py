@@ -172,8 +172,8 @@ def only_one(found: Sequence[Path], folder: Path, what: str) -> Path | None:
 def find_tables(folder: Path, clouds: Container[Path] = ()) -> tuple[list[Path], list[Path]]:
     """Find what holds poses in a folder, files or folders with a file per pose, and files of times, by their contents.
 
-    `clouds` are no tables.
-    Files of times also say so in their name, because a column of numbers may be anything. We read the start of each.
+    Files of times also say so in their name, because a column of numbers may be anything. We read the start of each,
+    without the `clouds`.
     """
     tables = sorted(path for path in visible(folder) if path.suffix.lower() in _TABLES and path not in clouds)
     folders = sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")
