@@ -273,8 +273,8 @@ class FlowResult:
         cluster_id: (N,) int64, 0 ... M-1 in raster order of each cluster's first pixel; -1 = in no cluster that has
             points both at t+1 and before.
         score: (N,) float32 in [0, 1], normalised cross-correlation of the cluster with t+1 at the peak (finest scale;
-            verified method: scale of the object). It is not a probability. It is 0 where cluster_id is -1 and for
-            objects that were not correlated, such as most static objects of the verified method.
+            verified method: scale of the object). It is not a probability. It is 0 where cluster_id is -1, and in
+            the verified method for objects that no candidate moves.
         is_valid: (N,) bool, True for active points: finite, not ground, not of the vehicle itself (`Config.ego_box`),
             and inside the region.
         confidence: (N,) float32 in [0, 1], estimated probability that the end-point error of the residual flow is

@@ -98,6 +98,7 @@ def moving_scene(seeds: Sequence[int], num_steps: int = 2, pixel_size: float = 0
     for seed in seeds:
         rng = np.random.default_rng(seed)
         times = np.arange(num_steps) * (1.0 if rng.random() < 0.5 else rng.uniform(0.8, 1.2))
+        times[:2] = 0.0, 1.0
         elapsed.append(times)
         parts: list[list[np.ndarray]] = [[] for _ in range(num_steps)]
         of_parts: list[list[np.ndarray]] = [[] for _ in range(num_steps)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from functools import partial
-from typing import Iterator
+from typing import Any, Iterator
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from cflow_torch.verified.method import VerifiedFlow
 from cflow_torch.verified.refinement import refine
 from cflow_torch.verified.selection import Objects
 from cflow_torch.windows.bev_grid import Grid
-from cflow_torch.windows.collation import make_batch
+from cflow_torch.windows.collation import Batch, make_batch
 
 RANGE = (-8.0, -7.0, -2.0, 8.0, 7.0, 3.0)
 
@@ -145,9 +145,15 @@ def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
     with pytest.MonkeyPatch.context() as without:
         without.setattr(VerifiedFlow, "add_overhung", staticmethod(lambda sweeps, components, tree: (sweeps, tree)))
         without.setattr(VerifiedFlow, "refine", staticmethod(partial(refine, slow=_nothing_is_slow)))
+        without.setattr(VerifiedFlow, "draw", staticmethod(_draw_as_if_all_was_measured))
         (result,) = make_model(settings)([window])
     assert_same(result, reference_flow(window, settings))
     return result
+
+
+def _draw_as_if_all_was_measured(batch: Batch, *given: Any) -> HeightSlicedSweeps:
+    """The sweeps without their coverage."""
+    return HeightSlicedSweeps.of(replace(batch, coverage=None), *given)
 
 
 def _nothing_is_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: torch.Tensor, _: object) -> torch.Tensor:

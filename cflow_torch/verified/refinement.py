@@ -143,7 +143,6 @@ class Source:
     target_start: Tensor  # (K,) int64, number of the first pixel of t+1 of its window, see `pixel_key`
     target_layers: Tensor  # (3, K) int32, in which we search for the target
     elapsed: Tensor  # (K,) float64, sweep intervals from the voxel to t+1
-    elapsed_of_t: Tensor  # (K,) float64, sweep intervals from t to t+1
     before_t: Tensor  # (K,) float64, sweep intervals from the voxel to t
 
     @classmethod
@@ -166,7 +165,6 @@ class Source:
         noise = constant((_NOISE**2, 0.0, 0.0, _NOISE**2, 0.0, _NOISE**2), torch.float64, voxel.device)[:, None]
         position = take_columns(voxels.position, voxel)  # [3, K]
         centre = take_columns(centre, by_object.of_item)  # [2, K]
-        elapsed_of_t = elapsed[:, 1].index_select(0, window)
         elapsed = elapsed.view(-1).index_select(0, window * num_steps + voxels.step.index_select(0, voxel))
         return cls(
             voxel=voxel,
@@ -178,8 +176,7 @@ class Source:
             target_start=pixel_key(voxels.grid, window * num_steps, constant(((0,), (0,)), torch.int64, voxel.device)),
             target_layers=((voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS).int(),
             elapsed=elapsed,
-            elapsed_of_t=elapsed_of_t,
-            before_t=elapsed - elapsed_of_t,
+            before_t=elapsed - 1,
         )
 
     def __len__(self) -> int:
@@ -197,7 +194,6 @@ class Source:
             target_start=self.target_start[some],
             target_layers=self.target_layers[:, some],
             elapsed=self.elapsed[some],
-            elapsed_of_t=self.elapsed_of_t[some],
             before_t=self.before_t[some],
         )
 
@@ -286,7 +282,7 @@ class Registration:
         # The object rotates about its centre, which moves on from t to t+1. From the moved centre, `arm` leads to the
         # moved voxel.
         arm = rotate(rotation * source.elapsed, source.offset + velocity * source.before_t)
-        moved = source.centre + velocity * source.elapsed_of_t + arm
+        moved = source.centre + velocity + arm
         moved = torch.cat((moved, source.height))  # [3, K]
 
         # 0 = none: this voxel is far away, and belongs to no object.

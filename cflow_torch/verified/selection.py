@@ -31,8 +31,7 @@ class Objects:
     """The selected objects, in order of their first pixel in the list: those of copies come last."""
 
     pixels: Groups  # the P' pixels, grouped by object
-    # The G objects, grouped by their node. Static objects whose component is not a node are in no group.
-    by_node: Groups
+    by_node: Groups  # the G objects, grouped by the node whose motion they take; static objects are in no group
     first: Tensor  # (G,) int64, position of the first pixel of each object in the list
 
     @property
@@ -64,11 +63,10 @@ def select_objects(
         dissent: finds the nodes inside a winner that do not move with it.
 
     Returns:
-        The objects. A pixel belongs to the first of these that exists:
-        1. the node whose motion the finest of its nodes of the levels takes, or a node of another kind, if that has
-           more evidence, or dissents from this one; of several, the one with the most evidence;
-        2. its plain component, if that is linked. Then it is static.
-        Otherwise it is static and belongs to no object.
+        The objects. A pixel moves with the node whose motion the finest of its nodes of the levels takes. If the pixel
+        is also in nodes of other kinds, each of these that has more evidence, or dissents from that node, takes the
+        pixel; of several, the one with the most evidence. A pixel that moves with no node belongs to its plain
+        component if that is linked, else to no object, and is static.
 
     Convention:
         The value of a child is its own evidence or the sum of its children's values, whichever is more, minus `price`,
@@ -87,12 +85,9 @@ def select_objects(
     taken, left = dissent(sweeps, tree, verdict, around, significance, price)
     moving = _moving_nodes(tree, _of_finest(taken, finest), verdict.evidence, left)
 
-    # The key of an object is the number of its node, else N plus the number of its component.
-    plain_node = torch.where(tree.kind == tree.num_levels - 1, node, none)
-    static = Groups(tree.pixel, sweeps.num_pixels).min(tree.members.spread(plain_node, none=none), empty=none)  # [P']
-    key = _keys_of_components(components, none, sweeps.num_pixels)
-    key = torch.where(static < none, static, key)
-    key = torch.where(moving < none, moving, key)
+    # The key of an object is the number of its node if it moves, else N plus the number of its component.
+    static = _keys_of_components(components, none, sweeps.num_pixels)
+    key = torch.where(moving < none, moving, static)
     return number_objects(Groups(key, none + components.count), tree.count)
 
 

@@ -47,14 +47,10 @@ def find_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: Tensor, longes
     is_significant = bias * bias >= _BIAS_Z**2 * (only_ahead + only_behind)
     is_biased = is_significant & (bias.abs() >= _LEAST_BIAS * total) & (total > 0)
 
-    num_directions = len(_AHEAD)
-    # The largest key is that of the first direction with the largest bias. (`argmax` may return any of a tie.)
-    rank = torch.arange(num_directions - 1, -1, -1, device=bias.device)[:, None]
-    direction = (bias.abs().masked_fill(~is_biased, 0) * num_directions + rank).argmax(0)  # [G]
+    direction = bias.abs().masked_fill(~is_biased, 0).argmax(0)  # [G]
     sign = bias.gather(0, direction[None])[0].sign() * is_biased.any(0)
     ahead = constant(_AHEAD, torch.float64, bias.device).index_select(0, direction)  # [G, 2], rows and columns
-    elapsed = sweeps.elapsed[:, 1].index_select(0, window)
-    return ahead.flip(1) * (sweeps.grid.pixel_size * sign / elapsed)[:, None]
+    return ahead.flip(1) * (sweeps.grid.pixel_size * sign)[:, None]
 
 
 def _matched_slices(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor) -> tuple[Tensor, Tensor, Tensor]:

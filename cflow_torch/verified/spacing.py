@@ -20,7 +20,7 @@ from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch
 
 # Bins of directions: fine azimuths in rows of a degree of elevation, and fine elevations in columns of azimuth.
-_AZIMUTHS = 8192  # fine azimuths, of 0.04 to 0.09 degrees; four quadrants
+_AZIMUTHS = 8192  # fine azimuths, of 0.03 to 0.06 degrees; four quadrants
 _PER_COLUMN = 8  # of them in a column
 _LEVELS = 1920  # fine elevations
 _PER_DEGREE = 16  # of them in a row

@@ -181,7 +181,7 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     of_t, other = _pairs(sweeps, parts, cells, max_speed)  # [H] each
     window = parts.window.index_select(0, of_t)
     elapsed = sweeps.elapsed.index_select(0, window)  # [H, S]
-    before_t = elapsed - elapsed[:, 1:2]
+    before_t = elapsed - 1
     interval = before_t.gather(1, parts.step.index_select(0, other)[:, None])[:, 0]
     velocity = (take_columns(parts.centre, of_t) - take_columns(parts.centre, other)) / interval  # [2, H]
     place = take_columns(parts.centre, of_t)[..., None] - velocity[..., None] * before_t  # [2, H, S]

@@ -50,8 +50,8 @@ class Batch:
     num_windows: int  # B
     num_steps: int  # S, number of sweeps of the longest window
     has_pairs: bool  # some windows have two sweeps only
-    # (B, S) float64, time k from each sweep to t+1 in sweep intervals: a displacement is k times the flow. 0 for step 0
-    # and for sweeps that a window lacks, negative for sweeps after t+1.
+    # (B, S) float64, time k from each sweep to t+1 in sweep intervals: a displacement is k times the flow. 1 for sweep
+    # t, 0 for step 0 and for sweeps that a window lacks, negative for sweeps after t+1.
     elapsed: Tensor
     seconds: Tensor  # (B, S) float64, `elapsed` in seconds, for `max_speed`
     origin: Tensor  # (B, S, 3) float64, metres, frame of t+1: origin of the ego frame of each sweep

@@ -166,8 +166,6 @@ def select_objects(
         if node.level < num_levels:
             moving[node.members] = taken[i]
             winner_of[node.members] = winners[i]
-        if node.level == num_levels - 1:
-            name[node.members] = i
     name = np.where(moving >= 0, moving, name)
     most = np.zeros(len(plain), dtype=int)  # evidence of the best other node
     for i, node in enumerate(nodes):

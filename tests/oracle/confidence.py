@@ -1,4 +1,4 @@
-"""What is certainly dynamic, and how far the flow of a point can be trusted: counts -> a bin -> a probability."""
+"""What probably moves, and how far the flow of a point can be trusted: counts -> a bin -> a probability."""
 
 from __future__ import annotations
 
@@ -21,39 +21,39 @@ DISPLACEMENT, BLOCK = 0.4, 1.6  # metres per interval; metres
 
 
 def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tuple[int, bool]:
-    """The bin of an object with a motion, counted from the first one of such objects, and whether it is dynamic.
+    """The bin of an object with a motion, counted from the first one of such objects, and whether it moves.
 
-    The bin depends on what the motion loses by being displaced by 0.4 m per interval, the best of four displacements,
-    in standard deviations of what it finds. An object is static if fewer than one in 30 of its bin move. Otherwise, if
-    it moves by 0.05 m and loses at least one standard deviation, it is dynamic, if its window has history, or it is
-    within 35 m, moves by two pixels or finds more than half as much where it moves to as in place. So is one that is
-    not a line and is found less in place than where it moves to, if it loses something or moves at least twice as far
-    as it is displaced.
+    The surplus of a motion is what it wins minus what it loses, by the near counts. In a pair, that of a slow motion is
+    reduced by that of the best of four copies, displaced by 0.4 m per interval. The margin is this, in standard
+    deviations of what it wins and loses, over the root of the number of other sweeps. If a copy explains the sweeps as
+    well, to a standard deviation, a line has no margin, and with history neither has an object that is found in place
+    as often as that. An object moves if its motion is at least 0.05 m, and P(moving) of its bin at least 0.05, if it is
+    fast 0.15, with history 0.02 and 0.05.
     """
     if not any(rigid.flow):
         return 0, False
-    off, motion = DISPLACEMENT / sweeps.size, motion_of_pixels(sweeps, members, rigid)
-    displaced = [motion + shift for shift in ((0, 0), (off, 0), (-off, 0), (0, off), (0, -off))]
+    speed, off = math.hypot(*rigid.flow), DISPLACEMENT / sweeps.size
+    is_fast, is_far = speed >= TABLE["fast"], np.square(rigid.centre).sum() >= TABLE["far"] ** 2
+    motion = motion_of_pixels(sweeps, members, rigid)
     is_alone, is_wide = (motion != np.array(rigid.flow)[::-1] / sweeps.size).any(1), are_wide(sweeps, members)
     is_wide = np.where(is_alone, is_wide, is_wide[~is_alone].any())
-    surplus, *others = (surplus_of(sweeps, members, each, is_wide) for each in displaced)
-    gain, stays = surplus - max(others), found_in_place(sweeps, members, sweeps.image)[:, 0].sum()
-    z = gain / math.sqrt(surplus + stays) if gain > 0 else 0.0
+    (won, lost), *copies = (
+        np.sum(count_wins(sweeps, members, motion + shift, True, is_wide), 1)
+        for shift in ((0, 0), (off, 0), (-off, 0), (0, off), (0, -off))
+    )
+    noise = math.sqrt(max(won + lost, 1))
+    over_copies = (won - lost - max(more - less for more, less in copies)) / noise
+    value = (won - lost) / noise if sweeps.has_history or is_fast else over_copies
     is_line = principal_axis(sweeps, members[sweeps.pixels[members, 0] == 0]) is not None
-    speed = math.hypot(*rigid.flow)
-    is_told = sweeps.has_history or speed >= 2 * sweeps.size or math.hypot(*rigid.centre) < 35
-    is_sure = z >= 1 and (is_told or 2 * surplus > stays)
-    leaves = (gain > 0 or speed >= 2 * DISPLACEMENT) and surplus > stays and not is_line
-    is_fast, is_far = speed >= TABLE["fast"], np.square(rigid.centre).sum() >= TABLE["far"] ** 2
-    num_margins = 1 + len(TABLE["margin"])
-    number = (4 * sweeps.has_history + 2 * is_far + is_fast) * num_margins + (z >= np.array(TABLE["margin"])).sum()
-    is_likely = TABLE["moving"][len(TABLE["moving"]) - 8 * num_margins + number] >= 1 / 30
-    return int(number), bool(speed >= 0.05 and is_likely and (is_sure or leaves))
-
-
-def surplus_of(sweeps: SlicedSweeps, members: np.ndarray, motion: np.ndarray, is_wide: np.ndarray) -> int:
-    """Slices won minus those lost, by the near counts."""
-    return int(np.subtract(*count_wins(sweeps, members, motion, True, is_wide)).sum())
+    stays = sweeps.has_history and won - lost <= found_in_place(sweeps, members, sweeps.image)[:, 0].sum()
+    if over_copies < 1 and (is_line or stays):
+        value = 0.0
+    value /= math.sqrt(len(sweeps.elapsed) - 1)
+    reached = (value >= np.array(TABLE["margin"])).sum()
+    number = (4 * sweeps.has_history + 2 * is_far + is_fast) * (1 + len(TABLE["margin"])) + reached
+    first = len(TABLE["moving"]) - 8 * (1 + len(TABLE["margin"]))
+    least = (0.05 if is_fast else 0.02) if sweeps.has_history else (0.15 if is_fast else 0.05)
+    return int(number), bool(speed >= 0.05 and TABLE["moving"][first + number] >= least)
 
 
 def motion_of_pixels(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> np.ndarray:

@@ -189,6 +189,26 @@ def test_inside_a_car_a_cyclist_moves_by_himself_and_a_parked_car_is_static(z, d
         assert (flow[(row == first) | (row == first + 1), 1] == (own if dissents else 4.0)).all()
 
 
+def test_what_is_static_inside_a_car_takes_no_motion_of_its_parts():
+    # A car that moves by 4 pixels a sweep, and two parked ones in one component of the middle level. One of these has a
+    # motion that differs too little from that of the moving car to dissent, so it does what both parked cars do.
+    images = np.zeros((1, 4, 20, 40), dtype=np.uint8)
+    for step in range(4):
+        for row, first in ((1, 20 - 4 * step), (6, 20), (9, 20)):
+            images[0, step, row : row + 2, first : first + 12] = 15
+    sweeps = from_images(images, SIZE)
+    every = torch.ones(sweeps.num_pixels, dtype=torch.bool)
+    components = find_components(sweeps, ChangedPixels(every, ~every, ~every), (3, 1))
+    nodes = movable_nodes(sweeps, components, None)
+    assert nodes.kind.tolist() == [0, 1, 1, 2, 2] and nodes.by_parent.of_item.tolist() == [5, 0, 0, 2, 2]
+    speed = torch.tensor([4.0, 4.0, 0.0, 4.5, 0.0], dtype=torch.float64)
+    motion = torch.stack((0 * speed, speed), 1)
+    objects = select_objects(sweeps, components, nodes, Verdict(motion, torch.tensor([9000, 8000, 0, 50, 0])), 1.5)
+    flow = objects.pixels.spread(objects.by_node.spread(motion))[:, 1]
+    is_parked = sweeps.pixels.row_col[0] >= 6
+    assert (flow[~is_parked] == 4.0).all() and (flow[is_parked] == 0.0).all()
+
+
 @pytest.mark.parametrize("own, z, dissents", [(2.0, 1.5, True), (3.0, 1.5, False), (2.0, 100.0, False)])
 def test_changed_pixels_inside_a_moving_car_move_by_themselves(own, z, dissents):
     # A person walks along the car, pixel to pixel, so no component of a level separates them. The pixels of the person

@@ -109,8 +109,6 @@ def test_a_slow_person_is_found(truth):
     clouds = [person(truth, rng), person((0.0, 0.0), rng)]
     (flow,) = found(one_object(clouds, (0.0, 0.0)))
     assert np.linalg.norm(flow - truth) < 0.025
-    later = found(one_object(clouds, (0.0, 0.0), (0.0, 2.0)))[0]  # the same way in twice the time
-    np.testing.assert_allclose(later, flow / 2, atol=0.002)  # the prior holds the motion, not the way
 
 
 @pytest.mark.parametrize("longest, moves", [(0.45, False), (0.65, True), (None, True)])
