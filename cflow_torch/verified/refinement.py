@@ -48,7 +48,7 @@ from cflow_torch.verified.voxel_centroids import (
 
 # We chose these values on real pairs and windows with history (docs/benchmarks.md).
 LAYER_HEIGHT = 0.1  # metres, of the voxels, which are as wide as the finest pixels
-NUM_LAYERS = 32  # number of layers of voxels before they repeat
+NUM_LAYERS = 64  # number of layers of voxels before they repeat
 MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _NOISE = 0.05  # metres, standard deviation between two centroids, besides the covariances of their surfaces
 _FARTHEST = 0.2  # metres, between the two voxels of a correspondence

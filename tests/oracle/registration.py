@@ -15,7 +15,7 @@ import numpy as np
 
 from oracle.height_slices import SlicedSweeps, Vector, slice_of
 
-LAYER_HEIGHT, NUM_LAYERS = 0.1, 32  # of voxels, metres; their number, then they repeat
+LAYER_HEIGHT, NUM_LAYERS = 0.1, 64  # of voxels, metres; their number, then they repeat
 FARTHEST = 0.2  # metres, between the voxels of a pair
 FAR = 3.0  # squared distance of a pair, in standard deviations of both surfaces, at which its weight is a quarter
 NOISE = 0.05  # metres, standard deviation of a centroid across its surface

@@ -92,6 +92,15 @@ def test_the_slices_around_are_those_within_the_reach():
             assert np.array_equal(found, expected.both[step, row, col])
 
 
+def test_a_pixel_in_the_corner_of_the_region_is_around_no_empty_place():
+    # At the corner, the reach is several pixels. Beyond the border, no sweep has anything, nor has it around there.
+    cloud = np.concatenate((rings(1.2, 0), [[-39.99, -29.99, 0.2]]))
+    sweeps = sweeps_of([Window(Sweep(cloud), Sweep(cloud))], SETTINGS)
+    row, col = sweeps.pixels.row_col
+    assert sweeps.columns.reach.max() > 1 and ((row == row.min()) & (col == col.min())).any()
+    assert not sweeps.columns.slices[0].any()
+
+
 def test_a_wall_that_a_sparse_sensor_samples_elsewhere_in_each_sweep_is_static(monkeypatch):
     settings = make_config("default", point_cloud_range=REGION)
     window = Window(Sweep(rings(1.2, 0)), Sweep(rings(1.2, 1)), tuple(Sweep(rings(1.2, 2 + seed)) for seed in range(4)))
