@@ -46,7 +46,7 @@ class Scene(NamedTuple):
         for window in range(self.sweeps.batch.num_windows):
             sweeps = for_oracle(self.sweeps, window)
             numbers = (pixels.window[self.objects.first] == window).nonzero()[:, 0].tolist()
-            of_pixel = self.objects.pixels.of_item[pixels.window == window].tolist()
+            of_pixel = self.objects.by_object.of_item[pixels.window == window].tolist()
             object_of = np.array([numbers.index(own) if own in numbers else -1 for own in of_pixel], dtype=int)
             result.append((sweeps, object_of, [(x, y) for x, y in self.flow[numbers].tolist()]))
         return result

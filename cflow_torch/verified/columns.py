@@ -103,8 +103,10 @@ class Columns:
 
     A byte of `slices` holds two sets of height slices:
 
-        bit          7 6 5 4 | 3 2 1 0
-        slices of    the 3 x 3 pixels around | the pixel itself
+        bit          7 6 5 4                         3 2 1 0
+        slices of    the pixels within the reach     the pixel itself
+
+    Near the sensor, the reach is 3 x 3 pixels (`Spacing`).
     """
 
     grid: Grid  # H rows and W columns, without the border

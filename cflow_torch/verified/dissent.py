@@ -8,7 +8,7 @@ are too few to tell:
     winner     [   A     A  c  p ]     a car A, a cyclist c behind it and a parked car p: all move as A
     dissent              [c][p]        c moves by itself, p is static
 
-A component of changed pixels is in no other node, but its pixels may take the motion of a winner. It dissents likewise.
+A component of changed pixels has no parent, but its pixels may take the motion of a winner. It dissents likewise.
 """
 
 from __future__ import annotations

@@ -30,18 +30,18 @@ PRICE = 4 * PER_SLICE
 class Objects:
     """The selected objects, in order of their first pixel in the list: those of copies come last."""
 
-    pixels: Groups  # the P' pixels, grouped by object
-    by_node: Groups  # the G objects, grouped by the node whose motion they take; static objects are in no group
+    by_object: Groups  # the P' pixels
+    by_node: Groups  # the G objects, by the node whose motion they take; static objects are in no group
     first: Tensor  # (G,) int64, position of the first pixel of each object in the list
 
     @property
     def count(self) -> int:
         """Number of objects, G."""
-        return self.pixels.count
+        return self.by_object.count
 
     def length_at_newest(self, sweeps: HeightSlicedSweeps) -> Tensor:
         """(G,) float64, metres, longer side of the bounding box of the pixels at t+1; 0 without any."""
-        return longer_side(corners_at_newest(sweeps.pixels, self.pixels), sweeps.grid.pixel_size)
+        return longer_side(corners_at_newest(sweeps.pixels, self.by_object), sweeps.grid.pixel_size)
 
 
 def select_objects(

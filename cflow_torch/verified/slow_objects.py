@@ -58,9 +58,9 @@ def _matched_slices(sweeps: HeightSlicedSweeps, objects: Objects, wanted: Tensor
 
     The counts of objects that are not wanted, (G,) bool, are 0. For t+1, "ahead" is the opposite side.
     """
-    is_wanted = objects.pixels.spread(wanted) & (sweeps.pixels.step < 2)  # [P]
+    is_wanted = objects.by_object.spread(wanted) & (sweeps.pixels.step < 2)  # [P]
     index = flat_nonzero(is_wanted)
-    of_object = objects.pixels[index]  # [K]
+    of_object = objects.by_object[index]  # [K]
     pixels = sweeps.pixels[index]  # [K]
     sides = (*_AHEAD, *((-row, -col) for row, col in _AHEAD))
     sign = (2 * pixels.step.int() - 1)[:, None, None]  # -1 for t+1

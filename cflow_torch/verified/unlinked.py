@@ -51,12 +51,12 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         max_speed: m/s; None = 60.
 
     Convention:
-        Parts have the pixels of a sweep that are missing, or that every other sweep lacks. A part of t takes its
-        velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least half of
-        the older sweeps. A sweep before t-1 for which it puts the part outside of the region is not counted. Of the
-        velocities of a part of t, or of t+1, the one that the fewest sweeps lack wins, then the one with the smallest
-        errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part
-        belongs to its first node. The velocity of a node must win more slices near its targets than it loses.
+        Parts have the pixels of a sweep that are missing, or of which every other sweep lacks a slice. A part of t
+        takes its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least
+        half of the older sweeps. A sweep before t-1 counts only if the velocity puts the part inside the region there.
+        Of the velocities of a part of t, or of t+1, the one that the fewest sweeps lack wins, then the one with the
+        smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part belongs to its
+        first node. The velocity of a node must win more slices near its targets than it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
@@ -66,8 +66,8 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
     tracks = _tracks(sweeps, parts, _FASTEST if max_speed is None else max_speed)
     objects = _pixels_of(tracks, parts)
     pixels = sweeps.pixels[parts.pixel]
-    is_wide = _are_wide(sweeps, pixels, objects, tracks.velocity)
-    kept = flat_nonzero(is_wide & _are_found(sweeps, pixels, objects, tracks.velocity))
+    is_broad = _are_broad(sweeps, pixels, objects, tracks.velocity)
+    kept = flat_nonzero(is_broad & _are_found(sweeps, pixels, objects, tracks.velocity))
     objects = objects.select(kept)
     member = flat_nonzero(objects.is_member)
     return tree.with_nodes(
@@ -83,7 +83,7 @@ class _Parts(NamedTuple):
     """Parts: pixels of one sweep that may be fast and lie together. There are Q parts of K pixels."""
 
     pixel: Tensor  # (K,) int64, positions in the list of pixels
-    pixels: Groups  # these K pixels, grouped by part
+    by_part: Groups  # these K pixels, grouped by part
     window: Tensor  # (Q,) int64
     step: Tensor  # (Q,) int64
     centre: Tensor  # (2, Q) float64, (y, x), finest pixels
@@ -189,7 +189,7 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
     is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
-    # An older sweep cannot confirm that an object was outside of the region, so only t-1 must always do it.
+    # Outside of the region, an older sweep can confirm nothing, so it does not count. Sweep t-1 always counts.
     is_counted = is_given & cells.contains(place)
     is_counted[:, :3] = is_given[:, :3]
     rank = _ranks(error, is_found, is_counted)
@@ -265,7 +265,7 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
 
 def _are_alike(sweeps: HeightSlicedSweeps, parts: _Parts, of_t: Tensor, other: Tensor) -> Tensor:
     """Tell which other parts, (..., N, M), are of like size as N parts of t, if the window is a pair. Else all are."""
-    size = parts.pixels.size()
+    size = parts.by_part.size()
     own = size.index_select(0, of_t)[:, None]
     size = size.index_select(0, other.view(-1)).view_as(other)
     is_like = (size <= _LIKE * own) & (own <= _LIKE * size)
@@ -289,10 +289,10 @@ def _pixels_of(tracks: _Tracks, parts: _Parts) -> Groups:
     track = torch.arange(count, device=tracks.part.device)[:, None].expand_as(tracks.part)
     of_track = Groups(tracks.part.reshape(-1), len(parts)).where(tracks.is_found.reshape(-1))
     first_track = of_track.min(track.reshape(-1), empty=count)  # [Q]
-    return Groups(parts.pixels.spread(first_track, none=count), count)
+    return Groups(parts.by_part.spread(first_track, none=count), count)
 
 
-def _are_wide(sweeps: HeightSlicedSweeps, pixels: Pixels, objects: Groups, velocity: Tensor) -> Tensor:
+def _are_broad(sweeps: HeightSlicedSweeps, pixels: Pixels, objects: Groups, velocity: Tensor) -> Tensor:
     """Tell which objects are wide enough across their motion, (N,) bool."""
     speed = velocity.square().sum(1).sqrt().clamp(min=1)
     across = (velocity / speed[:, None]).flip(1) * constant((1.0, -1.0), torch.float64, speed.device)  # [N, 2]

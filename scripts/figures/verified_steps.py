@@ -103,8 +103,8 @@ def draw_row(panels: list[Any], drive: Any, low: tuple[float, float], width: flo
             corner, far = inside.min(0) - 0.5 * size, inside.max(0) + 1.5 * size
             line = {NodeKind.CHANGED: (":", 1.3), NodeKind.OVERHUNG: ("--", 1.6)}.get(level, ("-", 1.0))
             panels[2].add_patch(Rectangle(corner, *(far - corner), fill=False, linestyle=line[0], linewidth=line[1]))
-    chosen = torch.where(objects.pixels.spread(moves))[0]
-    chosen, rgb = colours(chosen, objects.pixels.of_item[chosen])
+    chosen = torch.where(objects.by_object.spread(moves))[0]
+    chosen, rgb = colours(chosen, objects.by_object.of_item[chosen])
     rgb[(chosen >= own) & (pixels.row_col[:, chosen].sum(0) % 6 < 2)] = 255
     paint(panels[3], (every, PALE), (chosen, rgb))
 

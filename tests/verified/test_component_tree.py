@@ -135,14 +135,14 @@ def test_the_cut_equals_the_oracle(seed, of_evidence):
     # Random pixels hardly gain anything, so at z = 0 some nodes dissent.
     objects = select_objects(found.sweeps, found.components, found.nodes, verdict, 0.0)
     node = objects.by_node.of_item
-    assert torch.equal(objects.pixels.of_item[objects.first], torch.arange(objects.count))
+    assert torch.equal(objects.by_object.of_item[objects.first], torch.arange(objects.count))
     assert torch.equal(objects.first, objects.first.sort().values)
     start = 0
     for window, tree in enumerate(found.trees):
         own = found.names(window)
         verdicts = zip(*[verdict_of[window, name] for name in own])
         expected, chosen = oracle.select_objects(found.windows[window], tree, *verdicts, 0.0)
-        mine = objects.pixels.of_item[found.sweeps.pixels.window == window]
+        mine = objects.by_object.of_item[found.sweeps.pixels.window == window]
         numbers = torch.where(mine < objects.count, mine - start, -1).tolist()
         assert numbers == expected.tolist()
         of_window = node[start : start + len(chosen)].tolist()
@@ -184,7 +184,7 @@ def test_inside_a_car_a_cyclist_moves_by_himself_and_a_parked_car_is_static(z, d
     motion = torch.stack((0 * speed, speed), 1)
     objects = select_objects(sweeps, components, nodes, Verdict(motion, torch.tensor([9000, 9000, 4000, 4000, 0])), z)
     row = sweeps.pixels.row_col[0]
-    flow = objects.pixels.spread(objects.by_node.spread(motion))
+    flow = objects.by_object.spread(objects.by_node.spread(motion))
     for first, own in ((3, 4.0), (6, 2.0), (9, 0.0)):
         assert (flow[(row == first) | (row == first + 1), 1] == (own if dissents else 4.0)).all()
 
@@ -204,7 +204,7 @@ def test_what_is_static_inside_a_car_takes_no_motion_of_its_parts():
     speed = torch.tensor([4.0, 4.0, 0.0, 4.5, 0.0], dtype=torch.float64)
     motion = torch.stack((0 * speed, speed), 1)
     objects = select_objects(sweeps, components, nodes, Verdict(motion, torch.tensor([9000, 8000, 0, 50, 0])), 1.5)
-    flow = objects.pixels.spread(objects.by_node.spread(motion))[:, 1]
+    flow = objects.by_object.spread(objects.by_node.spread(motion))[:, 1]
     is_parked = sweeps.pixels.row_col[0] >= 6
     assert (flow[~is_parked] == 4.0).all() and (flow[is_parked] == 0.0).all()
 
@@ -226,7 +226,7 @@ def test_changed_pixels_inside_a_moving_car_move_by_themselves(own, z, dissents)
     speed = torch.tensor([4.0, 4.0, own], dtype=torch.float64)
     motion = torch.stack((0 * speed, speed), 1)
     objects = select_objects(sweeps, components, nodes, Verdict(motion, torch.tensor([9000, 8000, 4000])), z)
-    flow = objects.pixels.spread(objects.by_node.spread(motion))[:, 1]
+    flow = objects.by_object.spread(objects.by_node.spread(motion))[:, 1]
     assert (flow[~is_person] == 4.0).all()
     assert (flow[is_person] == (own if dissents else 4.0)).all()
 
@@ -246,7 +246,7 @@ def test_a_pixel_that_joined_a_moving_node_moves_with_it_although_a_later_node_o
     evidence[first] = 100
     verdict = Verdict((evidence > 0)[:, None].double().expand(-1, 2), evidence)
     objects = select_objects(sweeps, components, nodes, verdict, 1.5)
-    assert objects.by_node.of_item[objects.pixels.of_item[joined]].tolist() == [first]
+    assert objects.by_node.of_item[objects.by_object.of_item[joined]].tolist() == [first]
 
 
 @pytest.mark.parametrize("num_missing, may_move", [(0, False), (1, False), (2, True)])
