@@ -55,7 +55,8 @@ def propose(nodes: Tree, blocks: Sequence[int], sweeps: HeightSlicedSweeps, conf
     if sweeps.num_steps > 2:
         own = torch.cat((masked_median(own, estimates.available)[:, None], own), 1)
     own = own + 0.0  # turns -0.0 into 0.0
-    of_parent = nodes.by_parent.spread(own[:, 0]) + nodes.motion
+    # A fast object has no parent: its velocity takes this place.
+    of_parent = nodes.by_parent.spread(own[:, 0]) + nodes.linked_velocity
     return Candidates(torch.cat((own, of_parent[:, None]), 1), estimates.newest_score())
 
 

@@ -31,7 +31,7 @@ from cflow_torch.windows.bev_grid import Grid
 
 NUM_SLICES = 4
 OWN = (1 << NUM_SLICES) - 1  # the bits of the pixel itself
-REACH = 2  # rows and columns; several steps search this far around a pixel
+BORDER = 2  # empty rows and columns around an image; no step searches farther around a pixel
 _COUNTS = tuple(bin(slices).count("1") for slices in range(OWN + 1))
 _SECOND = 32  # bits; where the second of two counts in one number begins
 _BOTH_COUNTS = tuple(low + (high << _SECOND) for high in _COUNTS for low in _COUNTS)
@@ -89,7 +89,7 @@ class Columns:
 
     Only this class and `position_of` know how positions and slots are numbered.
 
-    The image of a window has an empty border of `REACH` positions (b), so that only distant positions need a test:
+    The image of a window has an empty border of `BORDER` positions (b), so that only distant positions need a test:
 
         b b b b b b b b
         b b b b b b b b
@@ -125,7 +125,7 @@ class Columns:
 
         The border must be False.
         """
-        stride = grid.width + 2 * REACH
+        stride = grid.width + 2 * BORDER
         device = is_occupied.device
         square = _square(1, stride, device)
         is_column = mark(is_occupied, (flat_nonzero(is_occupied) + square).view(-1))
@@ -204,7 +204,7 @@ class Columns:
     @property
     def stride(self) -> int:
         """Positions from a row of an image to the next one."""
-        return self.grid.width + 2 * REACH
+        return self.grid.width + 2 * BORDER
 
     @property
     def num_slots(self) -> int:
@@ -354,7 +354,7 @@ class Columns:
         self.rank.view(-1).index_copy_(0, entry, number)
         first_slot = (column + columns_before) * self.num_slots
         window, row_col = _split(self.grid, self.position.index_select(0, column))
-        start = window * area + REACH * (self.stride + 1)
+        start = window * area + BORDER * (self.stride + 1)
         place = torch.stack((first_slot, start, window, step, *row_col), 1)
         # With copies, there are at most twice as many columns.
         dtype = index_dtype(max(len(self.image), 2 * self.slices.numel()), place.device)
@@ -383,13 +383,13 @@ class Columns:
 
 def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:
     """Return the positions of pixels in the images of the windows, (K,) in the dtype of row and column, never 0."""
-    line = row + (window * (grid.height + 2 * REACH) + REACH)
-    return line.mul_(grid.width + 2 * REACH).add_(col).add_(REACH)
+    line = row + (window * (grid.height + 2 * BORDER) + BORDER)
+    return line.mul_(grid.width + 2 * BORDER).add_(col).add_(BORDER)
 
 
 def num_positions(grid: Grid, num_windows: int) -> int:
     """Return the number of positions in the images of B windows, with their borders."""
-    return num_windows * (grid.height + 2 * REACH) * (grid.width + 2 * REACH)
+    return num_windows * (grid.height + 2 * BORDER) * (grid.width + 2 * BORDER)
 
 
 def _square(reach: int, stride: int, device: torch.device) -> Tensor:
@@ -400,17 +400,17 @@ def _square(reach: int, stride: int, device: torch.device) -> Tensor:
 
 def _inside(is_column: Tensor, grid: Grid) -> Tensor:
     """Clear the borders of images, (B * area,) bool, and list the positions that remain, (C,) int64."""
-    images = is_column.view(-1, grid.height + 2 * REACH, grid.width + 2 * REACH)
-    images[:, :REACH] = images[:, -REACH:] = False
-    images[:, :, :REACH] = images[:, :, -REACH:] = False
+    images = is_column.view(-1, grid.height + 2 * BORDER, grid.width + 2 * BORDER)
+    images[:, :BORDER] = images[:, -BORDER:] = False
+    images[:, :, :BORDER] = images[:, :, -BORDER:] = False
     return flat_nonzero(is_column)
 
 
 def _split(grid: Grid, position: Tensor) -> tuple[Tensor, Tensor]:
     """Return the window of K positions, (K,) int64, and row and column in its image, (2, K) int64."""
-    line, col = split_index(position, grid.width + 2 * REACH)
-    window, row = split_index(line, grid.height + 2 * REACH)
-    return window, torch.stack((row, col)) - REACH
+    line, col = split_index(position, grid.width + 2 * BORDER)
+    window, row = split_index(line, grid.height + 2 * BORDER)
+    return window, torch.stack((row, col)) - BORDER
 
 
 def _reach_and_tall(grid: Grid, position: Tensor, spacing: Spacing) -> tuple[Tensor | None, Tensor | None]:

@@ -22,7 +22,8 @@ from cflow_torch.verified.dissent import Dissent, with_dissent
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.paired_test import PER_SLICE, Verdict
 
-# The price of an object on each level. Children move separately only if that gains more evidence.
+# The price of an object on each level. Children move separately only if that gains more evidence. It is two slices that
+# both the exact counts and the near counts win.
 PRICE = 4 * PER_SLICE
 
 

@@ -37,7 +37,7 @@ _REACH = 8  # cells; objects that move farther from sweep to sweep are not linke
 _ERROR = 0.7  # metres from that place to a part that confirms the velocity, at most, ...
 _ERROR_SHARE = 0.05  # ... and further for each metre that the object has moved
 _FASTEST = 60.0  # m/s, if the settings have no bound
-_LENGTHS = 2  # objects that move less than a half of the length of their part are linked by their pixels
+_LEAST_MOVE = 0.5  # of the length of a part; what moves less is linked by its pixels
 _LACKING = float(1 << 20)  # finest pixels, for a sweep without a part; longer than any sum of errors
 _LEAST_SIZE = 16  # of an unmatched component in a pair; smaller ones are mostly static (`confidence.json`)
 _LIKE = 2  # in a pair, the larger of two parts has at most this many times as many pixels as the other
@@ -75,7 +75,7 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         members=objects[member],
         window=objects.max(pixels.window, empty=0),
         kind=NodeKind.UNLINKED,
-        motion=tracks.velocity.index_select(0, kept),
+        linked_velocity=tracks.velocity.index_select(0, kept),
     )
 
 
@@ -125,7 +125,7 @@ def _unmatched_of_pairs(sweeps: HeightSlicedSweeps, components: Components) -> t
 
 
 class _Map:
-    """A map of each sweep with a part in each cell; of several parts, any one."""
+    """A map of each sweep with a part in each cell; of several parts, the last one."""
 
     def __init__(self, sweeps: HeightSlicedSweeps, parts: _Parts) -> None:
         grid = sweeps.grid
@@ -254,7 +254,7 @@ def _pairs(sweeps: HeightSlicedSweeps, parts: _Parts, cells: _Map, max_speed: fl
     distance = (_centres(parts, other) - centre[:, None, :, None]).square_().sum(0).sqrt_()
     seconds = (sweeps.batch.seconds - sweeps.batch.seconds[:, 1:2]).abs()[window, step]
     farthest = max_speed * seconds / sweeps.grid.pixel_size + 1
-    nearest = parts.length.index_select(0, of_t) / _LENGTHS
+    nearest = _LEAST_MOVE * parts.length.index_select(0, of_t)
     is_pair = is_part & (distance <= farthest[..., None]) & (distance >= nearest[:, None])
     if sweeps.batch.has_pairs:
         is_pair &= _are_alike(sweeps, parts, of_t, other)

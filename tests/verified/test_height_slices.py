@@ -19,7 +19,7 @@ from turning_car import MODEL, REGION, turning_car
 
 from cflow_torch import Sweep, VerifiedFlow, Window
 from cflow_torch.ground.heights import GroundHeights
-from cflow_torch.verified.columns import OWN, REACH, count_slices
+from cflow_torch.verified.columns import BORDER, OWN, count_slices
 from cflow_torch.verified.height_slices import SLICE_HEIGHT, HeightSlicedSweeps, pack_bits, slice_of
 
 SIZE = 0.25
@@ -31,8 +31,8 @@ LOW, HIGH = np.array(RANGE[:3]), np.array(RANGE[3:])
 def drawn(sweeps: HeightSlicedSweeps) -> np.ndarray:
     """Bytes of all positions of B windows, then of B windows of copies, and S sweeps, (2 B, S, H, W)."""
     columns = sweeps.columns
-    images = columns.image.view(-1, columns.grid.height + 2 * REACH, columns.stride)
-    column = images[:, REACH:-REACH, REACH:-REACH].long()
+    images = columns.image.view(-1, columns.grid.height + 2 * BORDER, columns.stride)
+    column = images[:, BORDER:-BORDER, BORDER:-BORDER].long()
     return columns.slices[:, : sweeps.num_steps][column].permute(0, 3, 1, 2).numpy()
 
 
