@@ -11,7 +11,7 @@ from scenes import pose, scene, sweeps_of
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.config import VerifiedConfig
-from cflow_torch.verified import changed_pixels, confidence
+from cflow_torch.verified import changed_pixels, motion_margin
 from cflow_torch.verified.changed_pixels import ChangedPixels, RangeImages, find_changed
 
 REGION = (-20.0, -20.0, -3.0, 20.0, 20.0, 5.0)
@@ -166,5 +166,5 @@ def test_shadows_of_a_parked_car_do_not_move_the_wall(speed, monkeypatch):
         return
     # If every sweep saw everything, the edges of the shadow would be changed pixels, which move.
     monkeypatch.setattr(changed_pixels.RangeImages, "farther", lambda self, image, at: torch.ones_like(at[0]).float())
-    monkeypatch.setattr(confidence, "_LEAST_LIKELY", 4 * (0.0,))  # also those that are hardly ever right
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))  # also those that are hardly ever right
     assert model([window])[0].residual_flow.any()

@@ -16,7 +16,7 @@ from cflow_torch import FlowResult, Sweep, VerifiedFlow, Window, make_config, ma
 from cflow_torch.data.log import window as window_of
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
-from cflow_torch.verified import confidence
+from cflow_torch.verified import confidence, motion_margin
 from cflow_torch.verified.paired_test import verify
 from cflow_torch.verified.refinement import refine
 
@@ -26,7 +26,7 @@ def test_the_tables_are_monotone_and_the_oracle_reads_them():
     table = confidence.TABLE
     sizes, shares, margins = (len(table[name]) + 1 for name in ("size", "share", "margin"))
     for name, falls in (("probabilities", False), ("moving", True)):
-        assert table[name][confidence._Bins.unmeasured] == 0.5
+        assert table[name][confidence.Bins.unmeasured] == 0.5
         start = 2 + len(table["bias"])
         biased = table[name][2:start]
         assert biased == sorted(biased, reverse=not falls)
@@ -54,13 +54,13 @@ def test_a_point_that_is_missing_in_another_sweep_has_bins_of_its_own(numbered):
         result = flow_as_oracle(Window(both, Sweep(wall), older), MODEL.replace(num_history=1))
         bins = (result.confidence * 128).round().int()
         row = 2 * len(older)
-        is_static = (bins >= confidence._Bins.static + row * shares) & (
-            bins < confidence._Bins.static + (row + 1) * shares
+        is_static = (bins >= confidence.Bins.static + row * shares) & (
+            bins < confidence.Bins.static + (row + 1) * shares
         )
         assert is_static[:900].float().mean() > 0.9
         sizes = len(confidence.TABLE["size"]) + 1
         assert (
-            bins[900:] == confidence._Bins.unmatched + len(older) * sizes + sizes - 2
+            bins[900:] == confidence.Bins.unmatched + len(older) * sizes + sizes - 2
         ).all()  # 40 pixels, the last bin but one
 
 
@@ -75,7 +75,7 @@ def test_in_a_pair_a_missed_person_is_biased_and_a_wall_is_not(numbered, num_mor
     older, newer = (np.concatenate((person + (shift, 0, 0), wall)) for shift, wall in zip((0, 0.05), walls))
     window = Window(Sweep(older), Sweep(newer), num_more * (Sweep(older - (0.05, 0, 0)),))
     bins = (model([window])[0].confidence * 128).round()
-    is_biased = (bins >= confidence._Bins.biased) & (bins < confidence._Bins.unmatched)
+    is_biased = (bins >= confidence.Bins.biased) & (bins < confidence.Bins.unmatched)
     assert is_biased[300:].float().mean() < 0.05
     assert is_biased[:300].float().mean() > 0.5 if num_more == 0 else not is_biased.any()
 
@@ -84,7 +84,7 @@ def test_a_wall_next_to_a_pedestrian_has_less_confidence(numbered):
     window, is_walker = beside_a_wall(0.13, 20.0)
     settings = MODEL.replace(point_cloud_range=(-10.0, -10.0, -3.0, 10.0, 10.0, 8.0), num_history=4)
     bins = (128 * flow_as_oracle(window, settings).confidence).round()
-    is_beside = (bins >= confidence._Bins.beside) & (bins < confidence._Bins.moving)
+    is_beside = (bins >= confidence.Bins.beside) & (bins < confidence.Bins.moving)
     assert is_beside.any() and not is_beside[is_walker].all()
     assert np.abs(window.pc0.points[is_beside, 0] - 4.0).max() < 1.0
 
@@ -99,7 +99,7 @@ def test_far_begins_where_the_table_says(numbered, monkeypatch):
     for number in near.cluster_id[near.residual_flow.any(1)].unique():
         is_own = near.cluster_id == number
         is_beyond = points[is_own].mean(0).norm() > 3
-        assert (change[is_own] == 2 * confidence._Bins.num_margins * is_beyond).all()
+        assert (change[is_own] == 2 * confidence.Bins.num_margins * is_beyond).all()
     assert (change > 0).any() and (change[~near.residual_flow.any(1)] == 0).all()
 
 
@@ -121,7 +121,7 @@ def test_a_wall_has_less_confidence_than_a_car(monkeypatch):
     car = np.concatenate((long_side, np.stack((np.full(300, -2.05), rng.uniform(-5, -3, 300), long_side[:, 2]), 1)))
     points = np.concatenate((wall, car))
     model = VerifiedFlow(MODEL)
-    monkeypatch.setattr(confidence, "_LEAST_LIKELY", 4 * (0.0,))  # both are dynamic
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))  # both are dynamic
     model.verify = partial(verify, slides=lambda *given: torch.zeros(given[3].shape[:2], dtype=torch.bool))
     (result,) = model([Window(Sweep(points), Sweep(points + (0.3, 0.0, 0.0)))])
     assert result.residual_flow[:, 0].min() > 0.2
@@ -155,14 +155,14 @@ def test_a_motion_that_is_hardly_ever_right_is_dropped_and_its_probability_stays
     older, newer = (Sweep((places + rng.uniform(0, (0.5, 0.5, 1.5), (40, 12, 3))).reshape(-1, 3)) for _ in "ab")
     model = VerifiedFlow.from_preset()
     (result,) = model([Window(older, newer)])
-    monkeypatch.setattr(confidence, "_LEAST_LIKELY", 4 * (0.0,))
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))
     (every,) = model([Window(older, newer)])
     is_dropped = every.residual_flow.any(1) & ~result.residual_flow.any(1)
     assert is_dropped.any() and (every.moving[is_dropped] < 0.15).all() and torch.equal(result.moving, every.moving)
 
 
 def test_a_motion_below_the_least_one_is_static(monkeypatch):
-    monkeypatch.setattr(confidence, "MOVING", 0.2)
+    monkeypatch.setattr(motion_margin, "MOVING", 0.2)
     car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
     for speed in (0.15, 0.25):
         window = Window(Sweep(car), Sweep(car + torch.tensor([speed, 0.0, 0.0])))

@@ -13,7 +13,7 @@ from scenes import sweeps_of
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.config import VerifiedConfig
-from cflow_torch.verified import confidence, spacing
+from cflow_torch.verified import motion_margin, spacing
 from cflow_torch.verified.columns import SLICE_HEIGHT
 from cflow_torch.verified.spacing import Spacing
 from cflow_torch.windows.bev_grid import Grid
@@ -106,5 +106,5 @@ def test_a_wall_that_a_sparse_sensor_samples_elsewhere_in_each_sweep_is_static(m
     window = Window(Sweep(rings(1.2, 0)), Sweep(rings(1.2, 1)), tuple(Sweep(rings(1.2, 2 + seed)) for seed in range(4)))
     assert VerifiedFlow(settings)([window])[0].residual_flow.any(1).double().mean() < 0.02
     monkeypatch.setattr(spacing, "_FARTHEST", 1)
-    monkeypatch.setattr(confidence, "_LEAST_LIKELY", 4 * (0.0,))  # also motions that are hardly ever right
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))  # also motions that are hardly ever right
     assert VerifiedFlow(settings)([window])[0].residual_flow.any(1).double().mean() > 0.1

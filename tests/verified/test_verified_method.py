@@ -16,7 +16,7 @@ from cflow_torch import Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.hdf5.reader import HDF5Log
 from cflow_torch.data.log import window as window_of
-from cflow_torch.verified import candidates, confidence, paired_test
+from cflow_torch.verified import candidates, motion_margin, paired_test
 
 NEAR = (-12.0, -3.0, -math.inf, -2.0, 4.0, math.inf)
 WIDER = (-35.0, -25.0, -math.inf, 25.0, 25.0, math.inf)
@@ -83,7 +83,7 @@ def test_a_wall_that_seems_to_slide_is_static(monkeypatch):
 
     without = partial(paired_test.verify, slides=nothing_slides)
     monkeypatch.setattr(VerifiedFlow, "verify", staticmethod(without))
-    monkeypatch.setattr(confidence, "_LEAST_LIKELY", 4 * (0.0,))
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))
     assert (VerifiedFlow(MODEL)([window])[0].residual_flow[:, 0] > 1.0).any()
 
 
