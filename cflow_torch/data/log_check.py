@@ -15,7 +15,7 @@ from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import OF_POINTS, READINGS, STILL, TIMES_OF_POSES, UNITS, WORLD
+from cflow_torch.windows.conventions import OF_POINTS, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
 from cflow_torch.windows.readings import (
@@ -162,7 +162,7 @@ def _frame(log: _CheckedLog) -> list[Finding]:
         return [right, *_motion(log, "")]
     units = [f"points_{unit}" for unit in UNITS]
     # The unit under which the points fit the poses may be another one.
-    unit = _fitting(log, [reading, *units]) if reading in units and known_poses(log) is not None else ""
+    unit, _ = _fitting(log, [reading, *units]) if reading in units and known_poses(log) is not None else ("", 0)
     if unit not in ("", reading):
         reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
@@ -171,10 +171,11 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     return [wrong, *(_motion(log, reading) if reading or where == "last" else [])]
 
 
-def _fitting(log: Log, readings: Iterable[str]) -> str:
-    """Return the first of the readings of the points under which they fit the poses; "" = none."""
+def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
+    """Return the first of the readings under which the points fit the poses, and the share in place; "" = none."""
     judged = ((name, judge_log(ReadAs(log, name))) for name in readings)
-    return next((name for name, each in judged if not each.best and each.given >= LEAST_SHARE), "")
+    fitting = ((name, each.given) for name, each in judged if not each.best and each.given >= LEAST_SHARE)
+    return next(fitting, ("", 0.0))
 
 
 def _problem_of(log: Log, index: int) -> tuple[str, str]:
@@ -195,10 +196,11 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     if has_poses and judgement.best and checked.misfit:
         return checked.misfit
     if NO_READING in judgement.best and has_poses:
-        fitting = _fitting(log, OF_POINTS)
+        fitting, share = _fitting(log, (REVERSED, *OF_POINTS))
         if fitting:
-            text = f"{judgement}, unless points are converted: give {_setting(log, fitting)}"
-            return [Finding("frame", WRONG, text, True)]
+            shares = f"{judgement.given:.2f} of the static structure is in place as given, {share:.2f} then"
+            text = f"{READINGS[fitting].cause} ({shares}): give {_setting(log, fitting)}"
+            return [Finding("ego motion" if fitting == REVERSED else "frame", WRONG, text, True)]
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]

@@ -15,7 +15,7 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import LATEST, OF_POINTS, READINGS, TIMES_OF_POSES, WORLD
+from cflow_torch.windows.conventions import LATEST, OF_POINTS, READINGS, REVERSED, TIMES_OF_POSES, WORLD
 from cflow_torch.windows.readings import STEPS
 
 _LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
@@ -118,7 +118,7 @@ class ReadAs(LogWrapper):
     @cached_property
     def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
         given = self.log.trajectory
-        if given is None or self.reading in (*TIMES_OF_POSES, *STEPS):
+        if given is None or self.reading in (REVERSED, *TIMES_OF_POSES, *STEPS):
             return None
         times, poses = given
         return times, self._convert(poses)

@@ -173,6 +173,7 @@ POSES = {
 }
 WRONG_POSES = {
     **{name: each(change) for name, change in POSES.items()},
+    "reversed": lambda poses: poses[::-1],
     "late": extrapolated(-1),
     "early": extrapolated(1),
     "half_late": half(-1),
@@ -217,6 +218,14 @@ def test_mirrored_clouds_are_named_and_no_pose_is_blamed(drive, name):
     axes = AXES[name]  # its own inverse
     (problem,) = find_problems(Wrong(drive, points=lambda points, _: points @ axes))
     assert "(left-handed)" in problem and f"data.read_as={name}" in problem
+
+
+def test_points_with_the_axes_of_the_world_are_named(drive):
+    """As of drivers that level and align clouds, but leave them around the vehicle."""
+    wrong = Wrong(drive, points=lambda points, pose: points @ pose[:3, :3].T)
+    (problem,) = find_problems(wrong)
+    assert "the points have the axes of the world" in problem and "data.read_as=world_axes" in problem
+    assert find_problems(read_as(wrong, "world_axes")) == []
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.5])
