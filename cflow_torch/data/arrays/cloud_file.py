@@ -294,8 +294,10 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _by_rows(array: np.ndarray) -> np.ndarray:
-    """Return an organised cloud, (H, W) or (H, W, C), with a row per point."""
+    """Return an organised cloud, (H, W) or (H, W, C), or a transposed one, (C, N), with a row per point."""
     num_axes = 1 if array.dtype.names is not None else 2
+    if array.ndim == num_axes == 2 and 3 <= len(array) <= _MOST_COLUMNS < array.shape[1]:
+        return array.T
     return array.reshape(-1, *array.shape[-1:][: num_axes - 1]) if array.ndim == num_axes + 1 else array
 
 

@@ -225,8 +225,9 @@ class ArraysLog(Log):
         named = times_of_names([stem_of(path) for path in self.files])
         if named is not None:
             return named
-        if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
-            return trajectory.times_ns.tolist()
+        times_ns = None if trajectory is None else trajectory.counted(None).times_ns
+        if times_ns is not None and len(times_ns) == count:
+            return times_ns.tolist()  # type: ignore[no-any-return]
         tables = find_tables(self.folder, self.files)[1] if times == "auto" else []
         file = only_one([table for table in tables if len(poses_text.read_times(table)) == count], self.folder, "times")
         self._note(f"the times of its sweeps are those of {file.name}" if file else "")
@@ -288,7 +289,7 @@ class ArraysLog(Log):
             is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2)) & (rows >= 0)
             if not is_known.all():
                 count = f"{(~is_known).sum()} of {len(rows)} sweeps"
-                self._note(f"{count} have no pose, or one of NaN, in {source} and are left out")
+                self._note(f"{count} have no pose, or one of NaN or zeros, in {source} and are left out")
             poses = trajectory.poses[rows][is_known]
         kept = np.flatnonzero(is_known)
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
@@ -301,7 +302,7 @@ class ArraysLog(Log):
         """Return the indices of files without times after which others are missing, by the numbers in their names."""
         steps = np.diff([_number_of(stem_of(path)) for path in self.files])
         usual = np.median(steps)
-        gaps = np.flatnonzero(steps > usual).tolist()
+        gaps = [gap for gap in np.flatnonzero(steps > usual).tolist() if gap not in self.gaps]
         if self._has_times or not gaps or steps.min() <= 0 or (steps == usual).mean() <= _LEAST_USUAL:
             return []
         first = self.files[gaps[0]].name
