@@ -96,9 +96,12 @@ def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.n
     is_rare = bool(np.median(np.diff(known)) > _longest_gap(known)) and covered.mean() < _FEWEST_COVERED
     if is_rare or not covered.any():
         raise CFlowError(_describe_misfit(trajectory.source, known, wanted))
-    left, right, time = before[covered], after[covered], wanted[covered]
-    share = np.where(left == right, 0.0, (time - known[left]) / np.maximum(known[right] - known[left], 1))
-    poses = interpolate_motion(trajectory.poses[left], trajectory.poses[right], share)
+    poses = trajectory.poses[before[covered]]
+    is_between = (before != after)[covered]
+    if is_between.any():
+        left, right = (rows[covered][is_between] for rows in (before, after))
+        share = (wanted[covered][is_between] - known[left]) / (known[right] - known[left])
+        poses[is_between] = interpolate_motion(trajectory.poses[left], trajectory.poses[right], share)
     notes = [_describe_uncovered(trajectory.source, known, wanted, covered), _describe_rate(known)]
     return poses, covered, "; ".join(filter(None, notes))
 

@@ -394,10 +394,11 @@ def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
         folder = tmp_path / str(number)
         folder.mkdir()
         for k in range(len(POSES)):
-            np.savez(folder / f"{k}.npz", points=np.ones((5, 3)), **arrays(k))
+            np.savez(folder / f"{k}.npz", pcl=np.ones((6, 3)), **arrays(k))  # the largest table is the cloud
         with pytest.warns(CFlowWarning, match=f"its poses come from the arrays {name} of its clouds"):
             log: Any = ArraysLog(folder)
         assert np.allclose(log.poses, POSES, atol=1e-9) and log.has_viewpoints
+        assert log.sweep(3).points.shape == (6, 3)
         assert np.diff(log.timestamps).tolist() == [10**8 if "stamp" in name else 1] * (len(POSES) - 1)
 
 

@@ -259,7 +259,7 @@ class BagLog(Log):
             if len(moving) == 1 and frames.are_joined(moving[0], lidar):  # an odometry that publishes registered clouds
                 self._note(f"its clouds are in {lidar}, the frame of the world; we move them to {moving[0]}")
                 return moving[0]
-        named = [name for name in (_BASE, *self._child.values()) if name and name != lidar]
+        named = [name for name in (_BASE, *self._child.values()) if name and not frames.are_joined(name, lidar)]
         for name in named if self._mount is None else []:
             is_in_tf = len(frames.change_times(name)) > 1
             if is_in_tf or name in self._child.values():
@@ -288,8 +288,12 @@ class BagLog(Log):
         for connection, arrived, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
             if connection.topic == self.topic:
-                stamps.append((_stamp(message, 0), arrived))
-                self._lidar = self._lidar or message.header.frame_id.lstrip("/")
+                frame = _frame_of(message)
+                self._lidar = self._lidar or frame
+                if frame == self._lidar:
+                    stamps.append((_stamp(message, 0), arrived))
+                else:
+                    self._note(f"its clouds are of several sensors: we read those in {self._lidar}, not in {frame}")
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
                     self._pose_delays.append(arrived - _stamp(link, arrived))
@@ -374,7 +378,8 @@ class BagLog(Log):
             clouds = [connection for connection in reader.connections if connection.topic == self.topic]
             for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
                 message = reader.deserialize(data, connection.msgtype)
-                if self._use_arrival or _stamp(message, arrived) + self._shift == time:
+                is_at_time = self._use_arrival or _stamp(message, arrived) + self._shift == time
+                if is_at_time and _frame_of(message) == self._lidar:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
 
@@ -401,6 +406,10 @@ def _stamp(message: Any, arrived: int) -> int:
     """Return the time of a header in nanoseconds; if it is 0, the time of arrival."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
+
+
+def _frame_of(message: Any) -> str:
+    return str(message.header.frame_id.lstrip("/"))  # ROS 1 allows a leading slash
 
 
 def _pose_of(message: Any, arrived: int) -> Sample:

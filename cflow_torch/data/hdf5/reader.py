@@ -15,7 +15,7 @@ from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argove
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
 from cflow_torch.errors import CFlowError, import_optional
-from cflow_torch.transforms import rigid_transform
+from cflow_torch.transforms import poses_from_quaternions, rigid_transform
 from cflow_torch.types import Sweep
 
 # Time stamps count from 1970 or 1980: smaller ones are microseconds (16 digits), others nanoseconds (18 or 19).
@@ -154,8 +154,11 @@ class HDF5Log(Log):
             return stored @ self.ego_T_lidar
 
     def _matrix(self, index: int, key: str, dtype: Any) -> np.ndarray | None:
-        """Read a rigid transform, (4, 4); a file may have only its upper three rows."""
+        """Read a rigid transform, (4, 4); a file may have only its upper three rows, or x y z qx qy qz qw."""
         matrix = self._values(index, key, None, dtype)
+        if matrix is not None and matrix.shape == (7,):
+            where = f"{self.file}: {key} of sweep {self.timestamps[index]}"
+            return poses_from_quaternions(matrix[:3], matrix[[6, 3, 4, 5]], lambda _: where)[0]
         if matrix is not None and matrix.shape == (3, 4):
             return np.concatenate([matrix, np.eye(4, dtype=matrix.dtype)[3:]])
         is_square = matrix is None or matrix.shape == (4, 4)
