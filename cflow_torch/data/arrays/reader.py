@@ -37,8 +37,8 @@ from cflow_torch.windows.returns import missing_returns
 
 _VIEWPOINT, _ARRAYS = "VIEWPOINT", "the arrays"  # sources of poses that come with the clouds
 _LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
+_LEAST_REACH = 0.8  # part of a table after which the row of the last file is, unless the layout says so
 _LEAST_USUAL = 2 / 3  # share of steps between the numbers of files that are equal, or the numbers are irregular
-_LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
 class ArraysLog(Log):
@@ -79,6 +79,8 @@ class ArraysLog(Log):
     """
 
     has_raw_times: bool = True
+    # Whether numbers of files are rows of tables in this layout. Else the last number must be near the end of a table.
+    _numbers_are_rows = False
 
     def __init__(
         self,
@@ -247,7 +249,7 @@ class ArraysLog(Log):
         numbered = dict(zip(map(_number_of, stems), range(len(stems))))
         rows = np.array([numbered.get(number, -1) for number in numbers])
         is_enough = (rows >= 0).mean() > (_LEAST_NAMED if len(stems) != len(self.files) else 1 - 1e-9)
-        if len(numbered) == len(stems) > 0 and is_enough and max(numbers) >= _LEAST_REACH * max(numbered):
+        if len(numbered) == len(stems) > 0 and is_enough and self._reaches(max(numbers), max(numbered)):
             return rows
         if len(row_of) != len(self.files) or len({re.sub(r"\d+", "", label) for label in labels}) > 1:
             return None
@@ -263,11 +265,16 @@ class ArraysLog(Log):
         if count == len(self.files) or labelled is not None:
             return np.arange(count) if labelled is None else labelled
         numbers = np.array([_number_of(stem_of(path)) % 10**9 for path in self.files])
-        fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
-        if len(fitting) != 1 or len(set(numbers)) < len(numbers) or fitting[0].max() < _LEAST_REACH * count:
+        firsts = (0,) if self._numbers_are_rows else (0, 1)
+        fitting = [numbers - first for first in firsts if (numbers >= first).all() and (numbers < first + count).all()]
+        if len(fitting) != 1 or len(set(numbers)) < len(numbers) or not self._reaches(fitting[0].max(), count):
             return None
         self._note(f"it has {count} {what} for {len(self.files)} sweeps, so each takes that of its number")
         return fitting[0]
+
+    def _reaches(self, last: int, end: int) -> bool:
+        """Test whether the last number of a file may be a row of a table, by the end of the table."""
+        return self._numbers_are_rows or last >= _LEAST_REACH * end
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
         trajectory = trajectory.counted(stamps)

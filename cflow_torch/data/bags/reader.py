@@ -12,7 +12,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.folder import find_poses_near
 from cflow_torch.data.arrays.poses_text import read_poses
-from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, sample, sorted_poses
+from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, is_pose, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import search
 from cflow_torch.data.log import Log
@@ -48,6 +48,7 @@ _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by 
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
+_LOST = "{} that are NaN or zeros are left out"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 
 
@@ -296,12 +297,17 @@ class BagLog(Log):
                     self._note(f"its clouds are of several sensors: we read those in {self._lidar}, not in {frame}")
             elif connection.msgtype in _TF_TYPES:
                 for link in message.transforms:
+                    if not is_pose(_pose_of(link, arrived)):
+                        self._note(_LOST.format("transforms"))
+                        continue
                     self._pose_delays.append(arrived - _stamp(link, arrived))
                     child = link.child_frame_id.lstrip("/")  # ROS 1 allows a leading slash
                     parents[child] = link.header.frame_id.lstrip("/")
                     links.setdefault(child, []).append(_pose_of(link, arrived))
             else:
-                poses = _driven(message, arrived)
+                driven = _driven(message, arrived)
+                poses = list(filter(is_pose, driven))
+                self._note(_LOST.format("poses") if len(poses) < len(driven) else "")
                 if not poses:
                     continue
                 if hasattr(message, "poses"):
