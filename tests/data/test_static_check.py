@@ -257,6 +257,22 @@ def test_points_in_the_world_are_found_and_moved_back(source, request):
     assert "world's frame" in find_problems(world)[0] and read_as(good) is good
 
 
+def test_points_in_the_frame_of_the_first_sweep_are_found_and_moved_back(drive):
+    """Clouds of an odometry program that begins at the first sweep, next to poses in a map's frame."""
+    start, far = np.linalg.inv(drive.poses[0]), as_matrix(rotations_about(2, 1.0), (500, -300, 20))
+    first = Wrong(
+        drive,
+        points=lambda points, pose: to_world(to_world(points, pose), start),
+        poses=lambda poses: far @ poses,
+    )
+    for reading in ("auto", "world"):
+        log = read_as(first, reading)
+        assert log.readings == (WORLD,)
+        assert np.allclose(log.sweep(9).points, drive.sweep(9).points, atol=1e-3)
+        steps = [np.linalg.inv(each.poses[9]) @ each.poses[3] for each in (log, drive)]
+        assert np.allclose(*steps, atol=1e-6)
+
+
 def test_a_mounting_that_one_pair_shows_weakly_is_not_named():
     """A slight turn in one of several pairs is no evidence: in the others, both mountings are the same."""
     straight = {GIVEN: 0.34}
