@@ -294,7 +294,8 @@ def _repeated(log: Log) -> list[Finding]:
     first = [log.sweep(index) for index in range(2)]
     if repeats(*first):
         return [Finding("sweeps", WRONG, REPEATED, True)]
-    again = 0.0 if _is_grid(first[0]) else _share_again(*first)
+    is_known = _is_grid(first[0]) or bool(frame_problem(first[0].points)[0])  # then "to the millimetre" means nothing
+    again = 0.0 if is_known else _share_again(*first)
     if again > _ACCUMULATED:
         text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
         fix = "give the points that each sweep has measured itself, not a map or sweeps that were added up"

@@ -580,7 +580,7 @@ def spherical(unit):
     [
         (lambda points, _: 1000 * points, "data.read_as=points_millimetres"),
         (lambda points, _: 100 * points, "data.read_as=points_centimetres"),
-        (lambda points, _: 0.001 * points, "in metres"),
+        (lambda points, _: 0.001 * points, "data.read_as=points_kilometres"),
         (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
         (lambda points, _: points @ AXES["down"], "data.read_as=points_upside_down"),
         (camera_points, "data.read_as=points_camera"),

@@ -101,7 +101,7 @@ class HDF5Log(Log):
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
         time = None if self.timestamps[-1] < _FIRST_MICROSECOND else nanoseconds  # None: the groups are numbered
         if pose is not None and not np.isfinite(pose).all():
-            raise MissingFile(f"{self.file}: the pose of sweep {timestamp} is not finite, so its pairs have no flow")
+            raise MissingFile(f"{self.file}: the pose of sweep {timestamp} is not finite")
         return Sweep(points[:, :3], is_ground, pose, time, self._point_times(index, time, points))
 
     def _point_times(self, index: int, time: int | None, points: np.ndarray) -> np.ndarray | None:
