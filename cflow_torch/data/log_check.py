@@ -9,7 +9,7 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
-from cflow_torch.data.log_motion import Lapse, find_lapses, find_missing, judge_log
+from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
 from cflow_torch.data.neighbours import Neighbours, alternate
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
@@ -247,15 +247,14 @@ def _setting(log: Log, reading: str) -> str:
 
 
 def _lapses(log: _CheckedLog) -> list[Finding]:
-    if not log.lapses:
-        return []
-    if log.misfit:
-        return log.misfit
+    wrong = [lapse for lapse in log.lapses if lapse.kind != MISSING]
+    if not wrong or log.misfit:
+        return log.misfit if wrong else []
     texts = [
         f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
-        if each.is_single
+        if each.kind == POSE
         else f"the poses jump by {each.metres:.1f} m before sweep {each.sweep}"
-        for each in log.lapses
+        for each in wrong
     ]
     fix = "correct it, or remove the sweep; for a jump, give poses of a continuous frame (odometry, not the map)"
     return [Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)]
@@ -391,13 +390,12 @@ def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
     if repeated:
         text = f"{len(repeated)} of them repeat the points of the sweep before, the first is sweep {repeated[0]}"
         findings.append(Finding("sweeps", WRONG, f"{text}: leave them out, or copy their files again"))
-    missing = find_missing(log)
-    for index, metres in missing:
-        text = f"sweeps seem to be missing before sweep {index}, because the vehicle moves {metres:.1f} m there"
-        findings.append(Finding("sweeps", WRONG, f"{text}: give the times of the sweeps"))
-    known = (
-        {lapse.sweep for lapse in log.lapses} | set(repeated) | {index for index, _ in missing} | set(neighbours.small)
-    )
+    for lapse in log.lapses:
+        if lapse.kind == MISSING:
+            where = f"before sweep {lapse.sweep}, because the vehicle moves {lapse.metres:.1f} m there"
+            text = f"sweeps seem to be missing {where}: give the times of the sweeps"
+            findings.append(Finding("sweeps", WRONG, text))
+    known = {lapse.sweep for lapse in log.lapses} | set(repeated) | set(neighbours.small)
     misplaced = neighbours.misplaced(log)
     if misplaced and (log.misfit or set(log.motion.best) - {NO_READING}):
         misplaced = []  # they are explained

@@ -17,7 +17,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, poses_beyond
 from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
-from cflow_torch.data.log_motion import find_lapses, judge_log
+from cflow_torch.data.log_motion import JUMP, POSE, find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
 from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import make_drive
@@ -555,9 +555,9 @@ def test_single_poses_that_are_off_are_found(drive):
         poses[7:, 1, 3] += 1.5
         return poses
 
-    for change, index, is_single in ((glitch, 6, True), (turned, 6, True), (jump, 7, False)):
+    for change, index, kind in ((glitch, 6, POSE), (turned, 6, POSE), (jump, 7, JUMP)):
         (lapse,) = find_lapses(Wrong(drive, poses=change))
-        assert (lapse.sweep, lapse.is_single) == (index, is_single)
+        assert (lapse.sweep, lapse.kind) == (index, kind)
     assert "jump by 1.5 m before sweep 7" in find_problems(Wrong(drive, poses=jump))[0]
     assert find_lapses(Wrong(drive)) == []
 
