@@ -296,27 +296,38 @@ class BagLog(Log):
                 else:
                     self._note(f"its clouds are of several sensors: we read those in {self._lidar}, not in {frame}")
             elif connection.msgtype in _TF_TYPES:
-                for link in message.transforms:
-                    if not is_pose(_pose_of(link, arrived)):
-                        self._note(_LOST.format("transforms"))
-                        continue
-                    self._pose_delays.append(arrived - _stamp(link, arrived))
-                    child = link.child_frame_id.lstrip("/")  # ROS 1 allows a leading slash
-                    parents[child] = link.header.frame_id.lstrip("/")
-                    links.setdefault(child, []).append(_pose_of(link, arrived))
+                self._add_transforms(message, arrived, parents, links)
             else:
-                driven = _driven(message, arrived)
-                poses = list(filter(is_pose, driven))
-                self._note(_LOST.format("poses") if len(poses) < len(driven) else "")
-                if not poses:
-                    continue
-                if hasattr(message, "poses"):
-                    tracks[connection.topic] = []  # each message repeats the path so far
-                tracks.setdefault(connection.topic, []).extend(poses)
-                self._pose_delays.append(arrived - poses[-1][0])
-                self._child[connection.topic] = getattr(message, "child_frame_id", "").lstrip("/")
+                self._add_poses(connection.topic, message, arrived, tracks)
         self._frames = Frames(parents, links)
         return self._arrivals(stamps), tracks
+
+    def _add_transforms(
+        self, message: Any, arrived: int, parents: dict[str, str], links: dict[str, list[Sample]]
+    ) -> None:
+        """Add the transforms of a message to the parents and the samples of each frame."""
+        for link in message.transforms:
+            pose = _pose_of(link, arrived)
+            if not is_pose(pose):
+                self._note(_LOST.format("transforms"))
+                continue
+            self._pose_delays.append(arrived - _stamp(link, arrived))
+            child = link.child_frame_id.lstrip("/")
+            parents[child] = _frame_of(link)
+            links.setdefault(child, []).append(pose)
+
+    def _add_poses(self, topic: str, message: Any, arrived: int, tracks: dict[str, list[Sample]]) -> None:
+        """Add the poses of a message to those of its topic."""
+        driven = _driven(message, arrived)
+        poses = list(filter(is_pose, driven))
+        self._note(_LOST.format("poses") if len(poses) < len(driven) else "")
+        if not poses:
+            return
+        if hasattr(message, "poses"):
+            tracks[topic] = []  # each message repeats the path so far
+        tracks.setdefault(topic, []).extend(poses)
+        self._pose_delays.append(arrived - int(poses[-1][0]))
+        self._child[topic] = getattr(message, "child_frame_id", "").lstrip("/")
 
     def _arrivals(self, stamps: list[tuple[int, int]]) -> dict[int, int]:
         """Return the time of each cloud and its arrival, from header stamps and arrivals. We say if stamps repeat."""
