@@ -132,7 +132,7 @@ class AV2Log(BoxLog):
         self._note(note)
         kept = np.flatnonzero(is_known)
         self.timestamps = [self.timestamps[k] for k in kept]
-        self.gaps = frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
+        self.gaps |= frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
         self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
         return poses
 
