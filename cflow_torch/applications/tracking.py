@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, regroup
+from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, of_own_vehicle, regroup
 from cflow_torch.applications.completion import TrackedPoints, complete
 from cflow_torch.applications.floor import UNKNOWN_FLOOR, Floor
 from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
@@ -125,6 +125,7 @@ class Tracker:
         self.times = self._times(sweeps)
         self.floor = Floor.of(sweeps.pc0)
         groups = MovingGroups.of(sweeps, result)
+        groups = groups.divide(torch.where(of_own_vehicle(groups, sweeps.pc0), -1, 0))
         tracks, points = self._predict(self.times, groups.point.device)
         groups = regroup(groups, tracks)
         matches = match(tracks, points.position, points.track, groups)
