@@ -357,7 +357,13 @@ def track_points(
         log = CachedLog(log, model.config.num_sweeps)
         results = enumerate(model([sweeps])[0] for sweeps in windows(log, model.config.num_history))
     tracker = LogTracker(CachedLog(log, 2), sweep_interval)
-    for index, result in results:
+    for pair in results:
+        if not (isinstance(pair, tuple) and len(pair) == 2):
+            raise CFlowError(
+                f"results holds {type(pair).__name__}: give pairs (index of the sweep, its flow), such as "
+                "enumerate(results)"
+            )
+        index, result = pair
         tracker.push(index, result)
     return tracker.table(), tracker.points
 

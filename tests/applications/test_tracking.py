@@ -338,6 +338,8 @@ def test_tracking_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_wrong_inputs_are_one_clear_error() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
+    with pytest.raises(CFlowError, match=r"such as enumerate\(results\)"):
+        track(log, [log.result(0)])  # type: ignore[list-item]
     tracker = Tracker()
     tracker.push((log.sweep(3), log.sweep(4)), log.result(3))
     with pytest.raises(CFlowError, match="order of time"):
