@@ -60,14 +60,16 @@ def write_drivestudio(
     for number, track_id in enumerate(ids.tolist()):
         is_here = instance == number
         rows = row[is_here]
-        annotations = {
-            "frame_idx": frame[is_here].tolist(),
-            "obj_to_world": boxes[rows].tolist(),
-            "box_size": sizes[rows].tolist(),
-        }
         is_deformable = class_of(table, int(rows[0])) in _DEFORMABLE
-        name = deformable_class if is_deformable and deformable_class is not None else class_name
-        infos[str(number)] = {"id": str(track_id), "class_name": name, "frame_annotations": annotations}
+        infos[str(number)] = {
+            "id": str(track_id),
+            "class_name": deformable_class if is_deformable and deformable_class is not None else class_name,
+            "frame_annotations": {
+                "frame_idx": frame[is_here].tolist(),
+                "obj_to_world": boxes[rows].tolist(),
+                "box_size": sizes[rows].tolist(),
+            },
+        }
     frames = {str(number): instance[frame == number].tolist() for number in range(len(sweep_of_frame))}
     write_json(folder / FRAMES_FILE, frames)
     write_json(folder / INSTANCES_FILE, infos)

@@ -141,11 +141,15 @@ class Tracker:
         step = tracks.motion.velocity * self.times.interval
         step[track_of_group] = flow
         points = _missing_points(points, tracks, step).followed_by(_seen_points(groups, track_of_point, step))
-        is_kept = tracks.missed <= _MAX_MISSED
-        self._tracks = tracks._replace(box=tracks.box + step, path=tracks.path + step).take(is_kept)
-        self._points = points.renumber(torch.where(is_kept, is_kept.cumsum(0) - 1, -1))
+        self._keep(tracks._replace(box=tracks.box + step, path=tracks.path + step), points)
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
+
+    def _keep(self, tracks: TrackStates, points: _TrackPoints) -> None:
+        """Keep the tracks that were seen lately, and their points, for the next sweep."""
+        is_kept = tracks.missed <= _MAX_MISSED
+        self._tracks = tracks.take(is_kept)
+        self._points = points.renumber(torch.where(is_kept, is_kept.cumsum(0) - 1, -1))
 
     def _times(self, sweeps: Window) -> Times:
         """Return the times of the pair t, t+1, and note them for the next one."""
