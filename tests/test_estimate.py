@@ -154,9 +154,10 @@ FLIP = np.diag([1.0, -1, -1, 1])
         (lambda a, b, T: (a, b, np.linalg.inv(T)), "inverted"),
         (lambda a, b, T: (b, a, T), "interchanged"),
         (lambda a, b, T: (a, a, T), "the same points"),
+        (lambda a, b, T: (a, b * np.float32(np.nan), T), "pc1 has no finite points"),
         (lambda a, b, T: (a @ np.float32(FLIP[:3, :3]), b @ np.float32(FLIP[:3, :3]), FLIP @ T @ FLIP), "z seems"),
     ],
-    ids=["inverted", "interchanged", "repeated", "z down"],
+    ids=["inverted", "interchanged", "repeated", "empty", "z down"],
 )
 def test_likely_mistakes_are_warned_of(street, change, found):
     now, later, T = street
@@ -167,8 +168,8 @@ def test_likely_mistakes_are_warned_of(street, change, found):
     inspect, window = Inspection(), Window(Sweep(pc0, masks[0], T), Sweep(pc1, masks[1], np.eye(4)))
     with pytest.warns(CFlowWarning, match=found):
         inspect([window])
-    with warnings.catch_warnings():  # once, but for repeated sweeps
-        warnings.simplefilter("error" if found != "the same points" else "ignore")
+    with warnings.catch_warnings():  # once, but for what is wrong with pc1
+        warnings.simplefilter("error" if found not in ("the same points", "pc1 has no finite points") else "ignore")
         inspect([window])
 
 

@@ -18,6 +18,7 @@ from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import FlowLabels
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import PathLike, as_path, exist, is_timestamp, remote_errors, safe_name
+from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
 from cflow_torch.transforms import poses_at, poses_from_quaternions, transform_points
 from cflow_torch.types import CFlowError, Sweep, check_array, vector_columns
 
@@ -85,15 +86,17 @@ class AV2Log(BoxLog):
     """One Argoverse 2 sensor log.
 
     Args:
-        folder: log folder with `sensors/lidar/<ns>.feather` and `city_SE3_egovehicle.feather`.
+        folder: log folder with `sensors/lidar/<ns>.feather` and `city_SE3_egovehicle.feather`. Without this file, there
+            are no poses; sweeps that it does not cover are left out (`fit_to_sweeps`). We warn of both.
         ground: rule for the map's ground raster, "av2-api" or "bsfe" (`GROUND_RULES`); None = no ground
-            masks. A log whose map has no raster has no ground masks either.
+            masks. A log whose map has no raster, or that has no poses, has no ground masks either.
 
     Convention:
         - Points are in the ego frame of their sweep (stored as float16). The world is the frame of the city.
         - Truth comes from the first of these sources that the log has: `flow_labels/<ns of sweep t>.feather` (if that
           folder exists, a pair without a file has no truth); `flow_labels.feather`, for the first pair;
-          `annotations.feather`, for pairs inside the annotated time. Boxes without points are dropped, as in av2-api.
+          `annotations.feather`, for pairs inside the annotated time, if there are poses. Boxes without points are
+          dropped, as in av2-api.
     """
 
     is_compensated: bool = True
@@ -107,28 +110,42 @@ class AV2Log(BoxLog):
         self._files = {int(file.stem): file for file in sweeps.glob("*.feather") if is_timestamp(file.stem)}
         self.timestamps = sorted(self._files)
         self._check_count(f"{self.folder}: sensors/lidar/<nanoseconds>.feather")
-        self._stored_poses = FeatherFile(self.folder / "city_SE3_egovehicle.feather")
-        times, rows = np.unique(self._stored_poses.vector("timestamp_ns", np.int64), return_index=True)
-        has_pose = np.isin(self.timestamps, times)
-        if not has_pose.all():
-            first = f"{self.timestamps[int(has_pose.argmin())]} ({(~has_pose).sum()} missing)"
-            raise CFlowError(f"{self._stored_poses.file} has no pose at the time of sweep {first}")
-        self._pose_rows = dict(zip(times.tolist(), rows.tolist()))  # time -> row
-        self._poses = self._poses_at(self.timestamps)
+        self._driven = self._read_trajectory()
+        self._poses = None if self._driven is None else self._pose_per_sweep(self._driven)
         if ground is not None and ground not in GROUND_RULES:
             raise CFlowError(f"ground rules are {sorted(GROUND_RULES)}, got {ground!r}")
         self._rule, self._raster = ground, read_ground_raster(self.folder / "map") if ground else None
 
+    def _read_trajectory(self) -> Trajectory | None:
+        """Read all poses of the vehicle; None, with a warning, if their file is missing."""
+        file = self.folder / "city_SE3_egovehicle.feather"
+        if not exist(file):
+            self._note(f"{file} is missing, so it has no poses. Download it, or set data.odometry=true")
+            return None
+        stored = FeatherFile(file)
+        times, rows = np.unique(stored.vector("timestamp_ns", np.int64), return_index=True)
+        return Trajectory(_poses(stored, rows, times.tolist()), times, False, str(file))
+
+    def _pose_per_sweep(self, trajectory: Trajectory) -> np.ndarray:
+        """Return the poses of the sweeps, (K, 4, 4), and leave out sweeps that have none."""
+        poses, is_known, note = fit_to_sweeps(trajectory, self.timestamps)
+        self._note(note)
+        kept = np.flatnonzero(is_known)
+        self.timestamps = [self.timestamps[k] for k in kept]
+        self.gaps |= frozenset(np.flatnonzero(np.diff(kept) > 1).tolist())
+        self._check_count(f"{self.folder}: without the sweeps that have no pose, it")
+        return poses
+
     def sweep(self, index: int) -> Sweep:
-        """Read sweep `index`, with a ground mask if the log has a raster."""
+        """Read sweep `index`, with a ground mask if the log has a raster and poses."""
         timestamp = self._timestamp(index)
-        stored, pose, is_ground = FeatherFile(self._files[timestamp]), self._poses[index], None
+        stored, pose, is_ground = FeatherFile(self._files[timestamp]), self._pose(index), None
         points = stored.matrix("xyz", np.float32)
         # Logs of other writers may lack the times.
         times = stored.vector("offset_ns", np.int64) * 1e-9 if "offset_ns" in stored.names else None
-        if self._raster is not None and self._rule:
+        if self._raster is not None and self._rule and pose is not None:
             is_ground = self._raster.is_ground(transform_points(points, pose), self._rule)
-        return Sweep(points=points, is_ground=is_ground, pose=pose.copy(), timestamp_ns=timestamp, point_times=times)
+        return Sweep(points, is_ground, pose, timestamp, times)
 
     def _labels(self, index: int) -> FlowLabels | None:
         folder, first_pair = self.folder / "flow_labels", self.folder / "flow_labels.feather"
@@ -149,8 +166,11 @@ class AV2Log(BoxLog):
         cameras = []
         for name, (size, matrix, mount) in self._calibration.items():
             image_time = min(self._image_times[name], key=lambda each: abs(each - time), default=time)
-            pose = self._poses[index] if image_time == time else poses_at(np.array([image_time]), *self._trajectory)[0]
-            T_camera_ego = at_image(mount, pose, self._poses[index])
+            T_camera_ego = np.linalg.inv(mount)
+            if self._driven is not None and image_time != time:
+                times_ns: Any = self._driven.times_ns
+                image_pose = poses_at(np.array([image_time]), times_ns, self._driven.poses)[0]
+                T_camera_ego = at_image(mount, image_pose, self._pose(index))
             cameras.append(Camera(name, str(image_time), size, matrix, T_camera_ego, (image_time - time) * 1e-9))
         return cameras
 
@@ -189,13 +209,9 @@ class AV2Log(BoxLog):
                 for name in self._calibration
             }
 
-    def _poses_at(self, times: Sequence[int]) -> np.ndarray:
-        return _poses(self._stored_poses, np.array([self._pose_rows[time] for time in times]), times)
-
-    @cached_property
-    def _trajectory(self) -> tuple[np.ndarray, np.ndarray]:
-        """All poses of the vehicle: (M,) int64 nanoseconds, and (M, 4, 4)."""
-        return np.array(list(self._pose_rows)), self._poses_at(list(self._pose_rows))
+    def _pose(self, index: int) -> Any:
+        """Return a copy of the pose of sweep `index`, (4, 4); None = unknown."""
+        return None if self._poses is None else self._poses[index].copy()
 
     def _points(self, index: int) -> np.ndarray:
         return FeatherFile(self._files[self.timestamps[index]]).matrix("xyz", np.float32)

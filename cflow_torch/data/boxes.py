@@ -70,7 +70,7 @@ def points_in_box(points: np.ndarray, size: np.ndarray, pose: np.ndarray) -> np.
 class BoxLog(Log):
     """Base class of logs whose truth comes from tracked boxes."""
 
-    _poses: np.ndarray  # (K, 4, 4) float64, `T_world_ego` of each sweep
+    _poses: Any  # (K, 4, 4) float64, `T_world_ego` of each sweep; None = unknown, so there is no truth
 
     def _points(self, index: int) -> np.ndarray:
         """Read the (N, 3) float32 points of a sweep, in its ego frame."""
@@ -82,7 +82,7 @@ class BoxLog(Log):
 
     def _labels(self, index: int) -> FlowLabels | None:
         boxes0, boxes1 = self._boxes(index), self._boxes(index + 1)
-        if boxes0 is None or boxes1 is None:
+        if boxes0 is None or boxes1 is None or self._poses is None:
             return None
         T_ego1_ego0 = np.linalg.inv(self._poses[index + 1]) @ self._poses[index]
         return flow_from_boxes(self._points(index), boxes0, boxes1, T_ego1_ego0)

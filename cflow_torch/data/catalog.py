@@ -168,6 +168,7 @@ _CONVERSIONS = {
 def _why_nothing_fits(top: Path) -> str:
     """Say what a file or folder without a log has instead; "" = we do not know."""
     from cflow_torch.data.arrays.cloud_file import SUFFIXES
+    from cflow_torch.data.arrays.cloud_text import SUFFIXES as TEXTS
 
     level, suffixes = [top], Counter()  # type: ignore[var-annotated]
     for _ in range(_DEEPEST):
@@ -176,9 +177,11 @@ def _why_nothing_fits(top: Path) -> str:
     if not suffixes:
         return "it has no files" if top.is_dir() else ""
     suffix, count = suffixes.most_common(1)[0]
-    clouds = [kind for kind in suffixes if kind in SUFFIXES]
+    clouds = [kind for kind in suffixes if kind in SUFFIXES] or [kind for kind in suffixes if kind in TEXTS]
     if clouds and all(suffixes[kind] == 1 for kind in clouds):
-        return f"it has one point cloud ({clouds[0]}); scene flow needs two sweeps or more of a log in one folder"
+        return f"it has one file of points ({clouds[0]}); scene flow needs a file for each of two sweeps or more"
+    if clouds and clouds[0] in SUFFIXES:
+        return f"its {suffixes[clouds[0]]} {clouds[0]} files lie alone in their folders: put those of a log into one"
     if suffix in _CONVERSIONS:
         return f"its {count} {suffix} files are not read: {_CONVERSIONS[suffix]}"
     return ""

@@ -9,13 +9,13 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, WRONG, Finding
 from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_poses
-from cflow_torch.data.log_motion import Lapse, find_lapses, find_missing, judge_log
+from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
 from cflow_torch.data.neighbours import Neighbours, alternate
 from cflow_torch.data.read_as import ReadAs, begins_late
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.transforms import relative_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import OF_POINTS, READINGS, STILL, TIMES_OF_POSES, UNITS, WORLD
+from cflow_torch.windows.conventions import OF_POINTS, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
 from cflow_torch.windows.inspection import REPEATED, repeats
 from cflow_torch.windows.point_frame import frame_problem
 from cflow_torch.windows.readings import (
@@ -162,7 +162,7 @@ def _frame(log: _CheckedLog) -> list[Finding]:
         return [right, *_motion(log, "")]
     units = [f"points_{unit}" for unit in UNITS]
     # The unit under which the points fit the poses may be another one.
-    unit = _fitting(log, [reading, *units]) if reading in units and known_poses(log) is not None else ""
+    unit, _ = _fitting(log, [reading, *units]) if reading in units and known_poses(log) is not None else ("", 0)
     if unit not in ("", reading):
         reading, problem = unit, f"{READINGS[unit].cause}, because the motion then fits that of the poses"
     fix = f"; {_setting(log, reading)} converts them" if reading else ""
@@ -171,10 +171,11 @@ def _frame(log: _CheckedLog) -> list[Finding]:
     return [wrong, *(_motion(log, reading) if reading or where == "last" else [])]
 
 
-def _fitting(log: Log, readings: Iterable[str]) -> str:
-    """Return the first of the readings of the points under which they fit the poses; "" = none."""
+def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
+    """Return the first of the readings under which the points fit the poses, and the share in place; "" = none."""
     judged = ((name, judge_log(ReadAs(log, name))) for name in readings)
-    return next((name for name, each in judged if not each.best and each.given >= LEAST_SHARE), "")
+    fitting = ((name, each.given) for name, each in judged if not each.best and each.given >= LEAST_SHARE)
+    return next(fitting, ("", 0.0))
 
 
 def _problem_of(log: Log, index: int) -> tuple[str, str]:
@@ -195,10 +196,11 @@ def _motion(checked: _CheckedLog, reading: str) -> list[Finding]:
     if has_poses and judgement.best and checked.misfit:
         return checked.misfit
     if NO_READING in judgement.best and has_poses:
-        fitting = _fitting(log, OF_POINTS)
+        fitting, share = _fitting(log, (REVERSED, *OF_POINTS))
         if fitting:
-            text = f"{judgement}, unless points are converted: give {_setting(log, fitting)}"
-            return [Finding("frame", WRONG, text, True)]
+            shares = f"{judgement.given:.2f} of the static structure is in place as given, {share:.2f} then"
+            text = f"{READINGS[fitting].cause} ({shares}): give {_setting(log, fitting)}"
+            return [Finding("ego motion" if fitting == REVERSED else "frame", WRONG, text, True)]
     if not judgement.best:
         text = f"{judgement.given:.2f} of the static structure is in place some sweeps later"
         return [Finding("ego motion", RIGHT, text + ("" if has_poses else ", without poses"), True)]
@@ -245,15 +247,14 @@ def _setting(log: Log, reading: str) -> str:
 
 
 def _lapses(log: _CheckedLog) -> list[Finding]:
-    if not log.lapses:
-        return []
-    if log.misfit:
-        return log.misfit
+    wrong = [lapse for lapse in log.lapses if lapse.kind != MISSING]
+    if not wrong or log.misfit:
+        return log.misfit if wrong else []
     texts = [
         f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
-        if each.is_single
+        if each.kind == POSE
         else f"the poses jump by {each.metres:.1f} m before sweep {each.sweep}"
-        for each in log.lapses
+        for each in wrong
     ]
     fix = "correct it, or remove the sweep; for a jump, give poses of a continuous frame (odometry, not the map)"
     return [Finding("poses", WRONG, f"{', '.join(texts)}: {fix}", True)]
@@ -292,7 +293,8 @@ def _repeated(log: Log) -> list[Finding]:
     first = [log.sweep(index) for index in range(2)]
     if repeats(*first):
         return [Finding("sweeps", WRONG, REPEATED, True)]
-    again = 0.0 if _is_grid(first[0]) else _share_again(*first)
+    is_known = _is_grid(first[0]) or bool(frame_problem(first[0].points)[0])  # then "to the millimetre" means nothing
+    again = 0.0 if is_known else _share_again(*first)
     if again > _ACCUMULATED:
         text = f"{100 * again:.0f} % of the points of the first sweep are also in the second one, to the millimetre"
         fix = "give the points that each sweep has measured itself, not a map or sweeps that were added up"
@@ -388,13 +390,12 @@ def _misplaced(log: _CheckedLog, neighbours: Neighbours) -> list[Finding]:
     if repeated:
         text = f"{len(repeated)} of them repeat the points of the sweep before, the first is sweep {repeated[0]}"
         findings.append(Finding("sweeps", WRONG, f"{text}: leave them out, or copy their files again"))
-    missing = find_missing(log)
-    for index, metres in missing:
-        text = f"sweeps seem to be missing before sweep {index}, because the vehicle moves {metres:.1f} m there"
-        findings.append(Finding("sweeps", WRONG, f"{text}: give the times of the sweeps"))
-    known = (
-        {lapse.sweep for lapse in log.lapses} | set(repeated) | {index for index, _ in missing} | set(neighbours.small)
-    )
+    for lapse in log.lapses:
+        if lapse.kind == MISSING:
+            where = f"before sweep {lapse.sweep}, because the vehicle moves {lapse.metres:.1f} m there"
+            text = f"sweeps seem to be missing {where}: give the times of the sweeps"
+            findings.append(Finding("sweeps", WRONG, text))
+    known = {lapse.sweep for lapse in log.lapses} | set(repeated) | set(neighbours.small)
     misplaced = neighbours.misplaced(log)
     if misplaced and (log.misfit or set(log.motion.best) - {NO_READING}):
         misplaced = []  # they are explained

@@ -35,17 +35,18 @@ _LEAST_MOTION = 0.2  # metres between the sweeps of a pair, else the vehicle sta
 _SUSPECT, _SUSPECT_SHARE = 0.2, 0.3
 _ARM = 10.0  # metres; a rotation counts as the motion of a point that far away
 _FEWEST_POSES = 5  # that tell a usual step
-_AS_AROUND, _CLEARLY = "as around it", 1.3  # factor by which another reading is better than the steps around
+POSE, JUMP, MISSING = "pose", "jump", "missing"
+_OTHER, _CLEARLY = "another step", 1.3  # factor by which another reading is better than another step
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
 _LONG = 1.7  # length of a step over the usual one, if sweeps are missing
 
 
 class Lapse(NamedTuple):
-    """A step between two poses that the points contradict."""
+    """A step between two poses that differs from those around it, and what the points say of it."""
 
-    sweep: int  # index of the sweep whose pose is wrong, or before which the poses jump
-    metres: float  # how much the step differs from those around it; a rotation counts at 10 m
-    is_single: bool  # True: only this pose is wrong; False: all later poses are shifted
+    sweep: int  # index of the sweep after the step
+    metres: float  # by which the step differs from those around it, rotations at 10 m; of missing sweeps, its length
+    kind: str  # POSE = only the pose of the sweep is wrong; JUMP = all later ones are shifted; MISSING = sweeps are
 
 
 def choose_pairs(
@@ -225,49 +226,45 @@ def steps_of(log: Log) -> Steps | None:
 
 
 def find_lapses(log: Log) -> list[Lapse]:
-    """Find poses that are wrong, and jumps of the poses, in the order of the log.
+    """Find wrong poses, jumps of the poses, and sweeps that are missing, in the order of the log.
 
     A step between neighbouring poses is suspect if it differs from the steps around it. We read the two sweeps of the
-    most suspect steps, and compare the points under the step and under that of the neighbours.
+    most suspect steps, and compare the points under the step and under that of the neighbours. In logs with times,
+    steps are in proportion to them.
     """
     steps = steps_of(log)
     if steps is None:
         return []
-    wrong = sorted(k for k in steps.suspects if _contradicted(log, k, steps.given[k], steps.usual[k]))
     lapses: list[Lapse] = []
-    for step in wrong:
-        if lapses and lapses[-1].sweep == step and not lapses[-1].is_single:
-            lapses[-1] = lapses[-1]._replace(is_single=True)  # away from, and back to the trajectory
-        else:
-            lapses.append(Lapse(step + 1, float(steps.excess[step]), False))
+    for index in sorted(steps.suspects):
+        given, usual = steps.given[index], steps.usual[index]
+        length, usual_length = (float(np.linalg.norm(each[:3, 3])) for each in (given, usual))
+        is_long = index not in log.gaps and usual_length > _LEAST_MOTION and length > _LONG * usual_length
+        pair = _pair_around(log, index)
+        if pair is None:
+            continue
+        if _is_contradicted(pair, given, usual):
+            if lapses and lapses[-1].sweep == index and lapses[-1].kind == JUMP:
+                lapses[-1] = lapses[-1]._replace(kind=POSE)  # away from, and back to the trajectory
+            else:
+                lapses.append(Lapse(index + 1, float(steps.excess[index]), JUMP))
+        elif is_long and _is_contradicted(pair, usual, given):
+            lapses.append(Lapse(index + 1, length, MISSING))
     return lapses
 
 
-def find_missing(log: Log) -> list[tuple[int, float]]:
-    """Find sweeps before which others are missing, with the metres to the sweep before: steps that the points confirm.
-
-    In logs with times, steps are in proportion to them.
-    """
-    steps = steps_of(log)
-    if steps is None:
-        return []
-    lengths, usual = (np.linalg.norm(each[:, :3, 3], axis=1) for each in (steps.given, steps.usual))
-    unknown = [k for k in steps.suspects if k not in log.gaps]
-    long = [k for k in unknown if lengths[k] > _LONG * usual[k] and usual[k] > _LEAST_MOTION]
-    confirmed = sorted(k for k in long if _contradicted(log, k, steps.usual[k], steps.given[k]))
-    return [(k + 1, float(lengths[k])) for k in confirmed]
-
-
-def _contradicted(log: Log, index: int, step: np.ndarray, usual: np.ndarray) -> bool:
-    """Test whether a step fits best as those around it, and not under another reading of all poses."""
+def _pair_around(log: Log, index: int) -> Pair | None:
+    """Prepare sweep `index` and the next one, with the poses before them; None = they have too little structure."""
     start = max(index - _BEFORE, 0)
     poses = known_poses(log)
     around = None if poses is None else poses[start : index + 2]
-    pair = make_pair(log.sweep(index), log.sweep(index + 1), around, (index - start, index + 1 - start), False)
-    if pair is None:
-        return False
-    transforms = {GIVEN: step, _AS_AROUND: usual}
+    return make_pair(log.sweep(index), log.sweep(index + 1), around, (index - start, index + 1 - start), False)
+
+
+def _is_contradicted(pair: Pair, step: np.ndarray, other: np.ndarray) -> bool:
+    """Test whether the points fit best under another step, and not under another reading of all poses."""
+    transforms = {GIVEN: step, _OTHER: other}
     if not judge([replace(pair, transforms=transforms, has_motion=True)]).best:
         return False
     shares = replace(pair, transforms={**pair.transforms, **transforms}).shares_of_poses(OFF)
-    return max(shares.values()) < max(_CLEARLY * shares[_AS_AROUND], LEAST_SHARE)
+    return max(shares.values()) < max(_CLEARLY * shares[_OTHER], LEAST_SHARE)

@@ -9,13 +9,14 @@ from typing import Any, Sequence
 import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
-from cflow_torch.data.log import FlowLabels, Log, LogWrapper, points_surround_poses, poses_beyond
+from cflow_torch.data.log import FlowLabels, Log, LogWrapper, known_poses, points_surround_poses, poses_beyond
 from cflow_torch.data.log_motion import judge_log
+from cflow_torch.data.odometry import PosedLog
 from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import LATEST, OF_POINTS, READINGS, TIMES_OF_POSES, WORLD
+from cflow_torch.windows.conventions import LATEST, OF_POINTS, READINGS, REVERSED, TIMES_OF_POSES, WORLD
 from cflow_torch.windows.readings import STEPS
 
 _LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
@@ -41,8 +42,24 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
     if reading not in READ_AS:
         raise CFlowError(f"read_as={reading!r}: give one of {', '.join(str(one or 'null') for one in READ_AS)}")
     if reading == "auto":
-        return ReadAs(log, WORLD, is_found=True) if _is_in_world(log) else log
+        placed = _in_world_of_points(log)
+        return ReadAs(placed, WORLD, is_found=True) if _is_in_world(placed) else log
+    if reading == WORLD:
+        log = _in_world_of_points(log)
     return log if reading is None else ReadAs(log, reading)
+
+
+def _in_world_of_points(log: Log) -> Log:
+    """Return the log with poses in the world around whose poses its points lie: that of the poses or the first sweep.
+
+    Programs write clouds in the frame of the first one, next to poses in that of a map.
+    """
+    try:
+        poses = None if log.surrounds_poses else known_poses(log)
+        from_first = log if poses is None else PosedLog(log, np.linalg.inv(poses[0]) @ poses)
+        return from_first if from_first.surrounds_poses else log
+    except (CFlowError, OSError):
+        return log  # `sweep` raises the error
 
 
 def _is_in_world(log: Log) -> bool:
@@ -118,7 +135,7 @@ class ReadAs(LogWrapper):
     @cached_property
     def trajectory(self) -> tuple[np.ndarray, np.ndarray] | None:
         given = self.log.trajectory
-        if given is None or self.reading in (*TIMES_OF_POSES, *STEPS):
+        if given is None or self.reading in (REVERSED, *TIMES_OF_POSES, *STEPS):
             return None
         times, poses = given
         return times, self._convert(poses)

@@ -50,12 +50,21 @@ class Trajectory(NamedTuple):
 
 
 def checked_poses(matrices: np.ndarray, source: str) -> np.ndarray:
-    """Check (K, 4, 4) or (K, 3, 4) rigid motions and return them as (K, 4, 4) float64. Errors name the `source`."""
+    """Check (K, 4, 4) or (K, 3, 4) rigid motions and return them as (K, 4, 4) float64. Errors name the `source`.
+
+    Poses that are not finite, or have a rotation of zeros, are unknown: NaN. If all are, that is an error.
+    """
     if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)) or matrices.dtype.kind not in "fiu":
         raise CFlowError(f"{source} has shape {matrices.shape} and dtype {matrices.dtype}; pass (K, 4, 4) numbers")
     poses = np.tile(np.eye(4, dtype=np.result_type(matrices, np.float16)), (len(matrices), 1, 1))
     poses[:, : matrices.shape[1]] = matrices
-    return np.stack([rigid_transform(pose, f"pose {row} of {source}") for row, pose in enumerate(poses)])
+    is_unknown = ~(np.isfinite(poses).all(axis=(1, 2)) & (poses[:, :3, :3] != 0).any(axis=(1, 2)))
+    if is_unknown.all():
+        raise CFlowError(f"{source} has no pose of finite numbers")
+    poses[is_unknown] = np.eye(4)
+    checked = np.stack([rigid_transform(pose, f"pose {row} of {source}") for row, pose in enumerate(poses)])
+    checked[is_unknown] = np.nan
+    return checked
 
 
 def positions_of_degrees(latitude: np.ndarray, longitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,9 +96,12 @@ def fit_to_sweeps(trajectory: Trajectory, times_ns: Sequence[int]) -> tuple[np.n
     is_rare = bool(np.median(np.diff(known)) > _longest_gap(known)) and covered.mean() < _FEWEST_COVERED
     if is_rare or not covered.any():
         raise CFlowError(_describe_misfit(trajectory.source, known, wanted))
-    left, right, time = before[covered], after[covered], wanted[covered]
-    share = np.where(left == right, 0.0, (time - known[left]) / np.maximum(known[right] - known[left], 1))
-    poses = interpolate_motion(trajectory.poses[left], trajectory.poses[right], share)
+    poses = trajectory.poses[before[covered]]
+    is_between = (before != after)[covered]
+    if is_between.any():
+        left, right = (rows[covered][is_between] for rows in (before, after))
+        share = (wanted[covered][is_between] - known[left]) / (known[right] - known[left])
+        poses[is_between] = interpolate_motion(trajectory.poses[left], trajectory.poses[right], share)
     notes = [_describe_uncovered(trajectory.source, known, wanted, covered), _describe_rate(known)]
     return poses, covered, "; ".join(filter(None, notes))
 

@@ -28,7 +28,7 @@ from cflow_torch.fleet.manifest import checked_manifest, claim_log, complete_fra
 from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.windows.inspection import inactive_is_an_error, repeats
+from cflow_torch.windows.inspection import inactive_is_an_error, pair_problem
 from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # batches that are read ahead, and that wait to be written
@@ -41,7 +41,7 @@ class _Frame:
     timestamp: int
     content: Window | FlowResult | Exception | None = None
     points: Any = None  # of sweep t, if they are written
-    is_repetition: bool = False
+    problem: str = ""  # of the pair
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -100,8 +100,8 @@ class Worker:
             for frame in self._pass(log, partial(self._write, folder, claim), todo):
                 name = frame_name(log, frame.timestamp)
                 left.discard(name)
-                if checks and frame.is_repetition:
-                    yield Noted(name, "the next sweep has the same points")
+                if checks and frame.problem:
+                    yield Noted(name, frame.problem)
                 if isinstance(frame.content, Exception):
                     yield Failed(name, describe_error(frame.content))
                 else:
@@ -142,7 +142,7 @@ class Worker:
         frame = _Frame(int(log.timestamps[index]))
         with _stage(frame, "read"):
             frame.content = sweeps = window(log, index, self._job.config.num_history, self._job.config.num_future)
-            frame.is_repetition = repeats(sweeps.pc0, sweeps.pc1)
+            frame.problem = pair_problem(sweeps.pc0, sweeps.pc1)
         return frame
 
     def _compute(self, frames: list[_Frame]) -> list[_Frame]:

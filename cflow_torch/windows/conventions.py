@@ -17,7 +17,8 @@ from cflow_torch.transforms import (
 from cflow_torch.windows.deskewing import DIRECTIONS, SCANS
 
 OFF, TIMES = "off", "times"  # scans: the points stay, or move by their times
-STILL, WORLD, INVERTED, CAMERA, MOUNT = "still", "world", "inverted", "camera", "mount"
+STILL, WORLD, INVERTED, REVERSED = "still", "world", "inverted", "reversed"
+CAMERA, MOUNT = "camera", "mount"
 MARGIN = 1.3  # share in place over that as given, from which a reading is clearly better
 _SMALL = 1.1  # the same of small mistakes, which make a small difference
 # Vehicles of the same speed stand still without the ego motion: up to 1.56. Mirrored axes change little on a straight
@@ -39,7 +40,7 @@ AXES = {  # ego_T_stored of frames with other axes: x, y and z of the stored fra
     "z_first": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], float),  # z, x, y
 }
 MIRRORED = ("mirrored", "mirrored_back", "swapped", "swapped_back")  # left-handed
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048, "kilometres": 1e3}
 
 _Convert = Callable[[np.ndarray], np.ndarray]
 
@@ -85,6 +86,12 @@ def _transposed(axes: np.ndarray) -> _Convert:
 
 def _still(poses: np.ndarray) -> np.ndarray:
     return np.tile(np.eye(4), (len(poses), 1, 1))
+
+
+def _unturned(poses: np.ndarray) -> np.ndarray:
+    unturned = _still(poses)
+    unturned[:, :3, 3] = poses[:, :3, 3]
+    return unturned
 
 
 def _joined(poses: np.ndarray) -> np.ndarray:
@@ -172,6 +179,9 @@ READINGS: dict[str, Reading] = {
     INVERTED: Reading(
         "the poses are inverted (T_ego_world instead of T_world_ego), or the sweeps are interchanged", np.linalg.inv
     ),
+    # Only all poses of a log tell this one.
+    REVERSED: Reading("the clouds are in reverse order, or the poses are", lambda poses: poses[::-1]),
+    "world_axes": Reading("the points have the axes of the world, but lie around the vehicle", _unturned),
     STILL: Reading(
         "the static world stands still without the poses, so they are of another log, or the points are compensated",
         _still,

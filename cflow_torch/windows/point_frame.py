@@ -48,6 +48,8 @@ def frame_problem(points: Array) -> tuple[str, str]:
         unit, why = ("millimetres", "") if widest >= _MILLIMETRES else _small_unit(positions)
         return f"points_{unit}", f"{spans}: they seem to be in {unit}{why}, give points in metres"
     if max(widest, farthest) < _SMALLEST:
+        if _SMALLEST <= widest * UNITS["kilometres"] < _LARGEST:
+            return "points_kilometres", f"{spans}: they seem to be in kilometres, give points in metres"
         return "", f"{spans}: are they in metres?"
     if _is_spherical(positions):
         return "points_spherical", "the columns seem to be range, azimuth and elevation: give x, y, z in metres"

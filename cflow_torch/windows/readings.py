@@ -23,6 +23,7 @@ from cflow_torch.windows.conventions import (
     MOUNTS,
     OFF,
     READINGS,
+    REVERSED,
     SCAN_READINGS,
     STILL,
     TIMES,
@@ -79,8 +80,8 @@ _NUM_BEST = 30  # places that are compared by the most points
 _BETWEEN = 0.2 * np.array([(x, y) for x in range(-1, 2) for y in range(-1, 2)])
 
 
-_OF_POSES = {name: reading.of_poses for name, reading in {**READINGS, **MOUNTS}.items() if reading.of_poses}
 _COMPARED = {**READINGS, **MOUNTS, **SCAN_READINGS}
+_OF_POSES = {name: reading.of_poses for name, reading in _COMPARED.items() if reading.of_poses and name != REVERSED}
 
 
 class ScannedStructure:

@@ -113,15 +113,15 @@ def test_a_folder_of_another_run_is_an_error_that_names_the_difference(tmp_path,
 
 def test_bad_frames_and_bad_logs_are_reported_and_skipped(log_folder, tmp_path, evaluate, capsys):
     root = tmp_path / "root"
-    for name in ("broken", "good", "no-poses"):
+    for name in ("broken", "good", "bad-poses"):
         shutil.copytree(log_folder, root / name)
-    (root / "no-poses" / "city_SE3_egovehicle.feather").unlink()
+    (root / "bad-poses" / "city_SE3_egovehicle.feather").write_bytes(b"")
     sweeps = sorted((root / "broken" / "sensors" / "lidar").iterdir())
     sweeps[3].write_bytes(sweeps[3].read_bytes()[:1000])
     assert evaluate(f"data.root={root}") == 1
     record, frame, error = results_of(tmp_path), f"broken/{sweeps[2].stem}", capsys.readouterr().err
-    assert "2 failed:" in error and f"  {frame}: " in error and "  no-poses: " in error
-    assert record["num_pairs"] == 2 + 3 and [name for name, _ in record["failures"]] == ["no-poses", frame]
+    assert "2 failed:" in error and f"  {frame}: " in error and "  bad-poses: " in error
+    assert record["num_pairs"] == 2 + 3 and [name for name, _ in record["failures"]] == ["bad-poses", frame]
 
 
 def test_a_scene_without_poses_names_what_helps(tmp_path, cflow, capsys):

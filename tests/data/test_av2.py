@@ -17,7 +17,7 @@ from cflow_torch.data.av2 import AV2Log, GroundRaster, read_ground_raster
 from cflow_torch.data.boxes import Boxes, flow_from_boxes
 from cflow_torch.data.catalog import find_sources
 from cflow_torch.data.log import window
-from cflow_torch.types import CFlowError
+from cflow_torch.types import CFlowError, CFlowWarning
 
 TIMES = (100, 200, 300)
 POINTS = np.array([[1, 2, 3], [10, 0, 0.5], [-4, 0, 0]], dtype=np.float16)
@@ -140,7 +140,6 @@ SWEEP, POSES, LABELS = "sensors/lidar/100.feather", "city_SE3_egovehicle.feather
 @pytest.mark.parametrize(
     ("file", "columns", "message"),
     [
-        (POSES, pose_columns((100, 300)), "no pose at the time of sweep 200"),
         (POSES, {**pose_columns(), "qw": np.full(3, 0.9)}, "the pose of 100 is not a rigid motion"),
         (POSES, {**pose_columns(), "timestamp_ns": np.array(TIMES, dtype=np.float64)}, "timestamp_ns has dtype"),
         (POSES, {key: value for key, value in pose_columns().items() if key != "qz"}, r"lacks the columns \['qz'\]"),
@@ -156,6 +155,24 @@ def test_bad_columns_are_refused(folder: Path, file: str, columns: dict[str, Any
         log = AV2Log(folder)
         log.sweep(0), log.labels(0)
     assert file in str(error.value)
+
+
+def test_sweeps_without_poses_are_left_out_or_the_log_has_none(folder: Path) -> None:
+    late = (200 + 10**9, 300 + 10**9)
+    for time, other in zip(TIMES[1:], late):
+        (folder / "sensors" / "lidar" / f"{time}.feather").rename(folder / "sensors" / "lidar" / f"{other}.feather")
+    write_table(folder / POSES, **pose_columns(late))
+    with pytest.warns(CFlowWarning, match="1 of 3 sweeps have no pose in .* left out: 1 before the first pose"):
+        log = AV2Log(folder)
+    assert log.timestamps == list(late)
+
+    (folder / POSES).unlink()
+    write_table(folder / LABELS, **label_columns())
+    with pytest.warns(CFlowWarning, match=r"egovehicle.feather is missing, so it has no poses. .*data.odometry=true"):
+        log = AV2Log(folder)
+    sweep = log.sweep(0)
+    assert len(log) == 3 and sweep.pose is None and sweep.is_ground is None and len(sweep.points) == 3
+    assert log.labels(0) is not None  # stored flow needs no poses
 
 
 def test_boxes_have_a_margin_and_the_last_one_wins() -> None:

@@ -118,6 +118,52 @@ def test_a_missing_link_is_named(tmp_path) -> None:
     assert log.frame == "base_link" and world(log, bag.recording) < 5e-3
 
 
+def test_an_odometry_of_a_frame_below_the_lidar_is_connected(tmp_path, recwarn) -> None:
+    """As of an inertial unit in the LiDAR, whose driver publishes where it is."""
+    bag = Recorder(tmp_path)
+    bag.transform(bag.stamps[0], "velodyne", "imu", np.linalg.inv(MOUNT))
+    bag.odometry(child="imu")
+    bag.clouds()
+    log = BagLog(bag.close())
+    assert log.frame == "velodyne" and world(log, bag.recording) < 5e-3
+    assert not [each for each in recwarn if "no transform" in str(each.message)]
+
+
+def test_lost_poses_and_transforms_are_left_out_and_said(tmp_path) -> None:
+    """Programs write NaN or zeros for a pose that they lost."""
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    make = bag.writer.make
+    for stamp, value in ((bag.stamps[3] + 7, np.nan), (bag.stamps[5] + 7, 0.0)):
+        vector, turn = (
+            make("geometry_msgs/msg/Vector3", value, 0, 0),
+            make("geometry_msgs/msg/Quaternion", 0, 0, 0, value),
+        )
+        link = bag.writer.transform(stamp, "odom", "base_link", np.eye(4))
+        fields = link.header, link.child_frame_id, make("geometry_msgs/msg/Transform", vector, turn)
+        bag.writer.write("/tf", stamp, TF, [make("geometry_msgs/msg/TransformStamped", *fields)])
+    bag.clouds()
+    with pytest.warns(CFlowWarning, match="transforms that are NaN or zeros are left out"):
+        log = BagLog(bag.close())
+    assert len(log) == 8 and world(log, bag.recording) < 5e-3
+
+
+def test_clouds_of_one_sensor_are_read_if_a_topic_has_two(tmp_path) -> None:
+    bag = Recorder(tmp_path)
+    bag.mount()
+    bag.drive()
+    for k in range(8):
+        unit = bag.recording.units(k)[0]
+        for frame in ("velodyne", "rear"):
+            fields = bag.writer.cloud(bag.stamps[k], unit.points if frame == "velodyne" else -unit.points, None)
+            fields = [bag.writer.header(bag.stamps[k], frame), *fields[1:]]
+            bag.writer.write("/points", bag.stamps[k], CLOUD, *fields)
+    with pytest.warns(CFlowWarning, match="clouds are of several sensors: we read those in velodyne, not in rear"):
+        log = BagLog(bag.close())
+    assert len(log) == 8 and world(log, bag.recording) < 5e-3
+
+
 def test_other_clocks_are_named_and_late_poses_counted(tmp_path) -> None:
     for name, lag in (("clock", -(10**18)), ("late", 500_000_000)):
         bag = Recorder(tmp_path / name)

@@ -114,8 +114,10 @@ def test_logs_are_found_below_and_at_a_folder(name: str, log: str, tmp_path: Pat
     [
         ([], "it has no files"),
         (["a.las", "b.laz", "c.las"], "its 2 .las files are not read: convert them with pdal"),
-        (["a/1.xyz"], "its 1 .xyz files are not read"),
-        (["1.pcd"], "it has one point cloud"),
+        (["a/1.xyz", "a/2.xyz"], "its 2 .xyz files are not read"),
+        (["a/1.xyz"], r"it has one file of points \(.xyz\); .* a file for each of two sweeps"),
+        (["1.pcd"], "it has one file of points"),
+        (["0/points.ply", "1/points.ply"], "its 2 .ply files lie alone in their folders: put those of a log into one"),
         (["a.pcap"], "its 1 .pcap files are not read"),
     ],
 )

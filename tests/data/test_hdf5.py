@@ -13,7 +13,8 @@ from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.writer import write_hdf5_scene
 from cflow_torch.data.log import window
-from cflow_torch.transforms import transform_points
+from cflow_torch.transforms import to_quaternions, transform_points
+from cflow_torch.types import CFlowWarning
 
 h5py = pytest.importorskip("h5py")
 
@@ -30,6 +31,8 @@ def test_another_process_opens_the_file_itself(tmp_path):
         ({"lidar": None, "points": np.zeros((50, 3), np.float32)}, "has no lidar, .*it has .*points"),
         ({"pose": None}, "no pose"),
         ({"lidar": np.zeros((50, 2), np.float32)}, "lidar.*N, 3"),
+        ({"lidar": np.zeros((3, 500), np.float32)}, "lidar.*N, 3"),
+        ({"pose": np.full((4, 4), np.nan)}, "pose of sweep .* is not finite"),
         ({"lidar": ["a", "b"]}, "lidar is not an array of bool, integers or floats"),
         ({"ground_mask": np.zeros(49, bool)}, "ground_mask.*shape"),
         ({"flow_is_valid": None}, "flow_is_valid"),
@@ -75,6 +78,40 @@ def test_poses_may_be_the_upper_three_rows(drive, tmp_path):
     with HDF5Log(tmp_path / "a.h5") as log:
         assert np.allclose(log.sweep(1).pose, drive.poses[1], atol=1e-6)
         assert np.allclose(log.poses, drive.poses, atol=1e-6)
+
+
+def test_poses_may_be_seven_numbers(drive, tmp_path):
+    write_hdf5_scene(drive, tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as scene:
+        for group in scene.values():
+            pose = group["pose"][()]
+            w, x, y, z = to_quaternions(pose[None, :3, :3])[0]
+            del group["pose"]
+            group["pose"] = np.r_[pose[:3, 3], x, y, z, w]
+    with HDF5Log(tmp_path / "a.h5") as log:
+        assert np.allclose(log.poses, drive.poses, atol=1e-6)
+
+
+def test_a_pose_of_nan_shortens_windows(drive, tmp_path):
+    write_hdf5_scene(drive, tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as scene:
+        scene[sorted(scene)[0]]["pose"][...] = np.nan
+    with HDF5Log(tmp_path / "a.h5") as log, pytest.warns(CFlowWarning, match="shorter, because .*pose .* not finite"):
+        assert len(window(log, 1, num_history=1).pch) == 0
+
+
+@pytest.mark.parametrize("form", ["nanoseconds", "unix seconds", "seconds"])
+def test_times_of_points_may_have_any_unit(drive, tmp_path, form):
+    write_hdf5_scene(drive, tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as scene:
+        for name, group in scene.items():
+            seconds = np.linspace(0, 0.1, len(group["lidar"]))
+            group.pop("lidar_dt", None)
+            units = {"nanoseconds": (seconds * 1e9).astype(np.int64), "unix seconds": int(name) * 1e-9 + seconds}
+            group["lidar_dt"] = units.get(form, seconds)
+    with HDF5Log(tmp_path / "a.h5") as log:
+        times = log.sweep(1).point_times
+        assert np.allclose(times, np.linspace(0, 0.1, len(times)), atol=1e-5)
 
 
 def test_data_of_other_files_are_never_read(tmp_path):

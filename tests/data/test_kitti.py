@@ -173,14 +173,41 @@ def test_a_raw_drive_has_poses_of_the_lidar_times_and_boxes(tmp_path: Path) -> N
 
 @pytest.mark.parametrize(
     ("missing", "message"),
-    [("oxts/data/0000000001.txt", "2 measurements for 3 sweeps"), ("../calib_imu_to_velo.txt", "calib_imu_to_velo")],
+    [("oxts/data/*[12].txt", "1 measurements for 3 sweeps"), ("../calib_imu_to_velo.txt", "calib_imu_to_velo")],
 )
 def test_a_raw_drive_without_what_poses_need_says_so(missing: str, message: str, tmp_path: Path) -> None:
     folder = write_raw(tmp_path / "day" / "drive")
-    (folder / missing).unlink()
+    for file in folder.glob(missing):
+        file.unlink()
     with pytest.warns(CFlowWarning, match=f"{message}.*no poses.*odometry"):
         log = KITTILog(folder)
     assert log.poses is None and log.sweep(0).pose is None and log.labels(0) is None
+
+
+def test_a_sweep_of_a_raw_drive_without_measurement_is_left_out(tmp_path: Path) -> None:
+    folder = write_raw(tmp_path / "day" / "drive")
+    whole = KITTILog(folder)
+    (folder / "oxts" / "data" / "0000000001.txt").unlink()
+    with pytest.warns(CFlowWarning, match="1 of 3 sweeps have no pose, .* left out"):
+        log = KITTILog(folder)
+    assert log.timestamps == whole.timestamps[::2] and np.allclose(log.poses, whole.poses[::2]) and log.gaps == {0}
+
+
+@pytest.mark.parametrize("first", [0, 5])
+def test_a_part_of_a_sequence_takes_its_rows_of_poses_and_times(first: int, tmp_path: Path) -> None:
+    """The clouds of a few sweeps with the tables of all."""
+    folder = write_sequence(tmp_path / "sequences" / "04")
+    clouds = sorted((folder / "velodyne").iterdir(), reverse=True)
+    for index, cloud in zip((2, 1, 0), clouds):
+        cloud.rename(folder / "velodyne" / f"{first + index:06d}.bin")
+    poses = np.tile(np.eye(4), (30, 1, 1))
+    poses[:, 0, 3] = STEP * np.arange(30) ** 2
+    poses = T_CAMERA_LIDAR @ poses @ np.linalg.inv(T_CAMERA_LIDAR)
+    (folder / "poses.txt").write_text("".join(text(pose[:3]) + "\n" for pose in poses))
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:.1f}\n" for k in range(30)))
+    log = KITTILog(folder)
+    assert log.timestamps == [(first + k) * 10**8 for k in range(3)]
+    assert np.allclose(log.poses[:, 0, 3], STEP * np.arange(first, first + 3) ** 2, atol=1e-4)
 
 
 def test_a_lost_sweep_keeps_the_others_at_their_times_and_poses(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.log import CachedLog, Log, LogWrapper, poses_beyond
 from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
-from cflow_torch.data.log_motion import find_lapses, judge_log
+from cflow_torch.data.log_motion import JUMP, POSE, find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
 from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import make_drive
@@ -173,6 +173,7 @@ POSES = {
 }
 WRONG_POSES = {
     **{name: each(change) for name, change in POSES.items()},
+    "reversed": lambda poses: poses[::-1],
     "late": extrapolated(-1),
     "early": extrapolated(1),
     "half_late": half(-1),
@@ -219,6 +220,14 @@ def test_mirrored_clouds_are_named_and_no_pose_is_blamed(drive, name):
     assert "(left-handed)" in problem and f"data.read_as={name}" in problem
 
 
+def test_points_with_the_axes_of_the_world_are_named(drive):
+    """As of drivers that level and align clouds, but leave them around the vehicle."""
+    wrong = Wrong(drive, points=lambda points, pose: points @ pose[:3, :3].T)
+    (problem,) = find_problems(wrong)
+    assert "the points have the axes of the world" in problem and "data.read_as=world_axes" in problem
+    assert find_problems(read_as(wrong, "world_axes")) == []
+
+
 @pytest.mark.parametrize("factor", [0.5, 2.5])
 def test_positions_of_another_scale_are_named_with_the_factor(drive, factor):
     (problem,) = find_problems(Wrong(drive, poses=scaled(factor)))
@@ -246,6 +255,22 @@ def test_points_in_the_world_are_found_and_moved_back(source, request):
     assert "world's frame" in text and "data.read_as=world" in text
     assert find_problems(read_as(world, "world")) == [], "what you say is not repeated"
     assert "world's frame" in find_problems(world)[0] and read_as(good) is good
+
+
+def test_points_in_the_frame_of_the_first_sweep_are_found_and_moved_back(drive):
+    """Clouds of an odometry program that begins at the first sweep, next to poses in a map's frame."""
+    start, far = np.linalg.inv(drive.poses[0]), as_matrix(rotations_about(2, 1.0), (500, -300, 20))
+    first = Wrong(
+        drive,
+        points=lambda points, pose: to_world(to_world(points, pose), start),
+        poses=lambda poses: far @ poses,
+    )
+    for reading in ("auto", "world"):
+        log = read_as(first, reading)
+        assert log.readings == (WORLD,)
+        assert np.allclose(log.sweep(9).points, drive.sweep(9).points, atol=1e-3)
+        steps = [np.linalg.inv(each.poses[9]) @ each.poses[3] for each in (log, drive)]
+        assert np.allclose(*steps, atol=1e-6)
 
 
 def test_a_mounting_that_one_pair_shows_weakly_is_not_named():
@@ -530,9 +555,9 @@ def test_single_poses_that_are_off_are_found(drive):
         poses[7:, 1, 3] += 1.5
         return poses
 
-    for change, index, is_single in ((glitch, 6, True), (turned, 6, True), (jump, 7, False)):
+    for change, index, kind in ((glitch, 6, POSE), (turned, 6, POSE), (jump, 7, JUMP)):
         (lapse,) = find_lapses(Wrong(drive, poses=change))
-        assert (lapse.sweep, lapse.is_single) == (index, is_single)
+        assert (lapse.sweep, lapse.kind) == (index, kind)
     assert "jump by 1.5 m before sweep 7" in find_problems(Wrong(drive, poses=jump))[0]
     assert find_lapses(Wrong(drive)) == []
 
@@ -555,7 +580,7 @@ def spherical(unit):
     [
         (lambda points, _: 1000 * points, "data.read_as=points_millimetres"),
         (lambda points, _: 100 * points, "data.read_as=points_centimetres"),
-        (lambda points, _: 0.001 * points, "in metres"),
+        (lambda points, _: 0.001 * points, "data.read_as=points_kilometres"),
         (lambda points, _: points + [500, 0, 0], "frame of the LiDAR or of the vehicle"),
         (lambda points, _: points @ AXES["down"], "data.read_as=points_upside_down"),
         (camera_points, "data.read_as=points_camera"),

@@ -394,10 +394,11 @@ def test_poses_may_be_arrays_of_the_clouds(tmp_path) -> None:
         folder = tmp_path / str(number)
         folder.mkdir()
         for k in range(len(POSES)):
-            np.savez(folder / f"{k}.npz", points=np.ones((5, 3)), **arrays(k))
+            np.savez(folder / f"{k}.npz", pcl=np.ones((6, 3)), **arrays(k))  # the largest table is the cloud
         with pytest.warns(CFlowWarning, match=f"its poses come from the arrays {name} of its clouds"):
             log: Any = ArraysLog(folder)
         assert np.allclose(log.poses, POSES, atol=1e-9) and log.has_viewpoints
+        assert log.sweep(3).points.shape == (6, 3)
         assert np.diff(log.timestamps).tolist() == [10**8 if "stamp" in name else 1] * (len(POSES) - 1)
 
 
@@ -576,9 +577,61 @@ def test_tables_may_hold_texts_and_lines_of_nan(tmp_path) -> None:
     matrices[4, 3] = np.nan
     named = [f"{stamp}.npy {row}" for stamp, row in zip(STAMPS, rows(matrices))]
     (tmp_path / "poses.txt").write_text("\n".join(named))
-    with pytest.warns(CFlowWarning, match="1 of 12 sweeps have no pose, or one of NaN, .* left out"):
+    with pytest.warns(CFlowWarning, match="1 of 12 sweeps have no pose, or one of NaN or zeros, .* left out"):
         log = ArraysLog(tmp_path)
     assert np.allclose(log.poses, np.delete(POSES, 4, 0)) and log.gaps == {3}
+
+
+@pytest.mark.parametrize("comment", ["#", "% ", "// "])
+@pytest.mark.parametrize("date", ["2023-11-14 22:13:{}.5", "2023-11-14T22:13:{}.5Z"])
+def test_comments_counts_and_dates_in_tables_of_poses(tmp_path, comment, date) -> None:
+    """Programs begin comments in other ways, write the number of poses first, and dates for times."""
+    lines = [line(k, date.format(20 + k), separator=", ") + "," for k in range(COUNT)]
+    header = [comment + "made by us", comment + "time, x, y, z, qx, qy, qz, qw"]
+    (tmp_path / "poses.txt").write_text("\n".join(header + lines))
+    trajectory = poses_text.read_poses(tmp_path / "poses.txt")
+    assert trajectory.times_ns is not None
+    assert trajectory.times_ns.tolist() == [1_700_000_000_500_000_000 + k * 10**9 for k in range(COUNT)]
+    assert np.allclose(trajectory.poses[:, 0, 3], range(COUNT))
+    (tmp_path / "poses.txt").write_text("\n".join([str(COUNT), *rows(POSES[:, :3].reshape(COUNT, 12))]))
+    assert np.allclose(poses_text.read_poses(tmp_path / "poses.txt").poses, POSES)
+
+
+def test_times_of_day_are_times(tmp_path) -> None:
+    clouds(tmp_path, range(COUNT))
+    texts = [f"12:59:59.{k}00" if k < 10 else f"13:00:00.{k - 10}00" for k in range(COUNT)]
+    (tmp_path / "times.txt").write_text("\n".join(["// local time", *texts]))
+    assert np.diff(ArraysLog(tmp_path).timestamps).tolist() == [100_000_000] * (COUNT - 1)
+
+
+@pytest.mark.parametrize("form", ["matrices", "quaternions", "array"])
+def test_poses_of_zeros_are_unknown(tmp_path, form) -> None:
+    """Programs write zeros for a pose that they lost."""
+    poses = np.concatenate([POSES[:4], np.zeros((1, 4, 4)), POSES[5:]])
+    clouds(tmp_path)
+    if form == "array":
+        np.save(tmp_path / "poses.npy", poses)
+    elif form == "matrices":
+        (tmp_path / "poses.txt").write_text("\n".join(rows(poses[:, :3].reshape(COUNT, 12))))
+    else:
+        lines = EXACT[:4] + [f"{seconds(STAMPS[4])} 0 0 0 0 0 0 0"] + EXACT[5:]
+        (tmp_path / "poses.txt").write_text("\n".join(lines))
+        assert np.allclose(ArraysLog(tmp_path).poses[:, 0, 3], range(12), atol=1e-5)
+        return
+    with pytest.warns(CFlowWarning, match="1 of 12 sweeps have no pose, or one of NaN or zeros, .* left out") as told:
+        log = ArraysLog(tmp_path)
+    assert np.allclose(log.poses, np.delete(POSES, 4, 0)) and log.gaps == {3}
+    assert len(told) == 1
+
+
+def test_numbers_in_front_of_poses_are_no_times(tmp_path) -> None:
+    """Of sweeps without times, too: these would have a second between them."""
+    clouds(tmp_path, range(COUNT))
+    lines = [f"{k} {row}" for k, row in enumerate(rows(POSES[:, :3].reshape(COUNT, 12)))]
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    log = ArraysLog(tmp_path)
+    assert log.timestamps == list(range(COUNT)) and log.sweep(0).timestamp_ns is None and log.trajectory is None
+    assert np.allclose(log.poses, POSES)
 
 
 def test_clouds_of_a_second_sensor_are_said(tmp_path) -> None:

@@ -183,7 +183,7 @@ def test_a_log_that_cannot_be_opened_is_skipped(fleet, single, tmp_path):
     first = sorted(root.iterdir())[0]
     poses = first / "city_SE3_egovehicle.feather"
     whole = poses.read_bytes()
-    for spoil in (lambda: poses.write_bytes(whole[:100]), poses.unlink, poses.mkdir):
+    for spoil in (lambda: poses.write_bytes(whole[:100]), lambda: (poses.unlink(), poses.mkdir())):
         spoil()
         report = run(root, out)
         assert [name for name, _ in report["failures"]] == [first.name] and report["frames"]["failed_logs"] == 1

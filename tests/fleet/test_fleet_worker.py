@@ -27,6 +27,7 @@ from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.run import Counters, format_missing, format_report
 from cflow_torch.fleet.work import Worker
+from cflow_torch.windows.inspection import REPEATED
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
     assert failed.name == names[1] and f"none of the {count} points of pc0 is active" in failed.message
     assert [event.name for event in events if isinstance(event, Done)] == [names[i] for i in (0, 2, 3)]
     notes = [(event.name, event.message) for event in events if isinstance(event, Noted)]
-    assert notes[-1] == (names[3], "the next sweep has the same points")
+    assert notes[-1] == (names[3], REPEATED)
     assert any("the sensor moves" in text for _, text in notes), "the log is checked by the part of its first frame"
 
 

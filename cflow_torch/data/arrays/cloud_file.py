@@ -96,7 +96,12 @@ def small_arrays(path: Path) -> dict[str, Any]:
     """Read the arrays of an `.npz` file that may be a pose or its time: up to 16 numbers, as nested lists."""
     with file_errors(path, _hint(path)):
         arrays = _plain_arrays(read_bytes(path))
-    return {name: array.tolist() for name, array in arrays.items() if array.size <= 16 and array.dtype.kind in "fiu"}
+    return {name: array.tolist() for name, array in arrays.items() if _is_small(array) and array.dtype.kind in "fiu"}
+
+
+def _is_small(array: np.ndarray) -> bool:
+    """Test whether an array may be a pose or its time."""
+    return array.size <= 16
 
 
 def in_single(points: np.ndarray) -> np.ndarray:
@@ -294,8 +299,10 @@ def _array_columns(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _by_rows(array: np.ndarray) -> np.ndarray:
-    """Return an organised cloud, (H, W) or (H, W, C), with a row per point."""
+    """Return an organised cloud, (H, W) or (H, W, C), or a transposed one, (C, N), with a row per point."""
     num_axes = 1 if array.dtype.names is not None else 2
+    if array.ndim == num_axes == 2 and 3 <= len(array) <= _MOST_COLUMNS < array.shape[1]:
+        return array.T
     return array.reshape(-1, *array.shape[-1:][: num_axes - 1]) if array.ndim == num_axes + 1 else array
 
 
@@ -315,10 +322,11 @@ def _archive_columns(content: bytes) -> dict[str, np.ndarray]:
     if set(_AXES) <= set(arrays):
         return arrays
     tables = {name: array for name, array in arrays.items() if array.ndim == 2 and array.shape[1] >= 3}
-    named = [array for name, array in tables.items() if name in _CLOUD_KEYS] or list(tables.values())
+    named = [array for name, array in tables.items() if name in _CLOUD_KEYS]
+    named = named or [array for array in tables.values() if not _is_small(array)] or list(tables.values())
     if len(named) != 1:
         need = f"x, y, z, or one (N, 3+) array, named {_CLOUD_KEYS[0]} if there are several"
-        raise CFlowError(f"it has the arrays {shortened(arrays.keys())}; pass plain arrays {need}")
+        raise CFlowError(f"it has the arrays {shortened(list(arrays))}; pass plain arrays {need}")
     return {**_array_columns(named[0]), **arrays}
 
 

@@ -9,7 +9,15 @@ from typing import Mapping, Sequence
 import numpy as np
 
 from cflow_torch.data.arrays.stamps import nanoseconds_of_dates, nanoseconds_of_numbers
-from cflow_torch.data.arrays.tables import MATRIX, Table, as_decimals, parse_table, table_of, tables_of_values
+from cflow_torch.data.arrays.tables import (
+    COMMENTS,
+    MATRIX,
+    Table,
+    as_decimals,
+    parse_table,
+    table_of,
+    tables_of_values,
+)
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
@@ -21,6 +29,7 @@ from cflow_torch.types import CFlowError
 
 _POSITION, _ANGLES = ("x", "y", "z"), ("roll", "pitch", "yaw")
 _QUATERNION = ("qw", "qx", "qy", "qz")
+_ROTATIONS = {*MATRIX[0:3], *MATRIX[4:7], *MATRIX[8:11], *_QUATERNION, "q0", "q1", "q2", "q3"}  # not all are zero
 _TIMES = {"time", "sec", "nsec"}
 _TUM = ("time", *_POSITION, "qx", "qy", "qz", "qw")
 # What columns without names hold, by their number; the last row of a matrix is ignored.
@@ -44,7 +53,7 @@ def read_poses(path: PathLike) -> Trajectory:
             pitch yaw; 6 have no time. 3 numbers are x y yaw, if the vehicle drives where it heads. Four lines may have
             a matrix, below a line of three numbers (Open3D). Of a g2o graph, vertices are read. If a line before the
             numbers names the columns (timestamp, x, qw, ...), they may have any order, and roll, pitch and yaw may
-            replace the quaternion. Other columns, empty lines and lines that begin with `#` are ignored. Times:
+            replace the quaternion. Other columns, empty lines and comments (`COMMENTS`) are ignored. Times:
             `nanoseconds_of_numbers`.
 
     Convention: yaw turns x to y, pitch then z to x, roll then y to z. What is not named of z, roll and pitch is 0. The
@@ -126,7 +135,10 @@ def _poses_of_table(table: Table, path: Path) -> Trajectory:
             f"{path} has {words.shape[1]} numbers per line; poses have 12 (KITTI), 8 (TUM) or 16, or a first line with "
             "the names timestamp, x, y, z, qx, qy, qz, qw, or roll, pitch, yaw, in any order"
         )
-    is_known = np.isfinite(words.astype(np.float64)).all(axis=1)
+    numbers = words.astype(np.float64)
+    rotation = [column for role, column in roles.items() if role in _ROTATIONS]
+    is_known = np.isfinite(numbers).all(axis=1)
+    is_known &= not rotation or (numbers[:, rotation] != 0).any(axis=1)  # programs write zeros for lost poses
     if not is_known.any():
         raise CFlowError(f"{path} has no line of finite numbers")
     if not _TIMES.isdisjoint(roles):  # programs write a line twice; without times, lines repeat if the vehicle stands
@@ -236,7 +248,8 @@ def read_times(path: PathLike) -> np.ndarray:
 
 def parse_times(content: bytes, path: Path) -> np.ndarray:
     with file_errors(path):
-        lines = [line for line in content.decode("utf-8-sig").splitlines() if line.strip() and line.strip()[0] != "#"]
+        lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
+        lines = [line for line in lines if not line.startswith(COMMENTS)]
     dates = nanoseconds_of_dates(lines)
     if dates:
         return _ascending(path, np.array(dates, np.int64))

@@ -37,8 +37,8 @@ from cflow_torch.windows.returns import missing_returns
 
 _VIEWPOINT, _ARRAYS = "VIEWPOINT", "the arrays"  # sources of poses that come with the clouds
 _LEAST_NAMED = 0.5  # share of the sweeps whose numbers poses have, if poses have numbers
+_LEAST_REACH = 0.8  # part of a table after which the row of the last file is, unless the layout says so
 _LEAST_USUAL = 2 / 3  # share of steps between the numbers of files that are equal, or the numbers are irregular
-_LEAST_REACH = 0.8  # share of a table after which its last row is, if numbers of files are its rows
 
 
 class ArraysLog(Log):
@@ -79,6 +79,8 @@ class ArraysLog(Log):
     """
 
     has_raw_times: bool = True
+    # Whether numbers of files are rows of tables in this layout. Else the last number must be near the end of a table.
+    _numbers_are_rows = False
 
     def __init__(
         self,
@@ -225,8 +227,9 @@ class ArraysLog(Log):
         named = times_of_names([stem_of(path) for path in self.files])
         if named is not None:
             return named
-        if trajectory is not None and trajectory.times_ns is not None and len(trajectory.times_ns) == count:
-            return trajectory.times_ns.tolist()
+        times_ns = None if trajectory is None else trajectory.counted(None).times_ns
+        if times_ns is not None and len(times_ns) == count:
+            return times_ns.tolist()  # type: ignore[no-any-return]
         tables = find_tables(self.folder, self.files)[1] if times == "auto" else []
         file = only_one([table for table in tables if len(poses_text.read_times(table)) == count], self.folder, "times")
         self._note(f"the times of its sweeps are those of {file.name}" if file else "")
@@ -246,7 +249,7 @@ class ArraysLog(Log):
         numbered = dict(zip(map(_number_of, stems), range(len(stems))))
         rows = np.array([numbered.get(number, -1) for number in numbers])
         is_enough = (rows >= 0).mean() > (_LEAST_NAMED if len(stems) != len(self.files) else 1 - 1e-9)
-        if len(numbered) == len(stems) > 0 and is_enough and max(numbers) >= _LEAST_REACH * max(numbered):
+        if len(numbered) == len(stems) > 0 and is_enough and self._reaches(max(numbers), max(numbered)):
             return rows
         if len(row_of) != len(self.files) or len({re.sub(r"\d+", "", label) for label in labels}) > 1:
             return None
@@ -262,11 +265,16 @@ class ArraysLog(Log):
         if count == len(self.files) or labelled is not None:
             return np.arange(count) if labelled is None else labelled
         numbers = np.array([_number_of(stem_of(path)) % 10**9 for path in self.files])
-        fitting = [numbers - first for first in (0, 1) if (numbers >= first).all() and (numbers < first + count).all()]
-        if len(fitting) != 1 or len(set(numbers)) < len(numbers) or fitting[0].max() < _LEAST_REACH * count:
+        firsts = (0,) if self._numbers_are_rows else (0, 1)
+        fitting = [numbers - first for first in firsts if (numbers >= first).all() and (numbers < first + count).all()]
+        if len(fitting) != 1 or len(set(numbers)) < len(numbers) or not self._reaches(fitting[0].max(), count):
             return None
         self._note(f"it has {count} {what} for {len(self.files)} sweeps, so each takes that of its number")
         return fitting[0]
+
+    def _reaches(self, last: int, end: int) -> bool:
+        """Test whether the last number of a file may be a row of a table, by the end of the table."""
+        return self._numbers_are_rows or last >= _LEAST_REACH * end
 
     def _pose_per_sweep(self, trajectory: Trajectory, stamps: list[int] | None) -> np.ndarray:
         trajectory = trajectory.counted(stamps)
@@ -288,7 +296,7 @@ class ArraysLog(Log):
             is_known = np.isfinite(trajectory.poses[rows]).all(axis=(1, 2)) & (rows >= 0)
             if not is_known.all():
                 count = f"{(~is_known).sum()} of {len(rows)} sweeps"
-                self._note(f"{count} have no pose, or one of NaN, in {source} and are left out")
+                self._note(f"{count} have no pose, or one of NaN or zeros, in {source} and are left out")
             poses = trajectory.poses[rows][is_known]
         kept = np.flatnonzero(is_known)
         self.files, self.timestamps = [self.files[k] for k in kept], [self.timestamps[k] for k in kept]
@@ -301,7 +309,7 @@ class ArraysLog(Log):
         """Return the indices of files without times after which others are missing, by the numbers in their names."""
         steps = np.diff([_number_of(stem_of(path)) for path in self.files])
         usual = np.median(steps)
-        gaps = np.flatnonzero(steps > usual).tolist()
+        gaps = [gap for gap in np.flatnonzero(steps > usual).tolist() if gap not in self.gaps]
         if self._has_times or not gaps or steps.min() <= 0 or (steps == usual).mean() <= _LEAST_USUAL:
             return []
         first = self.files[gaps[0]].name

@@ -11,6 +11,7 @@ _UNITS = ((10**17, 1), (10**14, 10**3), (10**11, 10**6))  # sizes of unix times,
 _STEPS = ((5 * 10**6, 1), (5 * 10**3, 10**3), (5, 10**6))  # the same, by the step from one time to the next
 _FIRST_UNIX = 10**9  # seconds; smaller times have another start
 _DATE = re.compile(r"(?<!\d)(\d{4})\D?(\d\d)\D?(\d\d)\D(\d\d)\D?(\d\d)\D?(\d\d)(?:\D(\d+))?")
+_CLOCK = re.compile(r"(?<![\d:])(\d\d?):(\d\d):(\d\d)(?:[.,](\d+))?(?![\d:])")
 _STAMP = re.compile(r"(?<!\d)([1-9]\d{12}|[1-9]\d{15,17}|[1-8]\d{18})(?!\d)")  # no numbers with zeros in front
 # Seconds and a fraction: unix seconds anywhere in a name, or the only number of a name.
 _SECONDS = (re.compile(r"(?<!\d)(\d{9,10})[._](\d+)(?!\d)"), re.compile(r"^\D*(\d{1,10})\.(\d+)$"))
@@ -35,18 +36,21 @@ def nanoseconds_of_numbers(words: Sequence[str]) -> list[int]:
 def nanoseconds_of_dates(texts: Sequence[str]) -> list[int] | None:
     """Convert texts that contain a date such as 2011-09-26 13:02:25.594360375 to nanoseconds since 1970 (UTC).
 
-    Year to second have all digits, with one separator or none. None = a text contains no date.
+    Year to second have all digits, with one separator or none. Of a time without a date (13:02:25.594), we return the
+    nanoseconds since midnight. None = a text contains neither.
     """
-    matches = [_DATE.search(text) for text in texts]
     times = []
-    for match in matches:
-        if match is None:
+    for text in texts:
+        date = _DATE.search(text)
+        clock = _CLOCK.search(text) if date is None else None
+        if date is None and clock is None:
             return None
+        *numbers, fraction = date.groups() if date else (1970, 1, 1, *clock.groups())  # type: ignore[union-attr]
         try:
-            date = datetime(*map(int, match.groups()[:6]), tzinfo=timezone.utc)  # type: ignore[arg-type,misc]
+            time = datetime(*map(int, numbers), tzinfo=timezone.utc)  # type: ignore[arg-type,misc]
         except ValueError:
             return None
-        times.append(int((date - _EPOCH).total_seconds()) * 10**9 + int((match[7] or "0")[:9].ljust(9, "0")))
+        times.append(int((time - _EPOCH).total_seconds()) * 10**9 + int((fraction or "0")[:9].ljust(9, "0")))
     return times
 
 

@@ -13,12 +13,15 @@ from typing import Any, Iterator, NamedTuple, Sequence
 import numpy as np
 import yaml  # type: ignore[import-untyped]
 
+from cflow_torch.data.arrays.stamps import nanoseconds_of_dates
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
 from cflow_torch.data.paths import read_bytes
 
 _FEWEST_NUMBERS = 7  # of a pose
+COMMENTS = ("#", "%", "//")
+"""Beginnings of lines that are no rows."""
 MATRIX = tuple(f"m{k}" for k in range(12))
 """Names of the entries of the upper three rows of a matrix, row by row."""
 _VECTORS = {  # numbers in a list of a JSON file, and a role that the name of the list has -> endings of their names
@@ -39,18 +42,23 @@ class Table(NamedTuple):
 def parse_table(content: bytes, path: Path) -> Table:
     """Read the table in a text file.
 
-    Names are those of the last line before the numbers, also if it begins with "#". They are empty if this line does
-    not have one name for each column. Columns of texts are left out; one of distinct texts names the rows.
+    Names are those of the last line before the numbers, also if it is a comment (`COMMENTS`). They are empty if this
+    line does not have one name for each column. Columns of dates become seconds. Other columns of texts are left out;
+    one of distinct texts names the rows.
     """
     with file_errors(path, "every line must have the same number of numbers"):
         lines = [line.strip() for line in content.decode("utf-8-sig").splitlines() if line.strip()]
         lines = _poses_only(lines)
-        start = next((k for k, line in enumerate(lines) if _is_row(split_line(line))), len(lines))
-        names = re.split("[,;]", lines[start - 1].lstrip("#")) if start else []
-        names = names if len(names) > 1 or not start else lines[start - 1].lstrip("#").split()
-        words = np.array([split_line(line) for line in lines[start:] if line[0] != "#"], str)
-        if any(line[0] != "#" for line in lines[: max(start - 1, 0)]) or words.ndim != 2 or not start < len(lines):
+        plain = [line for line in lines if not line.startswith(COMMENTS)]
+        usual = len(split_line(plain[len(plain) // 2])) if plain else 0
+        start = next((k for k, line in enumerate(lines) if _is_row(split_line(line), usual)), len(lines))
+        header = lines[start - 1].lstrip("#%/") if start else ""
+        names = re.split("[,;]", header) if re.search("[,;]", header) else header.split()
+        rows = [split_line(line) for line in lines[start:] if not line.startswith(COMMENTS)]
+        has_text = not all(line.startswith(COMMENTS) for line in lines[: max(start - 1, 0)])
+        if has_text or len(set(map(len, rows))) != 1:
             raise ValueError("it is empty, or has text before its numbers" if start else "its lines differ in length")
+        words = np.array(list(map(_seconds_of_dates, zip(*rows))), str).T
         columns = [column for column, word in enumerate(words[0]) if is_number(word)]
         texts = [words[:, column].tolist() for column in range(words.shape[1]) if column not in columns]
         labels: list[str] = next((column for column in texts if len(set(column)) == len(column)), [])
@@ -58,6 +66,12 @@ def parse_table(content: bytes, path: Path) -> Table:
         words = words[:, columns]
         words.astype(np.float64)  # raises the error
     return Table(names, words, labels)
+
+
+def _seconds_of_dates(column: Sequence[str]) -> Sequence[str]:
+    """Return a column of times of day, with or without dates, as seconds with decimals; others as they are."""
+    times = nanoseconds_of_dates(column) if ":" in column[0] else None
+    return column if times is None else [f"{Decimal(time).scaleb(-9):f}" for time in times]
 
 
 def read_numbers(path: Path) -> np.ndarray:
@@ -183,13 +197,14 @@ def _text_of(value: Any) -> str:
 def split_line(line: str) -> list[str]:
     decimal = line.replace(",", ".") if ";" in line else line  # as some languages write numbers
     decimal = re.sub(r"[\[\]]", " ", decimal).strip()  # as NumPy prints matrices
+    decimal = re.sub(r"(\d[-/.]\d\d) (?=\d\d:)", r"\1T", decimal)  # a date and its time are one word
     return re.split(r"[\s,;]+", decimal.rstrip(",; "))
 
 
-def _is_row(words: Sequence[str]) -> bool:
-    """Test whether words are a row of numbers, or a pose with a few texts."""
+def _is_row(words: Sequence[str], usual: int) -> bool:
+    """Test whether words are as many as usual in a table, and a row of numbers, or a pose with a few texts."""
     num_numbers = sum(map(is_number, words))
-    return num_numbers == len(words) or num_numbers >= _FEWEST_NUMBERS
+    return len(words) == usual and (num_numbers == len(words) or num_numbers >= _FEWEST_NUMBERS)
 
 
 def is_number(word: str) -> bool:

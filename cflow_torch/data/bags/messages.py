@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Tuple
 
 import numpy as np
@@ -119,6 +120,11 @@ class Frames:
 
 def sample(time_ns: int, position: Any, rotation: Any) -> Sample:
     return (time_ns, position.x, position.y, position.z, rotation.w, rotation.x, rotation.y, rotation.z)
+
+
+def is_pose(row: Sample) -> bool:
+    """Test whether a sample is a pose: programs write NaN or zeros for one that they lost."""
+    return all(map(math.isfinite, row)) and any(row[4:])
 
 
 def sorted_poses(samples: list[Sample], what: str) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.folder import find_poses_near
 from cflow_torch.data.arrays.poses_text import read_poses
-from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, sample, sorted_poses
+from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, is_pose, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import search
 from cflow_torch.data.log import Log
@@ -48,6 +48,7 @@ _ANOTHER_CLOCK = 1_000_000_000  # nanoseconds; clocks of one computer differ by 
 _LARGEST_DELAY = 500_000_000  # nanoseconds by which messages arrive later than others
 _EARLY = 100_000_000  # nanoseconds; a message that arrives so long before its time has another clock than the recorder
 _NEED = "bags need rosbags (extra bags): pip install rosbags"
+_LOST = "{} that are NaN or zeros are left out"
 _BASE = "base_link"  # the vehicle, by ROS's REP 105: x forward, y left, z up
 
 
@@ -259,7 +260,7 @@ class BagLog(Log):
             if len(moving) == 1 and frames.are_joined(moving[0], lidar):  # an odometry that publishes registered clouds
                 self._note(f"its clouds are in {lidar}, the frame of the world; we move them to {moving[0]}")
                 return moving[0]
-        named = [name for name in (_BASE, *self._child.values()) if name and name != lidar]
+        named = [name for name in (_BASE, *self._child.values()) if name and not frames.are_joined(name, lidar)]
         for name in named if self._mount is None else []:
             is_in_tf = len(frames.change_times(name)) > 1
             if is_in_tf or name in self._child.values():
@@ -288,25 +289,45 @@ class BagLog(Log):
         for connection, arrived, data in reader.messages(wanted):
             message = reader.deserialize(data, connection.msgtype)
             if connection.topic == self.topic:
-                stamps.append((_stamp(message, 0), arrived))
-                self._lidar = self._lidar or message.header.frame_id.lstrip("/")
+                frame = _frame_of(message)
+                self._lidar = self._lidar or frame
+                if frame == self._lidar:
+                    stamps.append((_stamp(message, 0), arrived))
+                else:
+                    self._note(f"its clouds are of several sensors: we read those in {self._lidar}, not in {frame}")
             elif connection.msgtype in _TF_TYPES:
-                for link in message.transforms:
-                    self._pose_delays.append(arrived - _stamp(link, arrived))
-                    child = link.child_frame_id.lstrip("/")  # ROS 1 allows a leading slash
-                    parents[child] = link.header.frame_id.lstrip("/")
-                    links.setdefault(child, []).append(_pose_of(link, arrived))
+                self._add_transforms(message, arrived, parents, links)
             else:
-                poses = _driven(message, arrived)
-                if not poses:
-                    continue
-                if hasattr(message, "poses"):
-                    tracks[connection.topic] = []  # each message repeats the path so far
-                tracks.setdefault(connection.topic, []).extend(poses)
-                self._pose_delays.append(arrived - poses[-1][0])
-                self._child[connection.topic] = getattr(message, "child_frame_id", "").lstrip("/")
+                self._add_poses(connection.topic, message, arrived, tracks)
         self._frames = Frames(parents, links)
         return self._arrivals(stamps), tracks
+
+    def _add_transforms(
+        self, message: Any, arrived: int, parents: dict[str, str], links: dict[str, list[Sample]]
+    ) -> None:
+        """Add the transforms of a message to the parents and the samples of each frame."""
+        for link in message.transforms:
+            pose = _pose_of(link, arrived)
+            if not is_pose(pose):
+                self._note(_LOST.format("transforms"))
+                continue
+            self._pose_delays.append(arrived - _stamp(link, arrived))
+            child = link.child_frame_id.lstrip("/")
+            parents[child] = _frame_of(link)
+            links.setdefault(child, []).append(pose)
+
+    def _add_poses(self, topic: str, message: Any, arrived: int, tracks: dict[str, list[Sample]]) -> None:
+        """Add the poses of a message to those of its topic."""
+        driven = _driven(message, arrived)
+        poses = list(filter(is_pose, driven))
+        self._note(_LOST.format("poses") if len(poses) < len(driven) else "")
+        if not poses:
+            return
+        if hasattr(message, "poses"):
+            tracks[topic] = []  # each message repeats the path so far
+        tracks.setdefault(topic, []).extend(poses)
+        self._pose_delays.append(arrived - int(poses[-1][0]))
+        self._child[topic] = getattr(message, "child_frame_id", "").lstrip("/")
 
     def _arrivals(self, stamps: list[tuple[int, int]]) -> dict[int, int]:
         """Return the time of each cloud and its arrival, from header stamps and arrivals. We say if stamps repeat."""
@@ -374,7 +395,8 @@ class BagLog(Log):
             clouds = [connection for connection in reader.connections if connection.topic == self.topic]
             for connection, _, data in reader.messages(clouds, start=arrived, stop=arrived + 1):
                 message = reader.deserialize(data, connection.msgtype)
-                if self._use_arrival or _stamp(message, arrived) + self._shift == time:
+                is_at_time = self._use_arrival or _stamp(message, arrived) + self._shift == time
+                if is_at_time and _frame_of(message) == self._lidar:
                     return cloud_columns(message)
             raise CFlowError("the cloud is gone; was the bag changed?")
 
@@ -401,6 +423,10 @@ def _stamp(message: Any, arrived: int) -> int:
     """Return the time of a header in nanoseconds; if it is 0, the time of arrival."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or arrived
+
+
+def _frame_of(message: Any) -> str:
+    return str(message.header.frame_id.lstrip("/"))  # ROS 1 allows a leading slash
 
 
 def _pose_of(message: Any, arrived: int) -> Sample:

@@ -14,14 +14,17 @@ from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.frames import StoredMotion, harness_motion, is_argoverse2, recognized_extrinsics
 from cflow_torch.data.log import FlowLabels, Log
 from cflow_torch.data.paths import PathLike, as_path, is_timestamp, source_for_random_access
-from cflow_torch.errors import CFlowError, import_optional
-from cflow_torch.transforms import rigid_transform
+from cflow_torch.data.point_times import find_times
+from cflow_torch.errors import CFlowError, MissingFile, import_optional
+from cflow_torch.transforms import poses_from_quaternions, rigid_transform
 from cflow_torch.types import Sweep
 
 # Time stamps count from 1970 or 1980: smaller ones are microseconds (16 digits), others nanoseconds (18 or 19).
 _FIRST_NANOSECOND = 10**17
 _FIRST_MICROSECOND = 10**14
 _LARGEST_CATEGORY = 255
+_MOST_COLUMNS = 64  # of a sweep with fewer points than columns; more are those of a transposed one
+_LONGEST_LAG = 10.0  # seconds from a sweep to its points
 EXTRINSIC = "ego_T_lidar"  # attribute of a scene that `write_hdf5_scene` stores
 
 
@@ -97,8 +100,21 @@ class HDF5Log(Log):
             pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
         nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
         time = None if self.timestamps[-1] < _FIRST_MICROSECOND else nanoseconds  # None: the groups are numbered
-        times = self._values(index, "lidar_dt", rows, np.float32)
-        return Sweep(points[:, :3], is_ground, pose, time, times)
+        if pose is not None and not np.isfinite(pose).all():
+            raise MissingFile(f"{self.file}: the pose of sweep {timestamp} is not finite")
+        return Sweep(points[:, :3], is_ground, pose, time, self._point_times(index, time, points))
+
+    def _point_times(self, index: int, time: int | None, points: np.ndarray) -> np.ndarray | None:
+        """Read the (N,) seconds from the sweep to its points; those of another unit or clock are converted."""
+        times = self._values(index, "lidar_dt", self._rows(index))
+        if times is None or np.abs(times).max(initial=0) <= _LONGEST_LAG:
+            return times if times is None else times.astype(np.float32)
+        period = None if time is None else float(np.median(np.diff(self.timestamps))) * 1e-9
+        found = find_times({"time": times}, time, period, points, self._note)
+        if found is None or found.seconds is None:
+            return None
+        points[found.is_stray] = np.nan
+        return np.where(found.is_stray, 0, found.seconds)
 
     def labels(self, index: int) -> FlowLabels | None:
         """Read the truth of the pair (index, index + 1); None if the sweep has no `flow`."""
@@ -154,8 +170,11 @@ class HDF5Log(Log):
             return stored @ self.ego_T_lidar
 
     def _matrix(self, index: int, key: str, dtype: Any) -> np.ndarray | None:
-        """Read a rigid transform, (4, 4); a file may have only its upper three rows."""
+        """Read a rigid transform, (4, 4); a file may have only its upper three rows, or x y z qx qy qz qw."""
         matrix = self._values(index, key, None, dtype)
+        if matrix is not None and matrix.shape == (7,):
+            where = f"{self.file}: {key} of sweep {self.timestamps[index]}"
+            return poses_from_quaternions(matrix[:3], matrix[[6, 3, 4, 5]], lambda _: where)[0]
         if matrix is not None and matrix.shape == (3, 4):
             return np.concatenate([matrix, np.eye(4, dtype=matrix.dtype)[3:]])
         is_square = matrix is None or matrix.shape == (4, 4)
@@ -203,7 +222,7 @@ class HDF5Log(Log):
             raise CFlowError(
                 f"{where} has no lidar, its (N, 3+) points; it has {', '.join(self.keys(index)) or 'nothing'}"
             )
-        if len(stored.shape) != 2 or stored.shape[1] < 3:
+        if len(stored.shape) != 2 or not 3 <= stored.shape[1] <= max(_MOST_COLUMNS, stored.shape[0]):
             raise CFlowError(f"{where}: lidar has shape {stored.shape}, not (N, 3+)")
         return (stored.shape[0],)
 

@@ -48,7 +48,8 @@ class KITTILog(ArraysLog):
         - Points are in the frame of the LiDAR: x ahead, y left, z up, 1.73 m above the road. There are no other frames.
         - Raw drives and the tracking set have poses from OXTS (GPS and IMU), moved to the LiDAR by the calibration
           (calib_imu_to_velo.txt in the folder of the drive or of its day; calib/NNNN.txt). Without calibration or with
-          fewer measurements than sweeps, we warn, and there are no poses.
+          measurements for less than half of the sweeps, we warn, and there are no poses. Other sweeps without one are
+          left out, and we say so.
         - KITTI-360 has raw drives in `data_3d_raw`, and poses of the IMU in `data_poses/<drive>/poses.txt` (or of the
           camera in cam0_to_world.txt), moved to the LiDAR by `calibration`. Sweeps without a pose are left out, and we
           say so.
@@ -61,6 +62,8 @@ class KITTILog(ArraysLog):
         - Truth of SemanticKITTI: points of the classes 251 to 259 move, by an unknown flow, so they are not valid, see
           `moving`. All other labelled points are static.
     """
+
+    _numbers_are_rows = True
 
     def __init__(self, source: KITTIDrive | PathLike, poses: Any = "auto") -> None:
         if not isinstance(source, KITTIDrive):
@@ -82,13 +85,12 @@ class KITTILog(ArraysLog):
         self._frames = [int(file.stem) for file in self.files]
         if source.layout == "raw":
             self._read_times()
-        if is_auto and _kitti360(root) is not None:
-            trajectory = self._poses_of_kitti360()
-            if trajectory is not None:
-                self.poses = self._pose_per_sweep(trajectory, list(self.timestamps) if self._has_times else None)
-                self._frames = [int(file.stem) for file in self.files]
-        elif is_auto and not is_sequence:
-            self.poses = self._poses_from_oxts()
+        trajectory = None
+        if is_auto and not is_sequence:
+            trajectory = self._poses_of_oxts() if _kitti360(root) is None else self._poses_of_kitti360()
+        if trajectory is not None:
+            self.poses = self._pose_per_sweep(trajectory, list(self.timestamps) if self._has_times else None)
+            self._frames = [int(file.stem) for file in self.files]
 
     def _gaps_in_numbers(self) -> list[int]:
         return [] if self.drive.layout == "raw" else super()._gaps_in_numbers()  # raw drives have times
@@ -152,35 +154,34 @@ class KITTILog(ArraysLog):
             self.timestamps = read_times(file)[self._frames].tolist()
         self._has_times = True
 
-    def _poses_from_oxts(self) -> np.ndarray | None:
-        """Return the poses of the LiDAR; None, with a warning, if a file that they need is missing."""
+    def _poses_of_oxts(self) -> Trajectory | None:
+        """Return the poses of the LiDAR, by number of the sweep; None, with a warning, if a file is missing.
+
+        Raw drives may lack some measurements: then their sweeps have no pose.
+        """
         root, name = self.drive.root, self.drive.clouds.name
         is_raw = self.drive.layout == "raw"
         folder = root / "oxts" / "data" if is_raw else root / "oxts"
         wanted = [f"{file.stem}.txt" for file in self.files] if is_raw else [f"{name}.txt"]
         with remote_errors(root):
             known = {file.name for file in folder.glob("*.txt")}
-        lost = [each for each in wanted if each not in known]
+        found = [each for each in wanted if each in known]
         calibration = self._calibration("imu_to_velo")
-        if lost or calibration is None:
+        if 2 * len(found) <= len(wanted) or calibration is None:
             what = f"there is no oxts/{name}.txt"
             if calibration is None:
                 what = "calib_imu_to_velo.txt of its day is missing" if is_raw else f"calib/{name}.txt is missing"
             elif is_raw:
-                what = f"oxts/data has {len(wanted) - len(lost)} measurements for {len(wanted)} sweeps"
+                what = f"oxts/data has {len(found)} measurements for {len(wanted)} sweeps"
             where = f"{root}{' or the folder of the day' if is_raw else ''}"
             self._note(f"{what}, so it has no poses. Download it to {where}, or set data.odometry=true")
             return None
-        table = np.concatenate([read_numbers(folder / each) for each in wanted])
-        if not is_raw and len(table) <= max(self._frames):
-            raise CFlowError(
-                f"{folder / wanted[0]} has {len(table)} lines; sweep {max(self._frames)} needs its own; copy it again"
-            )
-        poses = poses_from_oxts(table, folder / wanted[0])
-        poses = poses if is_raw else poses[self._frames]
+        table = np.concatenate([read_numbers(folder / each) for each in found])
+        poses = poses_from_oxts(table, folder / found[0])
         names = ("imu_to_velo.R imu_to_velo.T", "Tr_imu_velo", "Tr_imu_to_velo")
         T_world_lidar = poses @ np.linalg.inv(transform(calibration, root, *names))
-        return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar  # type: ignore[no-any-return]
+        labels = found if is_raw else [f"{frame:06d}" for frame in range(len(table))]
+        return Trajectory(np.linalg.inv(T_world_lidar[0]) @ T_world_lidar, None, False, str(folder), labels)
 
     def _poses_of_kitti360(self) -> Trajectory | None:
         """Return the poses of the LiDAR, by number of the sweep; None, with a warning, if a file is missing."""
