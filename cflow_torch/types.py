@@ -182,9 +182,18 @@ def check_sweep(names: Sequence[str], points: Any, is_ground: Any, pose: Any, po
     if point_times is not None:
         wanted = f"({rows},) floats, seconds after the time stamp of the sweep, one per point"
         check_array(point_times, of_times, (rows,), "f", wanted)
-    if pose is not None and np.shape(pose) != (4, 4):
-        wanted = f"give one (4, 4) rigid transform{last_row(np.shape(pose))}"
-        raise CFlowError(f"{of_pose} has shape {np.shape(pose)}: {wanted}")
+    if pose is not None:
+        _check_pose_shape(pose, of_pose)
+
+
+def _check_pose_shape(pose: Any, name: str) -> None:
+    wanted = "give one (4, 4) rigid transform"
+    try:
+        shape = np.shape(pose)
+    except ValueError:  # parts of several shapes, such as (R, t)
+        raise CFlowError(f"{name} is {type(pose).__name__}: {wanted}") from None
+    if shape != (4, 4):
+        raise CFlowError(f"{name} has shape {shape}: {wanted}{last_row(shape)}")
 
 
 @dataclass(frozen=True)
@@ -385,6 +394,8 @@ class FlowResult:
             )
         if not sweep_interval > 0:
             raise CFlowError(f"sweep_interval={sweep_interval}: give the seconds between two sweeps, for example 0.1")
+        if not 0 <= min_moving <= 1:
+            raise CFlowError(f"min_moving={min_moving}: give a probability from 0 (keep all) to 1")
         points = points.points if isinstance(points, Sweep) else points
         values = self.numpy()
         clusters = _Clusters.of(as_numpy(self.cluster_id))

@@ -39,6 +39,7 @@ EYE, SWEEPS = np.eye(4), {"pc0": Sweep(P0), "pc1": Sweep(P1)}
         ({**SWEEPS, "history": [P1]}, "history: give a list of cflow_torch.Sweep"),
         ({**SWEEPS, "future": Sweep(P1), "preset": "offline"}, "future: give a list of cflow_torch.Sweep"),
         ({"T_ego1_ego0": EYE[None]}, r"T_ego1_ego0 has shape \(1, 4, 4\)"),
+        ({"T_ego1_ego0": (np.eye(3), np.zeros(3))}, r"T_ego1_ego0 is tuple: give one \(4, 4\)"),
         ({"T_ego1_ego0": np.diag([1, 1, -1, 1.0])}, "T_ego1_ego0 is not rigid"),
         ({"pc0": np.repeat(P0, 10, 0).T}, r"pc0 has shape \(3, 500\): .* give its transpose"),
         ({"preset": "defualt"}, r"preset='defualt' \(did you mean default\?\)"),

@@ -7,14 +7,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups
+from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups, pose_of
 from cflow_torch.applications.track_state import TrackStates
 from cflow_torch.ops.indices import concat_ranges, lookup, unique_pairs
+from cflow_torch.types import Sweep
 
 _MIN_OVERLAP = 0.1  # least intersection over union of the voxels of two groups that match
 _MIN_CLAIM = 0.5  # a track of N points claims a group if its box holds at least 0.5 N points of the group
 MIN_STOPPED_SHARE = 0.3  # a track of N points has stopped if its box holds at least 0.3 N static points
 _MARGIN = 0.2  # metres, added to length, width and height of these boxes
+_ORIGIN_INSIDE = 0.5  # metres, at least, from the origin of a vehicle to its sides
 VOXELS = (0.3, 0.6, 1.2)  # metres, sides; sparse groups share only large voxels with the next sweep
 _HEIGHT = 3.0  # ratio of a voxel's height to its side: the beams hit an object at different heights in each sweep
 
@@ -34,6 +36,23 @@ def regroup(groups: MovingGroups, tracks: TrackStates) -> MovingGroups:
     known = tracks.take(tracks.is_confirmed)
     box = box_of_point(groups.point, known.box, known.size + _MARGIN, known.heading)
     return _divide(_make_pieces_static(groups, box, len(known.id)), box, known.num_points)
+
+
+def of_own_vehicle(groups: MovingGroups, sweep: Sweep) -> Tensor:
+    """Tell which points of a sweep belong to moving groups that are returns of its own vehicle, (M,) bool.
+
+    The origin of the vehicle is inside of it, and cannot be inside another object. Without a pose it is unknown.
+    """
+    if sweep.pose is None:
+        return torch.zeros_like(groups.moves)
+    flow = groups.mean(groups.step)
+    heading = torch.atan2(flow[:, 1], flow[:, 0])
+    centre, size = enclosing_boxes(*groups.moving, heading)
+    x, y, _ = (centre.new_tensor(pose_of(sweep)[:3, 3]) - centre).unbind(1)
+    along, across = rotate_about_z(x, y, -heading)
+    reach = size / 2 + _ORIGIN_INSIDE
+    is_own = (along.abs() <= reach[:, 0]) & (across.abs() <= reach[:, 1])
+    return lookup(is_own, torch.where(groups.moves, groups.group, len(is_own)), missing=False)
 
 
 def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:

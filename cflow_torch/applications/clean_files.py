@@ -14,6 +14,7 @@ from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, write_side
 from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
+from cflow_torch.data.paths import GZ
 from cflow_torch.types import CFlowError
 from cflow_torch.windows.conventions import OF_POINTS, WORLD
 
@@ -41,7 +42,7 @@ def write_clean_log(clean: CleanLog, log: Log, root: Path, suffix: str | None = 
         clean: the clean log of `log`.
         log: the drive.
         root: parent folder, created if it does not exist.
-        suffix: suffix of the clouds; None = that of the log's own clouds, `.npy` if it is not a folder of clouds.
+        suffix: suffix of the clouds; None = `own_suffix`.
 
     Convention: a mask has (N,) bool for the points of the sweep of `log`, True = not in the clean cloud. If the log is
         a folder of clouds with the same suffix, clouds keep their names, columns, types and VIEWPOINT, and the points
@@ -79,9 +80,15 @@ def write_clean_log(clean: CleanLog, log: Log, root: Path, suffix: str | None = 
 
 
 def own_suffix(log: Log) -> str:
-    """Return the suffix of the log's own clouds; `.npy` if it is not a folder of clouds, or if we only read them."""
+    """Return the suffix of the log's own clouds, without `.gz`.
+
+    It is `.npy` if the log is not a folder of clouds, or if we do not write their format, such as `.csv`.
+    """
     own = log.unwrapped
-    suffix = own.files[0].suffix if isinstance(own, ArraysLog) else ".npy"
+    if not isinstance(own, ArraysLog):
+        return ".npy"
+    file = own.files[0]
+    suffix = file.with_suffix("").suffix if file.suffix.lower() == GZ else file.suffix
     return suffix if suffix.lower() in SUFFIXES else ".npy"
 
 
@@ -104,8 +111,9 @@ def stored_masks(folder: Path, log: Log) -> Callable[[int], np.ndarray]:
 def _keeps_form(log: Log, suffix: str) -> bool:
     """Test whether the numbers of points in the files of a folder of clouds can stay as they are."""
     own = log.unwrapped
-    has_numbers = isinstance(own, ArraysLog) and np.array_equal(own.ego_T_lidar, np.eye(4))
-    return has_numbers and own_suffix(log).lower() == suffix.lower() and set(OF_POINTS).isdisjoint(log.readings)
+    if not isinstance(own, ArraysLog) or own.files[0].suffix.lower() != suffix.lower():
+        return False
+    return np.array_equal(own.ego_T_lidar, np.eye(4)) and set(OF_POINTS).isdisjoint(log.readings)
 
 
 def _viewpoint(log: Log, suffix: str) -> str | None:

@@ -26,6 +26,7 @@ CLASSES_OF_READER = {
 CLASSES = CLASSES_OF_READER["kitti"]
 """Classes for logs of other data sets."""
 _DEFORMABLE = ("pedestrian", "cyclist")  # classes of tracks
+_PER_KEY_FRAME = 5  # frames of 10 Hz, from one key frame of nuScenes to the next
 
 
 def write_drivestudio(
@@ -33,13 +34,15 @@ def write_drivestudio(
 ) -> None:
     """Write `folder/instances_info.json` and `folder/frame_instances.json`.
 
-    The first has, for each track, the sweeps in which it is seen, `T_world_box` (4, 4) and length, width, height in
-    metres. The second has the tracks of each sweep of the log, and none for the last one.
+    The first has, for each track, the frames in which it is seen, `T_world_box` (4, 4) and length, width, height in
+    metres. The second has the tracks of each frame, and none for the last one.
 
     Args:
         folder: created if it does not exist. DriveStudio reads `<scene>/instances`.
         table: tracks, see `track`.
-        log: the drive. Frames are numbered by its sweeps, and boxes are in the world of its poses.
+        log: the drive. Frames are its sweeps, and boxes are in the world of its poses. In a scene of nuScenes, frames
+            are its key frames and four times between each two of them, as DriveStudio prepares it at 10 Hz
+            (`interpolate_N=4`). Each has the boxes of the sweep that is nearest in time.
         class_name: class of the objects. DriveStudio chooses the kind of model by it.
         deformable_class: class of pedestrians and cyclists; None = `class_name`. We do not use a class of pedestrians,
             for which DriveStudio needs poses of their bodies.
@@ -48,20 +51,37 @@ def write_drivestudio(
         id of the track. A box has x along its length, y to the left and z up.
     """
     folder = as_path(folder)
-    ids, instance = np.unique(table["id"], return_inverse=True)
+    sweep_of_frame = _sweep_of_frames(log)
+    frame, row = np.nonzero(sweep_of_frame[:, None] == table["sweep"])
+    ids, instance = np.unique(table["id"][row], return_inverse=True)
     boxes = upright_poses(vectors(table, ("heading", *CENTRE)))
     sizes = vectors(table, SIZE)
     infos: dict[str, Any] = {}
     for number, track_id in enumerate(ids.tolist()):
-        rows = np.flatnonzero(instance == number)
-        annotations = {
-            "frame_idx": table["sweep"][rows].tolist(),
-            "obj_to_world": boxes[rows].tolist(),
-            "box_size": sizes[rows].tolist(),
-        }
+        is_here = instance == number
+        rows = row[is_here]
         is_deformable = class_of(table, int(rows[0])) in _DEFORMABLE
-        name = deformable_class if is_deformable and deformable_class is not None else class_name
-        infos[str(number)] = {"id": str(track_id), "class_name": name, "frame_annotations": annotations}
-    frames = {str(sweep): instance[table["sweep"] == sweep].tolist() for sweep in range(len(log.timestamps))}
+        infos[str(number)] = {
+            "id": str(track_id),
+            "class_name": deformable_class if is_deformable and deformable_class is not None else class_name,
+            "frame_annotations": {
+                "frame_idx": frame[is_here].tolist(),
+                "obj_to_world": boxes[rows].tolist(),
+                "box_size": sizes[rows].tolist(),
+            },
+        }
+    frames = {str(number): instance[frame == number].tolist() for number in range(len(sweep_of_frame))}
     write_json(folder / FRAMES_FILE, frames)
     write_json(folder / INSTANCES_FILE, infos)
+
+
+def _sweep_of_frames(log: Log) -> np.ndarray:
+    """Return the sweep of each frame of DriveStudio, (F,) int64."""
+    is_key_frame = np.array([token is not None for token in log.sample_tokens])
+    if is_key_frame.all():
+        return np.arange(len(is_key_frame))
+    times = np.array(log.timestamps)
+    key_times = times[is_key_frame]
+    position = np.arange(_PER_KEY_FRAME * (len(key_times) - 1) + 1) / _PER_KEY_FRAME  # in key frames
+    frame_times = np.interp(position, np.arange(len(key_times)), key_times)
+    return np.abs(times - frame_times[:, None]).argmin(axis=1)

@@ -7,13 +7,14 @@ from typing import Any, Iterable, Sequence
 
 import numpy as np
 
-from cflow_torch.applications.moving_groups import pose_of
+from cflow_torch.applications.association import of_own_vehicle
+from cflow_torch.applications.moving_groups import MovingGroups, pose_of
 from cflow_torch.applications.track_table import Table, box_corners, boxes_in_sweeps
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
-from cflow_torch.types import SIZE, VELOCITY, CFlowError, FlowResult, as_numpy, vectors
+from cflow_torch.types import SIZE, VELOCITY, CFlowError, FlowResult, Window, as_numpy, vectors
 
 DYNAMIC, STATIC = 255, 0  # values of pixels
 _RADIUS = 0.15  # metres around a moving point
@@ -102,7 +103,9 @@ def _moving_points(log: Log, index: int, result: FlowResult) -> tuple[np.ndarray
     if len(points) != len(result.residual_flow):
         rows = len(result.residual_flow)
         raise CFlowError(f"sweep {index} has {len(points)} points, but its flow {rows} rows: give both of one log")
+    groups = MovingGroups.of(Window(sweep, after), result)
     moves = as_numpy(result.is_moving) & np.isfinite(points).all(axis=1)
+    moves[as_numpy(groups.row[of_own_vehicle(groups, sweep)])] = False
     rotation = pose_of(sweep)[:3, :3].T @ pose_of(after)[:3, :3]  # from the axes of t+1 to those of t
     flow = as_numpy(result.residual_flow, np.float64)[moves] @ rotation.T
     seconds = 0.1

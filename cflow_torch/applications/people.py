@@ -28,23 +28,22 @@ _LEAST_SWEEPS = 0.5  # share of the sweeps of the group in which a person is see
 
 def divide_people(sweeps: Sequence[SweepTracks], table: Table) -> bool:
     """Give each person of a group a track. `table` has the boxes of the groups. Returns whether a group was divided."""
-    row_of = {(sweep, number): row for row, (sweep, number) in enumerate(zip(table["sweep"], table["id"]))}
     next_id = 1 + max((int(each.points.id.max(initial=-1)) for each in sweeps), default=-1)
     is_divided = False
     for number in np.unique(table["id"]).tolist():
         rows = np.flatnonzero(table["id"] == number)
         if np.median(np.hypot(table["vx"][rows], table["vy"][rows])) >= RUNNING:
             continue
-        seen = [each for each in sweeps if (each.points.sweep, number) in row_of and number in each.points.id]
-        points = [_in_box(each, table, row_of[each.points.sweep, number]) for each in seen]
-        sweep = torch.arange(len(seen)).repeat_interleave(torch.tensor([len(each) for each in points]))
-        person = people(torch.cat(points), sweep)
-        others = int(person.max())
+        row_of_sweep = dict(zip(table["sweep"][rows].tolist(), rows.tolist()))
+        seen = [each for each in sweeps if each.points.sweep in row_of_sweep and number in each.points.id]
+        person = _people_of_track([_in_box(each, table, row_of_sweep[each.points.sweep]) for each in seen])
+        others = max(int(each.max()) for each in person)
+        has_strays = any(int(each.min()) < 0 for each in person)
         is_on_foot = table["class"][rows[0]] in ("pedestrian", "cyclist")
-        if others > 0 and person.min() >= 0 or is_on_foot and person.min() < 0:
+        if others > 0 and not has_strays or is_on_foot and has_strays:
             ids = np.array([number, *range(next_id, next_id + others), -1])  # of person 0, 1, ...; of nobody
-            for index, each in enumerate(seen):
-                each.divide(number, ids[person[sweep == index].numpy()])
+            for each, of_points in zip(seen, person):
+                each.divide(number, ids[of_points.numpy()])
             next_id += others
             is_divided = True
     return is_divided
@@ -55,6 +54,13 @@ def _in_box(sweep: SweepTracks, table: Table, row: int) -> Tensor:
     position, _ = sweep.points.of_track(int(table["id"][row]))
     offset = position - [table[axis][row] for axis in CENTRE]
     return turned(torch.from_numpy(offset), torch.full((len(offset),), -table["heading"][row], dtype=torch.float64))
+
+
+def _people_of_track(points: Sequence[Tensor]) -> Sequence[Tensor]:
+    """Tell the people apart in the points of each sweep, see `people`."""
+    counts = [len(each) for each in points]
+    sweep = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+    return people(torch.cat(list(points)), sweep).split(counts)
 
 
 def people(points: Tensor, sweep: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, regroup
+from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, of_own_vehicle, regroup
 from cflow_torch.applications.completion import TrackedPoints, complete
 from cflow_torch.applications.floor import UNKNOWN_FLOOR, Floor
 from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
@@ -125,6 +125,7 @@ class Tracker:
         self.times = self._times(sweeps)
         self.floor = Floor.of(sweeps.pc0)
         groups = MovingGroups.of(sweeps, result)
+        groups = groups.divide(torch.where(of_own_vehicle(groups, sweeps.pc0), -1, 0))
         tracks, points = self._predict(self.times, groups.point.device)
         groups = regroup(groups, tracks)
         matches = match(tracks, points.position, points.track, groups)
@@ -140,11 +141,15 @@ class Tracker:
         step = tracks.motion.velocity * self.times.interval
         step[track_of_group] = flow
         points = _missing_points(points, tracks, step).followed_by(_seen_points(groups, track_of_point, step))
-        is_kept = tracks.missed <= _MAX_MISSED
-        self._tracks = tracks._replace(box=tracks.box + step, path=tracks.path + step).take(is_kept)
-        self._points = points.renumber(torch.where(is_kept, is_kept.cumsum(0) - 1, -1))
+        self._keep(tracks._replace(box=tracks.box + step, path=tracks.path + step), points)
         self._num_sweeps += 1
         return Tracked(table, track_id.cpu().numpy())
+
+    def _keep(self, tracks: TrackStates, points: _TrackPoints) -> None:
+        """Keep the tracks that were seen lately, and their points, for the next sweep."""
+        is_kept = tracks.missed <= _MAX_MISSED
+        self._tracks = tracks.take(is_kept)
+        self._points = points.renumber(torch.where(is_kept, is_kept.cumsum(0) - 1, -1))
 
     def _times(self, sweeps: Window) -> Times:
         """Return the times of the pair t, t+1, and note them for the next one."""
@@ -356,7 +361,13 @@ def track_points(
         log = CachedLog(log, model.config.num_sweeps)
         results = enumerate(model([sweeps])[0] for sweeps in windows(log, model.config.num_history))
     tracker = LogTracker(CachedLog(log, 2), sweep_interval)
-    for index, result in results:
+    for pair in results:
+        if not (isinstance(pair, tuple) and len(pair) == 2):
+            raise CFlowError(
+                f"results holds {type(pair).__name__}: give pairs (index of the sweep, its flow), such as "
+                "enumerate(results)"
+            )
+        index, result = pair
         tracker.push(index, result)
     return tracker.table(), tracker.points
 

@@ -121,7 +121,7 @@ def _how_to_read(log: Log, suffix: str | None) -> str:
     own = log.unwrapped
     if (suffix or own_suffix(log)).lower() != ".bin":
         return ""
-    if own_suffix(log).lower() == ".bin" and isinstance(own, ArraysLog) and own.bin_layout is not None:
+    if isinstance(own, ArraysLog) and own.files[0].suffix.lower() == ".bin" and own.bin_layout is not None:
         columns = own.bin_layout.columns
     else:
         columns = max(3 + len(log.columns(0)), KITTI_COLUMNS)

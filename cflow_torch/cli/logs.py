@@ -16,12 +16,15 @@ from cflow_torch.types import CFlowError
 
 
 def complete_data(data: dict[str, Any], out: TextIO | None = None) -> dict[str, Any]:
-    """Replace data=auto by the settings of the recognised format, and print it to `out`; None = standard output."""
+    """Replace data=auto by the settings of the recognised format, and print it to `out`; None = standard output.
+
+    Without a path, it is a simulated drive.
+    """
     if data.get("name") != AUTO:
         return data
     paths = paths_of(data)
     name = the_format(paths) if paths else "synthetic"
-    for path in paths:
+    for path in paths or ["no path is given, so we simulate a drive"]:
         print(f"{path}: data={name}", file=out)
     settings = dict(read_settings(FOLDER / "data" / f"{name}.yaml"))
     if "cache" in settings:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,27 @@ def test_the_clouds_of_a_folder_keep_their_names_columns_and_types(tmp_path: Pat
     assert removed == (sum(len(DRIVE.world(index)[0]) for index in range(4)), count, 0)
     back = ArraysLog(folder)
     assert back.timestamps == log.timestamps and len(back[3].points) == (DRIVE.world(3)[2] < 0).sum()
+
+
+@pytest.mark.parametrize("suffix, written", [(".csv", ".npy"), (".ply.gz", ".ply")])
+def test_clouds_whose_format_we_only_read_are_written_in_another(tmp_path: Path, suffix: str, written: str) -> None:
+    write_drive(tmp_path / "drive", ".ply")
+    for file in list((tmp_path / "drive").iterdir()):
+        if suffix == ".csv":
+            points = read_cloud(file)
+            table = np.column_stack([points, np.arange(len(points))])
+            np.savetxt(file.with_suffix(suffix), table, delimiter=",", header="x,y,z,intensity", comments="")
+        else:
+            Path(f"{file}.gz").write_bytes(gzip.compress(file.read_bytes()))
+        file.unlink()
+    log = ArraysLog(tmp_path / "drive")
+    write_clean_log(CleanLog(log, flow=DRIVE.result), log, tmp_path / "clean")
+    clean = ArraysLog(tmp_path / "clean" / "drive")
+    assert [file.name for file in clean.files] == [f"{name}{written}" for name in NAMES]
+    for index in range(len(NAMES)):
+        points, _, car = DRIVE.world(index)
+        assert np.allclose(clean.sweep(index).points, points[car < 0], atol=1e-4)
+        assert np.allclose(clean.columns(index)["intensity"], log.columns(index)["intensity"][car < 0])
 
 
 def test_points_without_a_position_are_left_out_and_counted(tmp_path: Path) -> None:

@@ -89,6 +89,15 @@ def test_masks_follow_objects_to_the_time_of_the_image(tmp_path: Path) -> None:
     assert (now[row, column] == 255).mean() > 0.95, "the points are inside the box"
 
 
+def test_returns_of_the_own_vehicle_do_not_hide_the_world(tmp_path: Path) -> None:
+    """The camera is on the roof, whose points move with the vehicle."""
+    poses = np.stack([pose(0.9 * k, 0, 0.0) for k in range(12)])
+    log = Filmed([straight((-2.25, -0.95), (0.9, 0.0)), straight((8, -3), (0.9, 0.0))], poses)
+    write_masks(tmp_path, log, [(3, log.result(3))], track(log, log.results()))
+    mask = np.asarray(Image.open(tmp_path / "front" / "003.png"))
+    assert 0.01 < (mask > 0).mean() < 0.2, "only the other car"
+
+
 def test_a_log_without_cameras_is_an_error(tmp_path: Path) -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     with pytest.raises(CFlowError, match="no calibration of cameras"):

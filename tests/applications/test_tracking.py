@@ -110,6 +110,15 @@ def test_tracks_do_not_depend_on_the_motion_of_the_vehicle() -> None:
     assert np.array_equal(moved["id"], static["id"])
 
 
+def test_returns_of_the_own_vehicle_are_not_a_track() -> None:
+    """Its roof rides along with it, so it moves like another car. Points of a car beside it must stay."""
+    roof = straight((-2.25, -0.95), (0.9, 0.0))
+    beside = straight((-2.0, 1.6), (0.9, 0.0))
+    log = Staged([roof, beside], np.stack([pose(0.9 * k, 0, 0.0) for k in range(12)]))
+    table = track(log, log.results())
+    assert len(set(table["id"])) == 1 and len(ids_of(log, table, 1)) == 11
+
+
 def test_flicker_that_goes_nowhere_is_not_a_track() -> None:
     log = Staged([straight((0, 0), (0.0, 0.0)), straight((15, 0), (0.9, 0.0))])
     results = log.results()
@@ -329,6 +338,8 @@ def test_tracking_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_wrong_inputs_are_one_clear_error() -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
+    with pytest.raises(CFlowError, match=r"such as enumerate\(results\)"):
+        track(log, [log.result(0)])  # type: ignore[list-item]
     tracker = Tracker()
     tracker.push((log.sweep(3), log.sweep(4)), log.result(3))
     with pytest.raises(CFlowError, match="order of time"):
@@ -502,6 +513,18 @@ def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> No
     assert np.allclose(poses[10, 0, :3, 0], (1, 0, 0), atol=0.01), "x along its length"
     assert np.allclose(poses[10, 1, :3, 0], (0, 1, 0), atol=0.01)
     assert np.allclose(sizes, SIZE, atol=1e-4)
+
+
+def test_frames_of_nuscenes_are_those_of_drivestudio_at_10_hz(tmp_path: Path) -> None:
+    """Sweep 11 begins the second key frame, so four frames between are at sweeps 2.2, 4.4, 6.6 and 8.8."""
+    log = Staged([straight((0, -6), (0.8, 0.0), 13)])
+    table = track(log, log.results())
+    log.sample_tokens = ["first", *[None] * 10, "second", None]
+    write_drivestudio(tmp_path, table, log)
+    poses, _, _ = read_instances(tmp_path)
+    assert len(poses) == 6
+    for frame, sweep in enumerate((0, 2, 4, 7, 9, 11)):
+        assert np.allclose(poses[frame, 0, :2, 3], log.middle(0)[sweep], atol=0.1), frame
 
 
 SMALL = "model.point_cloud_range=[-20,-20,-inf,20,20,inf]"

@@ -30,6 +30,11 @@ def test_a_path_is_enough(name, tmp_path, cflow, capsys):
         assert f"complete before  {len(files)}" in capsys.readouterr().out.replace("  complete", "complete")
 
 
+def test_a_call_without_a_path_says_that_it_simulates(cflow, capsys):
+    assert cflow("flow", "dry_run=true") == 0
+    assert "so we simulate a drive: data=synthetic\n" in capsys.readouterr().out
+
+
 def test_an_unknown_or_ambiguous_format_is_an_error(tmp_path):
     (tmp_path / "empty").mkdir()
     for place, message in (("absent", "no such file or folder"), ("empty", "it has no files")):

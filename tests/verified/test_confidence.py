@@ -12,7 +12,7 @@ from scenes import flow_as_oracle
 from test_changed_pixels import beside_a_wall
 from turning_car import MODEL, turning_car
 
-from cflow_torch import FlowResult, Sweep, VerifiedFlow, Window, make_config, make_model
+from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, make_config, make_model
 from cflow_torch.data.log import window as window_of
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import make_drive
@@ -203,6 +203,8 @@ def test_objects_leaves_out_what_is_probably_static():
         1,
     ]
     assert len(FlowResult.of(given).objects(points)) == 2
+    with pytest.raises(CFlowError, match="min_moving=50: give a probability"):
+        result.objects(points, min_moving=50)
 
 
 @pytest.mark.slow

@@ -186,7 +186,7 @@ def drive_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 LIST_FITS = """(() => {
-  document.querySelector("#list td").textContent = "pedestrian #116";  // the longest kind
+  document.querySelector("#list td").textContent = "pedestrian #1160";  // the longest kind
   const panel = document.querySelector("#objects");
   return panel.scrollWidth <= panel.clientWidth;
 })()"""
@@ -355,6 +355,8 @@ def test_a_phone_shows_all_controls_and_the_object_that_it_follows_beside_its_pa
     assert tab.locator("#list tbody tr").first.is_visible() and tab.evaluate(LIST_FITS), "no column is cut off"
     labels = tab.locator("#labels span:not(.ring)").all_inner_texts()
     assert labels and all(re.fullmatch(r"#\d+", text) for text in labels), "ids only"
+    tab.set_viewport_size({"width": 360, "height": 700})
+    assert tab.evaluate(LIST_FITS), "no column is cut off on a small phone"
 
     tab.set_viewport_size({"width": size[0], "height": size[1]})
     boxes = content_of(drive_page.read_text(encoding="utf-8"))["frames"][0]["boxes"]
