@@ -34,7 +34,7 @@ _DISPLACEMENT = 0.4  # metres per interval, along x and along y
 _COPIES_Z = 1.0  # standard deviations of noise by which a motion must exceed its displaced copies
 # P(moving) of slow and fast objects, in pairs, then with history; an object that is less likely to move is static. A
 # wrong motion of a fast object is a large error.
-_LEAST_LIKELY = (0.05, 0.15, 0.02, 0.05)
+_LEAST_LIKELY = (0.05, 0.15, 0.02, 0.04)
 
 
 class MotionMargin(NamedTuple):
