@@ -152,7 +152,7 @@ def flow_as_oracle(window: Window, settings: Config) -> FlowResult:
 
 
 def _draw_as_if_all_was_measured(batch: Batch, *given: Any) -> HeightSlicedSweeps:
-    """The sweeps without their coverage."""
+    """The sweeps without their coverage, which the oracle does not know."""
     return HeightSlicedSweeps.of(replace(batch, coverage=None), *given)
 
 

@@ -117,7 +117,6 @@ class Columns:
     reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
     most_reach: int
     tall: Tensor | None  # (K,) int64, the tall columns; None = there are none
-    unmeasured: Tensor | None = None  # (C + 1, S) bool, where `fill` set all bits; None = nowhere
 
     @classmethod
     def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int, spacing: Spacing) -> Columns:
@@ -178,7 +177,6 @@ class Columns:
             rank=torch.full_like(self.rank[:, : len(own)], _EMPTY),
             reach=None if self.reach is None else self.reach.index_select(0, own),
             tall=None if self.tall is None else flat_nonzero(draw(self.tall, len(self.position)).index_select(0, own)),
-            unmeasured=None if self.unmeasured is None else self.unmeasured.index_select(0, own),
         )
         copies._number(1)
         return copies, self.image.index_select(0, self.position.index_select(0, column) + half).long()
@@ -186,11 +184,9 @@ class Columns:
     def followed_by(self, copies: Columns) -> Columns:
         """Append the columns of copies, which are then numbered after these columns."""
         copies._number(len(self.position))
-        tall, unmeasured = self.tall, self.unmeasured
+        tall = self.tall
         if tall is not None and copies.tall is not None:
             tall = torch.cat((tall, copies.tall + (len(self.position) - 1)))
-        if unmeasured is not None and copies.unmeasured is not None:
-            unmeasured = torch.cat((unmeasured, copies.unmeasured[1:]))
         return replace(
             self,
             position=torch.cat((self.position, copies.position[1:])),
@@ -198,7 +194,6 @@ class Columns:
             rank=torch.cat((self.rank, copies.rank[:, 1:]), 1),
             reach=None if self.reach is None or copies.reach is None else torch.cat((self.reach, copies.reach[1:])),
             tall=tall,
-            unmeasured=unmeasured,
         )
 
     @property
@@ -364,21 +359,19 @@ class Columns:
         """Return the window of each column, (C + 1,) int64, and its row and column in the image, (2, C + 1) int64."""
         return _split(self.grid, self.position)
 
-    def fill(self, unmeasured: Tensor) -> Columns:
-        """Set all bits of empty pixels where a sweep did not measure, (C + 1, S) bool.
+    def fill(self, is_unknown: Tensor) -> None:
+        """Set all bits where it is not known what a sweep would have, (C + 1, S) bool.
 
-        There, nothing is missing, and a motion to such a place is found. A pixel is not compared with an unmeasured
-        place at its own position. The empty column stays empty.
+        There, nothing is missing, and what is looked up is found, in place as well as at a target. The empty column
+        stays empty. The pixels that are drawn already stay as they are.
         """
-        slices = self.slices[:, : unmeasured.shape[1]]
-        unmeasured = unmeasured & (slices & OWN == 0)
-        unmeasured[0] = False
-        slices |= unmeasured.view(torch.uint8) * 255
-        return replace(self, unmeasured=unmeasured)
+        filled = self.slices[1:, : is_unknown.shape[1]]
+        filled |= is_unknown[1:].view(torch.uint8) * 255
 
-    def are_unmeasured(self, pixels: Pixels) -> Tensor | None:
-        """Tell which sweeps did not measure at the positions of K pixels, (K, S) bool; None = all sweeps did."""
-        return None if self.unmeasured is None else self.unmeasured.index_select(0, self.column_of(pixels))
+    def are_filled(self, pixels: Pixels, step: int) -> Tensor:
+        """Tell at which of K pixels another sweep has slices, but no pixel: (K,) bool, see `fill`."""
+        is_empty = self.rank[step].index_select(0, self.column_of(pixels)) == _EMPTY
+        return is_empty & (self.look_up(pixels, step) & OWN > 0)
 
 
 def position_of(grid: Grid, window: int | Tensor, row: Tensor, col: Tensor) -> Tensor:

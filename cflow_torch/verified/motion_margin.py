@@ -76,15 +76,16 @@ def _margins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, i
     pixels = sweeps.pixels[pixel]  # [K]
     of_object = objects.by_object[pixel]  # [K]
     num_others = 1 + sweeps.num_more.index_select(0, sweeps.pixels.window[objects.first])  # [G], sweeps
+    has_history = num_others > 1
     near = _test_with_copies(sweeps, pixels, of_object, rigid)
     surplus = near.surplus()  # [G, 5]
     noise = (near.won + near.lost)[:, 0].clamp(min=1).double().sqrt()
     over_static = surplus[:, 0] / noise
     over_copies = (surplus[:, 0] - surplus[:, 1:].amax(1)) / noise
-    stays = (num_others > 1) & (surplus[:, 0] <= count_in_place(sweeps, pixels, of_object))
-    is_doubtful = (over_copies < _COPIES_Z) & (stays | _are_lines(sweeps, pixels, of_object))
-    margin = torch.where(is_fast | (num_others > 1), over_static, over_copies)
-    return margin.masked_fill(is_doubtful, 0.0) / num_others.double().sqrt()
+    stays = has_history & (surplus[:, 0] <= count_in_place(sweeps, pixels, of_object))
+    has_no_margin = (over_copies < _COPIES_Z) & (stays | _are_lines(sweeps, pixels, of_object))
+    margin = torch.where(is_fast | has_history, over_static, over_copies)
+    return margin.masked_fill(has_no_margin, 0.0) / num_others.double().sqrt()
 
 
 def _test_with_copies(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Groups, rigid: RigidMotion) -> Counts:
@@ -97,8 +98,7 @@ def _test_with_copies(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Gro
     alike = _group_by_motion(sweeps, pixels, of_object.of_item, rigid)
     near = count_wins(sweeps, pixels, alike.by_motion, alike.motion[:, None] + offsets).near
     of_group = Groups(alike.by_motion.max(of_object.of_item, empty=0), of_object.count)
-    won, lost = of_group.sum(torch.cat((near.won, near.lost), 1).t()).t().split(len(offsets), 1)
-    return Counts(won, lost)
+    return Counts(of_group.sum(near.won.t()).t(), of_group.sum(near.lost.t()).t())
 
 
 class _PixelsByMotion(NamedTuple):

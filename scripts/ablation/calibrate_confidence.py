@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
 """Confidence of the flow and P(moving): fit their tables on simulated drives, or evaluate them on other data.
 
-  python scripts/ablation/calibrate_confidence.py fit         writes verified/confidence.json, two passes
-  python scripts/ablation/calibrate_confidence.py evaluate    Argoverse 2 pair, KITTI 0000, PandaSet, simulated drives
+  python scripts/ablation/calibrate_confidence.py fit           writes verified/confidence.json, two passes
+  python scripts/ablation/calibrate_confidence.py fit-objects   the same, only the rows of objects with a motion
+  python scripts/ablation/calibrate_confidence.py evaluate      Argoverse 2 pair, KITTI 0000, PandaSet, simulated drives
 
 The windows come from sets.py. We fit on pairs (h = 0) and history (h = 4) of five sensors, region +-70 m, without
 ground: four kinds of scenes, seeds 100-103, and motorways, seeds 822-825. We evaluate on motorways, seeds 826-827, and
@@ -168,13 +169,15 @@ def simulated(seeds: Sequence[int], motorways: Sequence[int]) -> Iterable[Item]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task", choices=("fit", "evaluate"))
+    parser.add_argument("task", choices=("fit", "fit-objects", "evaluate"))
     given = parser.parse_args()
     torch.set_num_threads(1)
-    if given.task == "fit":
+    if given.task != "evaluate":
         items = list(simulated(SEEDS, MOTORWAYS))
+        first_bin = 0 if given.task == "fit" else confidence.Bins.moving
         for _ in range(2):  # P(moving) decides which objects move, and so which points are right
-            confidence.TABLE.update(fit(statistics(items, (0, HISTORY), MAX_POINTS)))
+            for name, values in fit(statistics(items, (0, HISTORY), MAX_POINTS)).items():
+                confidence.TABLE[name][first_bin:] = values[first_bin:]
         TABLE_FILE.write_text(json.dumps(confidence.TABLE) + "\n", encoding="utf-8")
         return
     pair = [sets.make_item(item.window, item.frame.labels) for item in sets.av2_pair()]  # ego motion of the poses
