@@ -9,7 +9,8 @@ from torch import Tensor
 
 from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups, pose_of
 from cflow_torch.applications.track_state import TrackStates
-from cflow_torch.ops.indices import concat_ranges, lookup, unique_pairs
+from cflow_torch.ops.groups import Groups
+from cflow_torch.ops.indices import concat_ranges, unique_pairs
 from cflow_torch.types import Sweep
 
 _MIN_OVERLAP = 0.1  # least intersection over union of the voxels of two groups that match
@@ -52,7 +53,7 @@ def of_own_vehicle(groups: MovingGroups, sweep: Sweep) -> Tensor:
     along, across = rotate_about_z(x, y, -heading)
     reach = size / 2 + _ORIGIN_INSIDE
     is_own = (along.abs() <= reach[:, 0]) & (across.abs() <= reach[:, 1])
-    return lookup(is_own, torch.where(groups.moves, groups.group, len(is_own)), missing=False)
+    return Groups(groups.group, len(is_own)).where(groups.moves).spread(is_own)
 
 
 def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:
@@ -88,7 +89,7 @@ def _divide(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGrou
 
 def _value_of_box(values: Tensor, box: Tensor, outside: float) -> Tensor:
     """Return the value of each box, (N,) int64, from those of K boxes, (K,); `outside` for box -1."""
-    return lookup(values, torch.where(box < 0, len(values), box), outside)
+    return Groups(box, len(values)).where(box >= 0).spread(values, none=outside)
 
 
 def match(tracks: TrackStates, points: Tensor, track_of_point: Tensor, groups: MovingGroups) -> TrackMatches:

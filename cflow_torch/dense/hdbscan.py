@@ -32,7 +32,7 @@ def find_dense_clusters(sweeps: ProjectedSweeps, config: DenseConfig) -> tuple[C
     pixels = _occupied_pixels(sweeps, labels)
     kept = _linked(pixels)
     clusters = pixels.labels.select(kept)
-    top_left, size = cluster_boxes(clusters, pixels.row, pixels.col)
+    top_left, size = cluster_boxes(clusters, torch.stack((pixels.row, pixels.col)))
     is_kept = clusters.is_member
     result = Clusters(
         window=pixels.window[clusters.first()],

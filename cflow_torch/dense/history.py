@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.segments import masked_median
+from cflow_torch.ops.medians import masked_median
 
 
 def pool(estimates: Tensor, available: Tensor) -> Tensor:

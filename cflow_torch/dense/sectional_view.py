@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from cflow_torch.config import DenseConfig
+from cflow_torch.dense.clustering import cluster_boxes
 from cflow_torch.dense.coarse_to_fine import ProjectedSweeps
 from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import Images, TemplatePairs
+from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import concat_ranges, flat_nonzero, renumber
-from cflow_torch.ops.segments import bounding_boxes
 
 
 def add_sectional_view(
@@ -79,7 +80,7 @@ def _draw_pairs(pairs: _Pairs, members: _Members, pixel_size: float) -> Template
     target = _target_points(pairs, members)
     pair = torch.cat((template.pair, target.pair))
     row_col = _project(torch.cat((template.positions, target.positions), 1), pairs.heading[:, pair], pixel_size)
-    first, size = bounding_boxes(row_col[0], row_col[1], pair, len(pairs.slot))
+    first, size = cluster_boxes(Groups(pair, len(pairs.slot)), row_col)
     row_col -= first[pair].t()
     of_template, of_target = row_col.split((len(template.pair), len(target.pair)), 1)
     return TemplatePairs(

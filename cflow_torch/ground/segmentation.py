@@ -18,7 +18,7 @@ from torch import Tensor
 
 from cflow_torch.errors import import_optional
 from cflow_torch.ground.plane import FARTHEST, CellHeights, Points, near_plane
-from cflow_torch.ops.indices import lookup
+from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.lower_surface import NO_HEIGHT, lower_surface
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.tensors import choose_device, read_positions
@@ -126,7 +126,7 @@ def _grid(points: Points, threshold: int) -> Tensor:
     cell = points.cell(_CELL_BITS, _CELLS)
     cells = CellHeights.of(points, height, cell, _CELLS)
     surface = lower_surface(cells.low.masked_fill(cells.count == 0, NO_HEIGHT).int())
-    is_low = height <= lookup(surface.flatten(), cell) + threshold
+    is_low = height <= Groups(cell, surface.numel()).spread(surface.flatten()) + threshold
     return is_low.logical_and_(points.is_active).logical_and_(plane.is_there.index_select(0, points.sweep))
 
 

@@ -12,8 +12,8 @@ from cflow_torch.dense.clustering import label_components
 from cflow_torch.keypoints.matching import KeypointMatches
 from cflow_torch.ops.indices import draw, flat_nonzero, index_in_group
 from cflow_torch.ops.labeling import connected_components
+from cflow_torch.ops.medians import segment_median
 from cflow_torch.ops.nearest import nearest_set_pixel
-from cflow_torch.ops.segments import segment_median
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -44,12 +43,6 @@ def nonzero_pairs(mask: Tensor) -> tuple[Tensor, Tensor]:
 def gather(index: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
     """Select the same elements of several tensors: (K, ...) of (N, ...) each, by (K,) int64 indices."""
     return tuple(values.index_select(0, index) for values in tensors)
-
-
-def lookup(table: Tensor, index: Tensor, missing: float = 0) -> Tensor:
-    """Select entries of an (N, ...) table: (K, ...) in its dtype. Index N, "none", has the entry `missing`."""
-    padding = (0, 0) * (table.dim() - 1) + (0, 1)
-    return F.pad(table, padding, value=missing).index_select(0, index)
 
 
 def scatter_count(index: Tensor, size: int, weights: Tensor | None = None) -> Tensor:
@@ -166,20 +159,6 @@ def largest_of_rows(values: Tensor) -> Tensor:
     if values.device.type == "cpu":
         return torch.from_numpy(values.numpy().argmax(1))
     return values.argmax(1)
-
-
-def occupied(image: Tensor) -> Tensor:
-    """Indices, (K,) int64, ascending, of the nonzero elements of an (N,) uint8 image that is mostly 0.
-
-    Cost: one pass over the image, on the CPU eight elements at a time; on a GPU, one synchronisation.
-    """
-    if image.device.type != "cpu":
-        return flat_nonzero(image)
-    num_words = image.numel() // 8
-    word = flat_nonzero(image[: 8 * num_words].view(torch.int64).bool())
-    index = (8 * word[:, None] + torch.arange(8)).flatten()
-    index = torch.cat((index, torch.arange(8 * num_words, image.numel())))
-    return index.index_select(0, flat_nonzero(image.index_select(0, index).bool()))
 
 
 def floor_divide(index: Tensor, divisor: int) -> Tensor:

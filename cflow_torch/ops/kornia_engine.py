@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cflow_torch.ops.segments import first_of_segment
+from cflow_torch.ops.groups import Groups
 from cflow_torch.types import CFlowError
 
 
@@ -51,4 +51,5 @@ def connected_components_kornia(occupancy: Tensor, pixels: Tensor, connectivity:
         linked[:, 1:-1:2, ::2] = image[:, 1:] & image[:, :-1]
         linked[:, ::2, 1:-1:2] = image[:, :, 1:] & image[:, :, :-1]
         labels = connected_components_union_find(linked[:, None])[..., ::2, ::2]
-    return first_of_segment(labels.flatten()[pixels], 4 * image.numel() + 1)
+    components = Groups(labels.flatten()[pixels], 4 * image.numel() + 1)
+    return components.spread(components.first())

@@ -20,9 +20,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, floor_divide, index_dtype, split_index
 from cflow_torch.ops.kornia_engine import connected_components_kornia
-from cflow_torch.ops.segments import first_of_segment
 
 # Half of the eight neighbours of a block. Links to the other half are found from the other block.
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -224,8 +224,8 @@ def connected_components(
     height = occupancy.shape[1]
     row = torch.add(row, floor_divide(row, height), alpha=padded.shape[1] - height)
     pixel = row * padded.shape[2] + col
-    component, bound = label_pixels(padded, pixel, row, col, connectivity, reach, engine)
-    return first_of_segment(component, bound)
+    components = Groups(*label_pixels(padded, pixel, row, col, connectivity, reach, engine))
+    return components.spread(components.first())
 
 
 def union_find(num_nodes: int, sources: Tensor, targets: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from cflow_torch.dense.correlation import Estimates, best_shifts
 from cflow_torch.dense.templates import TemplatePairs, make_pairs
 from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_empty, lazy_zeros
-from cflow_torch.ops.segments import masked_median
+from cflow_torch.ops.medians import masked_median
 from cflow_torch.verified.columns import OWN, Pixels, count_slices
 from cflow_torch.verified.component_tree import Tree
 from cflow_torch.verified.height_slices import HeightSlicedSweeps

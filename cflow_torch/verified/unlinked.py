@@ -22,7 +22,7 @@ from torch import Tensor
 
 from cflow_torch.ops.groups import FAR, Groups
 from cflow_torch.ops.indices import constant, flat_nonzero, gather, lazy_zeros, split_index, take_columns
-from cflow_torch.ops.segments import masked_median
+from cflow_torch.ops.medians import masked_median
 from cflow_torch.verified.columns import Pixels
 from cflow_torch.verified.component_tree import Components, NodeKind, Tree
 from cflow_torch.verified.height_slices import HeightSlicedSweeps

@@ -15,8 +15,8 @@ from cflow_torch.ops.kornia_engine import close_3x3_kornia
 from cflow_torch.ops.labeling import pad
 from cflow_torch.ops.linear import adjugate, full, upper
 from cflow_torch.ops.lower_surface import _cone
+from cflow_torch.ops.medians import masked_median, segment_median
 from cflow_torch.ops.nearest import nearest_set_pixel
-from cflow_torch.ops.segments import masked_median, segment_median
 
 
 @pytest.mark.parametrize("length", [0, 1, 50])
