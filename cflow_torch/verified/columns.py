@@ -116,7 +116,7 @@ class Columns:
     rank: Tensor  # (S, C + 1) int32, position of each pixel in the list of pixels; `_EMPTY` = the pixel is empty
     reach: Tensor | None  # (C + 1,) uint8, pixels, see `Spacing`; None = 1 everywhere
     most_reach: int
-    tall: Tensor | None  # (K,) int64, the tall columns; None = there are none
+    tall: Tensor | None  # (K,) int64, the tall columns, for `draw`; None = there are none, or all is drawn
 
     @classmethod
     def at(cls, is_occupied: Tensor, grid: Grid, num_steps: int, spacing: Spacing) -> Columns:
@@ -184,16 +184,13 @@ class Columns:
     def followed_by(self, copies: Columns) -> Columns:
         """Append the columns of copies, which are then numbered after these columns."""
         copies._number(len(self.position))
-        tall = self.tall
-        if tall is not None and copies.tall is not None:
-            tall = torch.cat((tall, copies.tall + (len(self.position) - 1)))
         return replace(
             self,
             position=torch.cat((self.position, copies.position[1:])),
             slices=torch.cat((self.slices, copies.slices[1:])),
             rank=torch.cat((self.rank, copies.rank[:, 1:]), 1),
             reach=None if self.reach is None or copies.reach is None else torch.cat((self.reach, copies.reach[1:])),
-            tall=tall,
+            tall=None,
         )
 
     @property
