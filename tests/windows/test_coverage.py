@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import assert_same_bits
+from scenes import assert_same_bits, sweeps_of
 
 from cflow_torch import VerifiedFlow
+from cflow_torch.config import VerifiedConfig
 from cflow_torch.evaluation.frame import ego_motion_flow
 from cflow_torch.simulator import Drive, make_drive
 from cflow_torch.types import Sweep, Window
@@ -67,6 +68,25 @@ def test_equals_plain_loops_for_sweeps_alone_and_together():
             cos, sin = np.cos(angle[2 * of_window + step]), np.sin(angle[2 * of_window + step])
             assert is_unmeasured == flags[2 * of_window + step][bin_of(cos * x + sin * y, cos * y - sin * x)]
     assert sum(flags[0]) > 100 and sum(flags[1]) == 0 and sum(flags[2]) > 100
+
+
+def test_copies_are_filled_where_a_sweep_did_not_measure():
+    """Windows of a block ahead to the left at t: in the second one, t+1 did not measure there."""
+    angle = np.radians(np.arange(0, 360, 0.5))
+    ring = np.stack((5 * np.cos(angle), 5 * np.sin(angle), np.full_like(angle, -1.6)), 1).astype(np.float32)
+    block = np.random.default_rng(0).uniform((2, 2, 0), (3, 3, 1), (60, 3)).astype(np.float32)
+    at_t = Sweep(np.concatenate((ring, block)), is_ground=np.arange(len(ring) + len(block)) < len(ring))
+    is_left = (angle > np.radians(10)) & (angle < np.radians(80))
+    whole, partial = (Sweep(points, is_ground=np.ones(len(points), bool)) for points in (ring, ring[~is_left]))
+    region = (-9.0, -9.0, -3.0, 9.0, 9.0, 3.0)
+    settings = VerifiedConfig(pixel_sizes=(0.25,), point_cloud_range=region)
+    sweeps = sweeps_of([Window(at_t, whole), Window(at_t, partial)], settings)
+    rows = sweeps.points.is_member.nonzero()[:, 0]
+    copied = sweeps.with_copies(rows)
+    copies = copied.pixels[torch.arange(sweeps.num_pixels, copied.num_pixels)]
+    assert len(rows) == 2 * len(block) and len(copies) == sweeps.num_pixels
+    assert torch.equal(copied.columns.are_filled(copies, 0), copies.window == 3)
+    assert torch.equal(copied.columns.look_up(copies, 0), sweeps.columns.look_up(sweeps.pixels, 0))
 
 
 def cut(sweep: Sweep, is_front: bool, is_lost: bool) -> np.ndarray:
