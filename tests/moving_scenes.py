@@ -7,13 +7,11 @@ from typing import NamedTuple, Sequence
 import numpy as np
 import torch
 from oracle.height_slices import NUM_SLICES, SLICE_HEIGHT, SlicedSweeps, Vector
-from oracle.registration import LAYER_HEIGHT, NUM_LAYERS
 from scenes import pose
 
 from cflow_torch.config import VerifiedConfig
 from cflow_torch.ops.groups import Groups
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.refinement import MOST_TIME
 from cflow_torch.verified.selection import Objects, number_objects
 from cflow_torch.verified.voxel_centroids import ObjectPoints, points_of_objects
 from cflow_torch.windows.bev_grid import Grid
@@ -38,7 +36,7 @@ class Scene(NamedTuple):
     def points(self) -> ObjectPoints:
         """Of all objects."""
         every = torch.ones(len(self.flow), dtype=torch.bool)
-        return points_of_objects(self.sweeps, self.objects, every, LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
+        return points_of_objects(self.sweeps, self.objects, every)
 
     def windows(self) -> list[tuple[SlicedSweeps, np.ndarray, list[Vector]]]:
         """Sweeps, object of each pixel and flow of each object for the oracle, window by window; objects from 0."""

@@ -38,6 +38,7 @@ from cflow_torch.verified.rigid_motion import RigidMotion, rotate
 from cflow_torch.verified.selection import Objects
 from cflow_torch.verified.slow_objects import find_slow
 from cflow_torch.verified.voxel_centroids import (
+    NUM_LAYERS,
     ObjectPoints,
     Voxels,
     VoxelSearch,
@@ -47,9 +48,6 @@ from cflow_torch.verified.voxel_centroids import (
 )
 
 # We chose these values on real pairs and windows with history (docs/benchmarks.md).
-LAYER_HEIGHT = 0.1  # metres, of the voxels, which are as wide as the finest pixels
-NUM_LAYERS = 64  # number of layers of voxels before they repeat
-MOST_TIME = 2.5  # sweep intervals: t, t-1 and jitter; older sweeps mislead if the rotation is not constant
 _NOISE = 0.05  # metres, standard deviation between two centroids, besides the covariances of their surfaces
 _FARTHEST = 0.2  # metres, between the two voxels of a correspondence
 _KERNEL = 3.0  # scale of the Geman-McClure kernel, in variances of the residual
@@ -89,7 +87,7 @@ def refine(
     flow = motion.flip(1) * sweeps.grid.pixel_size  # [G, 2], x and y, metres per sweep interval
     of_slow = slow(sweeps, objects, flow, longest)
     start = flow + of_slow
-    points = points_of_objects(sweeps, objects, start.any(1), LAYER_HEIGHT, NUM_LAYERS, MOST_TIME)
+    points = points_of_objects(sweeps, objects, start.any(1))
     return register_deskewed(points, sweeps, start, of_slow.any(1), num_iterations)
 
 
@@ -143,7 +141,6 @@ class Source:
     target_start: Tensor  # (K,) int64, number of the first pixel of t+1 of its window, see `pixel_key`
     target_layers: Tensor  # (3, K) int32, in which we search for the target
     elapsed: Tensor  # (K,) float64, sweep intervals from the voxel to t+1
-    before_t: Tensor  # (K,) float64, sweep intervals from the voxel to t
 
     @classmethod
     def of(cls, voxels: Voxels, covariance: Tensor, by_object: Groups, centre: Tensor, elapsed: Tensor) -> Source:
@@ -159,13 +156,12 @@ class Source:
         voxel = flat_nonzero(has_centre & (voxels.step > 0))
         by_object = by_object[voxel]
         window = voxels.window.index_select(0, voxel)
-        num_steps = elapsed.shape[1]
         up = constant(((-1,), (0,), (1,)), torch.int64, voxel.device)
         # The noise of a pair is added here, to its source.
         noise = constant((_NOISE**2, 0.0, 0.0, _NOISE**2, 0.0, _NOISE**2), torch.float64, voxel.device)[:, None]
+        corner = constant(((0,), (0,)), torch.int64, voxel.device)  # row and column of the first pixel
         position = take_columns(voxels.position, voxel)  # [3, K]
         centre = take_columns(centre, by_object.of_item)  # [2, K]
-        elapsed = elapsed.view(-1).index_select(0, window * num_steps + voxels.step.index_select(0, voxel))
         return cls(
             voxel=voxel,
             by_object=by_object,
@@ -173,10 +169,9 @@ class Source:
             offset=position[:2] - centre,
             height=position[2:],
             covariance=take_columns(covariance, voxel) + noise,
-            target_start=pixel_key(voxels.grid, window * num_steps, constant(((0,), (0,)), torch.int64, voxel.device)),
+            target_start=pixel_key(voxels.grid, window * voxels.num_steps, corner),
             target_layers=((voxels.layer.index_select(0, voxel) + up) % NUM_LAYERS).int(),
-            elapsed=elapsed,
-            before_t=elapsed - 1,
+            elapsed=elapsed[window, voxels.step.index_select(0, voxel)],
         )
 
     def __len__(self) -> int:
@@ -194,7 +189,6 @@ class Source:
             target_start=self.target_start[some],
             target_layers=self.target_layers[:, some],
             elapsed=self.elapsed[some],
-            before_t=self.before_t[some],
         )
 
     def chunks(self) -> Iterator[Source]:
@@ -232,9 +226,9 @@ class Registration:
     """
 
     def __init__(self, points: ObjectPoints, sweeps: HeightSlicedSweeps, num_objects: int) -> None:
-        self._voxels = Voxels.of(points, sweeps, NUM_LAYERS)
-        self._target = VoxelSearch(self._voxels, flat_nonzero(self._voxels.step == 0), reach=1)
-        self._covariance = covariance_of(self._voxels, sweeps.grid.pixel_size, LAYER_HEIGHT)  # [6, V]
+        self._voxels = Voxels.of(points, sweeps)
+        self._target = VoxelSearch(self._voxels, flat_nonzero(self._voxels.step == 0))
+        self._covariance = covariance_of(self._voxels)  # [6, V]
         object_id = self._voxels.object_id
         by_object = Groups(object_id.masked_fill(object_id < 0, num_objects), num_objects)
         at_t = by_object.where(self._voxels.step == 1)
@@ -266,22 +260,25 @@ class Registration:
             right_side = prior * (start - motion)  # [3, G]
             source = self._sample if iteration < num_iterations // 2 else self._source
             for some in source.chunks():
-                pairs = self._correspond(some, motion)
+                pairs = self._correspond(some, self._rigid(motion))
                 equations = pairs.by_object.sum(_normal_equations(pairs))  # [9, G]
                 hessian = hessian + equations[:6]
                 right_side = right_side + equations[6:]
             change = matvec(full(inverse(hessian)), right_side)
             motion = torch.add(motion, change, alpha=STEP_LENGTH)
+        return self._rigid(motion)
+
+    def _rigid(self, motion: Tensor) -> RigidMotion:
+        """Return the motion of the objects from its parameters, (3, G): x, y and the tangent of half the angle."""
         return RigidMotion(motion[:2].t(), motion[2], self._centre.nan_to_num(0.0).t())
 
-    def _correspond(self, source: Source, motion: Tensor) -> Correspondences:
-        """Move the source to t+1, and find the nearest voxels of the target; `motion` is (3, G), as in `align`."""
-        motion_of_voxel = take_columns(motion, source.by_object.of_item)  # [3, K]
-        velocity = motion_of_voxel[:2]
-        rotation = motion_of_voxel[2]
+    def _correspond(self, source: Source, rigid: RigidMotion) -> Correspondences:
+        """Move the source to t+1, and find the nearest voxels of the target."""
+        velocity = take_columns(rigid.flow.t(), source.by_object.of_item)  # [2, K]
+        rotation = rigid.rotation.index_select(0, source.by_object.of_item)
         # The object rotates about its centre, which moves on from t to t+1. From the moved centre, `arm` leads to the
         # moved voxel.
-        arm = rotate(rotation * source.elapsed, source.offset + velocity * source.before_t)
+        arm = rotate(rotation * source.elapsed, source.offset + velocity * (source.elapsed - 1))
         moved = source.centre + velocity + arm
         moved = torch.cat((moved, source.height))  # [3, K]
 
@@ -319,12 +316,11 @@ class Registration:
 
         Cost: 54 lookups for each voxel of the source.
         """
-        moved = torch.cat((rigid.flow.t(), rigid.rotation[None]))  # [3, G]
         source = self._source[flat_nonzero(self._source.by_object.spread(asked))]
-        sums = torch.zeros_like(moved)
+        static = rigid.only(torch.zeros_like(asked))
+        sums = torch.zeros((3, len(asked)), dtype=torch.float64, device=asked.device)
         for some in source.chunks():
-            static = self._correspond(some, torch.zeros_like(moved))
-            gain = self._correspond(some, moved).weight - static.weight
+            gain = self._correspond(some, rigid).weight - self._correspond(some, static).weight
             sums = sums + some.by_object.sum(torch.stack((gain, gain.square(), torch.ones_like(gain))))
         gain, square, count = sums
         return (gain > _SLOW_Z * square.sqrt()) & (gain >= _LEAST_GAIN * count)
@@ -343,10 +339,9 @@ class Registration:
         """
         time = self._voxels.time
         assert time is not None
-        motion = torch.cat((rigid.flow.t(), rigid.rotation[None]))
-        sums = torch.zeros_like(motion[:2])
+        sums = torch.zeros_like(self._centre)
         for source in self._source.chunks():
-            pairs = self._correspond(source, motion)
+            pairs = self._correspond(source, rigid)
             delay = time.index_select(0, pairs.target) - time.index_select(0, pairs.source)
             weight = (pairs.information[0, 0] + pairs.information[1, 1]) * pairs.elapsed
             sums = sums + pairs.by_object.sum(weight * torch.stack((pairs.elapsed, delay)))

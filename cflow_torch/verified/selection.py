@@ -40,6 +40,10 @@ class Objects:
         """Number of objects, G."""
         return self.by_object.count
 
+    def window(self, sweeps: HeightSlicedSweeps) -> Tensor:
+        """(G,) int64, window of each object."""
+        return sweeps.pixels.window[self.first]
+
     def length_at_newest(self, sweeps: HeightSlicedSweeps) -> Tensor:
         """(G,) float64, metres, longer side of the bounding box of the pixels at t+1; 0 without any."""
         return longer_side(corners_at_newest(sweeps.pixels, self.by_object), sweeps.grid.pixel_size)

@@ -34,7 +34,8 @@ class Shifts:
 
     def __init__(self, sweeps: HeightSlicedSweeps, window: Tensor, motions: Tensor, is_wide: Tensor) -> None:
         self._num_steps = sweeps.num_steps
-        elapsed = sweeps.elapsed_both_ways.index_select(1, window)  # [2, M, S]
+        to_newest = sweeps.elapsed.index_select(0, window)  # [M, S]
+        elapsed = torch.stack((to_newest, -to_newest))  # [2, M, S], from each sweep to t+1, and from t+1 to each sweep
         displacement = motions[:, None] * elapsed[..., None, None]  # [2, M, S, C, 2]
         pair = (displacement + 0.5).floor().int().view(torch.int64)[..., 0]  # [2, M, S, C], y and x as one number
         self.count, self._number, motion = _distinct(pair)

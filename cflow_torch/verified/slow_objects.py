@@ -38,7 +38,7 @@ def find_slow(sweeps: HeightSlicedSweeps, objects: Objects, flow: Tensor, longes
     """
     if not sweeps.batch.has_pairs:
         return torch.zeros_like(flow)
-    window = sweeps.pixels.window[objects.first]
+    window = objects.window(sweeps)
     asked = ~(flow.any(1) | sweeps.has_history.index_select(0, window))
     if longest is not None:
         asked &= objects.length_at_newest(sweeps) <= longest
