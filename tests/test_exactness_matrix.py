@@ -45,7 +45,7 @@ def in_pieces(config: Config, windows: list[Window]) -> Results:
     pieces = {
         "ops.chunks.CHUNK_ON_CPU": 997,
         "dense.correlation._PER_CALL_CPU": 600,
-        "verified.in_place._AT_ONCE_CPU": 500,
+        "verified.comparisons._AT_ONCE_CPU": 500,
         "keypoints.match_candidates._BAND_ROWS": 5,
         "keypoints.matching._PAIRS_AT_ONCE_CPU": 5000,
         "keypoints.matching._ENERGY_STEP": 2,

@@ -22,11 +22,12 @@ from torch import Tensor
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import constant, flat_nonzero
 from cflow_torch.verified.columns import Pixels, count_slices
+from cflow_torch.verified.comparisons import count_in_place
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.in_place import are_covered
 
 _THIN = 0.3  # metres, largest standard deviation of a line across it
 _LONG = 1.0  # metres, smallest standard deviation along it
+_COVERED = 65  # per cent of the slices of a line
 _ALONG = 0.04  # squared sine of the largest angle between a line and a motion along it
 _LEAST_TRAVEL = 1.2  # metres, of the ends of a long vehicle
 _ALIKE = 0.1  # the displacements of two ends that move together differ by at most this share of their sum
@@ -65,13 +66,23 @@ def slides_along_itself(sweeps: HeightSlicedSweeps, pixels: Pixels, groups: Grou
     window = at_newest.max(newest_pixels.window, empty=0)
     of_line = flat_nonzero(groups.spread(lines.is_line))  # few pixels
     pixels_of_lines = pixels[of_line]
-    is_covered = are_covered(sweeps, pixels_of_lines, groups[of_line])
+    of_newest_line = flat_nonzero(at_newest.spread(lines.is_line))
+    is_covered = are_covered(sweeps, newest_pixels[of_newest_line], at_newest[of_newest_line])
     # In a pair, a wall that is visible between two occluders has such ends. With history, the static test excludes it.
     travels = both_ends_move(sweeps, pixels_of_lines, groups[of_line]) & sweeps.has_history[window]
     num_more = at_newest.sum(count_slices(newest_pixels.slices) - _TALL)
     is_rail = (num_more < 0) & (lines.variance >= (_RAIL / pixel_size) ** 2)
     slides = lines.is_line & (is_rail | is_covered & ~travels)
     return slides[:, None] & lines.are_along(candidates)
+
+
+def are_covered(sweeps: HeightSlicedSweeps, newest: Pixels, groups: Groups) -> Tensor:
+    """Tell which of M groups of K pixels of t+1 were at the same position before, (M,) bool.
+
+    A group is covered if the other sweeps have 65 % of its slices within the reach (`Spacing`) of the same position.
+    """
+    near = count_in_place(sweeps, newest, groups, is_near=True)
+    return (near.compared > 0) & (near.found * 100 >= near.compared * _COVERED)
 
 
 class Lines(NamedTuple):

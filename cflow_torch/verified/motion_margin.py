@@ -23,9 +23,9 @@ from cflow_torch.ops.indices import constant, flat_nonzero
 from cflow_torch.types import MOVING
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.columns import Pixels
+from cflow_torch.verified.comparisons import count_in_place
 from cflow_torch.verified.confidence import TABLE, Bins, bin_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
-from cflow_torch.verified.in_place import count_in_place
 from cflow_torch.verified.paired_test import Counts, count_wins
 from cflow_torch.verified.rigid_motion import RigidMotion
 from cflow_torch.verified.selection import Objects
@@ -82,7 +82,7 @@ def _margins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, i
     noise = (near.won + near.lost)[:, 0].clamp(min=1).double().sqrt()
     over_static = surplus[:, 0] / noise
     over_copies = (surplus[:, 0] - surplus[:, 1:].amax(1)) / noise
-    stays = has_history & (surplus[:, 0] <= count_in_place(sweeps, pixels, of_object))
+    stays = has_history & (surplus[:, 0] <= count_in_place(sweeps, pixels, of_object).found)
     has_no_margin = (over_copies < _COPIES_Z) & (stays | _are_lines(sweeps, pixels, of_object))
     margin = torch.where(is_fast | has_history, over_static, over_copies)
     return margin.masked_fill(has_no_margin, 0.0) / num_others.double().sqrt()

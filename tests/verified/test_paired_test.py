@@ -13,11 +13,11 @@ from oracle import paired_test as oracle
 
 from cflow_torch import Sweep, VerifiedFlow, Window, make_config
 from cflow_torch.ops.groups import Groups
-from cflow_torch.verified import in_place as in_place_module
+from cflow_torch.verified import comparisons
 from cflow_torch.verified import paired_test as fast
-from cflow_torch.verified.aperture import both_ends_move, slides_along_itself
+from cflow_torch.verified.aperture import are_covered, both_ends_move, slides_along_itself
+from cflow_torch.verified.comparisons import count_in_place
 from cflow_torch.verified.component_tree import NodeKind, Tree
-from cflow_torch.verified.in_place import are_covered, count_in_place
 
 
 def random_images(rng: np.random.Generator, shape: tuple) -> np.ndarray:
@@ -28,7 +28,7 @@ def random_images(rng: np.random.Generator, shape: tuple) -> np.ndarray:
 
 @pytest.mark.parametrize("at_once", [1 << 18, 700])
 def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
-    monkeypatch.setattr(in_place_module, "_AT_ONCE_CPU", at_once)
+    monkeypatch.setattr(comparisons, "_AT_ONCE_CPU", at_once)
     far = num_covered = 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -41,7 +41,9 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
         candidates = torch.from_numpy(np.where(rng.random((6, 5, 1)) < 0.7, rng.normal(0, 1.5, (6, 5, 2)), 0.0))
         wins = fast.count_wins(sweeps, sweeps.pixels[kept], Groups(component[kept], 6), candidates)
         given = (sweeps, sweeps.pixels[kept], Groups(component[kept], 6))
-        in_place, covered = count_in_place(*given), are_covered(*given)
+        in_place = count_in_place(*given)
+        newest = kept[sweeps.pixels.step[kept] == 0]
+        covered = are_covered(sweeps, sweeps.pixels[newest], Groups(component[newest], 6))
         component[::7] = 6
         for number in range(6):
             window = for_oracle(sweeps, number // 3)
@@ -50,7 +52,8 @@ def test_counts_equal_the_oracle_up_to_the_border(at_once, monkeypatch):
             for is_near, counts in ((False, wins.exact), (True, wins.near)):
                 expected = [oracle.count_wins(window, members, each, is_near).sum(1) for each in motions]
                 assert np.array_equal(torch.stack((counts.won[number], counts.lost[number]), 1), expected)
-            assert in_place[number] == oracle.found_in_place(window, members, window.image)[:, 0].sum()
+            expected = oracle.found_in_place(window, members, window.image).sum(0)
+            assert [in_place.found[number], in_place.compared[number]] == expected.tolist()
             assert covered[number] == aperture.is_covered(window, members)
             num_covered += int(covered[number])
             far += int((candidates[number].abs().amax(1) > 1.5).sum())
