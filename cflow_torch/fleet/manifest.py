@@ -32,6 +32,7 @@ from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
 _FORMAT = 2
+_FRAME = re.compile(r"[0-9]{1,20}\.feather")
 _ENDING = b"ARROW1"  # last bytes of a feather file
 _TRACKS = r"tracks\.parquet|mot\.txt|kitti\.txt|instances_info\.json|frame_instances\.json"
 _DETECTIONS = r"nuscenes_detection\.json|nuscenes_tracking\.json|result\.pkl"
@@ -89,8 +90,15 @@ def checked_manifest(folder: Path, log: Log, identity: Mapping[str, Any]) -> dic
 
 
 def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written."""
+    """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written.
+
+    Frames that are older than the manifest are removed, because nothing says which settings they have.
+    """
+    # We list the files before we look for the manifest: what another process of this run writes later is not in the list.
+    older = [name for name in _names(folder) if _FRAME.fullmatch(name)]
     if not _is_claimed(folder, manifest):
+        for name in older:
+            (folder / name).unlink(missing_ok=True)
         write_json(folder / MANIFEST, manifest)
         _check_manifest(folder, _read(folder / MANIFEST) or {}, manifest)  # another process may have been quicker
 
@@ -160,13 +168,18 @@ def complete_frames(folder: Path) -> set[int]:
     Files without the log's manifest do not count, because their input is unknown. Incomplete files, such as those of an
     interrupted copy, do not count either.
     """
-    forget_listings(folder)
-    with remote_errors(folder):
-        names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
+    names = _names(folder)
     if MANIFEST not in names:
         return set()
-    frames = [name for name in names if re.fullmatch(r"[0-9]{1,20}\.feather", name)]
-    return {int(name[: -len(".feather")]) for name in frames if is_remote(folder) or _is_whole(folder / name)}
+    whole = [name for name in names if _FRAME.fullmatch(name) and (is_remote(folder) or _is_whole(folder / name))]
+    return {int(name[: -len(".feather")]) for name in whole}
+
+
+def _names(folder: Path) -> list[str]:
+    """Return the names of the files in a folder, none if there is no folder."""
+    forget_listings(folder)
+    with remote_errors(folder):
+        return [file.name for file in folder.iterdir()] if folder.is_dir() else []
 
 
 def frame_file(folder: Path, timestamp: int) -> Path:
@@ -204,4 +217,4 @@ def _read(file: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except CFlowError as error:
-        raise CFlowError(f"{file} is not a manifest ({error}): remove it, or give output=FOLDER") from None
+        raise CFlowError(f"{file} is not a manifest ({error}): remove that folder, or give output=FOLDER") from None
