@@ -86,7 +86,7 @@ class Local(Engine):
     """Worker processes of this machine."""
 
     name: str = setting("local", "the engine; engine= chooses it", choices=("local",))
-    timeout: float = _above_0(600, "seconds after which a silent worker is replaced (with several workers)")
+    timeout: float = _above_0(600, "seconds for a frame after which a silent worker is replaced (with several workers)")
     memory: float | None = _above_0(
         None, "limit of the address space of each worker on a CPU, in bytes, for example 8e9; null = no limit"
     )

@@ -94,7 +94,7 @@ def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
 
     Frames that are older than the manifest are removed, because nothing says which settings they have.
     """
-    # We list the files before we look for the manifest: what another process of this run writes later is not in the list.
+    # We list them before we look for the manifest, so that frames of another process of this run are not among them.
     older = [name for name in _names(folder) if _FRAME.fullmatch(name)]
     if not _is_claimed(folder, manifest):
         for name in older:

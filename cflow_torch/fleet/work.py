@@ -59,14 +59,17 @@ class Worker:
         self._source: Any = None
         self._log: Any = None
         self._reader, self._writer = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
-        self._events: Iterator[Event] = iter(())  # of the part that `next_event` has begun
+        self._events: Iterator[Event] = iter(())  # of the part that `begin` has begun
         self._is_stopped = False
 
-    def next_event(self, part: Part | None, is_stopped: bool) -> Event | None:
-        """Begin a part, if one is given, and return the next event of the part; None after the last one."""
+    def begin(self, part: Part, is_stopped: bool) -> Event | None:
+        """Begin a part, and return its first event. Cost: opens the log; odometry takes 0.2 s per sweep."""
+        self._events = self.run(part)
+        return self.next_event(is_stopped)
+
+    def next_event(self, is_stopped: bool) -> Event | None:
+        """Return the next event of the part; None after the last one."""
         self._is_stopped = is_stopped
-        if part is not None:
-            self._events = self.run(part)
         return next(self._events, None)
 
     def run(self, part: Part) -> Iterator[Event]:
