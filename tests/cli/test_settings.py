@@ -121,7 +121,7 @@ def test_a_wrong_preset_is_one_line(text, message, mine, cflow, capsys):
 @pytest.mark.parametrize(
     "name",
     ["10203656353524179475_7625_000_7645_000", "1e5", "2024_11_22", "-1.5", "true", "a_1", "Ausgänge/東京", 'it\'s "ü"']
-    + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "50%", "a#b"],
+    + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "C:\\data\\", '\\\\host\\a \\"b\\\\', "50%", "a#b"],
 )
 def test_names_are_text_even_if_they_look_like_numbers(name):
     overrides = hydra_overrides(Plot, split([f"log={name}", f"+data.root={name}", "pair=1"]))
