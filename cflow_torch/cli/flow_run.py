@@ -101,9 +101,12 @@ class FlowRun:
         print(f"{format_report(report)}\nflow files in {self.job.output}, report in {file}")
         status = report["exit_status"] or int(bool(failures))
         if status:
-            missing = format_missing(report) + "".join(f"\n  {name}: {message}" for name, message in failures)
-            print(f"missing:\n{missing}", file=sys.stderr)
-            end_unfinished(f"some frames are missing: see {file}", status)
+            lines = [format_missing(report), *(f"  {name}: {message}" for name, message in failures)]
+            print("\n".join(["missing:", *filter(None, lines)]), file=sys.stderr)
+            what = (
+                f"some frames are missing: see {file}" if report["exit_status"] else "some files could not be written"
+            )
+            end_unfinished(what, status)
 
     def _check_output(self) -> None:
         """Make sure that the results may be added to the output."""

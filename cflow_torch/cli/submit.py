@@ -9,7 +9,7 @@ from typing import Any, List, Mapping, Optional, Sequence, Tuple
 from cflow_torch.cli.commands import Submit
 from cflow_torch.cli.failures import Failures, collect_failures, finish
 from cflow_torch.cli.logs import open_logs
-from cflow_torch.cli.outputs import claim_output, output_folder
+from cflow_torch.cli.outputs import claim_output, local_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.log import Log
 from cflow_torch.estimate import make_model
@@ -26,7 +26,7 @@ _Listed = Optional[Mapping[str, Sequence[int]]]
 
 
 def task(cfg: Submit) -> None:
-    version, output = archive.get_version(cfg.version), output_folder(cfg)
+    version, output = archive.get_version(cfg.version), local_folder(cfg)
     if cfg.masks is not None and not version.is_masked:
         raise CFlowError(f"version {version.number} contains every point: masks= is only for version 1")
     if cfg.masks is not None and cfg.frames is not None:

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from small_logs import write_small_log
 
 from cflow_torch import make_config
-from cflow_torch.cli import failures, pairs
+from cflow_torch.cli import demo, failures, pairs
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.eval import objective
 from cflow_torch.config import Config
@@ -71,6 +71,31 @@ def test_demo_without_the_extras_lacks_only_picture_and_page(tmp_path, cflow, mo
     assert printed.out.startswith("no picture (") and "pip install matplotlib" in printed.out and not printed.err
     assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("flow.*"))
     assert "no page (" in printed.out and "k3d" in printed.out
+
+
+def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_path, cflow, monkeypatch):
+    pytest.importorskip("matplotlib")
+    for name in ("a", "b"):
+        shutil.copytree(log_folder, tmp_path / "logs" / name)
+    pages: list[Any] = []
+    monkeypatch.setattr(demo, "load_k3d", lambda: None)
+    monkeypatch.setattr(demo, "save_page", lambda log, results, *_, **__: pages.append((log.log_id, len(results))))
+    titles: list[str] = []
+    plot = demo.plot_flow
+    monkeypatch.setattr(
+        demo, "plot_flow", lambda *given, title, **view: (titles.append(title), plot(*given, **view))[1]
+    )
+    data = ("data=av2", f"data.root={tmp_path / 'logs'}", "data.check=false")
+    assert cflow("demo", *data, f"output={tmp_path / 'out'}", "pair=1", "model=paper", SMALL) == 0
+    assert pages == [("a", 3)] and titles == ["CorrelationFlow, a"]
+    assert results_of(tmp_path / "out")["num_pairs"] == 6
+
+
+def test_demo_and_submit_write_to_this_machine(log_folder, cflow, capsys):
+    pytest.importorskip("upath")
+    for call in (["demo"], ["submit", log_folder]):
+        assert cflow(*call, "output=memory://out") == 2
+        assert "give a folder of this machine" in capsys.readouterr().err
 
 
 def test_the_results_file_is_complete(log_folder, tmp_path, evaluate):
