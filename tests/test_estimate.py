@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import doctest
 import re
 import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -288,3 +290,9 @@ def test_models_are_typed_for_users(tmp_path):
         patch.setenv("MYPYPATH", package)
         printed, _, _ = api.run(["--config-file=", "--ignore-missing-imports", "--follow-imports=silent", str(file)])
     assert "verified.method.VerifiedFlow" in printed and re.search(r"list\[cflow_torch.types.FlowResult\]", printed)
+
+
+@pytest.mark.parametrize("module", ["estimate", "dense.method", "keypoints.method", "simulator.drive"])
+def test_examples_of_docstrings_run(module):
+    done = doctest.testmod(import_module(f"cflow_torch.{module}"), extraglobs={"torch": torch})
+    assert done.attempted > 0 and done.failed == 0
