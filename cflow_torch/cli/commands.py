@@ -141,8 +141,8 @@ class Demo(Command):
     """Simulates a drive, estimates its flow, scores it and draws it. You need no data.
 
     The drive is written in Argoverse 2's format to outputs/cache and read from there like a real log. OUTPUT
-    (outputs/demo) contains flow.html (a 3-D page for any browser) and flow.png of the first log, <log id>/ with flow files,
-    results.json with the scores, and config.yaml with the settings.
+    (outputs/demo) contains flow.html (a 3-D page for any browser), flow.png, <log id>/ with one flow file per pair,
+    results.json with the scores, and config.yaml with the settings. Of several logs, page and picture show the first.
 
     examples:
       cflow demo

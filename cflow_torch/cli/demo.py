@@ -16,7 +16,7 @@ from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import safe_name
 from cflow_torch.estimate import make_model
-from cflow_torch.stages import TimedModel
+from cflow_torch.stages import CallTime, time_report
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.page import load_k3d, save_page
@@ -28,7 +28,7 @@ def task(cfg: Demo) -> None:
     draws = _is_available("picture", lambda: blank_figure((1, 1), 100))  # matplotlib and k3d are extras
     shows = _is_available("page", load_k3d)
     scores = Scores(cfg)
-    model = TimedModel(make_model(cfg.model, cfg.device))
+    model = make_model(cfg.model, cfg.device)
     logs, failures = open_logs(cfg.data)
     if logs:
         check_pair(cfg.pair, logs[0])
@@ -50,8 +50,9 @@ def task(cfg: Demo) -> None:
     for log in logs:
         remove_stale(output / log.log_id)
     pairs = [(log, index) for log in logs for index in range(len(log.timestamps) - 1)]
-    failures += for_each_pair(pairs, model, keep)
-    scores.report(output, logs, model.report(), failures)
+    times: list[CallTime] = []
+    failures += for_each_pair(pairs, model, keep, times)
+    scores.report(output, logs, time_report(times), failures)
     print(f"picture: {picture}")
     if shows and results:
         page, tracks = output / "flow.html", track(logs[0], results)

@@ -26,7 +26,7 @@ from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
 from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.simulator.benchmark import generator_key
-from cflow_torch.stages import TimedModel
+from cflow_torch.stages import CallTime, time_report
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 # Settings that do not change the results.
@@ -42,17 +42,18 @@ def task(cfg: Eval) -> float:
         _print_scores(output, record["results"], record["seconds_per_pair"])
         return objective(record["results"])
     scores = Scores(cfg)
-    model = TimedModel(make_model(cfg.model, cfg.device))
+    model = make_model(cfg.model, cfg.device)
     logs, failures = open_logs(cfg.data)
     ensure_writable(output)
     first, step = cfg.data["first"], cfg.data["step"]
     pairs = [(log, index) for log in logs for index in chosen_pairs(log, first, step)]
-    failures += for_each_pair(pairs, model, scores.add)
+    times: list[CallTime] = []
+    failures += for_each_pair(pairs, model, scores.add, times)
     if scores.metrics.counts["num_frames"] == 0 and failures:
         raise CFlowError("no pair could be scored; {} failed first: {}".format(*failures[0]))
     if scores.metrics.counts["num_frames"] == 0:
         raise CFlowError("no pair has labels, so there is nothing to score; `cflow flow` needs no labels")
-    results = scores.report(output, logs, model.report(), failures)
+    results = scores.report(output, logs, time_report(times), failures)
     with suppress(UnfinishedJob):  # a job of a sweep returns its score; a single run exits with status 1
         finish(failures)
     return objective(results)
@@ -85,7 +86,7 @@ class Scores:
     def report(self, folder: Path, logs: Sequence[Log], seconds: dict[str, Any], failures: Failures) -> dict[str, Any]:
         """Print and return the scores, and write `folder/results.json` and `folder/config.yaml`.
 
-        `seconds` is the result of `TimedModel.report`.
+        `seconds` is the result of `time_report`.
         """
         results = self.metrics.compute()
         record = {

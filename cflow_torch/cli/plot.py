@@ -21,7 +21,6 @@ from cflow_torch.data.log import Log, window
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
-from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.animation import AnimatedPair, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
@@ -118,7 +117,7 @@ def _animate(cfg: Animation, model: SceneFlowModel, log: Log, output: Path) -> P
         title = f"{log.log_id}, {(log.timestamps[index] - log.timestamps[pairs[0]]) / 1e9:.1f} s"
         frames.append(AnimatedPair(sweeps.pc0.points, result, sweeps.pc0.is_ground, title))
 
-    finish(for_each_pair([(log, index) for index in pairs], TimedModel(model), keep))
+    finish(for_each_pair([(log, index) for index in pairs], model, keep))
     figures = flow_figures(
         frames,
         point_cloud_range=model.config.point_cloud_range,

@@ -17,7 +17,7 @@ from cflow_torch.evaluation.submission import archive, frames
 from cflow_torch.evaluation.submission.archive import SubmissionVersion
 from cflow_torch.evaluation.submission.frames import MaskArchive, SubmittedFrame
 from cflow_torch.fleet.progress import Progress
-from cflow_torch.stages import TimedModel
+from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Plan = List[Tuple[SubmittedFrame, int]]  # frames with their numbers of rows
@@ -33,7 +33,7 @@ def task(cfg: Submit) -> None:
         raise CFlowError("masks= already lists the frames that are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = frames.read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
-    model = TimedModel(make_model(cfg.model, cfg.device))
+    model = make_model(cfg.model, cfg.device)
     logs, failures = open_logs(cfg.data)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
@@ -74,7 +74,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
     return plan, failures
 
 
-def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Masks, folder: Path) -> Failures:
+def _write(plan: Plan, model: SceneFlowModel, version: SubmissionVersion, masks: _Masks, folder: Path) -> Failures:
     largest, total, count = 0.0, 0.0, 0
     todo = [frame for frame, rows in plan if not archive.is_complete(folder, frame.name, rows, version)]
 

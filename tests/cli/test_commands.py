@@ -210,7 +210,8 @@ def test_worker_processes_give_the_results_of_one_process(log_folder, tmp_path, 
         assert evaluate(f"data.root={root}", f"output={tmp_path / name}") == 1
         records.append(results_of(tmp_path / name))
     one, two = records
-    assert two["num_pairs"] == 2 and two["seconds_per_pair"]["pairs"] == one["seconds_per_pair"]["pairs"]
+    assert two["num_pairs"] == 2 and one["seconds_per_pair"]["pairs"] == 1, "the first pair is a warm-up"
+    assert two["seconds_per_pair"]["pairs"] in (1, 2), "and so is that of each process, unless there is no other"
     assert all(one[key] == two[key] for key in ("results", "failures", "data"))
 
 

@@ -6,6 +6,7 @@ import multiprocessing
 import signal
 import threading
 import time
+import warnings
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NoAnswer
 from dataclasses import replace
@@ -43,10 +44,11 @@ class FailingModel:
         self.model = make_model(CONFIG, "cpu")
         self.config, self.bad, self._error = self.model.config, bad, error
 
-    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
+    def __call__(self, windows: Sequence[Window], warns: bool) -> list[FlowResult]:
+        warnings.simplefilter("always")  # as a reader that changes the filters in its thread
         if any(w.pc0.timestamp_ns in self.bad for w in windows):
             raise self._error()
-        return self.model(windows)
+        return self.model(windows, warns)
 
 
 @pytest.mark.parametrize("error", [CFlowError("too odd"), MemoryError(), RuntimeError("CUDA: no memory"), KeyError(3)])
@@ -83,7 +85,12 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
             return Odd(drive)
 
     job = make_job(tmp_path, config=make_config("paper"), settings={}, batch=4)
-    events = list(Opener(job, "cpu").run(Part("odd")))
+    worker = Opener(job, "cpu")
+    worker._model = FailingModel([], AssertionError)
+    worker._model.model = make_model(job.config, "cpu")
+    with warnings.catch_warnings(record=True) as shown:
+        events = list(worker.run(Part("odd")))
+    assert not shown, "what fails is told once, as a failure"
     (failed,) = [event for event in events if isinstance(event, Failed)]
     count = len(drive.sweep(1).points)
     names = [f"{drive.log_id}/{stamp}" for stamp in drive.timestamps]
