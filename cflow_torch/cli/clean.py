@@ -24,7 +24,7 @@ from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.changes import check_same_run
+from cflow_torch.fleet.changes import OVERWRITE, check_same_run
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
@@ -62,20 +62,26 @@ def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
 
 def _is_new(cfg: Clean, log: Log, output: Path) -> bool:
     """Test whether a log is to be written. A folder with results of other settings or sweeps is a `CFlowError`."""
-    folder = output / log.log_id
-    if not folder.exists() or cfg.overwrite:
+    if not (output / log.log_id).exists() or cfg.overwrite:
         return True
+    _check(cfg, log, output)
+    return False
+
+
+def _check(cfg: Clean, log: Log, output: Path) -> None:
+    """Raise a `CFlowError` if the folder of a log has results of other settings or sweeps."""
+    folder = output / log.log_id
     file = _record_file(folder)
     before: dict[str, Any] = read_json(file) if file.exists() else {}
-    check_same_run(folder, before, json_ready(_record(cfg, log)), _FREE)
-    return False
+    remedy = "rename one of two logs of this name" if cfg.overwrite else OVERWRITE
+    check_same_run(folder, before, json_ready(_record(cfg, log)), _FREE, remedy)
 
 
 def _claim(cfg: Clean, log: Log, output: Path, is_new: bool) -> None:
     """Remove the older results of a log that is to be written, and record its settings."""
     folder = output / log.log_id
     if not is_new:
-        _is_new(cfg, log, output)  # another log of this run may have its name
+        _check(cfg, log, output)  # another log of this run may have its name
         return
     shutil.rmtree(folder, ignore_errors=True)
     for suffix in (".ply", ".png"):

@@ -115,9 +115,9 @@ def _print_scores(folder: Path, results: dict[str, Any], seconds: dict[str, Any]
 
 
 def finished_results(cfg: Eval, folder: Path) -> dict[str, Any] | None:
-    """Read the record of an earlier run with the same settings and versions; None without one, or with `overwrite`.
+    """Read the record of an earlier run with the same settings and versions in which nothing failed.
 
-    Results of other settings are a `CFlowError`.
+    None without one, or with `overwrite`. Results of other settings are a `CFlowError`.
     """
     file = folder / RESULTS
     if cfg.overwrite or not file.exists():
@@ -125,7 +125,7 @@ def finished_results(cfg: Eval, folder: Path) -> dict[str, Any] | None:
     record: dict[str, Any] = read_json(file)
     now = _origin(cfg)
     check_same_run(folder, {key: record.get(key) for key in now}, now, _PATHS)
-    return record
+    return None if record.get("failures") else record
 
 
 def objective(results: dict[str, Any]) -> float:

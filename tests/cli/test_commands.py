@@ -147,6 +147,11 @@ def test_bad_frames_and_bad_logs_are_reported_and_skipped(log_folder, tmp_path, 
     record, frame, error = results_of(tmp_path), f"broken/{sweeps[2].stem}", capsys.readouterr().err
     assert "2 failed:" in error and f"  {frame}: " in error and "  bad-poses: " in error
     assert record["num_pairs"] == 2 + 3 and [name for name, _ in record["failures"]] == ["bad-poses", frame]
+    shutil.copy(log_folder / "sensors" / "lidar" / sweeps[3].name, sweeps[3])
+    assert evaluate(f"data.root={root}") == 1 and results_of(tmp_path)["num_pairs"] == 6, "what failed is repeated"
+    shutil.rmtree(root / "bad-poses")
+    assert evaluate(f"data.root={root}") == 0 and "skipped" not in capsys.readouterr().out
+    assert evaluate(f"data.root={root}") == 0 and "skipped" in capsys.readouterr().out
 
 
 def test_a_scene_without_poses_names_what_helps(tmp_path, cflow, capsys):

@@ -90,6 +90,16 @@ def test_clean_resumes_and_overwrites_as_flow_does(drives, tmp_path, cflow, caps
     assert times(out / "drive_2") == second
 
 
+def test_clean_names_a_second_log_of_a_name(drives, tmp_path, cflow, capsys):
+    twin = Path(shutil.copytree(drives[0], tmp_path / "elsewhere" / "drive_1"))
+    next((twin / "sensors" / "lidar").iterdir()).unlink()
+    call = ("clean", *SMALL, f"output={tmp_path / 'out'}", "overwrite=true")
+    for _ in range(2):
+        assert cflow(*call, drives[0], twin) == 1
+        assert "rename one of two logs of this name" in capsys.readouterr().err
+        assert len(list((tmp_path / "out" / "drive_1" / "points").iterdir())) == 4
+
+
 def test_a_run_whose_tracks_fail_names_them_and_not_its_frames(drives, tmp_path, cflow, monkeypatch, capsys):
     def refuse(*_: Any) -> None:
         raise CFlowError("no room")
