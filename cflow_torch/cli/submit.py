@@ -22,7 +22,7 @@ from cflow_torch.types import CFlowError, FlowResult, Window
 
 Plan = List[Tuple[SubmittedFrame, int]]  # frames with their numbers of rows
 _Masks = Optional[MaskArchive]
-_Listed = Optional[Mapping[str, Sequence[int]]]
+_Listed = Optional[Mapping[str, Sequence[str]]]
 
 
 def task(cfg: Submit) -> None:
