@@ -56,7 +56,7 @@ def task(cfg: Demo) -> None:
     print(f"picture: {picture}")
     if shows and results:
         page, tracks = output / "flow.html", track(logs[0], results)
-        save_page(logs[0], results, page, tracks=lambda: tracks, preset=chosen_preset())
+        save_page(logs[0], results, page, tracks=lambda: tracks, preset=chosen_preset(cfg))
         print(f"3-D page, for any browser: {page}")
     print(f"flow files, scores, settings: {output}")
     finish(failures)

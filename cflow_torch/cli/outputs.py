@@ -19,7 +19,7 @@ from cflow_torch.cli.failures import is_sweep
 from cflow_torch.cli.info import processor
 from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.fleet.changes import check_same_run
+from cflow_torch.fleet.changes import check_same_run, nearest_preset
 from cflow_torch.types import CFlowError
 
 
@@ -42,8 +42,9 @@ def machine() -> dict[str, Any]:
     }
 
 
-def chosen_preset() -> str:
-    return str(HydraConfig.get().runtime.choices["model"])
+def chosen_preset(cfg: Command) -> str:
+    """Return the preset of a run; the nearest one if its settings come from the config.yaml of an earlier run."""
+    return str(HydraConfig.get().runtime.choices.get("model") or nearest_preset(asdict(cfg.model)))
 
 
 def output_folder(cfg: Command) -> Path:

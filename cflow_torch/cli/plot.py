@@ -85,7 +85,7 @@ def _from_above(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: W
     view: dict[str, Any] = {
         "is_ground": sweeps.pc0.is_ground,
         "point_cloud_range": model.config.point_cloud_range,
-        "title": f"{log.log_id}, sweep {log.timestamps[pair]}, preset {chosen_preset()}",
+        "title": f"{log.log_id}, sweep {log.timestamps[pair]}, preset {chosen_preset(cfg)}",
     }
     if not isinstance(cfg, FlowPicture):
         return plot_clusters(points, result, **view)

@@ -74,7 +74,7 @@ def _save_page(cfg: View, log: Log, results: Iterator[tuple[int, FlowResult]], f
         results if table is not None else tracked(),
         file,
         tracks=lambda: tracker.table() if table is None else table,
-        preset=chosen_preset() if cfg.flow is None else nearest_preset(method_of_flow(cfg.flow, log.log_id) or {}),
+        preset=chosen_preset(cfg) if cfg.flow is None else nearest_preset(method_of_flow(cfg.flow, log.log_id) or {}),
         max_flow=cfg.max_flow,
         voxel=cfg.voxel,
     )

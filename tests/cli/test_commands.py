@@ -60,6 +60,11 @@ def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys):
         assert f"3-D page, for any browser: {tmp_path / 'flow.html'}" in printed
         assert '"preset":"default"' in (tmp_path / "flow.html").read_text(encoding="utf-8")
     assert not list(tmp_path.rglob(".*")), "no temporary file is left"
+    again = tmp_path / "again"
+    assert cflow("demo", "--config-dir", tmp_path, "--config-name", "config", f"output={again}") == 0
+    assert results_of(again)["results"] == scores["results"]
+    if find_spec("k3d"):
+        assert (again / "flow.html").read_bytes() == (tmp_path / "flow.html").read_bytes()
 
 
 def test_demo_without_the_extras_lacks_only_picture_and_page(tmp_path, cflow, monkeypatch, capsys):
