@@ -13,6 +13,7 @@ from cflow_torch.cli.commands import FlowFiles
 from cflow_torch.cli.failures import Failures, end_unfinished
 from cflow_torch.cli.logs import find_logs
 from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config
+from cflow_torch.cli.track_formats import TRACK_FILES
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.catalog import source_name
 from cflow_torch.data.json_file import write_json
@@ -75,7 +76,7 @@ class FlowRun:
         self._check_output()
         if self._cfg.overwrite and self.shard.count == 1:
             for log in self.open_logs():
-                clear_log(self.output / log.log_id)
+                clear_log(self.output / log.log_id, TRACK_FILES)
         write_config(self._cfg, self.output)
         devices = self._useful_devices()
         settings = asdict(self._cfg.engine)

@@ -16,7 +16,7 @@ import re
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Iterable, Mapping, Sequence
+from typing import Any, Container, Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -34,9 +34,7 @@ MANIFEST = "manifest.json"
 _FORMAT = 2
 _FRAME = re.compile(r"[0-9]{1,20}\.feather")
 _ENDING = b"ARROW1"  # last bytes of a feather file
-_TRACKS = r"tracks\.parquet|mot\.txt|kitti\.txt|instances_info\.json|frame_instances\.json"
-_DETECTIONS = r"nuscenes_detection\.json|nuscenes_tracking\.json|result\.pkl"
-_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|{_DETECTIONS}|\..+\.tmp")
+_OURS = re.compile(r"[0-9]+\.feather|manifest\.json|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 
 
@@ -136,8 +134,8 @@ def describe_log(log: Log) -> dict[str, Any]:
     return {"log_id": log.log_id, "timestamps": stamps, "sweeps": digests}
 
 
-def clear_log(folder: Path) -> None:
-    """Remove the results of a log and no other files.
+def clear_log(folder: Path, tracks: Container[str] = ()) -> None:
+    """Remove the results of a log, also the files called `tracks`, and no other files.
 
     We remove the manifest last, because it marks the folder as ours.
     """
@@ -156,7 +154,7 @@ def clear_log(folder: Path) -> None:
     with suppress(OSError):
         masks.rmdir()
     for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
-        if _OURS.fullmatch(file.name):
+        if _OURS.fullmatch(file.name) or file.name in tracks:
             file.unlink()
     with suppress(OSError):  # it has other files, or an object store has no folders
         folder.rmdir()
