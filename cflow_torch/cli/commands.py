@@ -352,6 +352,7 @@ class Plot(Command):
 
     SUMMARY: ClassVar[str] = "draw flow, clusters, key points, correlation, scales or an animation"
     NAMED_BY: ClassVar[str] = "picture"
+    CHOOSES_PAIRS: ClassVar[bool] = True  # of an animation
     PRESET: ClassVar[str] = ""  # that the picture chooses, "" = none
     PIXEL_SIZES: ClassVar[tuple[float, ...]] = ()  # that the picture chooses
 
@@ -422,9 +423,7 @@ class ScalesPicture(CorrelationPicture):
 class Animation(Plot):
     """The flow of several pairs, one after the other, with the same view and colours. `pair` is ignored."""
 
-    first: int = setting(0, "index of the first pair", low=0)
-    step: int = _count(1, "draw every n-th pair")
-    count: int | None = _count(None, "number of pairs; null = to the end of the log")
+    count: int | None = _count(None, "number of pairs, from data.first, every data.step; null = to the end of the log")
     format: str = setting("gif", "gif | mp4 (extra video)", choices=("gif", "mp4"))
     frames_per_second: float = _above_0(5.0, "pictures per second")
     width: int = _count(800, "pixels")

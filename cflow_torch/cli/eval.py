@@ -45,8 +45,7 @@ def task(cfg: Eval) -> float:
     model = make_model(cfg.model, cfg.device)
     logs, failures = open_logs(cfg.data)
     ensure_writable(output)
-    first, step = cfg.data["first"], cfg.data["step"]
-    pairs = [(log, index) for log in logs for index in chosen_pairs(log, first, step)]
+    pairs = [(log, index) for log in logs for index in chosen_pairs(log, cfg.data)]
     times: list[CallTime] = []
     failures += for_each_pair(pairs, model, scores.add, times)
     if scores.metrics.counts["num_frames"] == 0 and failures:

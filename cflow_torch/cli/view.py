@@ -39,7 +39,7 @@ def task(cfg: View) -> None:
         with collect_failures(failures, log.log_id):
             if file in files:
                 raise CFlowError(f"{file} exists for another log of this name: give a data.root= with one of them")
-            pairs = chosen_pairs(log, cfg.data["first"], cfg.data["step"], cfg.count)
+            pairs = chosen_pairs(log, cfg.data, cfg.count)
             results = _results(recent, pairs, flow, failures)
             stored = None if cfg.flow is None else as_path(cfg.flow) / log.log_id / TRACKS_FILE
             table = None if stored is None or not stored.exists() else read_tracks(stored)
