@@ -45,7 +45,7 @@ def task(cfg: Submit) -> None:
     if cfg.overwrite:
         shutil.rmtree(folder, ignore_errors=True)
         file.unlink(missing_ok=True)
-    claim_output(cfg, output, ("device", "archive"))
+    claim_output(cfg, output)
     failures += _write(plan, model, version, masks, folder)
     finish(failures)
     _check(folder, version, plan)

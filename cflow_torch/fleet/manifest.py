@@ -28,6 +28,7 @@ from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
 from cflow_torch.fleet.changes import OVERWRITE, check_same_run
+from cflow_torch.setting import free_settings
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
@@ -43,7 +44,7 @@ def make_identity(
 ) -> dict[str, Any]:
     """Return what determines a result besides the sweeps: method, data settings, contents of files, versions.
 
-    `max_memory` does not change results, so it is left out. CPU and CUDA builds of one torch version count as the same.
+    CPU and CUDA builds of one torch version count as the same.
     """
     versions = {
         "cflow_torch": __version__,
@@ -51,7 +52,8 @@ def make_identity(
         "numpy": np.__version__,
     }
     data = {"reader": reader, **{key: value for key, value in settings.items() if key != "check"}}
-    method = {key: value for key, value in asdict(config).items() if key != "max_memory"}
+    free = free_settings(type(config))
+    method = {key: value for key, value in asdict(config).items() if key not in free}
     identity = json_ready(
         {"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions}
     )

@@ -127,7 +127,7 @@ def test_a_folder_of_another_run_is_an_error_that_names_the_difference(tmp_path,
     first = file.read_bytes()
     assert evaluate("device=cpu", "data.step=2") == 2
     error = capsys.readouterr().err
-    assert "config.data.step was 3, is 2" in error and "config.device was auto" in error and "overwrite=true" in error
+    assert "(data.step was 3, is 2; device was auto, is cpu)" in error and "overwrite=true" in error
     file.write_bytes(first.replace(b'"torch": "', b'"torch": "0.'))
     assert evaluate("data.step=3") == 2 and "versions.torch" in capsys.readouterr().err
     for broken, message in ((first[:1000], f"cannot read {file} as JSON"), (b"{}", "has results of another run")):
