@@ -74,6 +74,7 @@ class Config(Settings):
         optional=True,
         above=0,
         high=float(LIMIT),
+        free=True,
     )
 
     def check(self) -> None:

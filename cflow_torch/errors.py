@@ -27,10 +27,6 @@ class CFlowWarning(UserWarning):
     """Input that is allowed, but likely a mistake."""
 
 
-class NoActivePoints(CFlowWarning):
-    """No point of pc0 is active (finite, not ground, not of the vehicle, in the region), so no row has a result."""
-
-
 def near(word: str, known: Iterable[str]) -> str:
     """Return the hint " (did you mean X?)", "" if no name is similar.
 
@@ -53,11 +49,11 @@ def import_optional(module: str, need: str, name: str | None = None) -> Any:
         raise CFlowError(need) from error
 
 
-def warn(text: str, category: type[CFlowWarning] = CFlowWarning) -> None:
-    """Warn, and name the line of the user's code that called the package."""
+def warn(text: str) -> None:
+    """Give a `CFlowWarning`, and name the line of the user's code that called the package."""
     level = 2
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in _NOT_OF_USERS:
         level = level + 1
         frame = frame.f_back
-    warnings.warn(text, category, stacklevel=level)
+    warnings.warn(text, CFlowWarning, stacklevel=level)

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import METHODS, PRESETS, Config, make_config
+from cflow_torch.errors import warn
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.stages import stage
 from cflow_torch.tensors import choose_device
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch, make_batch
-from cflow_torch.windows.inspection import warn_of_inactive
+from cflow_torch.windows.inspection import inactive_problems
 from cflow_torch.windows.memory import split_windows
 from cflow_torch.windows.validation import check_windows
 
@@ -120,22 +121,23 @@ class SceneFlowModel(nn.Module):
         bounds = self.config.point_cloud_range
         return Grid(pixel_size, bounds[:3], bounds[3:])
 
-    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
+    def __call__(self, windows: Sequence[Window], warns: bool = True) -> list[FlowResult]:
         """Estimate the flow of every window, see `forward`."""
-        return super().__call__(windows)  # type: ignore[no-any-return]
+        return super().__call__(windows, warns)  # type: ignore[no-any-return]
 
-    def forward(self, windows: Sequence[Window]) -> list[FlowResult]:
+    def forward(self, windows: Sequence[Window], warns: bool = True) -> list[FlowResult]:
         """Estimate the flow t -> t+1 of the points of every window's pc0.
 
         Args:
             windows: B windows, of any numbers of points and sweeps.
+            warns: False = give no warning, because you check the results by `inactive_problems`.
 
         Returns:
             B results. Each depends only on its window and the settings.
 
         Warns:
-            NoActivePoints: no point of a pc0 is active. `Inspection` warns of other likely mistakes; `estimate_flow`
-                and `FlowStream` call it.
+            CFlowWarning: no point of a pc0 is active. `Inspection` warns of other likely mistakes; `estimate_flow` and
+                `FlowStream` call it.
 
         Convention: `torch.compile` does not change the model. Shapes differ from window to window, so compiling would
             not pay.
@@ -147,7 +149,11 @@ class SceneFlowModel(nn.Module):
         """
         dynamo = sys.modules.get("torch._dynamo")  # loaded if anyone compiles; an import takes seconds
         estimate = self._estimate if dynamo is None else dynamo.disable(self._estimate)
-        return estimate(windows)  # type: ignore[no-any-return]
+        results: list[FlowResult] = estimate(windows)
+        for problem in inactive_problems(windows, results, self.config) if warns else ():
+            if problem:
+                warn(problem)
+        return results
 
     @torch.no_grad()
     @one_thread()
@@ -167,7 +173,6 @@ class SceneFlowModel(nn.Module):
                     motion = self.motion(batch)
                 with stage("spread"):  # outside of inference mode: a training loop may use these tensors
                     results += _results(batch, motion)
-        warn_of_inactive(windows, results, self.config)
         return results
 
 

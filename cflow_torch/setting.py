@@ -61,6 +61,11 @@ class Settings:
         self.check()
 
 
+def free_settings(kind: type[Settings]) -> list[str]:
+    """Return the settings on whose values no result depends."""
+    return [f.name for f in fields(kind) if f.metadata.get("free")]  # type: ignore[arg-type]
+
+
 def setting(default: Any, help: str, *, kind: type | None = None, **limits: Any) -> Any:
     """Make a field of `Settings`: its default, its `help` (meaning and unit), and the `limits` of `bounds`.
 
@@ -80,6 +85,7 @@ def bounds(
     choices: tuple[Any, ...] = (),
     word: str | None = None,
     several: bool = False,
+    free: bool = False,
 ) -> dict[str, Any]:
     """Describe the allowed values of a setting.
 
@@ -87,7 +93,7 @@ def bounds(
     `Settings`, whose values may be given as a dictionary. If `optional`, the value None is allowed. `low` and `high`
     are the smallest and the largest allowed value. `above` is a lower bound that is not allowed itself. `choices` are
     all allowed values, or empty if they cannot be listed. `word` is one more allowed value, such as "auto". If
-    `several`, the value is a list of such values.
+    `several`, the value is a list of such values. If `free`, no result depends on the value.
     """
     return {
         "kind": kind,
@@ -98,6 +104,7 @@ def bounds(
         "choices": choices,
         "word": word,
         "several": several,
+        "free": free,
     }
 
 

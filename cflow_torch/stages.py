@@ -6,7 +6,7 @@ import statistics
 import threading
 import time
 from contextlib import contextmanager
-from typing import Any, Iterator, Sequence
+from typing import Any, Iterator, NamedTuple, Sequence
 
 import torch
 from torch.profiler import record_function
@@ -38,38 +38,46 @@ def stage_seconds() -> Iterator[dict[str, float]]:
         _watched.seconds = before
 
 
-class TimedModel:
-    """Wrap a method and time every call.
+class CallTime(NamedTuple):
+    """The time of a call of a method: from the windows in memory to the results on the device."""
 
-    The time of a pair starts when its window is in memory, and ends when its result is on the device. The first pair is
-    a warm-up and does not count, unless it is the only one.
-    """
+    seconds: float
+    stages: dict[str, float]  # seconds of each stage
+    is_warm_up: bool  # the first call of a process, which takes longer
+
+
+class TimedModel:
+    """Wrap a method and time every call."""
 
     def __init__(self, model: Any) -> None:
         self.model = model
-        self.config = model.config
-        self.pairs: list[tuple[float, dict[str, float]]] = []  # seconds of each call, and of its stages
+        self.times: list[CallTime] = []
 
-    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
-        """Return the results of the method, and record the seconds."""
+    def __call__(self, windows: Sequence[Window], warns: bool = True) -> list[FlowResult]:
+        """Return the results of the method, and record the time."""
         with stage_seconds() as stages:
             start = time.perf_counter()
-            results = self.model(windows)
+            results = self.model(windows, warns)
             if results and results[0].flow.is_cuda:
                 torch.cuda.synchronize(results[0].flow.device)
-            self.pairs.append((time.perf_counter() - start, stages))
+            self.times.append(CallTime(time.perf_counter() - start, stages, not self.times))
         return results
 
-    def report(self) -> dict[str, Any]:
-        """Seconds per pair: "median", "min" and "max", the number of "pairs", and "stages" (median of each)."""
-        if not self.pairs:
-            return {"pairs": 0}
-        counted, stages = zip(*(self.pairs[1:] or self.pairs))
-        names = list(dict.fromkeys(name for pair in stages for name in pair))
-        return {
-            "median": statistics.median(counted),
-            "min": min(counted),
-            "max": max(counted),
-            "pairs": len(counted),
-            "stages": {name: statistics.median(pair.get(name, 0.0) for pair in stages) for name in names},
-        }
+
+def time_report(times: Sequence[CallTime]) -> dict[str, Any]:
+    """Return seconds per call: "median", "min" and "max", the number of "pairs", and "stages" (median of each).
+
+    A warm-up does not count, unless there is nothing else.
+    """
+    counted = [each for each in times if not each.is_warm_up] or times
+    if not counted:
+        return {"pairs": 0}
+    seconds = [each.seconds for each in counted]
+    names = list(dict.fromkeys(name for each in counted for name in each.stages))
+    return {
+        "median": statistics.median(seconds),
+        "min": min(seconds),
+        "max": max(seconds),
+        "pairs": len(seconds),
+        "stages": {name: statistics.median(each.stages.get(name, 0.0) for each in counted) for name in names},
+    }

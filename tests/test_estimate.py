@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import doctest
 import re
 import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,10 +19,10 @@ from preset_windows import changed
 from scenes import assert_same, assert_same_bits, assert_zeros, config, scene
 
 from cflow_torch import CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow, estimate_flow, make_config, make_model
-from cflow_torch.errors import CFlowError, CFlowWarning, NoActivePoints
+from cflow_torch.errors import CFlowError, CFlowWarning
 from cflow_torch.ground.segmentation import find_ground_batch
 from cflow_torch.simulator import make_drive
-from cflow_torch.stages import TimedModel
+from cflow_torch.stages import TimedModel, time_report
 from cflow_torch.types import Sweep, Window
 from cflow_torch.windows.inspection import Inspection
 
@@ -112,12 +114,13 @@ def test_everything_ground_and_single_points():
     ids=["millimetres", "nothing finite"],
 )
 def test_a_warning_if_no_point_is_active(points, seen):
-    with pytest.warns(NoActivePoints, match=f"none of the .* points of pc0 is active.*{seen}"):
+    with pytest.warns(CFlowWarning, match=f"none of the .* points of pc0 is active.*{seen}"):
         assert not estimate_flow(points, P1).is_valid.any()
-    with pytest.warns(NoActivePoints, match="none of the"):
+    with pytest.warns(CFlowWarning, match="none of the"):
         make_model(config("dense"))([Window(Sweep(points), Sweep(P1))])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        make_model(config("dense"))([Window(Sweep(points), Sweep(P1))], warns=False)
         estimate_flow(P0, P1)
         estimate_flow(P0[:0], P1)
 
@@ -213,13 +216,16 @@ def test_results_are_ordinary_tensors_that_a_training_loop_may_use():
 
 def test_a_stop_watch_stands_in_for_the_method_and_knows_its_stages():
     watch, window = TimedModel(make_model(config("verified"))), scene(0)
-    assert watch.report() == {"pairs": 0}
+    assert time_report([]) == {"pairs": 0}
     results = [watch([window])[0] for _ in range(3)]
-    assert_same_bits(results[0], make_model(watch.config)([window])[0])
-    report = watch.report()
+    assert_same_bits(results[0], watch.model([window])[0])
+    report = time_report(watch.times)
     assert report["pairs"] == 2 and 0 < report["min"] <= report["median"] <= report["max"]
     names = {"compensate", "draw", "change", "tree", "propose", "verify", "select", "refine", "confidence", "spread"}
     assert set(report["stages"]) == names and sum(report["stages"].values()) <= 3 * report["max"]
+    first, *others = watch.times
+    assert time_report([first, first, *others]) == report, "the first call of each of two processes is a warm-up"
+    assert time_report([first])["median"] == first.seconds
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -288,3 +294,9 @@ def test_models_are_typed_for_users(tmp_path):
         patch.setenv("MYPYPATH", package)
         printed, _, _ = api.run(["--config-file=", "--ignore-missing-imports", "--follow-imports=silent", str(file)])
     assert "verified.method.VerifiedFlow" in printed and re.search(r"list\[cflow_torch.types.FlowResult\]", printed)
+
+
+@pytest.mark.parametrize("module", ["estimate", "dense.method", "keypoints.method", "simulator.drive"])
+def test_examples_of_docstrings_run(module):
+    done = doctest.testmod(import_module(f"cflow_torch.{module}"), extraglobs={"torch": torch})
+    assert done.attempted > 0 and done.failed == 0

@@ -48,6 +48,12 @@ def test_nothing_newer_than_python_3_8_is_used():
     assert NEWER.search("[top, *top.parents[:2]]") and not NEWER.search("file.parents[2]")
 
 
+def test_nothing_changes_the_filters_of_warnings():
+    """All threads share them: a reader would switch off the warnings, or the errors, of the thread that computes."""
+    texts = {str(file): file.read_text(encoding="utf-8") for file in PACKAGE.rglob("*.py")}
+    assert not [file for file, text in texts.items() if re.search("catch_warnings|simplefilter", text)]
+
+
 def test_importing_loads_nothing_heavy_and_changes_nothing():
     code = (
         "import sys, numpy, torch\n"

@@ -16,7 +16,7 @@ from cflow_torch.data.log import Log, window
 from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.tables import markdown
 from cflow_torch.model import SceneFlowModel
-from cflow_torch.stages import TimedModel
+from cflow_torch.stages import TimedModel, time_report
 from cflow_torch.types import Window
 from cflow_torch.windows.memory import peak_memory
 
@@ -43,7 +43,7 @@ def measure(
 
     Returns:
         "points" (mean number per sweep), "windows", "repeats", "device"; "seconds": of one window, see
-        `TimedModel.report`; "batches": size -> "median" (seconds of a batch), "windows_per_s"; "peak_bytes": on a GPU
+        `time_report`; "batches": size -> "median" (seconds of a batch), "windows_per_s"; "peak_bytes": on a GPU
         the most that was allocated at once, on a CPU the most that the process ever used, None = not known.
     """
     watch = TimedModel(model)
@@ -58,7 +58,7 @@ def measure(
         of_batch = TimedModel(model)
         for _ in range(1 + repeats):
             of_batch([windows[i % len(windows)] for i in range(size)])
-        median = of_batch.report()["median"]
+        median = time_report(of_batch.times)["median"]
         throughput[size] = {"median": median, "windows_per_s": size / median}
     sweeps = [sweep for each in windows for sweep in each.sweeps]
     return {
@@ -66,7 +66,7 @@ def measure(
         "windows": len(windows),
         "repeats": repeats,
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
-        "seconds": watch.report(),
+        "seconds": time_report(watch.times),
         "batches": throughput,
         "peak_bytes": torch.cuda.max_memory_allocated(device) if device.type == "cuda" else peak_memory(),
     }

@@ -16,9 +16,9 @@ from cflow_torch.types import CFlowError
 def task(cfg: Check) -> None:
     """Print the pages of each path, whatever its format is."""
     statuses = [0]
-    for path in paths_of(cfg.data) or [None]:
+    for data in [{**cfg.data, "root": path} for path in paths_of(cfg.data)] or [cfg.data]:
         try:
-            pages = _pages({**cfg.data, "root": path}, sys.stderr if cfg.json else sys.stdout)
+            pages = _pages(data, sys.stderr if cfg.json else sys.stdout)
         except CFlowError as error:
             print(f"error: {error}", file=sys.stderr)
             statuses.append(2)

@@ -14,23 +14,21 @@ from cflow_torch.applications.cleaning import CleanLog, MaskedLog, static_map_wi
 from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
 from cflow_torch.cli.logs import open_logs
-from cflow_torch.cli.outputs import local_folder, settings_record, versions, write_config
+from cflow_torch.cli.outputs import check_made_by, local_folder, made_by, write_config
 from cflow_torch.cli.stored_flow import method_of_flow, stored_flow
 from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import json_ready, read_json, write_json
+from cflow_torch.data.json_file import read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.changes import check_same_run
+from cflow_torch.fleet.changes import OVERWRITE
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
-# Settings that do not change the points of a log.
-_FREE = ("output", "overwrite", "device", "map", "data.root", "data.label", "data.check", "model.max_memory")
 _NEEDED = ("residual_flow", "cluster_id", "is_valid")  # of flow files
 
 
@@ -62,20 +60,26 @@ def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
 
 def _is_new(cfg: Clean, log: Log, output: Path) -> bool:
     """Test whether a log is to be written. A folder with results of other settings or sweeps is a `CFlowError`."""
-    folder = output / log.log_id
-    if not folder.exists() or cfg.overwrite:
+    if not (output / log.log_id).exists() or cfg.overwrite:
         return True
+    _check(cfg, log, output)
+    return False
+
+
+def _check(cfg: Clean, log: Log, output: Path) -> None:
+    """Raise a `CFlowError` if the folder of a log has results of other settings or sweeps."""
+    folder = output / log.log_id
     file = _record_file(folder)
     before: dict[str, Any] = read_json(file) if file.exists() else {}
-    check_same_run(folder, before, json_ready(_record(cfg, log)), _FREE)
-    return False
+    remedy = "rename one of two logs of this name" if cfg.overwrite else OVERWRITE
+    check_made_by(cfg, folder, before, _record(cfg, log), remedy)
 
 
 def _claim(cfg: Clean, log: Log, output: Path, is_new: bool) -> None:
     """Remove the older results of a log that is to be written, and record its settings."""
     folder = output / log.log_id
     if not is_new:
-        _is_new(cfg, log, output)  # another log of this run may have its name
+        _check(cfg, log, output)  # another log of this run may have its name
         return
     shutil.rmtree(folder, ignore_errors=True)
     for suffix in (".ply", ".png"):
@@ -85,13 +89,13 @@ def _claim(cfg: Clean, log: Log, output: Path, is_new: bool) -> None:
 
 def _record(cfg: Clean, log: Log) -> dict[str, Any]:
     """Return what the clean points follow from: settings, versions, sweeps, and the method of stored flow."""
-    settings = settings_record(cfg)
-    settings["data"].pop("root", None)  # several logs, which may be elsewhere tomorrow
-    made: dict[str, Any] = {"versions": versions(), "log": describe_log(log)}
+    made = made_by(cfg, log=describe_log(log))
+    for name in ("root", "label"):  # several logs, which may be elsewhere tomorrow
+        made["data"].pop(name, None)
     if cfg.flow is not None:
-        settings.pop("model")  # it is not used
+        del made["model"]  # it is not used
         made["flow_by"] = method_of_flow(cfg.flow, log.log_id)
-    return {**settings, **made}
+    return made
 
 
 def _record_file(folder: Path) -> Path:

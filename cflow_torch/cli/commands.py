@@ -19,7 +19,9 @@ PAIR_SETTINGS = ("data.first", "data.step")
 DATA_SETTINGS: dict[str, dict[str, Any]] = {
     **dict.fromkeys(("first", "seed", "first_seed"), bounds(int, low=0)),
     **dict.fromkeys(("step", "num_sweeps", "num_drives", "sweep_step"), bounds(int, low=1)),
-    **dict.fromkeys(("check", "both_returns"), bounds(bool)),
+    "both_returns": bounds(bool),
+    "check": bounds(bool, free=True),
+    "cache": bounds(str, free=True),
 }
 
 
@@ -31,8 +33,16 @@ def group(default: str | None, help: str = "", kind: type | None = None) -> Any:
     return field(default=default, metadata={"group": True, "help": help, **({} if kind is None else bounds(kind))})
 
 
-def _device() -> Any:
-    return setting(AUTO, "auto | cpu | cuda | cuda:1")
+def _output(default: str, help: str) -> Any:
+    return setting(default, help, free=True)
+
+
+def _overwrite(help: str) -> Any:
+    return setting(False, help, free=True)
+
+
+def _device(free: bool = False) -> Any:
+    return setting(AUTO, "auto | cpu | cuda | cuda:1", free=free)
 
 
 def _above_0(default: float | None, help: str, **limits: Any) -> Any:
@@ -51,8 +61,8 @@ def _share(help: str) -> Any:
     return setting(AUTO, help, kind=float, low=0, high=1e6, word=AUTO)
 
 
-def _path(help: str) -> Any:
-    return setting(None, help, kind=str)
+def _path(help: str, free: bool = False) -> Any:
+    return setting(None, help, kind=str, free=free)
 
 
 @dataclass(frozen=True)
@@ -86,7 +96,7 @@ class Local(Engine):
     """Worker processes of this machine."""
 
     name: str = setting("local", "the engine; engine= chooses it", choices=("local",))
-    timeout: float = _above_0(600, "seconds after which a silent worker is replaced (with several workers)")
+    timeout: float = _above_0(600, "seconds for a frame after which a silent worker is replaced (with several workers)")
     memory: float | None = _above_0(
         None, "limit of the address space of each worker on a CPU, in bytes, for example 8e9; null = no limit"
     )
@@ -121,7 +131,7 @@ class Command(Settings):
     SUMMARY: ClassVar[str]
     CHOOSES_PAIRS: ClassVar[bool] = False  # the command uses `PAIR_SETTINGS`
 
-    output: str = setting("outputs", "folder of the results")
+    output: str = _output("outputs", "folder of the results")
     model: Config = group("default", kind=Config)
     data: dict[str, Any] = group(AUTO)  # settings of the data set
 
@@ -142,7 +152,7 @@ class Demo(Command):
 
     The drive is written in Argoverse 2's format to outputs/cache and read from there like a real log. OUTPUT
     (outputs/demo) contains flow.html (a 3-D page for any browser), flow.png, <log id>/ with one flow file per pair,
-    results.json with the scores, and config.yaml with the settings.
+    results.json with the scores, and config.yaml with the settings. Of several logs, page and picture show the first.
 
     examples:
       cflow demo
@@ -152,7 +162,7 @@ class Demo(Command):
 
     SUMMARY: ClassVar[str] = "simulate a drive, estimate its flow, score it and draw it"
 
-    output: str = setting("outputs/demo", "folder of flow, scores, picture and settings")
+    output: str = _output("outputs/demo", "folder of flow, scores, picture and settings")
     device: str = _device()
     definition: str = setting("opensceneflow", "definition of the scores, see `cflow eval --help`")
     pair: int = setting(3, "index of the pair that is drawn", low=0)
@@ -177,7 +187,7 @@ class Check(Command):
 
     SUMMARY: ClassVar[str] = "say what is right and what is wrong in your data, and how to fix it"
 
-    output: str = setting("outputs/check", "unused, nothing is written")
+    output: str = _output("outputs/check", "unused, nothing is written")
     json: bool = setting(False, "true = print JSON")
 
 
@@ -186,7 +196,7 @@ class FlowFiles(Command):
     """Settings of the commands that write flow files."""
 
     device: str = _device()
-    overwrite: bool = setting(False, "true = compute these logs again and replace their older results")
+    overwrite: bool = _overwrite("true = compute these logs again and replace their older results")
     dry_run: bool = setting(False, "true = only count the frames of each log, and those left to do")
     shard: ShardSettings = setting(ShardSettings(), "share of the work for this process", kind=ShardSettings)
     engine: Engine = group("local", kind=Engine)
@@ -221,7 +231,7 @@ class Flow(FlowFiles):
 
     SUMMARY: ClassVar[str] = "estimate the flow of every pair of sweeps: resumable, parallel, on many machines"
 
-    output: str = setting("outputs/flow", "folder, or address in an object store")
+    output: str = _output("outputs/flow", "folder, or address in an object store")
     contents: Any = setting(
         AUTO,
         "columns of each file, such as [points, residual, is_valid]; auto = all but points (x, y, z of sweep t)",
@@ -269,7 +279,7 @@ class Label(FlowFiles):
 
     SUMMARY: ClassVar[str] = "write pseudo-labels for self-supervised training into OpenSceneFlow's scenes"
 
-    output: str = setting("outputs/label", "folder for the flow that the labels follow from")
+    output: str = _output("outputs/label", "folder for the flow that the labels follow from")
     model: Config = group("offline", kind=Config)
     data: dict[str, Any] = group("hdf5")
 
@@ -295,8 +305,8 @@ class Eval(Command):
     SUMMARY: ClassVar[str] = "estimate and score all labelled pairs of a data set"
     CHOOSES_PAIRS: ClassVar[bool] = True
 
-    output: str = setting("outputs/eval", "folder of the results; each job of a sweep writes to a folder below it")
-    overwrite: bool = setting(False, "true = repeat a run whose results.json exists")
+    output: str = _output("outputs/eval", "folder of the results; each job of a sweep writes to a folder below it")
+    overwrite: bool = _overwrite("true = repeat a run whose results.json exists")
     device: str = _device()
     definition: str = setting(
         "opensceneflow",
@@ -325,15 +335,15 @@ class Submit(Command):
 
     SUMMARY: ClassVar[str] = "write and check an archive for a public leaderboard"
 
-    output: str = setting("outputs/submit", "folder of the files and the archive")
-    device: str = _device()
+    output: str = _output("outputs/submit", "folder of the files and the archive")
+    device: str = _device(free=True)
     version: int = setting(3, "of the leaderboard: 1 (Argoverse 2, 2023) | 3 (multi-dataset challenge, 2026)")
-    archive: str | None = _path("zip or folder that is only checked against the data")
+    archive: str | None = _path("zip or folder that is only checked against the data", free=True)
     frames: str | None = _path("text file of frames, one <log>/<time stamp> per line; null = see docs/evaluation.md")
     masks: str | None = _path(
         "zip of the official masks, for version 1; null = eval_mask of the scenes, else the official rule"
     )
-    overwrite: bool = setting(False, "true = delete the files of an earlier run in output")
+    overwrite: bool = _overwrite("true = delete the files of an earlier run in output")
 
 
 @dataclass(frozen=True)
@@ -352,10 +362,11 @@ class Plot(Command):
 
     SUMMARY: ClassVar[str] = "draw flow, clusters, key points, correlation, scales or an animation"
     NAMED_BY: ClassVar[str] = "picture"
+    CHOOSES_PAIRS: ClassVar[bool] = True  # of an animation
     PRESET: ClassVar[str] = ""  # that the picture chooses, "" = none
     PIXEL_SIZES: ClassVar[tuple[float, ...]] = ()  # that the picture chooses
 
-    output: str = setting("outputs/plot", "local folder; the file is named after the picture")
+    output: str = _output("outputs/plot", "local folder; the file is named after the picture")
     device: str = _device()
     log: str | None = _path("id of the log; null = the first one")
     deskew: bool = setting(
@@ -422,9 +433,7 @@ class ScalesPicture(CorrelationPicture):
 class Animation(Plot):
     """The flow of several pairs, one after the other, with the same view and colours. `pair` is ignored."""
 
-    first: int = setting(0, "index of the first pair", low=0)
-    step: int = _count(1, "draw every n-th pair")
-    count: int | None = _count(None, "number of pairs; null = to the end of the log")
+    count: int | None = _count(None, "number of pairs, from data.first, every data.step; null = to the end of the log")
     format: str = setting("gif", "gif | mp4 (extra video)", choices=("gif", "mp4"))
     frames_per_second: float = _above_0(5.0, "pictures per second")
     width: int = _count(800, "pixels")
@@ -464,7 +473,7 @@ class View(Command):
     SUMMARY: ClassVar[str] = "write a 3-D page for the browser, or a recording for the viewer rerun"
     CHOOSES_PAIRS: ClassVar[bool] = True
 
-    output: str = setting("outputs/view", "local folder; each log gets <log id>.html or .rrd")
+    output: str = _output("outputs/view", "local folder; each log gets <log id>.html or .rrd")
     format: str = setting(
         "html", "html = a page for any browser | rerun = a recording for the viewer rerun", choices=("html", "rerun")
     )
@@ -493,7 +502,7 @@ class Stream(Command):
 
     SUMMARY: ClassVar[str] = "replay a log in real time and measure the latency"
 
-    output: str = setting("outputs/stream", "folder of stream.json")
+    output: str = _output("outputs/stream", "folder of stream.json")
     device: str = _device()
     pace: float | None = _above_0(
         1.0, "factor on the speed of the recording; null = as fast as possible", optional=True
@@ -520,17 +529,17 @@ class Clean(Command):
 
     SUMMARY: ClassVar[str] = "remove dynamic objects from logs, and build static maps"
 
-    output: str = setting("outputs/clean", "local folder; each log gets <log id>/points, poses.txt, ...")
+    output: str = _output("outputs/clean", "local folder; each log gets <log id>/points, poses.txt, ...")
     model: Config = group("offline", kind=Config)
-    device: str = _device()
-    overwrite: bool = setting(False, "true = write these logs again and replace their older results")
+    device: str = _device(free=True)
+    overwrite: bool = _overwrite("true = write these logs again and replace their older results")
     flow: str | None = _path("output folder of `cflow flow` whose flow is used; null = estimate the flow")
     remove_stopped: bool = setting(False, "also remove objects that move at another time, such as a waiting car")
     suffix: str | None = _path(
         "format of the clouds: .npy | .ply | .pcd | .bin | ...; null = that of the log's own clouds, else .npy"
     )
     map: bool = setting(
-        False, "also write the static points in the world, one per voxel, to <log id>.ply, and a picture"
+        False, "also write the static points in the world, one per voxel, to <log id>.ply, and a picture", free=True
     )
     voxel_size: float = _above_0(0.1, "side of a voxel of the map, in metres")
 
@@ -551,7 +560,7 @@ class Bench(Command):
 
     SUMMARY: ClassVar[str] = "measure run time and memory on your data"
 
-    output: str = setting("outputs/bench", "folder of bench.json")
+    output: str = _output("outputs/bench", "folder of bench.json")
     device: str = _device()
     pairs: int = _count(3, "number of pairs, spread evenly over the first log")
     repeats: int = _count(10, "timed runs of each pair and of each batch")

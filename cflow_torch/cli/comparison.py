@@ -83,7 +83,7 @@ def _order(cell: str) -> tuple[bool, float, str]:
 
 
 def headline(results: dict[str, Any], seconds: dict[str, Any]) -> dict[str, float]:
-    """The most important scores of `SceneFlowMetrics.compute` and of `TimedModel.report`; NaN = no value.
+    """The most important scores of `SceneFlowMetrics.compute` and of `time_report`; NaN = no value.
 
     "dynamic_error" (mean over classes, and over ranges if the definition has them), "static_epe" (mean over classes),
     "epe_fd" and "epe_bs" in metres, "moving_iou", "seconds" (median per pair).

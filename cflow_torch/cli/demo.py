@@ -9,14 +9,14 @@ from cflow_torch.cli.commands import Demo
 from cflow_torch.cli.eval import Scores
 from cflow_torch.cli.failures import finish
 from cflow_torch.cli.logs import check_pair, open_logs
-from cflow_torch.cli.outputs import chosen_preset, output_folder
+from cflow_torch.cli.outputs import chosen_preset, local_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import safe_name
 from cflow_torch.estimate import make_model
-from cflow_torch.stages import TimedModel
+from cflow_torch.stages import CallTime, time_report
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.bev import plot_flow, save_picture
 from cflow_torch.viz.page import load_k3d, save_page
@@ -24,14 +24,14 @@ from cflow_torch.viz.style import blank_figure
 
 
 def task(cfg: Demo) -> None:
-    output, picture = output_folder(cfg), "none"
+    output, picture = local_folder(cfg), "none"
     draws = _is_available("picture", lambda: blank_figure((1, 1), 100))  # matplotlib and k3d are extras
     shows = _is_available("page", load_k3d)
     scores = Scores(cfg)
-    model = TimedModel(make_model(cfg.model, cfg.device))
+    model = make_model(cfg.model, cfg.device)
     logs, failures = open_logs(cfg.data)
     if logs:
-        check_pair(cfg.pair, max(logs, key=lambda log: len(log.timestamps)))
+        check_pair(cfg.pair, logs[0])
     ensure_writable(output)
     results: list[tuple[int, FlowResult]] = []
 
@@ -39,6 +39,8 @@ def task(cfg: Demo) -> None:
         nonlocal picture
         write_flow(output / safe_name(log.log_id, "the log") / f"{log.timestamps[index]}.feather", result)
         scores.add(log, index, sweeps, result)
+        if log is not logs[0]:  # the page and the picture show the first log
+            return
         results.append((index, result))
         if draws and index == cfg.pair:
             view: Any = {"is_ground": sweeps.pc0.is_ground, "point_cloud_range": model.config.point_cloud_range}
@@ -48,12 +50,13 @@ def task(cfg: Demo) -> None:
     for log in logs:
         remove_stale(output / log.log_id)
     pairs = [(log, index) for log in logs for index in range(len(log.timestamps) - 1)]
-    failures += for_each_pair(pairs, model, keep)
-    scores.report(output, logs, model.report(), failures)
+    times: list[CallTime] = []
+    failures += for_each_pair(pairs, model, keep, times)
+    scores.report(output, logs, time_report(times), failures)
     print(f"picture: {picture}")
     if shows and results:
         page, tracks = output / "flow.html", track(logs[0], results)
-        save_page(logs[0], results, page, tracks=lambda: tracks, preset=chosen_preset())
+        save_page(logs[0], results, page, tracks=lambda: tracks, preset=chosen_preset(cfg))
         print(f"3-D page, for any browser: {page}")
     print(f"flow files, scores, settings: {output}")
     finish(failures)

@@ -15,22 +15,26 @@ from cflow_torch.cli.commands import Demo, Eval
 from cflow_torch.cli.comparison import RESULTS, headline, summary
 from cflow_torch.cli.failures import Failures, UnfinishedJob, finish
 from cflow_torch.cli.logs import chosen_pairs, open_logs
-from cflow_torch.cli.outputs import machine, output_folder, settings_record, versions, write_config
+from cflow_torch.cli.outputs import (
+    check_made_by,
+    machine,
+    made_by,
+    output_folder,
+    settings_record,
+    versions,
+    write_config,
+)
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import json_ready, read_json, write_json
+from cflow_torch.data.json_file import read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.estimate import make_model
 from cflow_torch.evaluation.frame import EvalFrame
 from cflow_torch.evaluation.metrics import SceneFlowMetrics
 from cflow_torch.evaluation.tables import format_table
-from cflow_torch.fleet.changes import check_same_run
 from cflow_torch.simulator.benchmark import generator_key
-from cflow_torch.stages import TimedModel
+from cflow_torch.stages import CallTime, time_report
 from cflow_torch.types import CFlowError, FlowResult, Window
-
-# Settings that do not change the results.
-_PATHS = ("config.output", "config.overwrite", "config.data.cache")
 
 
 def task(cfg: Eval) -> float:
@@ -42,17 +46,17 @@ def task(cfg: Eval) -> float:
         _print_scores(output, record["results"], record["seconds_per_pair"])
         return objective(record["results"])
     scores = Scores(cfg)
-    model = TimedModel(make_model(cfg.model, cfg.device))
+    model = make_model(cfg.model, cfg.device)
     logs, failures = open_logs(cfg.data)
     ensure_writable(output)
-    first, step = cfg.data["first"], cfg.data["step"]
-    pairs = [(log, index) for log in logs for index in chosen_pairs(log, first, step)]
-    failures += for_each_pair(pairs, model, scores.add)
+    pairs = [(log, index) for log in logs for index in chosen_pairs(log, cfg.data)]
+    times: list[CallTime] = []
+    failures += for_each_pair(pairs, model, scores.add, times)
     if scores.metrics.counts["num_frames"] == 0 and failures:
         raise CFlowError("no pair could be scored; {} failed first: {}".format(*failures[0]))
     if scores.metrics.counts["num_frames"] == 0:
         raise CFlowError("no pair has labels, so there is nothing to score; `cflow flow` needs no labels")
-    results = scores.report(output, logs, model.report(), failures)
+    results = scores.report(output, logs, time_report(times), failures)
     with suppress(UnfinishedJob):  # a job of a sweep returns its score; a single run exits with status 1
         finish(failures)
     return objective(results)
@@ -85,7 +89,7 @@ class Scores:
     def report(self, folder: Path, logs: Sequence[Log], seconds: dict[str, Any], failures: Failures) -> dict[str, Any]:
         """Print and return the scores, and write `folder/results.json` and `folder/config.yaml`.
 
-        `seconds` is the result of `TimedModel.report`.
+        `seconds` is the result of `time_report`.
         """
         results = self.metrics.compute()
         record = {
@@ -99,7 +103,9 @@ class Scores:
                 "logs": [{"log_id": log.log_id, "sweeps": len(log.timestamps)} for log in logs],
                 "digest": self._digest.hexdigest()[:16],
             },
-            **_origin(self._cfg),
+            "versions": versions(),
+            "generator": _generator(self._cfg),
+            "config": settings_record(self._cfg),
             "definition": asdict(self.metrics.definition),
             "results": results,
         }
@@ -114,17 +120,17 @@ def _print_scores(folder: Path, results: dict[str, Any], seconds: dict[str, Any]
 
 
 def finished_results(cfg: Eval, folder: Path) -> dict[str, Any] | None:
-    """Read the record of an earlier run with the same settings and versions; None without one, or with `overwrite`.
+    """Read the record of an earlier run with the same settings and versions in which nothing failed.
 
-    Results of other settings are a `CFlowError`.
+    None without one, or with `overwrite`. Results of other settings are a `CFlowError`.
     """
     file = folder / RESULTS
     if cfg.overwrite or not file.exists():
         return None
     record: dict[str, Any] = read_json(file)
-    now = _origin(cfg)
-    check_same_run(folder, {key: record.get(key) for key in now}, now, _PATHS)
-    return record
+    before = {**record.get("config", {}), "versions": record.get("versions"), "generator": record.get("generator")}
+    check_made_by(cfg, folder, before, made_by(cfg, generator=_generator(cfg)))
+    return None if record.get("failures") else record
 
 
 def objective(results: dict[str, Any]) -> float:
@@ -140,7 +146,6 @@ def objective(results: dict[str, Any]) -> float:
     return 1.0 - headline(results, {})["moving_iou"]
 
 
-def _origin(cfg: Demo | Eval) -> dict[str, Any]:
-    """Return what determines the results, in types that JSON has."""
-    generator = generator_key() if cfg.data.get("name") == "benchmark" else None
-    return {"versions": versions(), "generator": generator, "config": json_ready(settings_record(cfg))}
+def _generator(cfg: Demo | Eval) -> Any:
+    """Return the version of the simulator; None = the data is not simulated."""
+    return generator_key() if cfg.data.get("name") == "benchmark" else None

@@ -5,35 +5,21 @@ from __future__ import annotations
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, Callable, Iterable, Iterator, Sequence
+from typing import Any, Callable, Iterable, Iterator
 
 import numpy as np
 from tqdm import tqdm
 
-from cflow_torch.applications.detection_files import (
-    DETECTIONS_FILE,
-    OPENPCDET_FILE,
-    TRACKING_FILE,
-    write_nuscenes,
-    write_openpcdet,
-)
-from cflow_torch.applications.instance_files import (
-    CLASSES,
-    CLASSES_OF_READER,
-    FRAMES_FILE,
-    INSTANCES_FILE,
-    write_drivestudio,
-)
-from cflow_torch.applications.kitti_tracks import write_kitti
 from cflow_torch.applications.masks import check_cameras, check_pillow, write_masks
 from cflow_torch.applications.moving_labels import write_moving_labels
-from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_mot, write_tracks
+from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_tracks
 from cflow_torch.applications.tracking import track_points
 from cflow_torch.cli.commands import Flow
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow_run import FlowRun
-from cflow_torch.cli.logs import chosen_pairs
+from cflow_torch.cli.logs import all_pairs
 from cflow_torch.cli.stored_flow import stored_flow
+from cflow_torch.cli.track_formats import TRACK_FORMATS
 from cflow_torch.data.catalog import Logs, source_name
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, has_track_ids, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
@@ -43,11 +29,6 @@ from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
 _FOR_MOVING = {"residual", "moving"}
-_TRACK_FILES = {
-    "mot": ("mot.txt", write_mot),
-    "kitti": ("kitti.txt", write_kitti),
-    "openpcdet": (OPENPCDET_FILE, write_openpcdet),
-}
 
 
 def task(cfg: Flow) -> None:
@@ -118,13 +99,12 @@ def _write_logs(cfg: Flow, run: FlowRun) -> Failures:
     for part in tqdm(run.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
             log = logs.open(part.source)
-            pairs = chosen_pairs(log, first=0, step=1)  # the pair over a gap has no flow
+            pairs = all_pairs(log)  # the pair over a gap has no flow
             if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
                 continue
             results = partial(_read_all, stored, log, pairs)
             if cfg.tracks or cfg.masks:
-                classes = CLASSES_OF_READER.get(logs.name, CLASSES)
-                tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, classes))
+                tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, logs.name))
             if cfg.masks:
                 tracks = read_tracks(output / log.log_id / TRACKS_FILE)
                 masks = masks_folder(output, log.log_id)
@@ -145,13 +125,13 @@ def _read_all(
 
 
 def _write_tracks(
-    kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, classes: Sequence[Any]
+    kind: Any, log: Log, results: Callable[[], Iterator[tuple[int, FlowResult]]], folder: Path, data_set: str
 ) -> str:
     """Write the tracks of a log and the ids of its points, unless they exist, and then the form `kind`.
 
     `results` reads the flow files. Returns a line with the files.
     """
-    frames = (frame_file(folder, log.timestamps[index]) for index in chosen_pairs(log, first=0, step=1))
+    frames = (frame_file(folder, log.timestamps[index]) for index in all_pairs(log))
     if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, frames)):
         table, points = track_points(log, results())
         for each in points:
@@ -159,16 +139,9 @@ def _write_tracks(
         write_tracks(folder / TRACKS_FILE, table)  # last, so that a killed run begins again
     table = read_tracks(folder / TRACKS_FILE)
     files = [TRACKS_FILE]
-    if kind in _TRACK_FILES:
-        name, write = _TRACK_FILES[kind]
-        write(folder / name, table, log)
-        files.append(name)
-    elif kind == "drivestudio":
-        write_drivestudio(folder, table, log, *classes)
-        files += [INSTANCES_FILE, FRAMES_FILE]
-    elif kind == "nuscenes":
-        write_nuscenes(folder, table, log)
-        files += [DETECTIONS_FILE, TRACKING_FILE]
+    if kind in TRACK_FORMATS:
+        TRACK_FORMATS[kind].write(folder, table, log, data_set)
+        files += TRACK_FORMATS[kind].files
     return f"{folder}: {len(np.unique(table['id']))} tracks in {', '.join(files)}"
 
 

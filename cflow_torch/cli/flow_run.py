@@ -13,6 +13,7 @@ from cflow_torch.cli.commands import FlowFiles
 from cflow_torch.cli.failures import Failures, end_unfinished
 from cflow_torch.cli.logs import find_logs
 from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config
+from cflow_torch.cli.track_formats import TRACK_FILES
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.catalog import source_name
 from cflow_torch.data.json_file import write_json
@@ -75,7 +76,7 @@ class FlowRun:
         self._check_output()
         if self._cfg.overwrite and self.shard.count == 1:
             for log in self.open_logs():
-                clear_log(self.output / log.log_id)
+                clear_log(self.output / log.log_id, TRACK_FILES)
         write_config(self._cfg, self.output)
         devices = self._useful_devices()
         settings = asdict(self._cfg.engine)
@@ -101,9 +102,12 @@ class FlowRun:
         print(f"{format_report(report)}\nflow files in {self.job.output}, report in {file}")
         status = report["exit_status"] or int(bool(failures))
         if status:
-            missing = format_missing(report) + "".join(f"\n  {name}: {message}" for name, message in failures)
-            print(f"missing:\n{missing}", file=sys.stderr)
-            end_unfinished(f"some frames are missing: see {file}", status)
+            lines = [format_missing(report), *(f"  {name}: {message}" for name, message in failures)]
+            print("\n".join(["missing:", *filter(None, lines)]), file=sys.stderr)
+            what = (
+                f"some frames are missing: see {file}" if report["exit_status"] else "some files could not be written"
+            )
+            end_unfinished(what, status)
 
     def _check_output(self) -> None:
         """Make sure that the results may be added to the output."""

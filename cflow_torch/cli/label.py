@@ -12,13 +12,13 @@ from cflow_torch.applications.labels import find_labels
 from cflow_torch.cli.commands import Label
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow_run import FlowRun
-from cflow_torch.data.flow_file import read_flow
+from cflow_torch.cli.stored_flow import stored_flow
 from cflow_torch.data.hdf5.writer import check_writable, labelled_by, write_hdf5_labels
 from cflow_torch.data.json_file import write_json
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.machine import choose_devices
-from cflow_torch.fleet.manifest import complete_frames, frame_file
+from cflow_torch.fleet.manifest import complete_frames
 from cflow_torch.types import CFlowError
 
 
@@ -59,6 +59,7 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
     labelled: list[str] = []
     waiting: list[str] = []
     model = make_model(cfg.model, cfg.device)
+    stored = stored_flow(run.output, ())
     workers = len(choose_devices(cfg.device, cfg.engine.workers, os.environ))
     scenes = [part.source for part in run.parts]
     for scene in tqdm(scenes, desc="labels", unit="scene", disable=None):
@@ -71,7 +72,7 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
             if not set(stamps) <= complete_frames(folder):
                 waiting.append(scene.name)  # failed frames are in the report; others belong to another shard
                 continue
-            flows = (read_flow(frame_file(folder, stamp)) for stamp in stamps)
+            flows = (stored(log, index) for index in range(len(stamps)))
             labels = find_labels(log, flows, model, workers)
             write_hdf5_labels(scene, labels, run.job.identity["hash"], overwrite=run.job.redo)
             labelled.append(scene.name)

@@ -6,7 +6,7 @@ import os
 import platform
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,12 +14,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from cflow_torch import __version__
+from cflow_torch.cli.choices import known_settings
 from cflow_torch.cli.commands import Command, Submit
 from cflow_torch.cli.failures import is_sweep
 from cflow_torch.cli.info import processor
 from cflow_torch.data.atomic import ensure_writable, write_text
+from cflow_torch.data.json_file import json_ready
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.fleet.changes import check_same_run
+from cflow_torch.fleet.changes import OVERWRITE, check_same_run, nearest_preset
 from cflow_torch.types import CFlowError
 
 
@@ -42,8 +44,9 @@ def machine() -> dict[str, Any]:
     }
 
 
-def chosen_preset() -> str:
-    return str(HydraConfig.get().runtime.choices["model"])
+def chosen_preset(cfg: Command) -> str:
+    """Return the preset of a run; the nearest one if its settings come from the config.yaml of an earlier run."""
+    return str(HydraConfig.get().runtime.choices.get("model") or nearest_preset(asdict(cfg.model)))
 
 
 def output_folder(cfg: Command) -> Path:
@@ -72,21 +75,30 @@ def settings_record(cfg: Command) -> dict[str, Any]:
 
 def write_config(cfg: Command, folder: Path) -> None:
     """Write the settings and versions to `folder/config.yaml`."""
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(_config(cfg)))
+    write_text(
+        folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**settings_record(cfg), "versions": versions()}))
+    )
 
 
-def claim_output(cfg: Submit, folder: Path, ignored: Sequence[str]) -> None:
-    """Reject a folder whose config.yaml has other settings or versions, unless `cfg.overwrite`; write config.yaml.
+def made_by(cfg: Command, **more: Any) -> dict[str, Any]:
+    """Return what results follow from, in types that JSON has: the settings, the versions and what else is given."""
+    return json_ready({**settings_record(cfg), "versions": versions(), **more})  # type: ignore[no-any-return]
 
-    The settings `ignored` may differ, because files do not depend on them.
+
+def check_made_by(cfg: Command, folder: Path, before: Any, now: Any, remedy: str = OVERWRITE) -> None:
+    """Raise a `CFlowError` if the results in a folder follow from something else than `made_by` says now.
+
+    Settings that are `free` may differ.
     """
+    known = known_settings(type(cfg))
+    free = [name for name, owners in known.items() if any(limits and limits["free"] for limits in owners.values())]
+    check_same_run(folder, json_ready(before), now, free, remedy)
+
+
+def claim_output(cfg: Submit, folder: Path) -> None:
+    """Reject a folder whose config.yaml is that of other results, unless `cfg.overwrite`; write config.yaml."""
     file = ensure_writable(folder) / "config.yaml"
     if file.exists() and not cfg.overwrite:
         before = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
-        now = OmegaConf.to_container(_config(cfg))
-        check_same_run(folder, before, now, ("output", "overwrite", *ignored))
+        check_made_by(cfg, folder, before, made_by(cfg))
     write_config(cfg, folder)
-
-
-def _config(cfg: Command) -> Any:
-    return OmegaConf.create({**settings_record(cfg), "versions": versions()})

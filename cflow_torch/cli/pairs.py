@@ -24,49 +24,55 @@ from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
 from cflow_torch.fleet.work import run_ahead
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.setting import AUTO
-from cflow_torch.stages import TimedModel
+from cflow_torch.stages import CallTime, TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.windows.inspection import inactive_is_an_error
+from cflow_torch.windows.inspection import inactive_problems
 from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # windows per worker that are read ahead
 
 LogPair = Tuple[Log, int]  # a log and the index of the first of two sweeps
-Answer = Callable[[], Tuple[Window, FlowResult]]
+Answer = Callable[[], Tuple[Window, FlowResult, CallTime]]
 
 
 def for_each_pair(
-    pairs: Sequence[LogPair], model: TimedModel, use: Callable[[Log, int, Window, FlowResult], None]
+    pairs: Sequence[LogPair],
+    model: SceneFlowModel,
+    use: Callable[[Log, int, Window, FlowResult], None],
+    times: list[CallTime] | None = None,
 ) -> Failures:
     """Estimate the flow of pairs, and call `use` with the log, index, window and result of each pair, in order.
 
     The pairs of a log must follow one another. A bad pair is reported and skipped. The times of all pairs are added to
-    the model.
+    `times`.
     """
     failures: Failures = []
     for (log, index), answer in _answers(pairs, model):
         with collect_failures(failures, f"{log.log_id}/{log.timestamps[index]}"):
-            use(log, index, *answer())
+            sweeps, result, time = answer()
+            if times is not None:
+                times.append(time)
+            use(log, index, sweeps, result)
     return failures
 
 
-def _answers(pairs: Sequence[LogPair], model: TimedModel) -> Iterator[tuple[LogPair, Answer]]:
-    """Yield each pair and a function that returns its window and flow, or raises the error of that pair."""
-    method: Any = model.model
-    devices = choose_devices(method.device, AUTO, os.environ)
-    count = min(len(devices), len(pairs) // frames_per_worker(method.config)) if devices[0] == "cpu" else 1
-    windows = _windows(pairs, method.config)
+def _answers(pairs: Sequence[LogPair], model: SceneFlowModel) -> Iterator[tuple[LogPair, Answer]]:
+    """Yield each pair and a function that returns its window, flow and time, or raises the error of that pair."""
+    devices = choose_devices(model.device, AUTO, os.environ)
+    count = min(len(devices), len(pairs) // frames_per_worker(model.config)) if devices[0] == "cpu" else 1
+    windows = _windows(pairs, model.config)
     if count < 2:
-        yield from zip(Progress(pairs), (partial(_estimate, model, sweeps) for sweeps in windows))
+        timed = TimedModel(model)
+        yield from zip(Progress(pairs), (partial(_estimate, timed, sweeps) for sweeps in windows))
         return
-    executors = [ProcessExecutor(partial(_Estimator, method)) for _ in range(count)]
+    executors = [ProcessExecutor(partial(_Estimator, model)) for _ in range(count)]
     idle: SimpleQueue[ProcessExecutor] = SimpleQueue()
     for executor in executors:
         idle.put(executor)
     threads = ThreadPoolExecutor(count)
     try:
         answers = run_ahead(threads, partial(_estimate_elsewhere, idle), windows, _AHEAD * count)
-        yield from zip(Progress(pairs), (partial(_answer, model, answer) for answer in answers))
+        yield from zip(Progress(pairs), (partial(_answer, answer) for answer in answers))
     finally:
         for executor in executors:
             executor.close()
@@ -85,16 +91,19 @@ def _windows(pairs: Sequence[LogPair], config: Config) -> Iterator[Window | Exce
             yield error
 
 
-def _estimate(model: TimedModel, sweeps: Window | Exception) -> tuple[Window, FlowResult]:
+def _estimate(timed: TimedModel, sweeps: Window | Exception) -> tuple[Window, FlowResult, CallTime]:
     if isinstance(sweeps, Exception):
         raise sweeps
-    with inactive_is_an_error():
-        return sweeps, model([sweeps])[0]
+    results = timed([sweeps], warns=False)
+    (problem,) = inactive_problems([sweeps], results, timed.model.config)
+    if problem:
+        raise CFlowError(problem)
+    return sweeps, results[0], timed.times[-1]
 
 
 def _estimate_elsewhere(
     idle: SimpleQueue[ProcessExecutor], sweeps: Window | Exception
-) -> tuple[Window, dict[str, np.ndarray], Any]:
+) -> tuple[Window, dict[str, np.ndarray], CallTime]:
     """Estimate a window in an idle worker process. If the process ends, try once more, in another one."""
     if isinstance(sweeps, Exception):
         raise sweeps
@@ -109,22 +118,21 @@ def _estimate_elsewhere(
         idle.put(executor)
 
 
-def _answer(model: TimedModel, answer: Future[Any]) -> tuple[Window, FlowResult]:
-    sweeps, arrays, seconds = answer.result()
-    model.pairs.append(seconds)
-    return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+def _answer(answer: Future[Any]) -> tuple[Window, FlowResult, CallTime]:
+    sweeps, arrays, time = answer.result()
+    return sweeps, FlowResult(**{name: torch.from_numpy(array) for name, array in arrays.items()}), time
 
 
 class _Estimator:
     """The model of a worker process."""
 
-    def __init__(self, method: SceneFlowModel) -> None:
+    def __init__(self, model: SceneFlowModel) -> None:
         torch.set_num_threads(1)
         keep_freed_memory()
         show_warnings_as_lines()
-        self._model = TimedModel(method)
+        self._timed = TimedModel(model)
 
-    def estimate(self, sweeps: Window) -> tuple[dict[str, Any], Any]:
-        """Return arrays, because tensors would take shared memory, of which containers have little; and seconds."""
-        _, result = _estimate(self._model, sweeps)
-        return result.numpy(), self._model.pairs.pop()
+    def estimate(self, sweeps: Window) -> tuple[dict[str, Any], CallTime]:
+        """Return arrays, because tensors would take shared memory, of which containers have little; and the time."""
+        _, result, time = _estimate(self._timed, sweeps)
+        return result.numpy(), time

@@ -21,7 +21,6 @@ from cflow_torch.data.log import Log, window
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
-from cflow_torch.stages import TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.viz.animation import AnimatedPair, flow_figures, save_animation
 from cflow_torch.viz.bev import plot_flow, save_picture
@@ -86,7 +85,7 @@ def _from_above(cfg: Plot, model: SceneFlowModel, log: Log, pair: int, sweeps: W
     view: dict[str, Any] = {
         "is_ground": sweeps.pc0.is_ground,
         "point_cloud_range": model.config.point_cloud_range,
-        "title": f"{log.log_id}, sweep {log.timestamps[pair]}, preset {chosen_preset()}",
+        "title": f"{log.log_id}, sweep {log.timestamps[pair]}, preset {chosen_preset(cfg)}",
     }
     if not isinstance(cfg, FlowPicture):
         return plot_clusters(points, result, **view)
@@ -106,9 +105,9 @@ def _truth(cfg: FlowPicture, log: Log, pair: int, result: FlowResult) -> np.ndar
 
 def _animate(cfg: Animation, model: SceneFlowModel, log: Log, output: Path) -> Path:
     """Estimate the flow of several pairs, then draw them. Nothing is written if one of them fails."""
-    pairs = chosen_pairs(log, cfg.first, cfg.step, cfg.count)
+    pairs = chosen_pairs(log, cfg.data, cfg.count)
     if not pairs:
-        raise CFlowError(f"first={cfg.first}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
+        raise CFlowError(f"data.first={cfg.data['first']}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ensure_writable(output)
     frames: list[AnimatedPair] = []
 
@@ -118,7 +117,7 @@ def _animate(cfg: Animation, model: SceneFlowModel, log: Log, output: Path) -> P
         title = f"{log.log_id}, {(log.timestamps[index] - log.timestamps[pairs[0]]) / 1e9:.1f} s"
         frames.append(AnimatedPair(sweeps.pc0.points, result, sweeps.pc0.is_ground, title))
 
-    finish(for_each_pair([(log, index) for index in pairs], TimedModel(model), keep))
+    finish(for_each_pair([(log, index) for index in pairs], model, keep))
     figures = flow_figures(
         frames,
         point_cloud_range=model.config.point_cloud_range,

@@ -9,7 +9,7 @@ from typing import Any, List, Mapping, Optional, Sequence, Tuple
 from cflow_torch.cli.commands import Submit
 from cflow_torch.cli.failures import Failures, collect_failures, finish
 from cflow_torch.cli.logs import open_logs
-from cflow_torch.cli.outputs import claim_output, output_folder
+from cflow_torch.cli.outputs import claim_output, local_folder
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.log import Log
 from cflow_torch.estimate import make_model
@@ -17,23 +17,23 @@ from cflow_torch.evaluation.submission import archive, frames
 from cflow_torch.evaluation.submission.archive import SubmissionVersion
 from cflow_torch.evaluation.submission.frames import MaskArchive, SubmittedFrame
 from cflow_torch.fleet.progress import Progress
-from cflow_torch.stages import TimedModel
+from cflow_torch.model import SceneFlowModel
 from cflow_torch.types import CFlowError, FlowResult, Window
 
 Plan = List[Tuple[SubmittedFrame, int]]  # frames with their numbers of rows
 _Masks = Optional[MaskArchive]
-_Listed = Optional[Mapping[str, Sequence[int]]]
+_Listed = Optional[Mapping[str, Sequence[str]]]
 
 
 def task(cfg: Submit) -> None:
-    version, output = archive.get_version(cfg.version), output_folder(cfg)
+    version, output = archive.get_version(cfg.version), local_folder(cfg)
     if cfg.masks is not None and not version.is_masked:
         raise CFlowError(f"version {version.number} contains every point: masks= is only for version 1")
     if cfg.masks is not None and cfg.frames is not None:
         raise CFlowError("masks= already lists the frames that are evaluated: leave frames= out")
     masks = None if cfg.masks is None else MaskArchive(cfg.masks)
     listed = frames.read_frame_list(cfg.frames) if cfg.frames is not None else None if masks is None else masks.frames
-    model = TimedModel(make_model(cfg.model, cfg.device))
+    model = make_model(cfg.model, cfg.device)
     logs, failures = open_logs(cfg.data)
     plan, unreadable = _plan(logs, version, listed, masks)
     failures += unreadable
@@ -45,7 +45,7 @@ def task(cfg: Submit) -> None:
     if cfg.overwrite:
         shutil.rmtree(folder, ignore_errors=True)
         file.unlink(missing_ok=True)
-    claim_output(cfg, output, ("device", "archive"))
+    claim_output(cfg, output)
     failures += _write(plan, model, version, masks, folder)
     finish(failures)
     _check(folder, version, plan)
@@ -74,7 +74,7 @@ def _plan(logs: Sequence[Log], version: SubmissionVersion, listed: _Listed, mask
     return plan, failures
 
 
-def _write(plan: Plan, model: TimedModel, version: SubmissionVersion, masks: _Masks, folder: Path) -> Failures:
+def _write(plan: Plan, model: SceneFlowModel, version: SubmissionVersion, masks: _Masks, folder: Path) -> Failures:
     largest, total, count = 0.0, 0.0, 0
     todo = [frame for frame, rows in plan if not archive.is_complete(folder, frame.name, rows, version)]
 

@@ -39,7 +39,7 @@ def task(cfg: View) -> None:
         with collect_failures(failures, log.log_id):
             if file in files:
                 raise CFlowError(f"{file} exists for another log of this name: give a data.root= with one of them")
-            pairs = chosen_pairs(log, cfg.data["first"], cfg.data["step"], cfg.count)
+            pairs = chosen_pairs(log, cfg.data, cfg.count)
             results = _results(recent, pairs, flow, failures)
             stored = None if cfg.flow is None else as_path(cfg.flow) / log.log_id / TRACKS_FILE
             table = None if stored is None or not stored.exists() else read_tracks(stored)
@@ -74,7 +74,7 @@ def _save_page(cfg: View, log: Log, results: Iterator[tuple[int, FlowResult]], f
         results if table is not None else tracked(),
         file,
         tracks=lambda: tracker.table() if table is None else table,
-        preset=chosen_preset() if cfg.flow is None else nearest_preset(method_of_flow(cfg.flow, log.log_id) or {}),
+        preset=chosen_preset(cfg) if cfg.flow is None else nearest_preset(method_of_flow(cfg.flow, log.log_id) or {}),
         max_flow=cfg.max_flow,
         voxel=cfg.voxel,
     )

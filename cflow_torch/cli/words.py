@@ -185,7 +185,13 @@ def _as_text(value: str) -> str:
 
 
 def _quoted(value: str) -> str:
-    return '"' + value.replace('"', r"\"") + '"'
+    """Quote text as Hydra reads it: backslashes are plain, except in front of a quotation mark (C:\\data\\)."""
+    return '"' + re.sub(r'(\\*)("|\Z)', _escaped, value) + '"'
+
+
+def _escaped(match: re.Match[str]) -> str:
+    backslashes, mark = match.groups()
+    return 2 * backslashes + (r"\"" if mark else "")
 
 
 def check_exists(path: str) -> None:

@@ -117,8 +117,10 @@ def remove_stale(folder: PathLike) -> None:
 
 
 def _is_abandoned(path: Path) -> bool:
+    """Test whether a temporary file, or a folder and all that is below it, has not changed for an hour."""
     with suppress(Exception):  # some remote file systems have no modification times
-        return time.time() - path.stat().st_mtime > _ABANDONED
+        paths = [path, *path.rglob("*")] if path.is_dir() else [path]
+        return time.time() - max(each.stat().st_mtime for each in paths) > _ABANDONED
     return False
 
 

@@ -50,7 +50,7 @@ class Log(ABC):
 
     Attributes:
         log_id: name of the log, safe as a folder name; the name of its file or folder unless the reader says otherwise.
-        timestamps: sweep times, ascending; in nanoseconds, unless the reader says otherwise.
+        timestamps: sweep times, nanoseconds, ascending; other ascending numbers if the sweeps have no `timestamp_ns`.
         gaps: indices of sweeps after which the reader left out sweeps. No window reaches over a gap for its history or
             future, and `cflow flow` leaves out the pair over it.
         is_compensated: True = the format is known to be compensated for ego motion within a sweep.
@@ -164,6 +164,10 @@ class Log(ABC):
         """(4, 4) float64, from the LiDAR to KITTI's rectified camera 0; None = the log has no such camera."""
         return None
 
+    def sweep_name(self, index: int) -> str:
+        """Return the name of sweep `index` in the data set and in its submissions."""
+        return str(self._timestamp(index))
+
     @cached_property
     def sample_tokens(self) -> Sequence[str | None]:
         """Names of the sweeps in files of nuScenes; None = the sweep of a scene of nuScenes is not a key frame."""
@@ -267,11 +271,7 @@ def poses_beyond(log: Log, poses: np.ndarray, count: int) -> tuple[np.ndarray, i
 
 def intervals_of(log: Log) -> np.ndarray | None:
     """Return the (K-1,) float64 seconds from each sweep to the next; None = sweeps have no times. Reads one sweep."""
-    stamp = log.sweep(0).timestamp_ns
-    if stamp is None:
-        return None
-    is_in_microseconds = stamp == 1000 * log.timestamps[0] != log.timestamps[0]
-    return np.diff(np.array(log.timestamps, np.int64)) * (1e-6 if is_in_microseconds else 1e-9)
+    return None if log.sweep(0).timestamp_ns is None else np.diff(np.array(log.timestamps, np.int64)) * 1e-9
 
 
 def gaps_in(steps: np.ndarray) -> list[int]:
@@ -384,6 +384,7 @@ class _OfLog:
 for _name in (
     *("labels", "columns", "cameras", "poses", "trajectory", "readings", "surrounds_poses", "judgement", "findings"),
     *("eval_mask", "stored_motion", "moving", "units", "boxes", "T_camera0_lidar", "sample_tokens"),
+    "sweep_name",
     *("notes", "_note", "close", "unwrapped"),
 ):
     setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has

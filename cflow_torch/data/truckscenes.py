@@ -32,7 +32,7 @@ class TruckScenesLog(NuScenesLog):
     """One TruckScenes scene. Experimental: tested on simulated scenes only.
 
     Attributes:
-        timestamps: sweep times of the reference LiDAR (LIDAR_LEFT, else the first), in microseconds, at 10 Hz.
+        timestamps: sweep times of the reference LiDAR (LIDAR_LEFT, else the first), in nanoseconds, at 10 Hz.
 
     Convention: points are in the ego frame at the reference's time stamp. From every other LiDAR we take the sweep
         closest in time, unless it is more than 60 ms off. The world is UTM, with coordinates of some 1e6 m. We

@@ -9,7 +9,7 @@ import traceback
 from abc import ABC, abstractmethod
 from concurrent.futures import BrokenExecutor
 from threading import Lock, Thread
-from typing import Any, Callable
+from typing import Any, Callable, Mapping
 
 from cflow_torch.errors import CFlowError
 from cflow_torch.fleet.stop_signal import SIGNALS
@@ -57,25 +57,27 @@ class ProcessExecutor(Executor):
 
     Args:
         make: called in the process; returns the object. It is pickled, like the arguments and results of calls.
-        timeout: seconds after which a call without an answer is hopeless; None = never.
+        timeouts: method -> seconds after which a call without an answer is hopeless; a method without an entry may take
+            any time.
     """
 
-    def __init__(self, make: Callable[[], Any], timeout: float | None = None) -> None:
+    def __init__(self, make: Callable[[], Any], timeouts: Mapping[str, float] | None = None) -> None:
         self._make = make
-        self._timeout = timeout
+        self._timeouts = dict(timeouts or {})
         self._lock = Lock()  # of the fields below, for `close` in another thread
         self._process: Any = None
         self._connection: Any = None
         self._is_closed = False
 
     def call(self, method: str, *arguments: Any) -> Any:
+        timeout = self._timeouts.get(method)
         try:
             connection = self._connect()
             connection.send((method, arguments))
-            if connection.poll(self._timeout):
+            if connection.poll(timeout):
                 answer, error, trace = connection.recv()
             else:
-                answer, error, trace = None, BrokenExecutor(f"no answer for {self._timeout:g} s"), ""
+                answer, error, trace = None, BrokenExecutor(f"no answer for {timeout:g} s"), ""
         except (EOFError, OSError) as reason:  # the process has ended, or cannot start
             raise BrokenExecutor(self._end() or describe_error(reason)) from None
         if isinstance(error, BrokenExecutor):
@@ -152,4 +154,5 @@ def _ending(status: int | None) -> str:
     """Describe in words how a process with this exit status has ended."""
     if status is None or status >= 0:  # None: another thread has just read the status
         return f"exit status {status}"
-    return f"signal {-status}, {signal.strsignal(-status)}" + " (out of memory?)" * (-status == signal.SIGKILL)
+    is_kill = -status == getattr(signal, "SIGKILL", None)  # Windows has no such signal
+    return f"signal {-status}, {signal.strsignal(-status)}" + " (out of memory?)" * is_kill

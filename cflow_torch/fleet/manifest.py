@@ -16,7 +16,7 @@ import re
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Iterable, Mapping, Sequence
+from typing import Any, Container, Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -28,14 +28,14 @@ from cflow_torch.data.json_file import json_ready, read_json, write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import forget_listings, is_remote, remote_errors
 from cflow_torch.fleet.changes import OVERWRITE, check_same_run
+from cflow_torch.setting import free_settings
 from cflow_torch.types import CFlowError, as_numpy
 
 MANIFEST = "manifest.json"
 _FORMAT = 2
+_FRAME = re.compile(r"[0-9]{1,20}\.feather")
 _ENDING = b"ARROW1"  # last bytes of a feather file
-_TRACKS = r"tracks\.parquet|mot\.txt|kitti\.txt|instances_info\.json|frame_instances\.json"
-_DETECTIONS = r"nuscenes_detection\.json|nuscenes_tracking\.json|result\.pkl"
-_OURS = re.compile(rf"[0-9]+\.feather|manifest\.json|{_TRACKS}|{_DETECTIONS}|\..+\.tmp")
+_OURS = re.compile(r"[0-9]+\.feather|manifest\.json|\..+\.tmp")
 _LABELS = re.compile(r"[0-9]{6}\.label|\..+\.tmp")
 
 
@@ -44,7 +44,7 @@ def make_identity(
 ) -> dict[str, Any]:
     """Return what determines a result besides the sweeps: method, data settings, contents of files, versions.
 
-    `max_memory` does not change results, so it is left out. CPU and CUDA builds of one torch version count as the same.
+    CPU and CUDA builds of one torch version count as the same.
     """
     versions = {
         "cflow_torch": __version__,
@@ -52,7 +52,8 @@ def make_identity(
         "numpy": np.__version__,
     }
     data = {"reader": reader, **{key: value for key, value in settings.items() if key != "check"}}
-    method = {key: value for key, value in asdict(config).items() if key != "max_memory"}
+    free = free_settings(type(config))
+    method = {key: value for key, value in asdict(config).items() if key not in free}
     identity = json_ready(
         {"format": _FORMAT, "method": method, "data": data, "contents": contents, "versions": versions}
     )
@@ -89,8 +90,15 @@ def checked_manifest(folder: Path, log: Log, identity: Mapping[str, Any]) -> dic
 
 
 def claim_log(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written."""
+    """Write the manifest of `checked_manifest`, unless there is one. Call this before the first frame is written.
+
+    Frames that are older than the manifest are removed, because nothing says which settings they have.
+    """
+    # We list them before we look for the manifest, so that frames of another process of this run are not among them.
+    older = [name for name in _names(folder) if _FRAME.fullmatch(name)]
     if not _is_claimed(folder, manifest):
+        for name in older:
+            (folder / name).unlink(missing_ok=True)
         write_json(folder / MANIFEST, manifest)
         _check_manifest(folder, _read(folder / MANIFEST) or {}, manifest)  # another process may have been quicker
 
@@ -128,8 +136,8 @@ def describe_log(log: Log) -> dict[str, Any]:
     return {"log_id": log.log_id, "timestamps": stamps, "sweeps": digests}
 
 
-def clear_log(folder: Path) -> None:
-    """Remove the results of a log and no other files.
+def clear_log(folder: Path, tracks: Container[str] = ()) -> None:
+    """Remove the results of a log, also the files called `tracks`, and no other files.
 
     We remove the manifest last, because it marks the folder as ours.
     """
@@ -148,7 +156,7 @@ def clear_log(folder: Path) -> None:
     with suppress(OSError):
         masks.rmdir()
     for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
-        if _OURS.fullmatch(file.name):
+        if _OURS.fullmatch(file.name) or file.name in tracks:
             file.unlink()
     with suppress(OSError):  # it has other files, or an object store has no folders
         folder.rmdir()
@@ -160,13 +168,18 @@ def complete_frames(folder: Path) -> set[int]:
     Files without the log's manifest do not count, because their input is unknown. Incomplete files, such as those of an
     interrupted copy, do not count either.
     """
-    forget_listings(folder)
-    with remote_errors(folder):
-        names = [file.name for file in folder.iterdir()] if folder.is_dir() else []
+    names = _names(folder)
     if MANIFEST not in names:
         return set()
-    frames = [name for name in names if re.fullmatch(r"[0-9]{1,20}\.feather", name)]
-    return {int(name[: -len(".feather")]) for name in frames if is_remote(folder) or _is_whole(folder / name)}
+    whole = [name for name in names if _FRAME.fullmatch(name) and (is_remote(folder) or _is_whole(folder / name))]
+    return {int(name[: -len(".feather")]) for name in whole}
+
+
+def _names(folder: Path) -> list[str]:
+    """Return the names of the files in a folder, none if there is no folder."""
+    forget_listings(folder)
+    with remote_errors(folder):
+        return [file.name for file in folder.iterdir()] if folder.is_dir() else []
 
 
 def frame_file(folder: Path, timestamp: int) -> Path:
@@ -204,4 +217,4 @@ def _read(file: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except CFlowError as error:
-        raise CFlowError(f"{file} is not a manifest ({error}): remove it, or give output=FOLDER") from None
+        raise CFlowError(f"{file} is not a manifest ({error}): remove that folder, or give output=FOLDER") from None

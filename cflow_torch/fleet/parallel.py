@@ -21,7 +21,7 @@ from cflow_torch.fleet.work import Worker, make_worker
 Events = Generator[Event, None, None]
 _POLL_S = 0.2  # how soon a signal is noticed
 _GRACE_S = 20.0  # after a signal, time to finish the frames that have begun; schedulers kill after 30 s or more
-_REMEDY = "if memory is short, give fewer engine.workers"
+_REMEDY = "give fewer engine.workers if memory is short, or a larger engine.timeout if a frame takes longer"
 
 
 @contextmanager
@@ -35,7 +35,8 @@ def local_executors(
     if len(devices) == 1 and memory is None:
         yield [InlineExecutor(partial(Worker, job, devices[0]))]
     else:
-        yield [ProcessExecutor(partial(make_worker, job, device, memory), timeout) for device in devices]
+        limits = {"next_event": timeout}
+        yield [ProcessExecutor(partial(make_worker, job, device, memory), limits) for device in devices]
 
 
 def run_parallel(executors: Sequence[Executor], parts: Sequence[Part], stop: Callable[[], bool]) -> Events:
@@ -98,38 +99,38 @@ def _do_all(executor: Executor, todo: SimpleQueue[Part], stop: Callable[[], bool
             yield from _do(executor, todo.get_nowait(), stop)
 
 
-def _do(executor: Executor, part: Part, stop: Callable[[], bool]) -> Iterator[Event]:
+def _do(executor: Executor, part: Part, stop: Callable[[], bool], is_again: bool = False) -> Iterator[Event]:
     """Do a part. If its worker dies, try each frame that has no result once more, alone, then report it.
 
     If the log did not open, we try the part once more.
     """
     name = source_name(part.source)
-    left = {name}
+    left = {part.only or name}
     try:
-        yield from _events(executor, part, stop, left)
+        for event in _events(executor, part, stop, left):
+            if part.only is None or not isinstance(event, Opened):
+                yield event
+            elif not event.todo:  # its file was written just before the first worker died
+                yield Done(part.only, {})
         return
     except BrokenExecutor as error:
-        if stop():
-            return
-        yield Noted(name, f"a worker died ({error}): its frames are tried again, one by one")
-    for each in sorted(left):
-        if stop():
-            return
-        again = {each}
-        try:
-            for event in _events(executor, part if each == name else replace(part, only=each), stop, again):
-                if each == name or not isinstance(event, Opened):
-                    yield event
-                elif not event.todo:  # its file was written just before the first worker died
-                    yield Done(each, {})
-        except BrokenExecutor as error:
-            for lost in sorted(again):
-                yield Failed(lost, f"its worker died again ({error}): {_REMEDY}")
+        death = str(error)
+    if stop():
+        return
+    is_open = left != {name}
+    if is_again and (part.only is not None or not is_open):
+        for lost in sorted(left):
+            yield Failed(lost, f"its worker died again ({death}): {_REMEDY}")
+        return
+    yield Noted(name, f"a worker died ({death}): its frames are tried again, one by one")
+    for again in [replace(part, only=frame) for frame in sorted(left)] if is_open else [part]:
+        if not stop():
+            yield from _do(executor, again, stop, is_again=True)
 
 
 def _events(executor: Executor, part: Part, stop: Callable[[], bool], left: set[str]) -> Iterator[Event]:
     """Yield the events of a part. `left` has the names of what has no result: the log until it is open, then frames."""
-    event = executor.call("next_event", part, stop())
+    event = executor.call("begin", part, stop())
     while event is not None:
         if isinstance(event, Opened):
             left.clear()
@@ -137,4 +138,4 @@ def _events(executor: Executor, part: Part, stop: Callable[[], bool], left: set[
         elif not isinstance(event, Noted):
             left.discard(event.name)
         yield event
-        event = executor.call("next_event", None, stop())
+        event = executor.call("next_event", stop())

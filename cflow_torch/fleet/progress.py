@@ -34,6 +34,9 @@ class _Stderr:
         return getattr(sys.stderr, name)
 
 
+_STDERR = _Stderr()  # one object: `log_line` clears only bars of the same file
+
+
 class Progress(tqdm):  # type: ignore[type-arg]
     """Counts frames and shows the count on stderr. It is a context manager and iterates over frames, as any tqdm bar.
 
@@ -45,12 +48,12 @@ class Progress(tqdm):  # type: ignore[type-arg]
         if not sys.stderr.isatty():  # a short run prints nothing
             form = {"bar_format": _LINE, "mininterval": EVERY, "miniters": 1, "delay": EVERY}
         desc = f"{name}: " if name else ""
-        super().__init__(frames, desc, total, file=_Stderr(), unit=" frames", smoothing=0.05, **form)
+        super().__init__(frames, desc, total, file=_STDERR, unit=" frames", smoothing=0.05, **form)
 
 
 def log_line(text: str) -> None:
     """Print a line on stderr, above the bar."""
-    tqdm.write(text, file=_Stderr())
+    tqdm.write(text, file=_STDERR)
 
 
 def show_warnings_as_lines() -> None:

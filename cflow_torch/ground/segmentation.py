@@ -10,6 +10,7 @@ All arithmetic is in whole millimetres, so the bits do not depend on the batch, 
 
 from __future__ import annotations
 
+from numbers import Real
 from typing import Any, Sequence
 
 import numpy as np
@@ -77,13 +78,15 @@ def find_ground_batch(
     """
     if method not in GROUND_METHODS[1:]:
         raise CFlowError(f"method={method!r}: give one of {', '.join(map(repr, GROUND_METHODS[1:]))}")
-    if isinstance(threshold, bool) or not isinstance(threshold, (int, float)) or not 0 <= threshold < FARTHEST:
+    if isinstance(threshold, bool) or not isinstance(threshold, Real) or not 0 <= threshold < FARTHEST:
         raise CFlowError(f"threshold={threshold!r}: give metres above the ground, for example 0.3")
     if not clouds:
         return []
     positions, sweep = _stack(clouds, device)
     points = Points.of(positions, sweep, len(clouds))
-    is_ground = _patchwork(points, positions) if method == "patchwork" else _grid(points, round(threshold * 1000))
+    is_ground = (
+        _patchwork(points, positions) if method == "patchwork" else _grid(points, round(float(threshold) * 1000))
+    )
     masks = is_ground.split([cloud.shape[0] for cloud in clouds])
     return [
         mask.to(cloud.device) if isinstance(cloud, Tensor) else mask.cpu().numpy() for mask, cloud in zip(masks, clouds)

@@ -25,7 +25,7 @@ class CorrelationFlowKeypoints(CoarseToFine):
 
     Examples:
         >>> from cflow_torch import CorrelationFlowKeypoints, Sweep, Window
-        >>> model = CorrelationFlowKeypoints.from_preset("paper")
+        >>> model = CorrelationFlowKeypoints.from_preset("keypoints")
         >>> car = 0.1 * torch.cartesian_prod(torch.arange(45.0), torch.arange(18.0), torch.arange(15.0)) + 5.05
         >>> window = Window(pc0=Sweep(car), pc1=Sweep(car + torch.tensor([0.5, 0.0, 0.0])))
         >>> (result,) = model([window])

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-from contextlib import contextmanager
-from typing import Iterator, Sequence
+from typing import Sequence
 
 import numpy as np
 import torch
 
 from cflow_torch.config import Config
-from cflow_torch.errors import CFlowError, NoActivePoints, warn
+from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.conventions import INVERTED, STILL, WORLD
@@ -92,17 +90,21 @@ def repeats(pc0: Sweep, pc1: Sweep) -> bool:
     return have_same_points(pc0, pc1)
 
 
-def warn_of_inactive(windows: Sequence[Window], results: Sequence[FlowResult], config: Config) -> None:
-    """Warn of each window whose pc0 has rows, but no active point. The host waits for the device once."""
-    given = [(window, result) for window, result in zip(windows, results) if len(result.is_valid) > 0]
-    has_active = torch.stack([result.is_valid.any() for _, result in given]).tolist() if given else []
-    for (window, _), is_used in zip(given, has_active):
-        if not is_used:
-            warn(_describe_inactive(window.pc0.points, config), NoActivePoints)
+def inactive_problems(windows: Sequence[Window], results: Sequence[FlowResult], config: Config) -> list[str]:
+    """Return what is wrong with each window whose pc0 has rows, but no active point; "" = nothing.
+
+    Active points are finite, in the region, neither ground nor of the vehicle. Without one, no row has a result. Cost:
+    the host waits for the device once.
+    """
+    is_used = torch.stack([result.is_valid.any() for result in results]).tolist() if results else []
+    return [
+        "" if used or len(window.pc0.points) == 0 else _describe_inactive(window.pc0.points, config)
+        for window, used in zip(windows, is_used)
+    ]
 
 
 def _describe_inactive(points: Array, config: Config) -> str:
-    """Return the warning for a pc0 without active points, with the extent of its points."""
+    """Return the message for a pc0 without active points, with the extent of its points."""
     positions = as_numpy(points)[:, :3]
     finite = positions[np.isfinite(positions).all(axis=1)]
     seen = "all are NaN or infinite"
@@ -115,14 +117,3 @@ def _describe_inactive(points: Array, config: Config) -> str:
         f"none of the {len(positions)} points of pc0 is active ({seen}): are they metres, near the ego vehicle, and "
         f"not all of them ground? point_cloud_range={config.point_cloud_range}, in the ego frame at t+1"
     )
-
-
-@contextmanager
-def inactive_is_an_error() -> Iterator[None]:
-    """Turn the warning of `warn_of_inactive` into a `CFlowError`, for results that nobody reads one by one."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", NoActivePoints)
-        try:
-            yield
-        except NoActivePoints as warning:
-            raise CFlowError(str(warning)) from None

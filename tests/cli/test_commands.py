@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from small_logs import write_small_log
 
 from cflow_torch import make_config
-from cflow_torch.cli import failures, pairs
+from cflow_torch.cli import demo, failures, pairs
 from cflow_torch.cli.comparison import summary
 from cflow_torch.cli.eval import objective
 from cflow_torch.config import Config
@@ -60,6 +60,11 @@ def test_demo_writes_all_its_files(tmp_path, cache, cflow, capsys):
         assert f"3-D page, for any browser: {tmp_path / 'flow.html'}" in printed
         assert '"preset":"default"' in (tmp_path / "flow.html").read_text(encoding="utf-8")
     assert not list(tmp_path.rglob(".*")), "no temporary file is left"
+    again = tmp_path / "again"
+    assert cflow("demo", "--config-dir", tmp_path, "--config-name", "config", f"output={again}") == 0
+    assert results_of(again)["results"] == scores["results"]
+    if find_spec("k3d"):
+        assert (again / "flow.html").read_bytes() == (tmp_path / "flow.html").read_bytes()
 
 
 def test_demo_without_the_extras_lacks_only_picture_and_page(tmp_path, cflow, monkeypatch, capsys):
@@ -71,6 +76,31 @@ def test_demo_without_the_extras_lacks_only_picture_and_page(tmp_path, cflow, mo
     assert printed.out.startswith("no picture (") and "pip install matplotlib" in printed.out and not printed.err
     assert results_of(tmp_path)["num_pairs"] == 1 and not list(tmp_path.glob("flow.*"))
     assert "no page (" in printed.out and "k3d" in printed.out
+
+
+def test_the_page_and_the_picture_of_a_demo_show_the_first_log(log_folder, tmp_path, cflow, monkeypatch):
+    pytest.importorskip("matplotlib")
+    for name in ("a", "b"):
+        shutil.copytree(log_folder, tmp_path / "logs" / name)
+    pages: list[Any] = []
+    monkeypatch.setattr(demo, "load_k3d", lambda: None)
+    monkeypatch.setattr(demo, "save_page", lambda log, results, *_, **__: pages.append((log.log_id, len(results))))
+    titles: list[str] = []
+    plot = demo.plot_flow
+    monkeypatch.setattr(
+        demo, "plot_flow", lambda *given, title, **view: (titles.append(title), plot(*given, **view))[1]
+    )
+    data = ("data=av2", f"data.root={tmp_path / 'logs'}", "data.check=false")
+    assert cflow("demo", *data, f"output={tmp_path / 'out'}", "pair=1", "model=paper", SMALL) == 0
+    assert pages == [("a", 3)] and titles == ["CorrelationFlow, a"]
+    assert results_of(tmp_path / "out")["num_pairs"] == 6
+
+
+def test_demo_and_submit_write_to_this_machine(log_folder, cflow, capsys):
+    pytest.importorskip("upath")
+    for call in (["demo"], ["submit", log_folder]):
+        assert cflow(*call, "output=memory://out") == 2
+        assert "give a folder of this machine" in capsys.readouterr().err
 
 
 def test_the_results_file_is_complete(log_folder, tmp_path, evaluate):
@@ -97,7 +127,7 @@ def test_a_folder_of_another_run_is_an_error_that_names_the_difference(tmp_path,
     first = file.read_bytes()
     assert evaluate("device=cpu", "data.step=2") == 2
     error = capsys.readouterr().err
-    assert "config.data.step was 3, is 2" in error and "config.device was auto" in error and "overwrite=true" in error
+    assert "(data.step was 3, is 2; device was auto, is cpu)" in error and "overwrite=true" in error
     file.write_bytes(first.replace(b'"torch": "', b'"torch": "0.'))
     assert evaluate("data.step=3") == 2 and "versions.torch" in capsys.readouterr().err
     for broken, message in ((first[:1000], f"cannot read {file} as JSON"), (b"{}", "has results of another run")):
@@ -122,6 +152,11 @@ def test_bad_frames_and_bad_logs_are_reported_and_skipped(log_folder, tmp_path, 
     record, frame, error = results_of(tmp_path), f"broken/{sweeps[2].stem}", capsys.readouterr().err
     assert "2 failed:" in error and f"  {frame}: " in error and "  bad-poses: " in error
     assert record["num_pairs"] == 2 + 3 and [name for name, _ in record["failures"]] == ["bad-poses", frame]
+    shutil.copy(log_folder / "sensors" / "lidar" / sweeps[3].name, sweeps[3])
+    assert evaluate(f"data.root={root}") == 1 and results_of(tmp_path)["num_pairs"] == 6, "what failed is repeated"
+    shutil.rmtree(root / "bad-poses")
+    assert evaluate(f"data.root={root}") == 0 and "skipped" not in capsys.readouterr().out
+    assert evaluate(f"data.root={root}") == 0 and "skipped" in capsys.readouterr().out
 
 
 def test_a_scene_without_poses_names_what_helps(tmp_path, cflow, capsys):
@@ -185,7 +220,8 @@ def test_worker_processes_give_the_results_of_one_process(log_folder, tmp_path, 
         assert evaluate(f"data.root={root}", f"output={tmp_path / name}") == 1
         records.append(results_of(tmp_path / name))
     one, two = records
-    assert two["num_pairs"] == 2 and two["seconds_per_pair"]["pairs"] == one["seconds_per_pair"]["pairs"]
+    assert two["num_pairs"] == 2 and one["seconds_per_pair"]["pairs"] == 1, "the first pair is a warm-up"
+    assert two["seconds_per_pair"]["pairs"] in (1, 2), "and so is that of each process, unless there is no other"
     assert all(one[key] == two[key] for key in ("results", "failures", "data"))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,8 @@ def mine(tmp_path: Path) -> Path:
 def test_your_own_reader_by_configuration_only(mine, cflow, capsys):
     pytest.importorskip("matplotlib")
     own = ("--config-dir", mine / "my", "data=mine", "data.speed=5", "model=paper")
+    assert cflow("check", *own) in (0, 1)
+    assert re.search("^mine .*^back ", capsys.readouterr().out, re.MULTILINE | re.DOTALL)
     # A limit of its memory gives the worker a process of its own, which must find the reader, too.
     assert cflow("flow", *own, f"output={mine / 'flow'}", "engine.workers=1", "engine.memory=2e10") == 0
     for log, speed in (("mine", 0.5), ("back", -0.5)):

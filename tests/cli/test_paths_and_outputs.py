@@ -10,7 +10,8 @@ from typing import Any, Callable
 import pytest
 from small_logs import write_small_log
 
-from cflow_torch.errors import warn
+from cflow_torch.cli import flow
+from cflow_torch.errors import CFlowError, warn
 from cflow_torch.fleet.progress import show_warnings_as_lines
 
 SMALL = ("model=paper", "model.point_cloud_range=[-20,-20,-inf,20,20,inf]", "data.check=false")
@@ -87,6 +88,26 @@ def test_clean_resumes_and_overwrites_as_flow_does(drives, tmp_path, cflow, caps
     next((drives[1] / "sensors" / "lidar").iterdir()).unlink()
     assert cflow(*call, drives[1], "voxel_size=0.2") == 2, "another log of this name"
     assert times(out / "drive_2") == second
+
+
+def test_clean_names_a_second_log_of_a_name(drives, tmp_path, cflow, capsys):
+    twin = Path(shutil.copytree(drives[0], tmp_path / "elsewhere" / "drive_1"))
+    next((twin / "sensors" / "lidar").iterdir()).unlink()
+    call = ("clean", *SMALL, f"output={tmp_path / 'out'}", "overwrite=true")
+    for _ in range(2):
+        assert cflow(*call, drives[0], twin) == 1
+        assert "rename one of two logs of this name" in capsys.readouterr().err
+        assert len(list((tmp_path / "out" / "drive_1" / "points").iterdir())) == 4
+
+
+def test_a_run_whose_tracks_fail_names_them_and_not_its_frames(drives, tmp_path, cflow, monkeypatch, capsys):
+    def refuse(*_: Any) -> None:
+        raise CFlowError("no room")
+
+    monkeypatch.setattr(flow, "_write_tracks", refuse)
+    call = ("flow", "data.check=false", drives[0], f"output={tmp_path / 'out'}", "engine.workers=1")
+    assert cflow(*call, "model.num_history=0", "model.point_cloud_range=[-9,-9,-inf,9,9,inf]", "tracks=true") == 1
+    assert capsys.readouterr().err.endswith("missing:\n  drive_1: no room\n")
 
 
 def test_a_run_without_a_frame_claims_nothing(drives, tmp_path, cflow):

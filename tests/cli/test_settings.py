@@ -13,9 +13,10 @@ from omegaconf import OmegaConf
 
 from cflow_torch import make_config
 from cflow_torch.cli.choices import FOLDER, choices, read_settings
-from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Plot
+from cflow_torch.cli.commands import COMMANDS, WITH_SETTINGS, Flow, Plot
 from cflow_torch.cli.main import HELP
 from cflow_torch.cli.settings import help_of
+from cflow_torch.cli.track_formats import TRACK_FORMATS
 from cflow_torch.cli.words import hydra_overrides, read_call, split
 from cflow_torch.config import METHODS, PRESETS, Config
 from cflow_torch.data.catalog import DATA_SETS
@@ -121,7 +122,7 @@ def test_a_wrong_preset_is_one_line(text, message, mine, cflow, capsys):
 @pytest.mark.parametrize(
     "name",
     ["10203656353524179475_7625_000_7645_000", "1e5", "2024_11_22", "-1.5", "true", "a_1", "Ausgänge/東京", 'it\'s "ü"']
-    + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "50%", "a#b"],
+    + ["a (1)", "x=y", "s3://bucket/a", "C:\\data", "C:\\data\\", '\\\\host\\a \\"b\\\\', "50%", "a#b"],
 )
 def test_names_are_text_even_if_they_look_like_numbers(name):
     overrides = hydra_overrides(Plot, split([f"log={name}", f"+data.root={name}", "pair=1"]))
@@ -138,6 +139,11 @@ def test_hydra_syntax_in_names_keeps_its_meaning(compose):
     assert words("-m", "log=1_0,b,2_0", "pair=1,2") == ['log="1_0","b","2_0"', "pair=1,2"]
     assert words("log=[a,b]", "log=a,b") == ["log=[a,b]", 'log="a","b"']
     assert words("log=choice(a,b)", "log='1_0'") == ["log=choice(a,b)", "log='1_0'"]
+
+
+def test_tracks_has_the_formats_that_are_written():
+    (tracks,) = (f for f in fields(Flow) if f.name == "tracks")
+    assert set(tracks.metadata["choices"]) == {True, False, *TRACK_FORMATS}
 
 
 def test_the_page_lists_every_setting(cflow, capsys):

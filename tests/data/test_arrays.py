@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -313,6 +314,10 @@ def test_ply_reads_text(tmp_path):
     assert cloud["x"].tolist() == [1.5, 0] and cloud["y"].tolist() == [-2, 1e-3] and cloud["red"].tolist() == [255, 7]
     for old, new in (
         ("1.5 -2 255", "1.5 -2 256"),
+        ("1.5 -2 255", "1.5 -2 25.5"),
+        ("1.5 -2 255", "1.5 -2 nan"),
+        ("1.5 -2 255", "1.5 -2"),
+        ("1.5 -2 255\n0 1e-3 7", "1.5 -2\n0 1e-3"),
         ("float32 x", "list uchar int x"),
         ("element vertex 2", "element points 2"),
         ("end_header", ""),
@@ -321,6 +326,15 @@ def test_ply_reads_text(tmp_path):
         file.write_text(text.replace(old, new, 1))
         with pytest.raises(CFlowError, match=r"a\.ply"):
             read_cloud(file)
+
+
+def test_a_ply_text_may_have_no_points_and_numbers_beyond_float32():
+    head = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty int y\nend_header\n{}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert ply_fields(head.format(0, "").encode())["x"].shape == (0,)
+        far = ply_fields(head.format(1, "1e300 -2147483648\n").encode())
+    assert far["x"].tolist() == [np.inf] and far["y"].tolist() == [-(2**31)]
 
 
 def test_ply_files_of_other_programs_are_read(tmp_path):

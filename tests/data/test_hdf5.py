@@ -12,7 +12,7 @@ from small_logs import make_small_drive
 from cflow_torch import CFlowError
 from cflow_torch.data.hdf5.reader import HDF5Log, find_hdf5_scenes
 from cflow_torch.data.hdf5.writer import write_hdf5_scene
-from cflow_torch.data.log import window
+from cflow_torch.data.log import CachedLog, intervals_of, window
 from cflow_torch.transforms import to_quaternions, transform_points
 from cflow_torch.types import CFlowWarning
 
@@ -158,8 +158,10 @@ def test_every_key_is_read_in_its_own_type(tmp_path):
     file = write_scene(tmp_path / "val" / "scene.h5", **extra)
     assert find_hdf5_scenes(tmp_path) == find_hdf5_scenes(file.parent) == find_hdf5_scenes(file) == [file]
     with HDF5Log(file) as log:
-        assert list(log.timestamps) == list(STAMPS) and len(window(log, 1, 4).pch) == 1
-        assert log.sweep(1).timestamp_ns == STAMPS[1] * 1000, "microseconds become nanoseconds"
+        assert list(log.timestamps) == [1000 * stamp for stamp in STAMPS], "microseconds become nanoseconds"
+        assert log.sweep(1).timestamp_ns == log.timestamps[1] and log.sweep_name(1) == str(STAMPS[1])
+        assert len(window(log, 1, 4).pch) == 1 and np.allclose(intervals_of(log), 0.1)
+        assert CachedLog(log, 1).sweep_name(1) == log.sweep_name(1)
         for key, value in extra.items():
             read = log.values(0, key)
             assert read.dtype == value.dtype and np.array_equal(read, value[:, 0] if key == "cluster" else value), key

@@ -51,6 +51,16 @@ def test_a_result_is_written_and_the_rest_stays(scene: Path) -> None:
     assert find_hdf5_scenes(scene.parent) == [scene] and os.listdir(scene.parent) == [scene.name]
 
 
+def test_the_copy_of_another_writer_stays_until_it_is_old(scene: Path) -> None:
+    copy = scene.with_name(f".{scene.name}.0123abcd.tmp")
+    copy.write_bytes(b"half")
+    for is_left in (True, False):
+        write_hdf5_results(scene, "mine", [])
+        assert copy.exists() == is_left
+        if is_left:
+            os.utime(copy, (0, 0))
+
+
 @pytest.mark.parametrize("compression", [None, "gzip"])
 def test_what_is_added_is_compressed_as_the_points_are(scene: Path, compression: str | None) -> None:
     with h5py.File(scene, "r+") as opened:

@@ -251,8 +251,12 @@ def test_leftovers_of_a_killed_process_are_removed_when_they_are_old(tmp_path):
     (tmp_path / ".1.feather.tmp").write_bytes(b"")  # not ours
     remove_stale(tmp_path)
     assert len(names(tmp_path)) == 3, "a process may still write them"
+    (tmp_path / left[1] / "points").mkdir()
     for name in left:
         os.utime(tmp_path / name, (0, 0))
+    remove_stale(tmp_path)
+    assert names(tmp_path) == (".1.feather.tmp", left[1]), "a process writes into a folder of the log"
+    os.utime(tmp_path / left[1] / "points", (0, 0))
     remove_stale(tmp_path)
     assert names(tmp_path) == (".1.feather.tmp",)
     remove_stale(tmp_path / "absent")

@@ -84,6 +84,23 @@ def test_incomplete_files_are_computed_again(fleet, single, out):
     assert tree(out) == single
 
 
+def test_frames_without_a_manifest_are_never_taken_as_results_of_a_run(fleet, single, out, monkeypatch):
+    for file in frames(out):  # flow of other settings, as `cflow demo` writes it
+        file.write_bytes(b"ARROW1 of another method ARROW1")
+        file.with_name("manifest.json").unlink(missing_ok=True)
+
+    def stop_after_the_first(*arguments: Any) -> None:
+        write(*arguments)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        write = work.write_flow
+        patch.setattr(work, "write_flow", stop_after_the_first)
+        assert run(fleet, out, batch=1)["status"] == "interrupted"
+    assert run(fleet, out)["status"] == "complete"
+    assert tree(out) == single
+
+
 def test_other_settings_are_rejected_by_name(fleet, single, out):
     with pytest.raises(CFlowError, match=re.escape("method.pixel_sizes was [0.4], is [0.8]") + ".*overwrite=true"):
         run(fleet, out, settings=OTHER)
@@ -96,7 +113,7 @@ def test_other_settings_are_rejected_by_name(fleet, single, out):
     manifest = frames(out)[0].with_name("manifest.json")
     before = manifest.read_bytes()
     manifest.write_bytes(b"")
-    with pytest.raises(CFlowError, match=f"{manifest} is not a manifest"):
+    with pytest.raises(CFlowError, match=f"{manifest} is not a manifest.*remove that folder"):
         run(fleet, out)
     manifest.write_bytes(before)
     assert run(fleet, out)["frames"]["computed"] == 0

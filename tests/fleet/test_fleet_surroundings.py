@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -135,6 +136,31 @@ def test_a_run_ignores_sighup_under_nohup() -> None:
             assert not stop()
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+    def lines(self) -> list[str]:
+        """Return what is seen: after a carriage return, text replaces the text of its line."""
+        seen = []
+        for line in self.getvalue().split("\n"):
+            shown = ""
+            for text in line.split("\r"):
+                shown = text + shown[len(text) :]
+            seen.append(shown.rstrip())
+        return seen
+
+
+def test_a_line_replaces_the_bar_which_is_drawn_again_below(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with Progress(total=3) as bar:
+        bar.update(1)
+        log_line("a frame failed")
+        first, second = terminal.lines()
+        assert first == "a frame failed" and "/3" in second
 
 
 class Closed:

@@ -6,6 +6,7 @@ import multiprocessing
 import signal
 import threading
 import time
+import warnings
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NoAnswer
 from dataclasses import replace
@@ -21,7 +22,7 @@ from small_logs import make_small_drive
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import LogWrapper
-from cflow_torch.fleet import parallel, work
+from cflow_torch.fleet import executors, parallel, work
 from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.parallel import run_parallel
@@ -43,10 +44,11 @@ class FailingModel:
         self.model = make_model(CONFIG, "cpu")
         self.config, self.bad, self._error = self.model.config, bad, error
 
-    def __call__(self, windows: Sequence[Window]) -> list[FlowResult]:
+    def __call__(self, windows: Sequence[Window], warns: bool) -> list[FlowResult]:
+        warnings.simplefilter("always")  # as a reader that changes the filters in its thread
         if any(w.pc0.timestamp_ns in self.bad for w in windows):
             raise self._error()
-        return self.model(windows)
+        return self.model(windows, warns)
 
 
 @pytest.mark.parametrize("error", [CFlowError("too odd"), MemoryError(), RuntimeError("CUDA: no memory"), KeyError(3)])
@@ -83,7 +85,12 @@ def test_frames_without_an_active_point_fail_and_repeated_sweeps_are_noted(tmp_p
             return Odd(drive)
 
     job = make_job(tmp_path, config=make_config("paper"), settings={}, batch=4)
-    events = list(Opener(job, "cpu").run(Part("odd")))
+    worker = Opener(job, "cpu")
+    worker._model = FailingModel([], AssertionError)
+    worker._model.model = make_model(job.config, "cpu")
+    with warnings.catch_warnings(record=True) as shown:
+        events = list(worker.run(Part("odd")))
+    assert not shown, "what fails is told once, as a failure"
     (failed,) = [event for event in events if isinstance(event, Failed)]
     count = len(drive.sweep(1).points)
     names = [f"{drive.log_id}/{stamp}" for stamp in drive.timestamps]
@@ -175,7 +182,10 @@ def count(events: Iterator[Event], parts: Sequence[Part]) -> Counters:
     return counters
 
 
-AGAIN_DIED = "its worker died again (SIGSEGV): if memory is short, give fewer engine.workers"
+AGAIN_DIED = (
+    "its worker died again (SIGSEGV): "
+    "give fewer engine.workers if memory is short, or a larger engine.timeout if a frame takes longer"
+)
 AGAIN = "a worker died (SIGSEGV): its frames are tried again, one by one"
 
 
@@ -230,6 +240,15 @@ def test_workers_that_die_at_their_start_are_started_twice_for_each_log(fleet, t
         source.name for source in fleet.iterdir()
     )
     assert count(run_parallel([HereExecutor(job, failed_starts=1)], parts, never), parts).is_complete
+
+
+def test_a_frame_fails_only_after_its_worker_died_on_it_alone(source, tmp_path):
+    """The log opens at the second start only, and then a frame ends its worker once."""
+    parts = parts_of([source])
+    deadly = {f"{source.name}/{AV2Log(source).timestamps[1]}": 1}
+    executor = HereExecutor(make_job(tmp_path, batch=1), deadly, failed_starts=1)
+    counters = count(run_parallel([executor], parts, never), parts)
+    assert counters.is_complete and len(flow_files(tmp_path)) == counters.total == 5
 
 
 def test_a_worker_that_cannot_start_ends_the_run(fleet, tmp_path):
@@ -331,16 +350,41 @@ def test_a_process_whose_library_exits_or_loses_its_gpu_ends():
 
 
 def test_a_silent_process_is_ended_and_replaced():
-    executor = ProcessExecutor(partial(eval, "__import__('os')"), timeout=60.0)
+    executor = ProcessExecutor(partial(eval, "__import__('os')"), {"kill": 0.3})  # to start takes longer
     try:
         first = executor.call("getpid")
-        executor._timeout = 0.3
         with pytest.raises(BrokenExecutor, match="no answer for 0.3 s"):
             executor.call("kill", first, signal.SIGSTOP)
-        executor._timeout = 60.0  # to start takes longer
         assert executor.call("getpid") != first
     finally:
         executor.close()
+
+
+class SlowWorker:
+    """A worker that takes a second to open a log, and never computes a frame."""
+
+    def __init__(self, *_: Any) -> None: ...
+
+    def begin(self, part: Part, is_stopped: bool) -> Opened:
+        time.sleep(1)
+        return Opened("log", 1, ("log/0",))
+
+    def next_event(self, is_stopped: bool) -> None:
+        time.sleep(60)
+
+
+def test_a_log_may_take_long_to_open(tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel, "make_worker", SlowWorker)
+    with parallel.local_executors(make_job(tmp_path), ("cpu", "cpu"), timeout=0.5) as (first, _):
+        assert first.call("begin", Part("log"), False) == Opened("log", 1, ("log/0",))
+        with pytest.raises(BrokenExecutor, match="no answer for 0.5 s"):
+            first.call("next_event", False)
+
+
+def test_a_killed_process_is_described_where_there_is_no_sigkill(monkeypatch):
+    assert executors._ending(-9).endswith("(out of memory?)")
+    monkeypatch.delattr(signal, "SIGKILL")  # as on Windows, where `kill` gives this status
+    assert executors._ending(-signal.SIGTERM) == "signal 15, Terminated"
 
 
 def test_a_close_ends_a_call_of_another_thread():

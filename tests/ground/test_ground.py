@@ -87,6 +87,11 @@ def test_a_gpu_finds_the_same(sweeps):
         assert np.array_equal(a, b)
 
 
+def test_a_threshold_may_be_any_number():
+    points = rings(1.7)
+    assert np.array_equal(find_ground(points, threshold=np.float32(0.25)), find_ground(points, threshold=0.25))
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [

@@ -79,7 +79,7 @@ def test_truth_is_residual_and_only_where_it_is_known(cflow, drive, monkeypatch,
 
 
 def test_an_animation_has_a_picture_for_every_pair(cflow, tmp_path, capsys):
-    assert cflow("plot", "picture=animation", "model=paper", "width=300", "first=1", SMALL) == 0
+    assert cflow("plot", "picture=animation", "model=paper", "width=300", "data.first=1", SMALL) == 0
     assert "2 pairs from 1 to 2" in capsys.readouterr().out
     with Image.open(tmp_path / "out" / "animation.gif") as gif:
         assert gif.n_frames == 2 and gif.size[0] == 300
@@ -92,7 +92,7 @@ def test_an_animation_has_a_picture_for_every_pair(cflow, tmp_path, capsys):
         (["truth=perhaps"], "truth='perhaps'"),
         (["picture=keypoints", "model=paper"], "model=keypoints"),
         (["picture=correlation", "cluster=100000"], "cluster=100000"),
-        (["picture=animation", "first=9"], "first=9"),
+        (["picture=animation", "data.first=9"], "data.first=9"),
         (["picture=animation", "legend=middle", "count=1", "model=paper"], "legend"),
     ],
 )

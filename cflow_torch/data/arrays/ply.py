@@ -7,7 +7,6 @@ writes them), reads `uchar` as signed, and does not notice missing points. The l
 from __future__ import annotations
 
 import re
-import warnings
 from typing import Mapping, NamedTuple, Sequence
 
 import numpy as np
@@ -88,10 +87,16 @@ def _text_table(body: bytes, before: Sequence[_Element], vertex: _Element) -> np
     rows = lines[first : first + vertex.num_rows]
     if vertex.has_lists:
         rows = [" ".join(_without_lists(row.split(), vertex)) for row in rows]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # NumPy warns if there are no points
-        warnings.simplefilter("error", DeprecationWarning)  # NumPy warns if 256 is stored in a byte
-        table: np.ndarray = np.loadtxt(rows, vertex.scalars, ndmin=1)
+    table = np.zeros(len(rows), vertex.scalars)
+    names = vertex.scalars.names or ()
+    numbers = np.loadtxt(rows, ndmin=2) if rows else np.zeros((0, len(names)))  # float64 holds every number
+    if numbers.shape[1] != len(names):
+        raise ValueError(f"its vertices have {numbers.shape[1]} numbers, not {len(names)}")
+    for name, column in zip(names, numbers.T):
+        with np.errstate(all="ignore"):  # a number that does not fit is found below
+            table[name] = column
+        if table[name].dtype.kind in "iu" and not np.array_equal(table[name], column):
+            raise ValueError(f"its property {name} has numbers that {vertex.scalars[name].name} does not have")
     return table
 
 

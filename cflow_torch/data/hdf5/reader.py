@@ -51,9 +51,8 @@ class HDF5Log(Log):
         needs_poses: True = a sweep of unknown pose is an error; False = its pose is None, as `with_poses` expects.
 
     Attributes:
-        timestamps: names of the groups as integers, ascending, in nanoseconds or microseconds as the data set has
-            them; the `timestamp_ns` of sweeps are nanoseconds. Names may be seconds with decimals, which become
-            nanoseconds, or numbers 000000, 000001, ... Then sweeps have no `timestamp_ns`.
+        timestamps: nanoseconds, ascending. Names of groups (`sweep_name`) may be nanoseconds, microseconds, seconds
+            with decimals, or numbers 000000, 000001, ... Sweeps with numbers have no `timestamp_ns`.
         ego_T_lidar: (4, 4) float64, the transform in use.
 
     Convention:
@@ -97,11 +96,10 @@ class HDF5Log(Log):
         is_ground = self._values(index, "ground_mask", rows, np.bool_)
         pose = self._stored_pose(index)
         if pose is not None and not np.array_equal(self.ego_T_lidar, np.eye(4)):
-            pose = rigid_transform(pose, f"pose of sweep {timestamp} in {self.file}") @ self.ego_T_lidar
-        nanoseconds = timestamp if timestamp >= _FIRST_NANOSECOND else timestamp * 1000
-        time = None if self.timestamps[-1] < _FIRST_MICROSECOND else nanoseconds  # None: the groups are numbered
+            pose = rigid_transform(pose, f"pose of sweep {self.sweep_name(index)} in {self.file}") @ self.ego_T_lidar
+        time = None if self.timestamps[-1] < _FIRST_MICROSECOND else timestamp  # None: the groups are numbered
         if pose is not None and not np.isfinite(pose).all():
-            raise MissingFile(f"{self.file}: the pose of sweep {timestamp} is not finite")
+            raise MissingFile(f"{self.file}: the pose of sweep {self.sweep_name(index)} is not finite")
         return Sweep(points[:, :3], is_ground, pose, time, self._point_times(index, time, points))
 
     def _point_times(self, index: int, time: int | None, points: np.ndarray) -> np.ndarray | None:
@@ -124,7 +122,7 @@ class HDF5Log(Log):
             return None
         category = self._values(index, "flow_category_indices", rows)
         is_valid = self._values(index, "flow_is_valid", rows, np.bool_)
-        where = f"{self.file}: sweep {self.timestamps[index]}"
+        where = f"{self.file}: sweep {self.sweep_name(index)}"
         if category is None or is_valid is None:
             raise CFlowError(f"{where} has flow without flow_category_indices or flow_is_valid")
         if category.dtype.kind not in "iu" or category.max(initial=0) > _LARGEST_CATEGORY:
@@ -143,6 +141,9 @@ class HDF5Log(Log):
             rigid_transform(pose, f"pose of sweep {index} or {index + 1} of {self.file}")
         return StoredMotion(harness_motion(*poses), np.array_equal(self.ego_T_lidar, np.eye(4)))
 
+    def sweep_name(self, index: int) -> str:
+        return self._names[self._timestamp(index)]
+
     def keys(self, index: int) -> tuple[str, ...]:
         """Return the names of all arrays of sweep `index`, results included."""
         with scene_errors(self.file):
@@ -159,7 +160,7 @@ class HDF5Log(Log):
         values = self._values(index, key)
         if values is None:
             has = ", ".join(self.keys(index))
-            raise CFlowError(f"{self.file}: sweep {self.timestamps[index]} has no {key}; it has {has}")
+            raise CFlowError(f"{self.file}: sweep {self.sweep_name(index)} has no {key}; it has {has}")
         return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
     @cached_property
@@ -173,7 +174,7 @@ class HDF5Log(Log):
         """Read a rigid transform, (4, 4); a file may have only its upper three rows, or x y z qx qy qz qw."""
         matrix = self._values(index, key, None, dtype)
         if matrix is not None and matrix.shape == (7,):
-            where = f"{self.file}: {key} of sweep {self.timestamps[index]}"
+            where = f"{self.file}: {key} of sweep {self.sweep_name(index)}"
             return poses_from_quaternions(matrix[:3], matrix[[6, 3, 4, 5]], lambda _: where)[0]
         if matrix is not None and matrix.shape == (3, 4):
             return np.concatenate([matrix, np.eye(4, dtype=matrix.dtype)[3:]])
@@ -189,14 +190,14 @@ class HDF5Log(Log):
             motion = self._matrix(len(self._chain) - 1, "ego_motion", np.float64)
             if motion is None:
                 break
-            name = f"ego_motion of sweep {self.timestamps[len(self._chain) - 1]} in {self.file}"
+            name = f"ego_motion of sweep {self.sweep_name(len(self._chain) - 1)} in {self.file}"
             self._chain.append(self._chain[-1] @ np.linalg.inv(rigid_transform(motion, name)))
         if index < len(self._chain) > 1:
             return self._chain[index]
         if not self._needs_poses:
             return None
         raise CFlowError(
-            f"{self.file}: sweep {self.timestamps[index]} has no pose; it has {', '.join(self.keys(index))}. Store "
+            f"{self.file}: sweep {self.sweep_name(index)} has no pose; it has {', '.join(self.keys(index))}. Store "
             "pose (T_world_ego) of every sweep, or ego_motion to the next sweep, or set data.odometry=true"
         )
 
@@ -212,11 +213,11 @@ class HDF5Log(Log):
         return recognized_extrinsics(self.timestamps[0], points, is_ground)
 
     def _group(self, index: int) -> Any:
-        return member(self._scene, self._names[self._timestamp(index)], self.file)
+        return member(self._scene, self.sweep_name(index), self.file)
 
     def _rows(self, index: int) -> tuple[int]:
         """Return the number of points of a sweep without reading them, as the shape of a column."""
-        where = f"{self.file}: sweep {self._timestamp(index)}"
+        where = f"{self.file}: sweep {self.sweep_name(index)}"
         stored = member(self._group(index), "lidar", where)
         if stored is None:
             raise CFlowError(
@@ -228,7 +229,7 @@ class HDF5Log(Log):
 
     def _values(self, index: int, key: str, shape: tuple[int, ...] | None = None, dtype: Any = None) -> Any:
         """Read the array of a key, None if there is none. Its stored shape may have one more axis, of length 1."""
-        group, what = self._group(index), f"{self.file}: {key} of sweep {self.timestamps[index]}"
+        group, what = self._group(index), f"{self.file}: {key} of sweep {self.sweep_name(index)}"
         stored = member(group, key, what)
         if stored is None:
             return None
@@ -244,8 +245,10 @@ scene_errors = partial(file_errors, hint="copy or write the scene again")
 
 
 def sweep_names(scene: Any) -> dict[int, str]:
-    """Return the time stamp of each sweep of an open scene, and the name of its group."""
+    """Return the time stamp of each sweep of an open scene, nanoseconds, and the name of its group."""
     names = {int(name): name for name in scene if is_timestamp(name)}
+    if _FIRST_MICROSECOND <= max(names, default=0) < _FIRST_NANOSECOND:
+        names = {1000 * stamp: name for stamp, name in names.items()}
     decimals = [name for name in scene if "." in name]
     stamps = None if names else times_of_names(decimals)
     return names if stamps is None else dict(zip(stamps, decimals))

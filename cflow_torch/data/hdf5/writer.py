@@ -12,7 +12,7 @@ from typing import Any, Callable, Iterable, Mapping
 
 import numpy as np
 
-from cflow_torch.data.atomic import atomic_file, atomic_name
+from cflow_torch.data.atomic import atomic_file, atomic_name, remove_stale
 from cflow_torch.data.boxes import points_in_box
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.hdf5.reader import (
@@ -73,13 +73,13 @@ def write_hdf5_scene(log: Log, file: str | Path, eval_step: int = 5) -> None:
 def write_index_files(folder: str | Path) -> None:
     """Write `index_total.pkl`, `index_flow.pkl` and `index_eval.pkl` for all scenes of a folder.
 
-    Each is OpenSceneFlow's pickled list of [scene, time stamp], both strings.
+    Each is OpenSceneFlow's pickled list of [scene, name of the sweep], both strings.
     """
     folder = Path(folder)
     sweeps = []
     for file in (file for file in find_hdf5_scenes(folder) if file.parent == folder):
         with HDF5Log(file, ego_T_lidar=None) as log:
-            sweeps += [([log.log_id, str(stamp)], log.keys(k)) for k, stamp in enumerate(log.timestamps)]
+            sweeps += [([log.log_id, log.sweep_name(k)], log.keys(k)) for k in range(len(log))]
     for name, needed in (("total", "lidar"), ("flow", "flow"), ("eval", "eval_mask")):
         with atomic_file(folder / f"index_{name}.pkl") as index:
             pickle.dump([entry for entry, keys in sweeps if needed in keys], index, protocol=4)
@@ -190,8 +190,7 @@ def _write(file: str | Path, sweeps: Iterable[Any], store: Callable[..., None], 
     """Store the arrays of sweeps in a copy of a scene, which then replaces it; return the number of sweeps."""
     check_writable(file)
     file = Path(file).resolve()  # a link stays a link
-    for left in file.parent.glob(f".{file.name}.*.tmp"):  # copies of writers that were killed
-        left.unlink()
+    remove_stale(file.parent)  # copies of writers that were killed
     count = 0
     with atomic_name(file) as copy:
         shutil.copy(file, copy)

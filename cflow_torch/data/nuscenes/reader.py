@@ -81,7 +81,7 @@ class NuScenesLog(Log):
     Attributes:
         log_id: name of the scene.
         poses: (K, 4, 4) float64 `T_world_ego` of every sweep.
-        timestamps: sweep times of the data set, in microseconds; `Sweep.timestamp_ns` is in nanoseconds.
+        timestamps: sweep times, in nanoseconds; the tables have microseconds.
         sample_tokens: token of each key frame; None = the sweep is not a key frame.
 
     Convention:
@@ -135,7 +135,7 @@ class NuScenesLog(Log):
         row = np.arange(len(reference.times))
         last_key = np.maximum.accumulate(np.where(reference.is_key_frame, row, 0))
         kept = np.flatnonzero((row - last_key) % sweep_step == 0)
-        self.timestamps = reference.times[kept].tolist()
+        self.timestamps = (1000 * reference.times[kept]).tolist()
         self._check_count(f"scene {self.log_id} in {folder}")
         self._check_files(reference, kept, int((row - last_key).max()) + 1)
         self.poses: np.ndarray = reference.ego[kept]
@@ -166,15 +166,19 @@ class NuScenesLog(Log):
         except CFlowError:
             return True
 
+    def _microseconds(self, index: int) -> int:
+        """Return the time of a sweep as the tables have it."""
+        return self._timestamp(index) // 1000
+
     def sweep(self, index: int) -> Sweep:
         """Read sweep `index`: all LiDARs in one ego frame, in the order of `lidars`, else of sensor.json."""
         points, lag = self._cloud(index)
         times = lag * 1e-6 if lag.any() else None
-        return Sweep(points, None, self.poses[index].copy(), self.timestamps[index] * 1000, times)
+        return Sweep(points, None, self.poses[index].copy(), self.timestamps[index], times)
 
     def cameras(self, index: int) -> list[Camera]:
         """Return all cameras of the scene, each with its image nearest in time."""
-        time = self._timestamp(index)
+        time = self._microseconds(index)
         cameras = []
         for name, chain in self._camera_chains:
             row = int(np.abs(chain.times - time).argmin())
@@ -190,7 +194,7 @@ class NuScenesLog(Log):
         return sorted(self._tables.chains(self.log_id, "camera").items())
 
     def _labels(self, index: int) -> FlowLabels | None:
-        time0, time1 = self.timestamps[index : index + 2]
+        time0, time1 = self._microseconds(index), self._microseconds(index + 1)
         if time0 < self._tracks.start or time1 > self._tracks.end:
             return None
         points, lag = self._cloud(index)
@@ -220,7 +224,7 @@ class NuScenesLog(Log):
 
     def _cloud(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Read (N, 3) float32 points in the ego frame, and (N,) int64 microseconds from the time stamp; 0 = unknown."""
-        time = self._timestamp(index)
+        time = self._microseconds(index)
         clouds = []
         for chain in self._lidars.values():
             row = int(np.abs(chain.times - time).argmin())
@@ -247,7 +251,7 @@ class NuScenesLog(Log):
             )
         distinct, group = np.unique(times, return_inverse=True)
         at = (T_ego_world @ poses_at(distinct, *self._odometry))[group]
-        return transform_each(points, at).astype(np.float32), times - self.timestamps[index]
+        return transform_each(points, at).astype(np.float32), times - self._microseconds(index)
 
     def _points_of(self, file: Path) -> tuple[np.ndarray, np.ndarray | None]:
         """Return (N, 3) points in the frame of the LiDAR, and the (N,) int64 microseconds of shots; None = unknown."""
@@ -266,7 +270,7 @@ class NuScenesLog(Log):
         rear, front, half_width = self._own_vehicle
         own = (points[:, 0] > rear) & (points[:, 0] < front) & (np.abs(points[:, 1]) < half_width)
         if OWN_TRAILER in self._categories:
-            tracks, _ = self._tracks.at(self.timestamps[index])
+            tracks, _ = self._tracks.at(self._microseconds(index))
             for name, size, pose in zip(tracks.category, tracks.size, tracks.pose):
                 if name == OWN_TRAILER:
                     own |= points_in_box(points, size, self._T_ego_world[index] @ pose)

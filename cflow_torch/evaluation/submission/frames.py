@@ -23,23 +23,23 @@ _HALF_SIDE = 50.0  # metres; the official masks contain the points that are not 
 class MaskArchive:
     """The official evaluation masks: a zip of `<log>/<time stamp>.feather`, each with one bool column.
 
-    `frames` maps log ids to the time stamps that are evaluated.
+    `frames` maps log ids to the names of the sweeps that are evaluated.
     """
 
     def __init__(self, file: str | Path) -> None:
         self.file = Path(file)
-        self.frames: dict[str, list[int]] = {}
+        self.frames: dict[str, list[str]] = {}
         with file_errors(self.file):
             self._zip = zipfile.ZipFile(self.file)
         for path in map(PurePosixPath, sorted(self._zip.namelist())):
             if path.suffix == ".feather" and is_timestamp(path.stem):
-                self.frames.setdefault(str(path.parent), []).append(int(path.stem))
+                self.frames.setdefault(str(path.parent), []).append(path.stem)
         if not self.frames:
             raise CFlowError(f"{self.file} contains no masks: give a zip of <log>/<time stamp>.feather")
 
-    def mask(self, log_id: str, timestamp: int) -> np.ndarray:
+    def mask(self, log_id: str, sweep_name: str) -> np.ndarray:
         """Read the (N,) bool mask of a sweep; a missing or damaged one is a `CFlowError`."""
-        name = f"{log_id}/{timestamp}.feather"
+        name = f"{log_id}/{sweep_name}.feather"
         with file_errors(f"{self.file}: {name}"):
             file = FeatherFile(f"{self.file}: {name}", self._zip.read(name))
         if len(file.names) != 1:
@@ -53,13 +53,13 @@ def point_mask(log: Log, index: int, sweep: Sweep, masks: MaskArchive | None = N
     It is the official mask, else that of the log (`Log.eval_mask`), else the rule: no ground; |x|, |y| <= 50 m.
     """
     points = as_numpy(sweep.points)
-    mask = log.eval_mask(index) if masks is None else masks.mask(log.log_id, log.timestamps[index])
+    mask = log.eval_mask(index) if masks is None else masks.mask(log.log_id, log.sweep_name(index))
     if mask is None:
         if sweep.is_ground is None:
             raise CFlowError(f"log {log.log_id} has neither masks nor ground: give the official masks, or its map")
         return (np.abs(points[:, :2]) <= _HALF_SIDE).all(axis=1) & ~as_numpy(sweep.is_ground)
     if mask.shape != (len(points),):
-        name = f"{log.log_id}/{log.timestamps[index]}"
+        name = f"{log.log_id}/{log.sweep_name(index)}"
         raise CFlowError(f"evaluation mask of {name} has {len(mask)} rows, the sweep has {len(points)}")
     return mask
 
@@ -74,7 +74,7 @@ class SubmittedFrame:
     @property
     def name(self) -> str:
         """Return the path of the frame's file inside the archive."""
-        return f"{self.log.log_id}/{self.log.timestamps[self.index]}.feather"
+        return f"{self.log.log_id}/{self.log.sweep_name(self.index)}.feather"
 
     def count_rows(self, version: SubmissionVersion, masks: MaskArchive | None = None) -> int:
         """Count the rows that the file of the frame must have. This reads the sweep."""
@@ -82,31 +82,30 @@ class SubmittedFrame:
         return int(point_mask(self.log, self.index, sweep, masks).sum()) if version.is_masked else len(sweep.points)
 
 
-def plan_log(log: Log, listed: Mapping[str, Sequence[int]] | None = None) -> list[SubmittedFrame]:
+def plan_log(log: Log, listed: Mapping[str, Sequence[str]] | None = None) -> list[SubmittedFrame]:
     """List the frames of one log that a submission needs, in the order of time.
 
-    `listed` maps log ids to the time stamps of exactly the frames to submit. None = the sweeps that have an evaluation
+    `listed` maps log ids to the names of exactly the frames to submit. None = the sweeps that have an evaluation
     mask if the log has any, else the pairs 0, 5, 10 ... The last sweep is left out, because it has no successor;
     OpenSceneFlow writes no file for it either.
     """
     safe_name(log.log_id, "the log")
-    stamps = list(log.timestamps)[:-1]
+    pairs = range(len(log.timestamps) - 1)
     if listed is None:
-        pairs = range(len(stamps))
         masked = [i for i in pairs if log.eval_mask(i) is not None]
         return [SubmittedFrame(log, i) for i in masked or pairs[::STRIDE]]
-    wanted = sorted(set(listed.get(log.log_id, ())))
-    for stamp in set(wanted) - set(stamps):
+    wanted = set(listed.get(log.log_id, ()))
+    for name in sorted(wanted - {log.sweep_name(i) for i in pairs}):
         raise CFlowError(
-            f"{log.log_id}/{stamp} is listed, but is not a sweep of the log or is its last one, which has no flow"
+            f"{log.log_id}/{name} is listed, but is not a sweep of the log or is its last one, which has no flow"
         )
-    return [SubmittedFrame(log, stamps.index(stamp)) for stamp in wanted]
+    return [SubmittedFrame(log, i) for i in pairs if log.sweep_name(i) in wanted]
 
 
-def read_frame_list(file: str | Path) -> dict[str, list[int]]:
-    """Read log id -> time stamps from a text file: one `<log>/<time stamp>` per line, # for comments."""
+def read_frame_list(file: str | Path) -> dict[str, list[str]]:
+    """Read log id -> names of sweeps from a text file: one `<log>/<time stamp>` per line, # for comments."""
     file = Path(file)
-    result: dict[str, list[int]] = {}
+    result: dict[str, list[str]] = {}
     with file_errors(file, "pass a text file of frames"):
         lines = read_bytes(file).decode("utf-8").splitlines()
     for number, line in enumerate(lines, 1):
@@ -116,11 +115,11 @@ def read_frame_list(file: str | Path) -> dict[str, list[int]]:
         log, _, stamp = entry.rpartition("/")
         if not log or not is_timestamp(stamp):
             raise CFlowError(f"{file}, line {number}: {entry!r} is not a frame; write <log>/<time stamp>")
-        result.setdefault(log, []).append(int(stamp))
+        result.setdefault(log, []).append(stamp)
     return result
 
 
-def require_logs(logs: Iterable[Log], listed: Mapping[str, Sequence[int]] | None) -> None:
+def require_logs(logs: Iterable[Log], listed: Mapping[str, Sequence[str]] | None) -> None:
     """Raise a `CFlowError` if two logs have the same name, or if a listed log is not in the data."""
     names = [log.log_id for log in logs]
     twice = sorted({name for name in names if names.count(name) > 1})

@@ -27,7 +27,7 @@ class CFlow(nn.Module):
 
     Args:
         num_frames: sweeps per window, h + 2, because the harness also counts t+1 and t. None = that of the preset: 6
-            for "default" and "offline", 4 for "live", 2 for the others. If the harness passes fewer sweeps, we use
+            for "default", "offline" and "live", 2 for the others. If the harness passes fewer sweeps, we use
             those.
         ego_T_lidar: (4, 4) nested list or array that maps points to the frame whose poses the scenes store. None = the
             same frame. "auto" = recognise scenes of Argoverse 2, whose points are in the frame of up_lidar.
