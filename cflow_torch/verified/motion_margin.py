@@ -92,7 +92,7 @@ def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: Ri
 
 
 def _list_pixels(tree: Tree, objects: Objects, is_listed: Tensor) -> tuple[Tensor, Groups]:
-    """List the pixels of the nodes of some objects, (G,) bool; of an object that is no node, its own pixels.
+    """List the pixels of the nodes of some objects, (G,) bool; of an object that is not a node, its own pixels.
 
     Returns:
         pixel: (K,) int64, positions in the list of pixels.
