@@ -35,7 +35,7 @@ def regroup(groups: MovingGroups, tracks: TrackStates) -> MovingGroups:
     """Correct the moving groups of a sweep with the predicted boxes of confirmed tracks."""
     known = tracks.take(tracks.is_confirmed)
     box = box_of_point(groups.point, known.box, known.size + _MARGIN, known.heading)
-    return _divide(_make_pieces_static(groups, box, len(known.id)), box, known.num_points)
+    return _divide(_make_pieces_static(groups, box, known.num_points), box, known.num_points)
 
 
 def of_own_vehicle(groups: MovingGroups, sweep: Sweep) -> Tensor:
@@ -55,19 +55,21 @@ def of_own_vehicle(groups: MovingGroups, sweep: Sweep) -> Tensor:
     return lookup(is_own, torch.where(groups.moves, groups.group, len(is_own)), missing=False)
 
 
-def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:
+def _make_pieces_static(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGroups:
     """Make a moving group static if it is a small piece of a confirmed object that has stopped.
 
     While the vehicle passes a stopped object, the visible outline of the object changes. A piece of the object then
-    seems to move, and the track would follow this piece. We recognise a piece by the box of the object: it holds more
-    than half of the points of the group, and more static points than the group has points.
+    seems to move, and the track would follow this piece. We recognise a piece of an object of `num_points` points by
+    the box of the object. It holds more than half of the points of the group, which has fewer points than a stopped
+    object, and more static points than the group has points. A person beside a wall is not a piece of what stands in
+    the box, because the person has as many points as before.
     """
     is_inside = box >= 0
-    num_static = torch.bincount(box[is_inside & ~groups.moves], minlength=num_boxes)
+    num_static = torch.bincount(box[is_inside & ~groups.moves], minlength=len(num_points))
     moves_inside = is_inside & groups.moves
     group, box, _, count = unique_pairs(groups.group[moves_inside], box[moves_inside])
     size = groups.count[group]
-    is_piece = (count > size / 2) & (size < num_static[box])
+    is_piece = (count > size / 2) & (size < num_static[box]) & (size < MIN_STOPPED_SHARE * num_points[box])
     return groups.divide(torch.where(torch.isin(groups.group, group[is_piece]), -1, 0))
 
 

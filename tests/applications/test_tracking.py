@@ -215,6 +215,26 @@ def test_a_fence_beside_a_car_is_taken_out_of_its_track(has_fence: bool) -> None
     assert is_tracked[is_fence].any() == (not has_fence)
 
 
+class Hedge(Staged):
+    """A hedge stands 5 cm beside the path of a car, and has more points than the car where the car passes."""
+
+    def world(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        points, flow, car = super().world(index)
+        hedge = np.stack(np.meshgrid(np.arange(-5, 25, 0.02), [-0.05], np.arange(0, 1.2, 0.1)), -1).reshape(-1, 3)
+        return (
+            np.concatenate([points, hedge]),
+            np.concatenate([flow, np.zeros_like(hedge)]),
+            np.concatenate([car, np.full(len(hedge), -1)]),
+        )
+
+
+def test_what_passes_close_to_static_points_has_not_stopped() -> None:
+    log = Hedge([straight((0, 0), (0.9, 0.0))])
+    table = track(log, log.results())
+    assert table["is_moving"].all() and table["sweep"].tolist() == list(range(11))
+    assert np.allclose(table["vx"], 9, atol=0.05)
+
+
 def test_a_car_that_starts_and_one_that_stops_keep_their_points() -> None:
     """Cars that wait are static: another one left the place where one stops, and one starts where it has waited."""
     rest = straight((0, 0), (0.0, 0.0), 12)
