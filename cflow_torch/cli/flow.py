@@ -18,11 +18,13 @@ from cflow_torch.applications.detection_files import (
     write_openpcdet,
 )
 from cflow_torch.applications.instance_files import (
+    CAMERAS_OF_READER,
     CLASSES,
     CLASSES_OF_READER,
     FRAMES_FILE,
     INSTANCES_FILE,
     write_drivestudio,
+    write_drivestudio_masks,
 )
 from cflow_torch.applications.kitti_tracks import write_kitti
 from cflow_torch.applications.masks import check_cameras, check_pillow, write_masks
@@ -38,7 +40,13 @@ from cflow_torch.data.catalog import Logs, source_name
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, has_track_ids, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.log import Log
-from cflow_torch.fleet.manifest import complete_frames, frame_file, labels_folder, masks_folder
+from cflow_torch.fleet.manifest import (
+    complete_frames,
+    drivestudio_masks_folder,
+    frame_file,
+    labels_folder,
+    masks_folder,
+)
 from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
@@ -126,10 +134,7 @@ def _write_logs(cfg: Flow, run: FlowRun) -> Failures:
                 classes = CLASSES_OF_READER.get(logs.name, CLASSES)
                 tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, classes))
             if cfg.masks:
-                tracks = read_tracks(output / log.log_id / TRACKS_FILE)
-                masks = masks_folder(output, log.log_id)
-                write_masks(masks, log, results(), tracks)
-                tqdm.write(f"{masks}: masks of {len(pairs)} sweeps")
+                tqdm.write(_write_masks(cfg.tracks == "drivestudio", log, logs.name, results(), output))
             if cfg.labels is not None:
                 labels = labels_folder(output, log.log_id)
                 write_moving_labels(labels, log, results())
@@ -170,6 +175,20 @@ def _write_tracks(
         write_nuscenes(folder, table, log)
         files += [DETECTIONS_FILE, TRACKING_FILE]
     return f"{folder}: {len(np.unique(table['id']))} tracks in {', '.join(files)}"
+
+
+def _write_masks(
+    is_for_drivestudio: bool, log: Log, reader: str, results: Iterable[tuple[int, FlowResult]], output: Path
+) -> str:
+    """Write the masks of a log, whose tracks are written. Returns a line with their folder."""
+    tracks = read_tracks(output / log.log_id / TRACKS_FILE)
+    if is_for_drivestudio:
+        folder = drivestudio_masks_folder(output, log.log_id)
+        write_drivestudio_masks(folder, log, results, tracks, CAMERAS_OF_READER.get(reader, ()))
+    else:
+        folder = masks_folder(output, log.log_id)
+        write_masks(folder, log, results, tracks)
+    return f"{folder}: {sum(1 for _ in folder.glob('*/*.png'))} masks"
 
 
 def _into_scenes(name: str, run: FlowRun) -> Failures:
