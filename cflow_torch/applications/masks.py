@@ -135,9 +135,10 @@ def _moving_points(log: Log, index: int, result: FlowResult) -> tuple[np.ndarray
     if len(points) != len(result.residual_flow):
         rows = len(result.residual_flow)
         raise CFlowError(f"sweep {index} has {len(points)} points, but its flow {rows} rows: give both of one log")
-    groups = MovingGroups.of(Window(sweep, after), result)
+    sweeps = Window(sweep, after)
+    groups = MovingGroups.of(sweeps, result)
     moves = as_numpy(result.is_moving) & np.isfinite(points).all(axis=1)
-    moves[as_numpy(groups.row[of_own_vehicle(groups, sweep)])] = False
+    moves[as_numpy(groups.row[of_own_vehicle(groups, sweeps)])] = False
     rotation = pose_of(sweep)[:3, :3].T @ pose_of(after)[:3, :3]  # from the axes of t+1 to those of t
     flow = as_numpy(result.residual_flow, np.float64)[moves] @ rotation.T
     seconds = 0.1

@@ -119,6 +119,19 @@ def test_returns_of_the_own_vehicle_are_not_a_track() -> None:
     assert len(set(table["id"])) == 1 and len(ids_of(log, table, 1)) == 11
 
 
+@pytest.mark.parametrize(("step", "place", "is_own"), [(0.9, 1.3, True), (0.9, 3.0, False), (0.1, 1.3, False)])
+def test_mirrors_that_ride_along_are_not_a_track(step: float, place: float, is_own: bool) -> None:
+    """A small object beside the vehicle keeps its place: a mirror, one too far away, a person beside a slow robot."""
+
+    class Small(Staged):
+        def _body(self, car: int) -> np.ndarray:
+            return 0.15 * super()._body(car)
+
+    poses = np.stack([pose(step * k, 0, 0.0) for k in range(12)])
+    log = Small([straight((-1.0, place), (step, 0.0))], poses)
+    assert len(set(track(log, log.results())["id"])) == (not is_own)
+
+
 def test_flicker_that_goes_nowhere_is_not_a_track() -> None:
     log = Staged([straight((0, 0), (0.0, 0.0)), straight((15, 0), (0.9, 0.0))])
     results = log.results()
