@@ -11,13 +11,15 @@ from cflow_torch.applications.moving_groups import MIN_POINTS, MovingGroups, pos
 from cflow_torch.applications.track_state import TrackStates
 from cflow_torch.ops.groups import Groups
 from cflow_torch.ops.indices import concat_ranges, unique_pairs
-from cflow_torch.types import Sweep
+from cflow_torch.types import Window
 
 _MIN_OVERLAP = 0.1  # least intersection over union of the voxels of two groups that match
 _MIN_CLAIM = 0.5  # a track of N points claims a group if its box holds at least 0.5 N points of the group
 MIN_STOPPED_SHARE = 0.3  # a track of N points has stopped if its box holds at least 0.3 N static points
 _MARGIN = 0.2  # metres, added to length, width and height of these boxes
 _ORIGIN_INSIDE = 0.5  # metres, at least, from the origin of a vehicle to its sides
+_REACH = 2.7  # metres from the origin of the vehicle to the farthest of its returns
+_LEAST_RIDE, _RIDE_ERROR = 0.2, 0.1  # metres per sweep, faster than people walk; share by which flow is off
 VOXELS = (0.3, 0.6, 1.2)  # metres, sides; sparse groups share only large voxels with the next sweep
 _HEIGHT = 3.0  # ratio of a voxel's height to its side: the beams hit an object at different heights in each sweep
 
@@ -36,39 +38,49 @@ def regroup(groups: MovingGroups, tracks: TrackStates) -> MovingGroups:
     """Correct the moving groups of a sweep with the predicted boxes of confirmed tracks."""
     known = tracks.take(tracks.is_confirmed)
     box = box_of_point(groups.point, known.box, known.size + _MARGIN, known.heading)
-    return _divide(_make_pieces_static(groups, box, len(known.id)), box, known.num_points)
+    return _divide(_make_pieces_static(groups, box, known.num_points), box, known.num_points)
 
 
-def of_own_vehicle(groups: MovingGroups, sweep: Sweep) -> Tensor:
-    """Tell which points of a sweep belong to moving groups that are returns of its own vehicle, (M,) bool.
+def of_own_vehicle(groups: MovingGroups, sweeps: Window) -> Tensor:
+    """Tell which points of sweep t belong to moving groups that are returns of its own vehicle, (M,) bool.
 
-    The origin of the vehicle is inside of it, and cannot be inside another object. Without a pose it is unknown.
+    The origin of the vehicle is inside of it, and cannot be inside another object. Near the vehicle, a group is also
+    its own if it moves as the vehicle does, faster than people walk. Without poses, we cannot tell.
     """
-    if sweep.pose is None:
+    if sweeps.pc0.pose is None or sweeps.pc1.pose is None:
         return torch.zeros_like(groups.moves)
     flow = groups.mean(groups.step)
     heading = torch.atan2(flow[:, 1], flow[:, 0])
     centre, size = enclosing_boxes(*groups.moving, heading)
-    x, y, _ = (centre.new_tensor(pose_of(sweep)[:3, 3]) - centre).unbind(1)
-    along, across = rotate_about_z(x, y, -heading)
-    reach = size / 2 + _ORIGIN_INSIDE
-    is_own = (along.abs() <= reach[:, 0]) & (across.abs() <= reach[:, 1])
+    T_world_ego0, T_world_ego1 = (centre.new_tensor(pose_of(sweep)) for sweep in (sweeps.pc0, sweeps.pc1))
+    x, y, _ = (T_world_ego0[:3, 3] - centre).unbind(1)
+    offset = torch.stack(rotate_about_z(x, y, -heading), 1).abs()
+    holds_origin = (offset <= size[:, :2] / 2 + _ORIGIN_INSIDE).all(1)
+
+    motion = T_world_ego1 @ torch.linalg.inv(T_world_ego0)
+    ride = centre @ motion[:3, :3].T + motion[:3, 3] - centre  # of a point that is fixed to the vehicle
+    distance = ride.norm(dim=1)
+    rides = ((flow - ride).norm(dim=1) <= _RIDE_ERROR * distance) & (distance >= _LEAST_RIDE)
+    is_near = (offset + size[:, :2] / 2).norm(dim=1) <= _REACH
+    is_own = holds_origin | rides & is_near
     return Groups(groups.group, len(is_own)).where(groups.moves).spread(is_own)
 
 
-def _make_pieces_static(groups: MovingGroups, box: Tensor, num_boxes: int) -> MovingGroups:
+def _make_pieces_static(groups: MovingGroups, box: Tensor, num_points: Tensor) -> MovingGroups:
     """Make a moving group static if it is a small piece of a confirmed object that has stopped.
 
     While the vehicle passes a stopped object, the visible outline of the object changes. A piece of the object then
-    seems to move, and the track would follow this piece. We recognise a piece by the box of the object: it holds more
-    than half of the points of the group, and more static points than the group has points.
+    seems to move, and the track would follow this piece. We recognise a piece of an object of `num_points` points by
+    the box of the object. It holds more than half of the points of the group, which has fewer points than a stopped
+    object, and more static points than the group has points. A person beside a wall has as many points as before, so
+    is not a piece.
     """
     is_inside = box >= 0
-    num_static = torch.bincount(box[is_inside & ~groups.moves], minlength=num_boxes)
+    num_static = torch.bincount(box[is_inside & ~groups.moves], minlength=len(num_points))
     moves_inside = is_inside & groups.moves
     group, box, _, count = unique_pairs(groups.group[moves_inside], box[moves_inside])
     size = groups.count[group]
-    is_piece = (count > size / 2) & (size < num_static[box])
+    is_piece = (count > size / 2) & (size < num_static[box]) & (size < MIN_STOPPED_SHARE * num_points[box])
     return groups.divide(torch.where(torch.isin(groups.group, group[is_piece]), -1, 0))
 
 

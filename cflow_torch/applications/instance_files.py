@@ -1,17 +1,20 @@
-"""Write tracks as the instances of DriveStudio: `instances_info.json` and `frame_instances.json`."""
+"""Write tracks as the instances of DriveStudio, `instances_info.json` and `frame_instances.json`, and its masks."""
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Any, Iterable, Sequence
 
 import numpy as np
 
+from cflow_torch.applications.masks import DynamicShapes, check_cameras, write_mask
+from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import Table, class_of
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.transforms import upright_poses
-from cflow_torch.types import CENTRE, SIZE, vectors
+from cflow_torch.types import CENTRE, SIZE, FlowResult, vectors
 
 INSTANCES_FILE = "instances_info.json"
 FRAMES_FILE = "frame_instances.json"
@@ -25,7 +28,30 @@ CLASSES_OF_READER = {
 """Data set -> classes of rigid and of deformable objects in DriveStudio, whose loaders know only those of their set."""
 CLASSES = CLASSES_OF_READER["kitti"]
 """Classes for logs of other data sets."""
-_DEFORMABLE = ("pedestrian", "cyclist")  # classes of tracks
+CAMERAS_OF_READER = {
+    "av2": (
+        "ring_front_center",
+        "ring_front_left",
+        "ring_front_right",
+        "ring_side_left",
+        "ring_side_right",
+        "ring_rear_left",
+        "ring_rear_right",
+    ),
+    "kitti": ("image_02", "image_03"),
+    "nuscenes": ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK_RIGHT", "CAM_BACK"),
+    "pandaset": (
+        "front_camera",
+        "front_left_camera",
+        "front_right_camera",
+        "left_camera",
+        "right_camera",
+        "back_camera",
+    ),
+}
+"""Data set -> names of its cameras in our logs, in the order of DriveStudio's numbers 0, 1, 2, ..."""
+_RIGID = ("car", "truck")  # classes of tracks
+_DEFORMABLE = ("pedestrian", "cyclist")
 _PER_KEY_FRAME = 5  # frames of 10 Hz, from one key frame of nuScenes to the next
 
 
@@ -73,6 +99,48 @@ def write_drivestudio(
     frames = {str(number): instance[frame == number].tolist() for number in range(len(sweep_of_frame))}
     write_json(folder / FRAMES_FILE, frames)
     write_json(folder / INSTANCES_FILE, infos)
+
+
+def write_drivestudio_masks(
+    folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]], table: Table, cameras: Sequence[str]
+) -> None:
+    """Write `folder/KIND/FRAME_CAMERA.png`, as DriveStudio's loader reads them from `<scene>/dynamic_masks`.
+
+    The kinds are "all", which has the moving points and all boxes that `write_masks` draws, "human" with the boxes of
+    pedestrians and cyclists, and "vehicle" with those of cars and trucks.
+
+    Args:
+        folder: created if it does not exist.
+        log: a log whose reader knows the calibration of its cameras (`Log.cameras`).
+        results: (index, flow of sweep `index` to `index + 1`).
+        table: tracks of the log, see `track`.
+        cameras: names of the cameras 0, 1, 2, ...; the log's other cameras have no masks.
+
+    Convention: frames are those of `write_drivestudio`. The loader needs a file for each of them. Where a sweep has no
+        flow, such as the last one, we move the points and boxes of the sweep before to its time.
+    """
+    shapes = {index: DynamicShapes.of(log, index, result, table) for index, result in results}
+    if not shapes:
+        return
+    for frame, sweep in enumerate(_sweep_of_frames(log).tolist()):
+        source = max((index for index in shapes if index <= sweep), default=min(shapes))
+        T_sweep_source = np.linalg.inv(pose_of(log.sweep(sweep))) @ pose_of(log.sweep(source))
+        later = (log.timestamps[sweep] - log.timestamps[source]) * 1e-9
+        kinds = {
+            "all": shapes[source],
+            "human": shapes[source].boxes(_DEFORMABLE),
+            "vehicle": shapes[source].boxes(_RIGID),
+        }
+        seen = log.cameras(sweep)
+        check_cameras(log, seen)
+        for camera in seen:
+            if camera.name in cameras:
+                at_frame = camera._replace(
+                    T_camera_ego=camera.T_camera_ego @ T_sweep_source, seconds=camera.seconds + later
+                )
+                for kind, drawn in kinds.items():
+                    name = f"{frame:03d}_{cameras.index(camera.name)}.png"
+                    write_mask(folder / kind / name, drawn.draw(at_frame))
 
 
 def _sweep_of_frames(log: Log) -> np.ndarray:

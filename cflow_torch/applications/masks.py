@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Iterable, Sequence
+from typing import Any, Iterable, NamedTuple, Sequence
 
 import numpy as np
 
 from cflow_torch.applications.association import of_own_vehicle
 from cflow_torch.applications.moving_groups import MovingGroups, pose_of
-from cflow_torch.applications.track_table import Table, box_corners, boxes_in_sweeps
+from cflow_torch.applications.track_table import Table, box_corners, boxes_in_sweeps, class_of
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.log import Log
@@ -42,13 +42,9 @@ def write_masks(folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]
     for index, result in results:
         cameras = log.cameras(index)
         check_cameras(log, cameras)
-        points, point_velocity = _moving_points(log, index, result)
-        corners, box_velocity = _corners(log, {name: values[table["sweep"] == index] for name, values in table.items()})
+        shapes = DynamicShapes.of(log, index, result, table)
         for camera in cameras:
-            shapes = corners + camera.seconds * box_velocity[:, None]
-            mask = dynamic_mask(camera, points + camera.seconds * point_velocity, shapes)
-            with atomic_file(folder / camera.name / f"{camera.image}.png") as file:
-                _pillow().fromarray(mask).save(file, "PNG")
+            write_mask(folder / camera.name / f"{camera.image}.png", shapes.draw(camera))
 
 
 def check_cameras(log: Log, cameras: Sequence[Camera]) -> None:
@@ -58,6 +54,42 @@ def check_cameras(log: Log, cameras: Sequence[Camera]) -> None:
             f"log {log.log_id} has no calibration of cameras, which masks need: Argoverse 2, PandaSet, nuScenes and "
             "KITTI have it in the files of their cameras"
         )
+
+
+class DynamicShapes(NamedTuple):
+    """The P moving points of a sweep and the K boxes of its tracks, in the frame of its points, and their motion."""
+
+    points: np.ndarray  # (P, 3) float64 metres
+    point_velocity: np.ndarray  # (P, 3) float64 m/s
+    corners: np.ndarray  # (K, 8, 3) float64 metres, in the order of `box_corners`
+    box_velocity: np.ndarray  # (K, 3) float64 m/s
+    kind: np.ndarray  # (K,) class of each track
+
+    @classmethod
+    def of(cls, log: Log, index: int, result: FlowResult, table: Table) -> DynamicShapes:
+        """Collect those of sweep `index` of a log, given its flow and the table of tracks."""
+        rows = {name: values[table["sweep"] == index] for name, values in table.items()}
+        kind = np.array([class_of(rows, row) for row in range(len(rows["sweep"]))], dtype=np.str_)
+        return cls(*_moving_points(log, index, result), *_corners(log, rows), kind)
+
+    def boxes(self, kinds: Sequence[str]) -> DynamicShapes:
+        """Keep the boxes of tracks of some classes, and no points."""
+        is_kept = np.isin(self.kind, kinds)
+        no_points = np.zeros((0, 3))
+        return DynamicShapes(
+            no_points, no_points, self.corners[is_kept], self.box_velocity[is_kept], self.kind[is_kept]
+        )
+
+    def draw(self, camera: Camera) -> np.ndarray:
+        """Draw the shapes where they are at the time of the camera's image, see `dynamic_mask`."""
+        points = self.points + camera.seconds * self.point_velocity
+        return dynamic_mask(camera, points, self.corners + camera.seconds * self.box_velocity[:, None])
+
+
+def write_mask(path: Path, mask: np.ndarray) -> None:
+    """Write a mask, (height, width) uint8, as PNG."""
+    with atomic_file(path) as file:
+        _pillow().fromarray(mask).save(file, "PNG")
 
 
 def dynamic_mask(camera: Camera, points: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -103,9 +135,10 @@ def _moving_points(log: Log, index: int, result: FlowResult) -> tuple[np.ndarray
     if len(points) != len(result.residual_flow):
         rows = len(result.residual_flow)
         raise CFlowError(f"sweep {index} has {len(points)} points, but its flow {rows} rows: give both of one log")
-    groups = MovingGroups.of(Window(sweep, after), result)
+    sweeps = Window(sweep, after)
+    groups = MovingGroups.of(sweeps, result)
     moves = as_numpy(result.is_moving) & np.isfinite(points).all(axis=1)
-    moves[as_numpy(groups.row[of_own_vehicle(groups, sweep)])] = False
+    moves[as_numpy(groups.row[of_own_vehicle(groups, sweeps)])] = False
     rotation = pose_of(sweep)[:3, :3].T @ pose_of(after)[:3, :3]  # from the axes of t+1 to those of t
     flow = as_numpy(result.residual_flow, np.float64)[moves] @ rotation.T
     seconds = 0.1

@@ -125,7 +125,7 @@ class Tracker:
         self.times = self._times(sweeps)
         self.floor = Floor.of(sweeps.pc0)
         groups = MovingGroups.of(sweeps, result)
-        groups = groups.divide(torch.where(of_own_vehicle(groups, sweeps.pc0), -1, 0))
+        groups = groups.divide(torch.where(of_own_vehicle(groups, sweeps), -1, 0))
         tracks, points = self._predict(self.times, groups.point.device)
         groups = regroup(groups, tracks)
         matches = match(tracks, points.position, points.track, groups)

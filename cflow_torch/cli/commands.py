@@ -255,7 +255,8 @@ class Flow(FlowFiles):
     )
     masks: bool = setting(
         False,
-        "true = also write masks of dynamic objects for the calibrated cameras of each complete log, and its tracks",
+        "true = also write masks of dynamic objects for the calibrated cameras of each complete log, and its tracks; "
+        "with tracks=drivestudio, those that DriveStudio reads",
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any, Callable, Iterable, Iterator
 import numpy as np
 from tqdm import tqdm
 
+from cflow_torch.applications.instance_files import CAMERAS_OF_READER, write_drivestudio_masks
 from cflow_torch.applications.masks import check_cameras, check_pillow, write_masks
 from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_tracks
@@ -24,7 +25,13 @@ from cflow_torch.data.catalog import Logs, source_name
 from cflow_torch.data.flow_file import CONTENTS, ON_REQUEST, POINTS, add_track_ids, has_track_ids, read_flow
 from cflow_torch.data.hdf5.writer import check_result_name, check_writable, write_hdf5_results
 from cflow_torch.data.log import Log
-from cflow_torch.fleet.manifest import complete_frames, frame_file, labels_folder, masks_folder
+from cflow_torch.fleet.manifest import (
+    complete_frames,
+    drivestudio_masks_folder,
+    frame_file,
+    labels_folder,
+    masks_folder,
+)
 from cflow_torch.types import CFlowError, FlowResult
 
 _FOR_TRACKS = {"residual", "cluster_id", "is_valid", "confidence"}  # contents
@@ -106,10 +113,7 @@ def _write_logs(cfg: Flow, run: FlowRun) -> Failures:
             if cfg.tracks or cfg.masks:
                 tqdm.write(_write_tracks(cfg.tracks, log, results, output / log.log_id, logs.name))
             if cfg.masks:
-                tracks = read_tracks(output / log.log_id / TRACKS_FILE)
-                masks = masks_folder(output, log.log_id)
-                write_masks(masks, log, results(), tracks)
-                tqdm.write(f"{masks}: masks of {len(pairs)} sweeps")
+                tqdm.write(_write_masks(cfg.tracks == "drivestudio", log, logs.name, results(), output))
             if cfg.labels is not None:
                 labels = labels_folder(output, log.log_id)
                 write_moving_labels(labels, log, results())
@@ -143,6 +147,20 @@ def _write_tracks(
         TRACK_FORMATS[kind].write(folder, table, log, data_set)
         files += TRACK_FORMATS[kind].files
     return f"{folder}: {len(np.unique(table['id']))} tracks in {', '.join(files)}"
+
+
+def _write_masks(
+    is_for_drivestudio: bool, log: Log, reader: str, results: Iterable[tuple[int, FlowResult]], output: Path
+) -> str:
+    """Write the masks of a log, whose tracks are written. Returns a line with their folder."""
+    tracks = read_tracks(output / log.log_id / TRACKS_FILE)
+    if is_for_drivestudio:
+        folder = drivestudio_masks_folder(output, log.log_id)
+        write_drivestudio_masks(folder, log, results, tracks, CAMERAS_OF_READER.get(reader, ()))
+    else:
+        folder = masks_folder(output, log.log_id)
+        write_masks(folder, log, results, tracks)
+    return f"{folder}: {sum(1 for _ in folder.glob('*/*.png'))} masks"
 
 
 def _into_scenes(name: str, run: FlowRun) -> Failures:

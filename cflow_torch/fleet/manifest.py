@@ -147,14 +147,15 @@ def clear_log(folder: Path, tracks: Container[str] = ()) -> None:
     for file in labels.iterdir() if labels.is_dir() else ():
         if _LABELS.fullmatch(file.name):
             file.unlink()
-    masks = masks_folder(folder.parent, folder.name)
-    for camera in masks.iterdir() if masks.is_dir() else ():
-        for file in camera.glob("*.png"):
-            file.unlink()
+    for masks_of in (masks_folder, drivestudio_masks_folder):
+        masks = masks_of(folder.parent, folder.name)
+        for camera in masks.iterdir() if masks.is_dir() else ():
+            for file in camera.glob("*.png"):
+                file.unlink()
+            with suppress(OSError):
+                camera.rmdir()
         with suppress(OSError):
-            camera.rmdir()
-    with suppress(OSError):
-        masks.rmdir()
+            masks.rmdir()
     for file in sorted(folder.iterdir(), key=lambda file: file.name == MANIFEST):
         if _OURS.fullmatch(file.name) or file.name in tracks:
             file.unlink()
@@ -194,6 +195,11 @@ def labels_folder(output: Path, log_id: str) -> Path:
 def masks_folder(output: Path, log_id: str) -> Path:
     """Return the folder of the masks of a log's images, which has a folder for each camera."""
     return output / log_id / "masks"
+
+
+def drivestudio_masks_folder(output: Path, log_id: str) -> Path:
+    """Return the folder of the masks of a log's images for DriveStudio, which has a folder for each kind."""
+    return output / log_id / "dynamic_masks"
 
 
 def _is_whole(file: Path) -> bool:

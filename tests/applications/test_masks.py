@@ -16,6 +16,7 @@ from cflow_torch.data.camera import Camera, intrinsic_matrix
 Image = pytest.importorskip("PIL.Image", reason="needs the extra viz: pip install Pillow")
 from test_tracking import calls_on_a_drive  # noqa: E402
 
+from cflow_torch.applications.instance_files import write_drivestudio_masks  # noqa: E402
 from cflow_torch.applications.masks import dynamic_mask, write_masks  # noqa: E402
 from cflow_torch.data.av2 import AV2Log  # noqa: E402
 
@@ -98,6 +99,27 @@ def test_returns_of_the_own_vehicle_do_not_hide_the_world(tmp_path: Path) -> Non
     assert 0.01 < (mask > 0).mean() < 0.2, "only the other car"
 
 
+def test_masks_of_drivestudio_have_its_names_and_every_frame(tmp_path: Path) -> None:
+    """The last sweep has no flow: there, the car is where its flow in the sweep before has moved it."""
+    log = Filmed([straight((2, -8), (-0.9, 0.0))], np.tile(pose(0, -20, np.pi / 2, 0), (12, 1, 1)))
+    table = track(log, log.results())
+    write_drivestudio_masks(tmp_path, log, log.results(), table, ("other", "front"))
+    names = {f"{frame:03d}_{camera}.png" for frame in range(12) for camera in (0, 1)}
+    for kind in ("all", "human", "vehicle"):
+        assert {file.name for file in (tmp_path / kind).iterdir()} == names
+    masks = {kind: np.asarray(Image.open(tmp_path / kind / "011_0.png")) for kind in ("all", "human", "vehicle")}
+    assert not masks["human"].any() and masks["vehicle"].any()
+    assert np.array_equal(masks["all"], np.maximum(masks["vehicle"], masks["all"]))
+    car = log.sweep(11).points[log.world(11)[2] == 0]
+    column, row = CAMERA.project(CAMERA.see(car)).astype(int).T
+    is_in_image = (column >= 0) & (column < 200)
+    assert (masks["vehicle"][row, column.clip(0, 199)] > 0)[is_in_image].mean() > 0.99
+    person = {**table, "class": np.full(len(table["id"]), "pedestrian")}
+    write_drivestudio_masks(tmp_path / "people", log, log.results()[:1], person, ("front",))
+    assert not np.asarray(Image.open(tmp_path / "people" / "vehicle" / "000_0.png")).any()
+    assert np.asarray(Image.open(tmp_path / "people" / "human" / "000_0.png")).any()
+
+
 def test_a_log_without_cameras_is_an_error(tmp_path: Path) -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     with pytest.raises(CFlowError, match="no calibration of cameras"):
@@ -111,15 +133,19 @@ def test_the_command_writes_masks_and_overwrites_them(
     run = ("engine.workers=1", "masks=true")
     assert call("flow", "flow", *run) == 2 and "no calibration of cameras" in capsys.readouterr().err
     assert not list((tmp_path / "flow").glob("*/*.feather")), "it is told before anything is computed"
-    camera = CAMERA._replace(T_camera_ego=AHEAD @ pose(0, 0, 0, -1.5))
+    camera = CAMERA._replace(name="ring_front_center", T_camera_ego=AHEAD @ pose(0, 0, 0, -1.5))
     monkeypatch.setattr(AV2Log, "cameras", lambda log, index: [camera._replace(image=str(log.timestamps[index]))])
     assert call("flow", "flow", *run) == 0
-    (folder,) = (tmp_path / "flow").glob("*/masks/front")
+    (folder,) = (tmp_path / "flow").glob("*/masks/ring_front_center")
     flow_files = {file.stem for file in folder.parents[1].glob("*.feather")}
     assert {file.stem for file in folder.iterdir()} == flow_files and (folder.parents[1] / "tracks.parquet").exists()
     assert any(np.asarray(Image.open(file)).any() for file in folder.iterdir())
+    assert call("flow", "flow", *run, "tracks=drivestudio") == 0
+    of_drivestudio = folder.parents[1] / "dynamic_masks"
+    frames = sorted(file.name for file in (of_drivestudio / "all").iterdir())
+    assert frames == [f"{frame:03d}_0.png" for frame in range(len(flow_files) + 1)]
     assert call("flow", "flow", "engine.workers=1", "overwrite=true") == 0
-    assert not folder.exists(), "masks of another run"
+    assert not folder.exists() and not of_drivestudio.exists(), "masks of another run"
 
 
 def test_masks_of_the_real_log_cover_its_labelled_moving_points(av2_folder: Path) -> None:

@@ -119,6 +119,19 @@ def test_returns_of_the_own_vehicle_are_not_a_track() -> None:
     assert len(set(table["id"])) == 1 and len(ids_of(log, table, 1)) == 11
 
 
+@pytest.mark.parametrize(("step", "place", "is_own"), [(0.9, 1.3, True), (0.9, 3.0, False), (0.1, 1.3, False)])
+def test_mirrors_that_ride_along_are_not_a_track(step: float, place: float, is_own: bool) -> None:
+    """A small object beside the vehicle keeps its place: a mirror, one too far away, a person beside a slow robot."""
+
+    class Small(Staged):
+        def _body(self, car: int) -> np.ndarray:
+            return 0.15 * super()._body(car)
+
+    poses = np.stack([pose(step * k, 0, 0.0) for k in range(12)])
+    log = Small([straight((-1.0, place), (step, 0.0))], poses)
+    assert len(set(track(log, log.results())["id"])) == (not is_own)
+
+
 def test_flicker_that_goes_nowhere_is_not_a_track() -> None:
     log = Staged([straight((0, 0), (0.0, 0.0)), straight((15, 0), (0.9, 0.0))])
     results = log.results()
@@ -213,6 +226,26 @@ def test_a_fence_beside_a_car_is_taken_out_of_its_track(has_fence: bool) -> None
     is_tracked = track_id >= 0
     assert is_tracked[~is_fence].sum() == (log.world(8)[2] == 0)[~is_fence].sum(), "the car keeps its points"
     assert is_tracked[is_fence].any() == (not has_fence)
+
+
+class Hedge(Staged):
+    """A hedge stands 5 cm beside the path of a car, and has more points than the car where the car passes."""
+
+    def world(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        points, flow, car = super().world(index)
+        hedge = np.stack(np.meshgrid(np.arange(-5, 25, 0.02), [-0.05], np.arange(0, 1.2, 0.1)), -1).reshape(-1, 3)
+        return (
+            np.concatenate([points, hedge]),
+            np.concatenate([flow, np.zeros_like(hedge)]),
+            np.concatenate([car, np.full(len(hedge), -1)]),
+        )
+
+
+def test_what_passes_close_to_static_points_has_not_stopped() -> None:
+    log = Hedge([straight((0, 0), (0.9, 0.0))])
+    table = track(log, log.results())
+    assert table["is_moving"].all() and table["sweep"].tolist() == list(range(11))
+    assert np.allclose(table["vx"], 9, atol=0.05)
 
 
 def test_a_car_that_starts_and_one_that_stops_keep_their_points() -> None:
