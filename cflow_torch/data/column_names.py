@@ -49,4 +49,5 @@ def time_columns(names: Iterable[str]) -> list[str]:
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"\[.*?\]|\(.*?\)|[^a-z0-9]", "", name.lower())
+    ordered = re.sub(r"[ ._-]?(xyzw|wxyz)(?![a-z])", "", name.lower())  # quaternion_xyzw
+    return re.sub(r"\[.*?\]|\(.*?\)|[^a-z0-9]", "", ordered)

@@ -17,6 +17,7 @@ from cflow_torch.windows.stillness import Structure, are_finite, structure_rows
 _COMPARED = 300  # points of each sweep that are compared with the next one
 _AROUND = 10  # sweeps on each side that tell a usual share, or number of points
 _MISPLACED = 0.5  # part of the usual share, below which sweeps do not fit
+_TURNS = 8  # sweeps that tell whether two sensors measure in turns
 _FEW = 0.5  # part of the usual number of points, below which a sweep has few
 
 
@@ -82,22 +83,25 @@ class Neighbours(NamedTuple):
 
 
 def alternate(log: Log) -> bool:
-    """Test whether sweeps fit the second next one, but not the next: those of two sensors in turns.
+    """Test whether sweeps fit the second next one, but none fits the next: those of two sensors in turns.
 
-    False if a sweep cannot be read.
+    We compare up to eight sweeps. False if one of them cannot be read.
     """
-    first = (len(log.timestamps) - 4) // 2
-    if first < 0:
-        return False
+    count = min(_TURNS, len(log.timestamps))
+    first = (len(log.timestamps) - count) // 2
     try:
-        sweeps = [log.sweep(first + k) for k in range(4)]
+        sweeps = [log.sweep(first + k) for k in range(count)]
     except (CFlowError, OSError):
         return False
     points = [_structure(sweep) for sweep in sweeps]
-    pairs = ((0, 1), (1, 2), (2, 3)), ((0, 2), (1, 3))
-    near, second = ([_share_in_place(sweeps[a], points[a], sweeps[b], points[b]) for a, b in each] for each in pairs)
-    # Poses may be those of one of the sensors, so only its sweeps fit.
-    return max(second) >= LEAST_SHARE and max(near) < _MISPLACED * max(second)
+
+    def shares(start: int, step: int, by: int) -> list[float]:
+        pairs = ((k, k + by) for k in range(start, count - by, step))
+        return [_share_in_place(sweeps[a], points[a], sweeps[b], points[b]) for a, b in pairs]
+
+    # Poses may be those of one of the sensors, so only its sweeps fit: those of even, or of odd numbers.
+    second = max(min(shares(start, 2, 2), default=0.0) for start in (0, 1))
+    return second >= LEAST_SHARE and max(shares(0, 1, 1)) < _MISPLACED * second
 
 
 def _structure(sweep: Sweep) -> np.ndarray:
