@@ -21,7 +21,7 @@ _ROLES = {
     **{f"q{axis}": _ROTATION + axis for axis in "wxyz0123"},
     "roll": ".*roll(deg|degrees|rad|radians)?",
     "pitch": ".*pitch(deg|degrees|rad|radians)?",
-    "yaw": ".*(yaw|heading)(deg|degrees|rad|radians)?",
+    "yaw": ".*(yaw|heading|theta)(deg|degrees|rad|radians)?",
 }
 _OTHERS = "twist|linear|angular|veloc|accel|covariance|rate"
 

@@ -76,7 +76,7 @@ def test_records_of_several_types_are_read_by_their_first_three_numbers(tmp_path
         assert len(ArraysLog(tmp_path).sweep(1).points) == 2399
 
 
-@pytest.mark.parametrize("content", [packed()[:-3], street(4).tobytes()[:-4], b"a text " * 9000])
+@pytest.mark.parametrize("content", [packed()[:-3], street(4).tobytes()[:-4], street(4).T.tobytes(), b"a text " * 9000])
 def test_other_files_are_refused_and_the_setting_is_named(tmp_path, content: bytes) -> None:
     (tmp_path / "a.bin").write_bytes(content)
     with pytest.raises(CFlowError, match=r"a\.bin.*bin_columns"):

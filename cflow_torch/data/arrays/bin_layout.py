@@ -60,7 +60,7 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
     Convention: the type is the one, float32 or float64, little- or big-endian, in which numbers have sizes of
         coordinates. Columns differ in size (z is smaller than x and y, intensities are larger). We choose the number of
         columns, 3 to 8, that explains most of the variance of log sizes. Ties: the smallest. A file that is empty or
-        too short to tell is KITTI's. If no numbers fit, points may be records of several types that begin with x, y, z
+        too short to tell is KITTI's. If no type fits, points may be records of several types that begin with x, y, z
         in float32 (ring and time after them are integers or float64): the fewest bytes in which they do.
 
     Raises:
@@ -79,7 +79,7 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
         return min(good, key=lambda layout: layout.columns)
     if fitting and len(content) < _FEWEST * BinLayout().step and fitting[0] == BinLayout():
         return BinLayout()
-    records = (BinLayout(3, "<f4", rest) for rest in range(1, _LONGEST_RECORD - 11))
+    records = (BinLayout(3, "<f4", rest) for rest in range(1, _LONGEST_RECORD - 11) if not kind)
     record = next((layout for layout in records if _are_records(content, layout)), None)
     if record is not None:
         return record
