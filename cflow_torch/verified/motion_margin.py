@@ -1,7 +1,10 @@
 """The margin of motions: does an object move, or does it only seem to?
 
-The margin is the result of the paired test for the whole object: how much better the motion explains the sweeps than
-"static", in standard deviations of noise. In a pair, a slow object still covers most of its position, and a sparse
+The margin is the result of the paired test for the whole node of an object: how much better the motion explains the
+sweeps than "static", in standard deviations of noise. An object may be a remnant of its node, whose other pixels follow
+another motion. A remnant often has pixels in a few sweeps only, so it would have no margin of its own.
+
+In a pair, a slow object still covers most of its position, and a sparse
 surface is hit at other positions in every sweep. There, we compare the motion with copies of it, displaced by 0.4 m.
 
 If the copies explain the sweeps as well, two kinds of objects have no margin: a line may be a rail, which beams hit at
@@ -23,6 +26,7 @@ from cflow_torch.ops.indices import constant, flat_nonzero
 from cflow_torch.types import MOVING
 from cflow_torch.verified.aperture import principal_axes
 from cflow_torch.verified.columns import Pixels
+from cflow_torch.verified.component_tree import Tree
 from cflow_torch.verified.confidence import TABLE, Bins, bin_of
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.in_place import count_in_place
@@ -32,9 +36,9 @@ from cflow_torch.verified.selection import Objects
 
 _DISPLACEMENT = 0.4  # metres per interval, along x and along y
 _COPIES_Z = 1.0  # standard deviations of noise by which a motion must exceed its displaced copies
-# P(moving) of slow and fast objects, in pairs, then with history; an object that is less likely to move is static. A
-# wrong motion of a fast object is a large error.
-_LEAST_LIKELY = (0.05, 0.15, 0.02, 0.04)
+# P(moving) of slow and fast objects of pairs, and of objects with history; an object that is less likely to move is
+# static. In pairs, wrong motions of fast objects are frequent, and large errors.
+_LEAST_LIKELY = (0.05, 0.15, 0.02)
 
 
 class MotionMargin(NamedTuple):
@@ -44,26 +48,26 @@ class MotionMargin(NamedTuple):
     is_dynamic: Tensor  # (G,) bool, the object moves
 
 
-def motion_margin(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion) -> MotionMargin:
+def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: RigidMotion) -> MotionMargin:
     """Find which objects move, by the margins of their motions.
 
     Convention: an object moves if its speed is at least `MOVING`, and P(moving) of its bin at least `_LEAST_LIKELY`.
 
-    Cost: seven lookups for each pixel of the objects with a motion and each sweep.
+    Cost: seven lookups for each pixel of the nodes with a motion and each sweep.
     """
     speed = torch.linalg.vector_norm(rigid.flow, dim=1)  # [G], metres per sweep interval
     is_fast = speed >= float(TABLE["fast"])
     is_far = rigid.centre.square().sum(1) >= float(TABLE["far"]) ** 2
     has_history = sweeps.has_history.index_select(0, sweeps.pixels.window[objects.first])
-    margin = _margins(sweeps, objects, rigid, is_fast)
+    margin = _margins(sweeps, tree, objects, rigid, is_fast)
     bins = Bins.moving + (4 * has_history + 2 * is_far + is_fast) * Bins.num_margins + bin_of(margin, TABLE["margin"])
 
     moving = constant(tuple(TABLE["moving"]), torch.float32, bins.device).index_select(0, bins)
-    least = constant(_LEAST_LIKELY, torch.float32, bins.device).index_select(0, 2 * has_history + is_fast)
+    least = constant(_LEAST_LIKELY, torch.float32, bins.device).index_select(0, torch.where(has_history, 2, is_fast))
     return MotionMargin(bins, (speed >= MOVING) & (moving >= least))
 
 
-def _margins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, is_fast: Tensor) -> Tensor:
+def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: RigidMotion, is_fast: Tensor) -> Tensor:
     """Return the margin of each motion, (G,) float64; `is_fast` is (G,) bool.
 
     Convention: the surplus of a motion is the slices that it wins minus those that it loses, near counts. The margin is
@@ -72,9 +76,8 @@ def _margins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, i
         in all of them. If the surplus exceeds that of the best copy by less than `_COPIES_Z` standard deviations, the
         margin is 0 for lines, and with history for objects of which other sweeps have as many slices in place.
     """
-    pixel = flat_nonzero(objects.by_object.spread(rigid.flow.any(1)))
+    pixel, of_object = _list_pixels(tree, objects, rigid.flow.any(1))
     pixels = sweeps.pixels[pixel]  # [K]
-    of_object = objects.by_object[pixel]  # [K]
     num_others = 1 + sweeps.num_more.index_select(0, sweeps.pixels.window[objects.first])  # [G], sweeps
     has_history = num_others > 1
     near = _test_with_copies(sweeps, pixels, of_object, rigid)
@@ -86,6 +89,21 @@ def _margins(sweeps: HeightSlicedSweeps, objects: Objects, rigid: RigidMotion, i
     has_no_margin = (over_copies < _COPIES_Z) & (stays | _are_lines(sweeps, pixels, of_object))
     margin = torch.where(is_fast | has_history, over_static, over_copies)
     return margin.masked_fill(has_no_margin, 0.0) / num_others.double().sqrt()
+
+
+def _list_pixels(tree: Tree, objects: Objects, is_listed: Tensor) -> tuple[Tensor, Groups]:
+    """List the pixels of the nodes of some objects, (G,) bool; of an object that is no node, its own pixels.
+
+    Returns:
+        pixel: (K,) int64, positions in the list of pixels.
+        of_object: the K pixels, grouped by object.
+    """
+    is_node = objects.by_node.is_member
+    of_node = flat_nonzero(is_listed & is_node)  # [M], objects
+    pixel, members = tree.pixels_of(objects.by_node.of_item.index_select(0, of_node))
+    own = flat_nonzero(objects.by_object.spread(is_listed & ~is_node))
+    of_object = torch.cat((members.spread(of_node), objects.by_object.of_item.index_select(0, own)))
+    return torch.cat((pixel, own)), Groups(of_object, objects.count)
 
 
 def _test_with_copies(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Groups, rigid: RigidMotion) -> Counts:

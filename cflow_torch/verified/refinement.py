@@ -399,12 +399,14 @@ def deskew(points: ObjectPoints, sweeps: HeightSlicedSweeps, rigid: RigidMotion)
 
 
 def _at_instant(points: ObjectPoints, elapsed: Tensor, rigid: RigidMotion) -> Tensor:
-    """Return x and y of each point at the instant of its sweep, (2, N) float64."""
+    """Return x and y of each point at the instant of its sweep, (2, N) float64; exactly its position at time 0."""
     assert points.time is not None
     time = points.time.double()
     velocity = rigid.flow.index_select(0, points.object_id).t()  # [2, N]
     rotation = rigid.rotation.index_select(0, points.object_id)
     since_t = elapsed[points.window, 1] - elapsed[points.window, points.step]
     centre = rigid.centre.index_select(0, points.object_id).t() + velocity * since_t  # at the instant of the sweep
-    arm = points.position[:2] - velocity * time - centre
-    return centre + rotate(-time * rotation, arm)
+    position = points.position[:2]
+    displacement = -velocity * time
+    arm = position + displacement - centre
+    return position + displacement + (rotate(-time * rotation, arm) - arm)

@@ -20,7 +20,7 @@ from sets import ScoredSet, make_sets
 from torch import Tensor
 
 from cflow_torch.ops.groups import Groups
-from cflow_torch.verified import changed_pixels, component_tree, confidence, paired_test, refinement, selection
+from cflow_torch.verified import changed_pixels, component_tree, motion_margin, paired_test, refinement, selection
 from cflow_torch.verified.dissent import Dissent
 from cflow_torch.verified.height_slices import HeightSlicedSweeps
 from cflow_torch.verified.spacing import Spacing
@@ -36,8 +36,8 @@ def _linked_may_move(*given: Any) -> component_tree.Components:
     return replace(components, may_move=components.is_linked)
 
 
-def _without_margin(*given: Any) -> confidence.MotionMargin:
-    margin = confidence.motion_margin(*given)
+def _without_margin(*given: Any) -> motion_margin.MotionMargin:
+    margin = motion_margin.motion_margin(*given)
     return margin._replace(is_dynamic=torch.ones_like(margin.is_dynamic))
 
 
@@ -57,6 +57,11 @@ def _points_are_dense(*given: Any) -> Spacing:
     return Spacing.of(*given)._replace(most=1, has_tall=False)
 
 
+def _rings_are_dense(*given: Any) -> Spacing:
+    spacing = Spacing.of(*given)
+    return spacing._replace(rise=torch.zeros_like(spacing.rise), has_tall=False)
+
+
 def _without_coverage(batch: Any, *given: Any) -> HeightSlicedSweeps:
     return HeightSlicedSweeps.of(replace(batch, coverage=None), *given)
 
@@ -69,6 +74,7 @@ def _no_dissent(sweeps: Any, tree: Any, verdict: Any, winner: Tensor, significan
 STEPS: dict[str, dict[str, Any]] = {
     "all steps": {},
     "no spacing": {"draw": partial(HeightSlicedSweeps.of, measure_spacing=_points_are_dense)},
+    "no spacing of rings": {"draw": partial(HeightSlicedSweeps.of, measure_spacing=_rings_are_dense)},
     "no coverage": {"draw": _without_coverage},
     "no changed pixels": {"find_changed": _without_changed},
     "no unchanged pixels": {"add_unchanged": lambda sweeps, tree, motion: tree},

@@ -23,12 +23,14 @@ DISPLACEMENT, BLOCK = 0.4, 1.6  # metres per interval; metres
 def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tuple[int, bool]:
     """The bin of an object with a motion, counted from the first one of such objects, and whether it moves.
 
+    Members are all pixels of the node whose motion the object takes, also those that other objects took.
+
     The surplus of a motion is what it wins minus what it loses, by the near counts. In a pair, that of a slow motion is
     reduced by that of the best of four copies, displaced by 0.4 m per interval. The margin is this, in standard
     deviations of what it wins and loses, over the root of the number of other sweeps. If a copy explains the sweeps as
     well, to a standard deviation, a line has no margin, and with history neither has an object that is found in place
     as often as that. An object moves if its motion is at least 0.05 m, and P(moving) of its bin at least 0.05, if it is
-    fast 0.15, with history 0.02 and 0.04.
+    fast 0.15, and with history 0.02.
     """
     if not any(rigid.flow):
         return 0, False
@@ -52,7 +54,7 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     reached = (value >= np.array(TABLE["margin"])).sum()
     number = (4 * sweeps.has_history + 2 * is_far + is_fast) * (1 + len(TABLE["margin"])) + reached
     first = len(TABLE["moving"]) - 8 * (1 + len(TABLE["margin"]))
-    least = (0.04 if is_fast else 0.02) if sweeps.has_history else (0.15 if is_fast else 0.05)
+    least = 0.02 if sweeps.has_history else 0.15 if is_fast else 0.05
     return int(number), bool(speed >= 0.05 and TABLE["moving"][first + number] >= least)
 
 

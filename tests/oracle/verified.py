@@ -26,7 +26,7 @@ from oracle.spacing import are_tall, reach_of_pixels, spacing_of
 from oracle.sweeps import Cloud, PointMotion
 from oracle.unlinked import link_unlinked
 
-CHANGED_Z = 4.0  # standard deviations for nodes of changed pixels
+CHANGED_Z = 2.0  # times as many standard deviations for nodes of changed pixels
 LEAVES = 20  # slices that a fast object must win for each one that it loses
 
 
@@ -65,7 +65,8 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
     motions = [proven[i][0] if i >= 0 else (0.0, 0.0) for i in chosen.tolist()]
     size, members = sweeps.size, [np.flatnonzero(object_of == i) for i in range(len(chosen))]
     rigid = register(sweeps, object_of, [(x * size, y * size) for y, x in motions])
-    margins = [margin(sweeps, *given) for given in zip(members, rigid)]
+    tested = [nodes[i].members if i >= 0 else own for i, own in zip(chosen, members)]  # all pixels of the node
+    margins = [margin(sweeps, *given) for given in zip(tested, rigid)]
     bins = [number for number, _ in margins]
     of_pixels = probabilities(sweeps, object_of, rigid, bins, change[0], tree.levels[:-1][-2:])
 
@@ -88,9 +89,9 @@ def verified_flow(clouds: Sequence[Cloud], cloud1: Cloud, ground: np.ndarray, co
 
 def verify(sweeps: SlicedSweeps, node: Node, candidates: Sequence[Vector], num_levels: int) -> tuple[Vector, int]:
     """The candidate of most evidence, and its evidence: that of the counts and, with twice as many standard deviations,
-    that of the near counts. Fast objects need twice as many of both, nodes of changed pixels more. With history, all
-    must gain a slice for eight pixels."""
-    z = CHANGED_Z if node.level == num_levels else sweeps.config.significance
+    that of the near counts. Fast objects need twice as many of both counts, nodes of changed pixels twice as many of
+    each. With history, all must gain a slice for eight pixels."""
+    z = sweeps.config.significance * (CHANGED_Z if node.level == num_levels else 1)
     is_fast = node.level > num_levels
     least = 16 * len(node.members) / 8 * sweeps.has_history
     evidence = []

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from moving_scenes import from_images
 from oracle import confidence as oracle
 from scenes import flow_as_oracle
 from test_changed_pixels import beside_a_wall
@@ -15,10 +16,14 @@ from turning_car import MODEL, turning_car
 from cflow_torch import CFlowError, FlowResult, Sweep, VerifiedFlow, Window, make_config, make_model
 from cflow_torch.data.log import window as window_of
 from cflow_torch.evaluation.frame import ego_motion_flow
+from cflow_torch.ops.groups import Groups
 from cflow_torch.simulator import make_drive
 from cflow_torch.verified import confidence, motion_margin
+from cflow_torch.verified.component_tree import Tree
 from cflow_torch.verified.paired_test import verify
 from cflow_torch.verified.refinement import refine
+from cflow_torch.verified.rigid_motion import RigidMotion
+from cflow_torch.verified.selection import Objects
 
 
 def test_the_tables_are_monotone_and_the_oracle_reads_them():
@@ -121,7 +126,7 @@ def test_a_wall_has_less_confidence_than_a_car(monkeypatch):
     car = np.concatenate((long_side, np.stack((np.full(300, -2.05), rng.uniform(-5, -3, 300), long_side[:, 2]), 1)))
     points = np.concatenate((wall, car))
     model = VerifiedFlow(MODEL)
-    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))  # both are dynamic
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 3 * (0.0,))  # both are dynamic
     model.verify = partial(verify, slides=lambda *given: torch.zeros(given[3].shape[:2], dtype=torch.bool))
     (result,) = model([Window(Sweep(points), Sweep(points + (0.3, 0.0, 0.0)))])
     assert result.residual_flow[:, 0].min() > 0.2
@@ -155,10 +160,29 @@ def test_a_motion_that_is_hardly_ever_right_is_dropped_and_its_probability_stays
     older, newer = (Sweep((places + rng.uniform(0, (0.5, 0.5, 1.5), (40, 12, 3))).reshape(-1, 3)) for _ in "ab")
     model = VerifiedFlow.from_preset()
     (result,) = model([Window(older, newer)])
-    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 3 * (0.0,))
     (every,) = model([Window(older, newer)])
     is_dropped = every.residual_flow.any(1) & ~result.residual_flow.any(1)
     assert is_dropped.any() and (every.moving[is_dropped] < 0.15).all() and torch.equal(result.moving, every.moving)
+
+
+def test_a_remnant_has_the_margin_of_its_whole_node():
+    """Forty lone pixels move by five columns. The remnant has two of them, at t, and others took the rest."""
+    images = np.zeros((1, 2, 90, 12), dtype=np.uint8)
+    images[0, 1, 2:82:2, 2] = images[0, 0, 2:82:2, 7] = 1
+    sweeps, zero = from_images(images), torch.zeros(1, dtype=torch.int64)
+    every = torch.arange(sweeps.num_pixels)
+    tree = Tree(every, Groups(torch.zeros_like(every), 1), Groups(zero + 1, 1), zero, zero, torch.zeros(1, 2), 2)
+    rigid = RigidMotion(
+        torch.tensor([[5 * sweeps.grid.pixel_size, 0.0]]).double(), zero.double(), torch.zeros(1, 2).double()
+    )
+    is_remnant = (sweeps.pixels.step == 1) & (sweeps.pixels.row_col[0] < 6)
+    bins = []
+    for pixels in (every >= 0, is_remnant):
+        by_object = Groups(torch.where(pixels, 0, 1), 1)
+        objects = Objects(by_object, Groups(zero, 1), by_object.first())
+        bins.append(int(motion_margin.motion_margin(sweeps, tree, objects, rigid).bin))
+    assert int(is_remnant.sum()) == 2 and bins[0] == bins[1]
 
 
 def test_a_motion_below_the_least_one_is_static(monkeypatch):

@@ -94,6 +94,16 @@ def test_points_are_moved_to_where_they_were_at_the_instant_of_their_sweep(angle
     assert torch.equal(sharp.place[2:], expected.long())
 
 
+def test_points_without_an_offset_in_time_stay_exactly_where_they_are():
+    """Windows without times have such points if another window of the batch has times."""
+    lattice = 0.1 * np.mgrid[-20:20, -20:20].reshape(2, -1).T  # every other point is at the edge of its pixel
+    cloud = np.column_stack((lattice, np.full(len(lattice), 0.2)))
+    scene = with_times(one_object([cloud, cloud], (0.8, -0.3)), torch.zeros(2 * len(cloud)))
+    rigid = RigidMotion(scene.flow, torch.tensor([0.1]).double(), torch.tensor([[0.7, 0.3]]).double())
+    points = scene.points()
+    assert torch.equal(deskew(points, scene.sweeps, rigid).position, points.position)
+
+
 def test_points_that_leave_the_region_are_dropped_and_a_pixel_belongs_to_the_first_object():
     cloud = np.array([[0.05, 0.05, 0.2], [1.05, 0.05, 0.2], [2.95, 1.05, 0.2]])
     scene = with_times(one_object([cloud[:2], cloud], (0.0, 0.0)), torch.tensor([0.0, 0.0, 0.0, 1.0, -0.5]))

@@ -90,10 +90,10 @@ def test_the_first_candidate_with_most_evidence_is_chosen():
 
 
 @pytest.mark.parametrize(
-    "level, num_pixels, moves", [(0, 1, False), (0, 2, True), (NodeKind.CHANGED, 8, False), (NodeKind.CHANGED, 9, True)]
+    "level, num_pixels, moves", [(0, 1, False), (0, 2, True), (NodeKind.CHANGED, 4, False), (NodeKind.CHANGED, 5, True)]
 )
-def test_nodes_of_changed_pixels_need_4_standard_deviations(level, num_pixels, moves):
-    """Lone pixels that move win two slices each: 4 > 1.5 * 2 and 18 > 4 * 4.2, but 16 = 4 * 4."""
+def test_nodes_of_changed_pixels_need_twice_as_many_standard_deviations(level, num_pixels, moves):
+    """Lone pixels that move win two slices each: 4 > 1.5 * 2 and 10 > 3 * 3.2, but 8 < 3 * 2.8."""
     images = np.zeros((1, 2, 40, 12), dtype=np.uint8)
     images[0, 1, 2 : 4 * num_pixels : 4, 2] = images[0, 0, 2 : 4 * num_pixels : 4, 7] = 1
     sweeps, zero = from_images(images), torch.zeros(1, dtype=torch.int64)
