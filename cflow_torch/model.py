@@ -10,13 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import METHODS, PRESETS, Config, make_config
+from cflow_torch.diagnosis.inspection import warn_of_inactive
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.stages import stage
 from cflow_torch.tensors import choose_device
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch, make_batch
-from cflow_torch.windows.inspection import warn_of_inactive
 from cflow_torch.windows.memory import split_windows
 from cflow_torch.windows.validation import check_windows
 

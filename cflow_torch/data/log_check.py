@@ -12,13 +12,10 @@ from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_po
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
 from cflow_torch.data.neighbours import Neighbours, alternate
 from cflow_torch.data.read_as import ReadAs, begins_late
-from cflow_torch.errors import CFlowError, warn
-from cflow_torch.transforms import relative_transform, transform_points
-from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import OF_POINTS, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
-from cflow_torch.windows.inspection import REPEATED, repeats
-from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import (
+from cflow_torch.diagnosis.conventions import OF_POINTS, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
+from cflow_torch.diagnosis.inspection import REPEATED, repeats
+from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.readings import (
     EQUAL,
     HALVES,
     INACCURATE,
@@ -27,7 +24,10 @@ from cflow_torch.windows.readings import (
     Judgement,
     difference,
 )
-from cflow_torch.windows.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_in_place, structure_of
+from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_in_place, structure_of
+from cflow_torch.errors import CFlowError, warn
+from cflow_torch.transforms import relative_transform, transform_points
+from cflow_torch.types import Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted

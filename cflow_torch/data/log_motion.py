@@ -9,10 +9,9 @@ from typing import Callable, Container, Iterator, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.log import Log, known_poses, poses_beyond
-from cflow_torch.transforms import turn_of
-from cflow_torch.windows.conventions import MARGIN, OFF, STILL, TIMES, WORLD
-from cflow_torch.windows.inspection import repeats
-from cflow_torch.windows.readings import (
+from cflow_torch.diagnosis.conventions import MARGIN, OFF, STILL, TIMES, WORLD
+from cflow_torch.diagnosis.inspection import repeats
+from cflow_torch.diagnosis.readings import (
     GIVEN,
     LEAST_SHARE,
     UNKNOWN,
@@ -22,6 +21,7 @@ from cflow_torch.windows.readings import (
     judge,
     make_pair,
 )
+from cflow_torch.transforms import turn_of
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
 _BEFORE = 100  # sweeps before a suspect step, from whose poses other readings of it follow

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cflow_torch.data.log import Log
+from cflow_torch.diagnosis.inspection import repeats
+from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, are_finite, share_in_place, structure_of
 from cflow_torch.errors import CFlowError
 from cflow_torch.types import as_numpy
-from cflow_torch.windows.inspection import repeats
-from cflow_torch.windows.stillness import LEAST_SHARE, MISPLACED, are_finite, share_in_place, structure_of
 
 _AROUND = 10  # sweeps on each side that tell a usual share, or number of points
 _TURNS = 8  # sweeps that tell whether two sensors measure in turns

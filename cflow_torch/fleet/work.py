@@ -21,6 +21,7 @@ from cflow_torch.data.flow_file import POINTS, write_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.paths import as_path, safe_name
+from cflow_torch.diagnosis.inspection import MotionWatch, inactive_is_an_error, pair_problem
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.executors import describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, frame_name
@@ -28,7 +29,6 @@ from cflow_torch.fleet.manifest import checked_manifest, claim_log, complete_fra
 from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.windows.inspection import MotionWatch, inactive_is_an_error, pair_problem
 from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # batches that are read ahead, and that wait to be written

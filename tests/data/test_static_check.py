@@ -19,6 +19,8 @@ from cflow_torch.data.log import CachedLog, Log, LogWrapper, poses_beyond
 from cflow_torch.data.log_check import FOUND, RIGHT, WRONG, check_log, examine, find_problems
 from cflow_torch.data.log_motion import JUMP, POSE, find_lapses, judge_log
 from cflow_torch.data.read_as import read_as
+from cflow_torch.diagnosis.conventions import AXES, CAMERA, UNITS, WORLD
+from cflow_torch.diagnosis.readings import GIVEN, NO_READING, UNKNOWN, _compare
 from cflow_torch.errors import MissingFile
 from cflow_torch.simulator import make_drive
 from cflow_torch.transforms import (
@@ -31,8 +33,6 @@ from cflow_torch.transforms import (
     transform_points,
 )
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.conventions import AXES, CAMERA, UNITS, WORLD
-from cflow_torch.windows.readings import GIVEN, NO_READING, UNKNOWN, _compare
 
 MOUNTING = as_matrix(np.eye(3), (1.35, 0, 1.6))
 

@@ -21,13 +21,13 @@ from small_logs import make_small_drive
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import LogWrapper
+from cflow_torch.diagnosis.inspection import REPEATED
 from cflow_torch.fleet import parallel, work
 from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.parallel import run_parallel
 from cflow_torch.fleet.run import Counters, _follow, format_missing, format_report
 from cflow_torch.fleet.work import Worker
-from cflow_torch.windows.inspection import REPEATED
 
 
 @pytest.fixture

@@ -15,9 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
-from cflow_torch.types import Array, Sweep, as_numpy
-from cflow_torch.windows.conventions import (
+from cflow_torch.diagnosis.conventions import (
     MIRRORED,
     MOUNT,
     MOUNTS,
@@ -33,8 +31,10 @@ from cflow_torch.windows.conventions import (
     Reading,
     scaled,
 )
+from cflow_torch.diagnosis.stillness import FEWEST_POINTS, LEAST_SHARE, Structure, cell_keys, structure_rows
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
+from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, INSTANTS, SCANS
-from cflow_torch.windows.stillness import FEWEST_POINTS, LEAST_SHARE, Structure, cell_keys, structure_rows
 
 GIVEN = "as given"
 STEPS = ("steps", "steps_back")

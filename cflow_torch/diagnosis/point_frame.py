@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from cflow_torch.diagnosis.conventions import READINGS, UNITS
 from cflow_torch.ground.segmentation import find_ground, ground_side, has_ground
 from cflow_torch.transforms import rotations_about
 from cflow_torch.types import Array, as_numpy
-from cflow_torch.windows.conventions import READINGS, UNITS
 
 _FEWEST = 100  # points
 # Extent of the middle nine tenths of the points, in the units of the points. Clouds in metres have 5 to 200.

@@ -10,14 +10,14 @@ import numpy as np
 import torch
 
 from cflow_torch.config import Config
+from cflow_torch.diagnosis.conventions import INVERTED, STILL, WORLD
+from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judge, make_pair
+from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, share_in_place, structure_of
 from cflow_torch.errors import CFlowError, NoActivePoints, warn
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
-from cflow_torch.windows.conventions import INVERTED, STILL, WORLD
-from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import INACCURATE, NO_READING, UNKNOWN, judge, make_pair
 from cflow_torch.windows.returns import MISSING, without_missing
-from cflow_torch.windows.stillness import LEAST_SHARE, MISPLACED, share_in_place, structure_of
 from cflow_torch.windows.validation import have_same_points
 
 REPEATED = "pc1 has the same points as pc0, so everything seems to move with the sensor: give two different sweeps"

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from cflow_torch.data.log import Log, window
+from cflow_torch.diagnosis.inspection import MotionWatch
 from cflow_torch.simulator import make_drive
 from cflow_torch.types import Window
-from cflow_torch.windows.inspection import MotionWatch
 
 
 @pytest.fixture(scope="module")
