@@ -9,6 +9,7 @@ import numpy as np
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.dense.method import CorrelationFlow
+from cflow_torch.diagnosis.inspection import Inspection
 from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import GROUND_METHODS, find_ground_batch
 from cflow_torch.keypoints.method import CorrelationFlowKeypoints
@@ -17,7 +18,6 @@ from cflow_torch.tensors import choose_device
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, check_sweep
 from cflow_torch.verified.method import VerifiedFlow
-from cflow_torch.windows.inspection import Inspection
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import keep_nearest
 

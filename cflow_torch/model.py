@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import METHODS, PRESETS, Config, make_config
+from cflow_torch.diagnosis.inspection import inactive_problems
 from cflow_torch.errors import warn
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.stages import stage
@@ -17,7 +18,6 @@ from cflow_torch.tensors import choose_device
 from cflow_torch.types import CFlowError, FlowResult, Window
 from cflow_torch.windows.bev_grid import Grid
 from cflow_torch.windows.collation import Batch, make_batch
-from cflow_torch.windows.inspection import inactive_problems
 from cflow_torch.windows.memory import split_windows
 from cflow_torch.windows.validation import check_windows
 

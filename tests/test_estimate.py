@@ -19,12 +19,12 @@ from preset_windows import changed
 from scenes import assert_same, assert_same_bits, assert_zeros, config, scene
 
 from cflow_torch import CorrelationFlow, CorrelationFlowKeypoints, VerifiedFlow, estimate_flow, make_config, make_model
+from cflow_torch.diagnosis.inspection import Inspection
 from cflow_torch.errors import CFlowError, CFlowWarning
 from cflow_torch.ground.segmentation import find_ground_batch
 from cflow_torch.simulator import make_drive
 from cflow_torch.stages import TimedModel, time_report
 from cflow_torch.types import Sweep, Window
-from cflow_torch.windows.inspection import Inspection
 
 RNG = np.random.default_rng(0)
 P0, P1 = RNG.uniform(-5, 5, (50, 3)).astype(np.float32), RNG.uniform(-5, 5, (40, 3)).astype(np.float32)

@@ -16,9 +16,9 @@ from cflow_torch import CorrelationFlow, Sweep, Window
 PACKAGE = Path(cflow_torch.__file__).parent
 # A room imports from itself and from rooms that stand before it.
 ROOMS = (
-    *("errors", "types", "setting", "config", "stages", "tensors", "transforms", "ops", "ground", "windows", "model"),
-    *("dense", "keypoints", "verified", "estimate", "data", "simulator", "evaluation", "viz", "fleet", "applications"),
-    *("integrations", "configs", "cli"),
+    *("errors", "types", "setting", "config", "stages", "tensors", "transforms", "ops", "ground", "windows"),
+    *("diagnosis", "model", "dense", "keypoints", "verified", "estimate", "data", "simulator", "evaluation", "viz"),
+    *("fleet", "applications", "integrations", "configs", "cli"),
 )
 # Methods of the standard library that Python 3.8 lacks, and slices of Path.parents.
 NEWER = re.compile(

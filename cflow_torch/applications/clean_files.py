@@ -15,8 +15,8 @@ from cflow_torch.data.atomic import new_folder
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import GZ
+from cflow_torch.diagnosis.conventions import OF_POINTS, WORLD
 from cflow_torch.types import CFlowError
-from cflow_torch.windows.conventions import OF_POINTS, WORLD
 
 REMOVED_FOLDER = "removed"
 _WRITE_AGAIN = "give overwrite=true to write this log again"

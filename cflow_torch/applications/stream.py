@@ -13,13 +13,13 @@ import torch
 
 from cflow_torch.config import Config, make_config
 from cflow_torch.data.odometry import Odometry
+from cflow_torch.diagnosis.inspection import Inspection
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.ground.segmentation import GROUND_METHODS, find_ground
 from cflow_torch.tensors import choose_device, read_ground, read_positions
 from cflow_torch.types import Array, CFlowError, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.collation import make_batch
-from cflow_torch.windows.inspection import Inspection
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import check_windows
 

@@ -18,6 +18,7 @@ import torch
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.config import Config
 from cflow_torch.data.log import CachedLog, Log, window
+from cflow_torch.diagnosis.inspection import inactive_problems
 from cflow_torch.fleet.executors import ProcessExecutor
 from cflow_torch.fleet.machine import choose_devices, frames_per_worker
 from cflow_torch.fleet.progress import Progress, show_warnings_as_lines
@@ -26,7 +27,6 @@ from cflow_torch.model import SceneFlowModel
 from cflow_torch.setting import AUTO
 from cflow_torch.stages import CallTime, TimedModel
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.windows.inspection import inactive_problems
 from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # windows per worker that are read ahead

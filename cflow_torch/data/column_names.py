@@ -21,7 +21,7 @@ _ROLES = {
     **{f"q{axis}": _ROTATION + axis for axis in "wxyz0123"},
     "roll": ".*roll(deg|degrees|rad|radians)?",
     "pitch": ".*pitch(deg|degrees|rad|radians)?",
-    "yaw": ".*(yaw|heading)(deg|degrees|rad|radians)?",
+    "yaw": ".*(yaw|heading|theta)(deg|degrees|rad|radians)?",
 }
 _OTHERS = "twist|linear|angular|veloc|accel|covariance|rate"
 
@@ -49,4 +49,5 @@ def time_columns(names: Iterable[str]) -> list[str]:
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"\[.*?\]|\(.*?\)|[^a-z0-9]", "", name.lower())
+    ordered = re.sub(r"[ ._-]?(xyzw|wxyz)(?![a-z])", "", name.lower())  # quaternion_xyzw
+    return re.sub(r"\[.*?\]|\(.*?\)|[^a-z0-9]", "", ordered)

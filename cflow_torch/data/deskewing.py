@@ -11,10 +11,10 @@ import numpy as np
 from cflow_torch.data.finding import FOUND, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper, intervals_of
 from cflow_torch.data.log_motion import judge_log
+from cflow_torch.diagnosis.readings import Judgement
 from cflow_torch.transforms import poses_at, relative_transform, transform_each, transform_points
 from cflow_torch.types import CFlowError, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, ENDINGS, SCANS, deskew_points, scan_fractions
-from cflow_torch.windows.readings import Judgement
 
 _CHOICES = ("auto", "times", "off", *DIRECTIONS)
 _DYNAMIC = 0.05  # metres a sweep; labels of objects that move less stay static
@@ -36,8 +36,8 @@ class DeskewedLog(LogWrapper):
         log: the log; sweeps without poses stay as they are.
         deskew: "times" = by `Sweep.point_times`; "clockwise", "counterclockwise", "clockwise_left_at_start", ... = by
             the azimuth, see `scan_fractions`; "off" = the sweeps are compensated already; "auto" = the scan under which
-            the static world stands still best (`cflow_torch.windows.readings`). Without a clear one, points with times
-            of raw points are moved by these, and others stay.
+            the static world stands still best (`cflow_torch.diagnosis.readings`). Without a clear one, points with
+            times of raw points are moved by these, and others stay.
 
     Attributes:
         scan: how the sweeps are read, a value of `deskew` but "auto". It is decided at first use, by the log alone.

@@ -12,10 +12,10 @@ from torch.utils.data import Dataset
 
 from cflow_torch.data.camera import Camera
 from cflow_torch.data.finding import Finding
+from cflow_torch.diagnosis.readings import LEAST_DISTANCE, Judgement, is_around
 from cflow_torch.errors import MissingFile, warn
 from cflow_torch.transforms import poses_at
 from cflow_torch.types import CFlowError, Sweep, Window, check_array
-from cflow_torch.windows.readings import LEAST_DISTANCE, Judgement, is_around
 
 _GAP, _LONGEST_STEP = 2.5, 0.45  # a gap is longer than so many usual intervals, and seconds
 _Log = TypeVar("_Log", bound="Log")

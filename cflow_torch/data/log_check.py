@@ -12,23 +12,22 @@ from cflow_torch.data.log import CachedLog, Log, gaps_in, intervals_of, known_po
 from cflow_torch.data.log_motion import MISSING, POSE, Lapse, find_lapses, judge_log
 from cflow_torch.data.neighbours import Neighbours, alternate
 from cflow_torch.data.read_as import ReadAs, begins_late
-from cflow_torch.errors import CFlowError, warn
-from cflow_torch.transforms import relative_transform, transform_points
-from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import OF_POINTS, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
-from cflow_torch.windows.inspection import REPEATED, repeats
-from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import (
+from cflow_torch.diagnosis.conventions import OF_POINTS, READINGS, REVERSED, STILL, TIMES_OF_POSES, UNITS, WORLD
+from cflow_torch.diagnosis.inspection import REPEATED, repeats
+from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.readings import (
     EQUAL,
     HALVES,
     INACCURATE,
-    LEAST_SHARE,
     NO_READING,
     UNKNOWN,
     Judgement,
     difference,
 )
-from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite
+from cflow_torch.diagnosis.stillness import IN_PLACE, LEAST_SHARE, Structure, are_finite, share_in_place, structure_of
+from cflow_torch.errors import CFlowError, warn
+from cflow_torch.transforms import relative_transform, transform_points
+from cflow_torch.types import Sweep, as_numpy
 
 _CACHED = 12  # sweeps that several checks read
 _INVERTED_BY = 0.3  # metres by which ground lies above the other points, if the mask is inverted
@@ -41,8 +40,9 @@ _GRID = 0.2  # share of different coordinates, below which points lie on a grid
 _UNEVEN = 0.1  # change of the intervals of times from one to the next
 _EVEN = 0.5  # change of the motion over that of the intervals
 _MOST_SEEN = 20_000  # points that show in which directions a sweep measures, and whether they lie on a grid
-_DIRECTIONS = 72  # of a turn
-_LEAST_SHARED = 0.5  # share of the directions in which neighbouring sweeps both measure
+_DIRECTIONS = 36  # of a turn, and from straight down to straight up
+_LEAST_SHARED = 0.6  # share of the points in directions in which neighbouring sweeps both measure
+_FEWEST_SEEN = 300  # points that show in which directions a sweep measures
 _TOPICS = (
     "log",
     "sensor",
@@ -172,10 +172,21 @@ def _frame(log: _CheckedLog) -> list[Finding]:
 
 
 def _fitting(log: Log, readings: Iterable[str]) -> tuple[str, float]:
-    """Return the first of the readings under which the points fit the poses, and the share in place; "" = none."""
-    judged = ((name, judge_log(ReadAs(log, name))) for name in readings)
+    """Return the first of the readings under which the points fit the poses, and the share in place; "" = none.
+
+    Readings under which one pair does not fit at all are left out, because a judgement takes 30 times longer.
+    """
+    middle = (len(log.timestamps) - 2) // 2
+    logs = ((name, ReadAs(log, name)) for name in readings)
+    fitting_at_all = ((name, read) for name, read in logs if _share_of_pair(read, middle) >= LEAST_SHARE)
+    judged = ((name, judge_log(read)) for name, read in fitting_at_all)
     fitting = ((name, each.given) for name, each in judged if not each.best and each.given >= LEAST_SHARE)
     return next(fitting, ("", 0.0))
+
+
+def _share_of_pair(log: Log, index: int) -> float:
+    pc0, pc1 = log.sweep(index), log.sweep(index + 1)
+    return share_in_place(pc0, structure_of(pc0), pc1, structure_of(pc1))
 
 
 def _problem_of(log: Log, index: int) -> tuple[str, str]:
@@ -248,8 +259,10 @@ def _setting(log: Log, reading: str) -> str:
 
 def _lapses(log: _CheckedLog) -> list[Finding]:
     wrong = [lapse for lapse in log.lapses if lapse.kind != MISSING]
-    if not wrong or log.misfit:
-        return log.misfit if wrong else []
+    if not wrong or INACCURATE in log.motion.best:  # then most poses are off
+        return []
+    if log.misfit:
+        return log.misfit
     texts = [
         f"the pose of sweep {each.sweep} is {each.metres:.1f} m off (for points 10 m away)"
         if each.kind == POSE
@@ -303,14 +316,14 @@ def _repeated(log: Log) -> list[Finding]:
 
 
 def _parts(log: Log) -> list[Finding]:
-    """Compare the directions of the first two sweeps and, if they share few, also those of the third one."""
+    """Compare the directions of the first two sweeps and, if they share few, also those after them: one may be cut."""
     shared = 0.0
-    for index in range(min(2, len(log) - 1)):
+    for index in range(min(4, len(log) - 1)):
         shared = max(shared, _shared_directions(log.sweep(index), log.sweep(index + 1)))
         if shared >= _LEAST_SHARED:
             return []
     text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
-    fix = "join the clouds of one turn, or give those of one sensor (data.suffix, data.topic)"
+    fix = "join the clouds of one turn or view, or give those of one sensor (data.suffix, data.topic)"
     return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
 
 
@@ -341,19 +354,25 @@ def _is_grid(sweep: Sweep) -> bool:
 
 
 def _shared_directions(pc0: Sweep, pc1: Sweep) -> float:
-    """Return the share of the directions of one sweep in which the other has points; 1 if one has no points."""
+    """Return the share of points of a sweep in directions where the other has points, too; of both shares, the smaller.
+
+    1 if one of them has too few points to tell.
+    """
     in0, in1 = _directions(pc0), _directions(pc1)
-    return float((in0 & in1).sum() / min(in0.sum(), in1.sum())) if in0.any() and in1.any() else 1.0
+    if min(in0.sum(), in1.sum()) < _FEWEST_SEEN:
+        return 1.0
+    return float(min(in0[in1 > 0].sum() / in0.sum(), in1[in0 > 0].sum() / in1.sum()))
 
 
 def _directions(sweep: Sweep) -> np.ndarray:
-    """Return in which of 72 directions a sweep has points, (72,) bool."""
+    """Count the points of a sweep in each direction of azimuth and elevation, (36 * 36,) int64."""
     points = as_numpy(sweep.points)
-    x, y = points[:: len(points) // _MOST_SEEN + 1, :2].astype(np.float64).T
-    turns = np.arctan2(y, x)[np.isfinite(x + y)] / (2 * np.pi)
-    has_points = np.zeros(_DIRECTIONS, bool)
-    has_points[np.floor(turns * _DIRECTIONS).astype(int)] = True  # negative numbers count from the end
-    return has_points
+    x, y, z = points[:: len(points) // _MOST_SEEN + 1, :3].astype(np.float64).T
+    is_known = np.isfinite(x + y + z)
+    azimuth = np.arctan2(y, x)[is_known] / (2 * np.pi) + 0.5  # 0 to 1
+    elevation = np.arctan2(z, np.hypot(x, y))[is_known] / np.pi + 0.5
+    row, column = (np.minimum(share * _DIRECTIONS, _DIRECTIONS - 1).astype(np.int64) for share in (azimuth, elevation))
+    return np.bincount(row * _DIRECTIONS + column, minlength=_DIRECTIONS**2)
 
 
 def _each_sweep(log: _CheckedLog) -> list[Finding]:

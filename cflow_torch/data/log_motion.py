@@ -9,10 +9,9 @@ from typing import Callable, Container, Iterator, NamedTuple, Sequence
 import numpy as np
 
 from cflow_torch.data.log import Log, known_poses, poses_beyond
-from cflow_torch.transforms import turn_of
-from cflow_torch.windows.conventions import MARGIN, OFF, STILL, TIMES, WORLD
-from cflow_torch.windows.inspection import repeats
-from cflow_torch.windows.readings import (
+from cflow_torch.diagnosis.conventions import MARGIN, OFF, STILL, TIMES, WORLD
+from cflow_torch.diagnosis.inspection import repeats
+from cflow_torch.diagnosis.readings import (
     GIVEN,
     LEAST_SHARE,
     UNKNOWN,
@@ -22,6 +21,7 @@ from cflow_torch.windows.readings import (
     judge,
     make_pair,
 )
+from cflow_torch.transforms import turn_of
 
 _LONGEST_STEP, _MOST_SWEEPS = 6.4, 5  # metres and sweeps between the two sweeps of a pair
 _BEFORE = 100  # sweeps before a suspect step, from whose poses other readings of it follow
@@ -38,7 +38,7 @@ _FEWEST_POSES = 5  # that tell a usual step
 POSE, JUMP, MISSING = "pose", "jump", "missing"
 _OTHER, _CLEARLY = "another step", 1.3  # factor by which another reading is better than another step
 _NUM_SUSPECTS = 4  # steps that are compared with the points, largest first
-_LONG = 1.7  # length of a step over the usual one, if sweeps are missing
+_LONG = 1.7  # length of a step over all those around it, if sweeps are missing
 
 
 class Lapse(NamedTuple):
@@ -196,6 +196,7 @@ class Steps(NamedTuple):
 
     given: np.ndarray  # (K-1, 4, 4), maps each sweep to the next
     usual: np.ndarray  # (K-1, 4, 4), of the median rotation and speed of the steps around it
+    longest: np.ndarray  # (K-1,) metres, of the largest speed of the steps around it
     excess: np.ndarray  # (K-1,) metres by which a step differs, rotations at 10 m
 
     @property
@@ -215,14 +216,16 @@ def steps_of(log: Log) -> Steps | None:
     interval = np.diff(np.asarray(log.timestamps, np.float64)).clip(1e-9)
     rate = steps[:, :3, 3] / interval[:, None]
     usual = np.empty_like(steps)
+    longest = np.zeros(len(steps))
     for index in range(len(steps)):
         around = [k for k in range(index - 3, index + 4) if 0 <= k < len(steps) and k != index]
         turns = np.arctan2(steps[around, 1, 0], steps[around, 0, 0])
         usual[index] = steps[around[int(np.argsort(turns, kind="stable")[len(around) // 2])]]  # of median rotation
         usual[index, :3, 3] = np.median(rate[around], 0) * interval[index]
+        longest[index] = np.linalg.norm(rate[around], axis=1).max() * interval[index]
     excess = np.linalg.norm(steps[:, :3, 3] - usual[:, :3, 3], axis=1)
     excess += _ARM * np.linalg.norm(steps[:, :2, 0] - usual[:, :2, 0], axis=1)
-    return Steps(steps, usual, excess)
+    return Steps(steps, usual, longest, excess)
 
 
 def find_lapses(log: Log) -> list[Lapse]:
@@ -238,8 +241,8 @@ def find_lapses(log: Log) -> list[Lapse]:
     lapses: list[Lapse] = []
     for index in sorted(steps.suspects):
         given, usual = steps.given[index], steps.usual[index]
-        length, usual_length = (float(np.linalg.norm(each[:3, 3])) for each in (given, usual))
-        is_long = index not in log.gaps and usual_length > _LEAST_MOTION and length > _LONG * usual_length
+        length = float(np.linalg.norm(given[:3, 3]))
+        is_long = index not in log.gaps and length > _LONG * max(steps.longest[index], _LEAST_MOTION)
         pair = _pair_around(log, index)
         if pair is None:
             continue

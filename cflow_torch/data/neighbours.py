@@ -7,16 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from cflow_torch.data.log import Log
+from cflow_torch.diagnosis.inspection import repeats
+from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, are_finite, share_in_place, structure_of
 from cflow_torch.errors import CFlowError
-from cflow_torch.transforms import relative_transform
-from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.inspection import repeats
-from cflow_torch.windows.readings import FEWEST_POINTS, LEAST_SHARE
-from cflow_torch.windows.stillness import Structure, are_finite, structure_rows
+from cflow_torch.types import as_numpy
 
-_COMPARED = 300  # points of each sweep that are compared with the next one
 _AROUND = 10  # sweeps on each side that tell a usual share, or number of points
-_MISPLACED = 0.5  # part of the usual share, below which sweeps do not fit
+_TURNS = 8  # sweeps that tell whether two sensors measure in turns
 _FEW = 0.5  # part of the usual number of points, below which a sweep has few
 
 
@@ -37,12 +34,12 @@ class Neighbours(NamedTuple):
             sweep, structure = None, np.zeros((0, 3))
             try:
                 sweep = log.sweep(index)
-                structure = _structure(sweep)
+                structure = structure_of(sweep)
                 result.num_points[index] = int(are_finite(as_numpy(sweep.points)).sum())
             except (CFlowError, OSError) as error:
                 result.errors[index] = error
             if index:
-                result.shares.append(_share_in_place(last, last_structure, sweep, structure))
+                result.shares.append(share_in_place(last, last_structure, sweep, structure))
             if last is not None and sweep is not None and repeats(last, sweep):
                 result.repeated.append(index)
             last, last_structure = sweep, structure
@@ -65,7 +62,7 @@ class Neighbours(NamedTuple):
         shares = np.array(self.shares)
         usual = np.array([_median(shares[max(k - _AROUND, 0) : k + _AROUND + 1]) for k in range(len(shares))])
         with np.errstate(invalid="ignore"):
-            is_low = (usual >= LEAST_SHARE) & (shares < _MISPLACED * usual)
+            is_low = (usual >= LEAST_SHARE) & (shares < MISPLACED * usual)
         is_low[list(log.gaps)] = False
         edges = np.flatnonzero(np.diff([False, True, *is_low, True, False])).reshape(-1, 2)
         runs = []
@@ -74,7 +71,7 @@ class Neighbours(NamedTuple):
             has_ends = first > 0 and after <= len(shares)
             if has_ends and last >= first:
                 pc0, pc1 = log.sweep(first - 1), log.sweep(last + 1)
-                if _share_in_place(pc0, _structure(pc0), pc1, _structure(pc1)) < _MISPLACED * usual[first - 1]:
+                if share_in_place(pc0, structure_of(pc0), pc1, structure_of(pc1)) < MISPLACED * usual[first - 1]:
                     continue
             if has_ends or last >= first:
                 runs.append((first, last))
@@ -82,38 +79,27 @@ class Neighbours(NamedTuple):
 
 
 def alternate(log: Log) -> bool:
-    """Test whether sweeps fit the second next one, but not the next: those of two sensors in turns.
+    """Test whether sweeps fit the second next one, but none fits the next: those of two sensors in turns.
 
-    False if a sweep cannot be read.
+    We compare up to eight sweeps. False if one of them cannot be read.
     """
-    first = (len(log.timestamps) - 4) // 2
-    if first < 0:
-        return False
+    count = min(_TURNS, len(log.timestamps))
+    first = (len(log.timestamps) - count) // 2
     try:
-        sweeps = [log.sweep(first + k) for k in range(4)]
+        sweeps = [log.sweep(first + k) for k in range(count)]
     except (CFlowError, OSError):
         return False
-    points = [_structure(sweep) for sweep in sweeps]
-    pairs = ((0, 1), (1, 2), (2, 3)), ((0, 2), (1, 3))
-    near, second = ([_share_in_place(sweeps[a], points[a], sweeps[b], points[b]) for a, b in each] for each in pairs)
-    # Poses may be those of one of the sensors, so only its sweeps fit.
-    return max(second) >= LEAST_SHARE and max(near) < _MISPLACED * max(second)
+    points = [structure_of(sweep) for sweep in sweeps]
 
+    def shares(start: int, step: int, by: int) -> list[float]:
+        pairs = ((k, k + by) for k in range(start, count - by, step))
+        return [share_in_place(sweeps[a], points[a], sweeps[b], points[b]) for a, b in pairs]
 
-def _structure(sweep: Sweep) -> np.ndarray:
-    """Return the points of the static structure of a sweep, (K, 3) float64."""
-    return as_numpy(sweep.points)[structure_rows(sweep), :3].astype(np.float64)
+    # Poses may be those of one of the sensors, so only its sweeps fit: those of even, or of odd numbers.
+    second = max(min(shares(start, 2, 2), default=0.0) for start in (0, 1))
+    return second >= LEAST_SHARE and max(shares(0, 1, 1)) < MISPLACED * second
 
 
 def _median(values: np.ndarray) -> float:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else 0.0
-
-
-def _share_in_place(pc0: Sweep | None, points0: np.ndarray, pc1: Sweep | None, points1: np.ndarray) -> float:
-    """Return the share of the structure of a sweep, (K, 3), in place in that of another; NaN = too little of it."""
-    if pc0 is None or pc1 is None or min(len(points0), len(points1)) < FEWEST_POINTS:
-        return float("nan")
-    has_poses = pc0.pose is not None and pc1.pose is not None
-    T = relative_transform(pc1.pose, pc0.pose) if has_poses else np.eye(4)
-    return Structure(points1).share(points0[:_COMPARED], T)

@@ -9,12 +9,12 @@ import numpy as np
 
 from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, LogWrapper, known_poses
+from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.stillness import IN_PLACE, Structure, are_finite, cell_keys
 from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import find_ground
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.stillness import IN_PLACE, Structure, are_finite, cell_keys
 
 _NEAR, _CELL = 2.7, 0.25  # metres from the origin along x and y, and side of a cell
 _LEAST_MOTION, _FEWEST_SWEEPS, _MOST_SWEEPS = 2.0, 3, 4  # metres between the compared sweeps, and their number

@@ -21,7 +21,8 @@ _COARSE = 8  # steps of a float in that half; with fewer, the type cannot hold t
 class PointTimes(NamedTuple):
     """Times of the points of one sweep."""
 
-    seconds: np.ndarray | None  # (N,) float64 seconds after the stamp of the sweep; None = the values are not times
+    # (N,) float64 seconds after the stamp of the sweep, of stray values any within a sweep; None = these are not times.
+    seconds: np.ndarray | None
     is_stray: np.ndarray  # (N,) bool, True = this value is far from all others, so the time of the point is unknown
     note: str  # what we assumed, or why there are no times; "" = nothing to say
 
@@ -83,7 +84,7 @@ def seconds_after(
         revolution = period if period is not None and period <= _LONGEST_PERIOD else _USUAL_PERIOD
         duration = revolution * (1.0 if points is None else _turns(values[~is_stray], points[~is_stray]))
         note = f"times of points go from 0 to 1, so we take them for shares of a sweep of {duration:.3g} s"
-        return PointTimes(values.astype(np.float64) * duration, is_stray, note)
+        return PointTimes(np.where(is_stray, 0.0, values) * duration, is_stray, note)
     if values.dtype.kind == "f" and abs(centre) > 1 and half < _COARSE * np.spacing(abs(centre)):
         return PointTimes(
             None, nothing, f"times of points near {centre:.10g} are too coarse in {values.dtype}: ignored"
@@ -101,7 +102,7 @@ def seconds_after(
         if stamp_ns is not None:
             note = f"times of points have another clock than the sweeps ({lag:+.6g} s), so the first is at the stamp"
         lag = -float(seconds[~is_stray].min())
-    return PointTimes(seconds + lag, is_stray, note)
+    return PointTimes(np.where(is_stray, 0.0, seconds) + lag, is_stray, note)
 
 
 def _is_default(values: np.ndarray) -> np.ndarray:

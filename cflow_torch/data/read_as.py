@@ -12,12 +12,12 @@ from cflow_torch.data.finding import FOUND, RIGHT, Finding
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper, known_poses, points_surround_poses, poses_beyond
 from cflow_torch.data.log_motion import judge_log
 from cflow_torch.data.odometry import PosedLog
+from cflow_torch.diagnosis.conventions import LATEST, OF_POINTS, READINGS, REVERSED, TIMES_OF_POSES, WORLD
+from cflow_torch.diagnosis.readings import STEPS
 from cflow_torch.errors import CFlowError
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.transforms import rigid_transform, transform_points
 from cflow_torch.types import Sweep, as_numpy
-from cflow_torch.windows.conventions import LATEST, OF_POINTS, READINGS, REVERSED, TIMES_OF_POSES, WORLD
-from cflow_torch.windows.readings import STEPS
 
 _LEAST_HEIGHT = 0.5  # metres that nine tenths of the heights span, if they are heights
 READ_AS = ("auto", None, *READINGS)
@@ -30,7 +30,7 @@ def read_as(log: Log, reading: str | None | Sequence[str] = "auto") -> Log:
         log: any log.
         reading: None = as it is. "auto" = the same, unless the points are in the world's frame: then "world". Several
             are used one after the other. What else is allowed is a name in `READINGS` of
-            `cflow_torch.windows.conventions`, whose `cause` says what it means, such as "inverted" (poses are
+            `cflow_torch.diagnosis.conventions`, whose `cause` says what it means, such as "inverted" (poses are
             T_ego_world), "late" (the pose of sweep i is at sweep i + 1; those at an end are extrapolated), "camera"
             (axes of the poses), "feet" (unit of the poses) and "points_feet" (unit of the points). The poses stay under
             a reading of the points, so give ("points_camera", "camera") if both have a camera's axes.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import signal
 import time
 from collections import Counter
@@ -22,8 +23,9 @@ from cflow_torch.fleet.stop_signal import StopSignal
 from cflow_torch.fleet.work import open_quickly
 from cflow_torch.types import CFlowError
 
-_SHOWN_NOTES = 3  # how often a message is shown; the report names every log with this message
+_SHOWN = 3  # how often a message is shown during a run; the report names every log or frame with this message
 _SHOWN_FAILURES = 20  # that are listed at the end; the report has them all
+_NUMBER = re.compile(r"-?\d[\d.e+-]*")  # messages that differ by these only are alike
 
 
 def run_fleet(
@@ -92,9 +94,9 @@ def _follow(events: Iterator[Event], counters: Counters, num_parts: int) -> None
             counters.add(event)
             if counters.num_opened:
                 progress.total = round(counters.total * max(1, num_parts / counters.num_opened))
-            if isinstance(event, Failed):
+            if isinstance(event, Failed) and counters.times_failed(event.message) <= _SHOWN:
                 log_line(f"failed: {event.name}: {event.message}")
-            elif isinstance(event, Noted) and counters.times_noted(event.message) <= _SHOWN_NOTES:
+            elif isinstance(event, Noted) and counters.times_noted(event.message) <= _SHOWN:
                 log_line(f"warning: {event.name}: {event.message}")
             progress.update(counters.total - counters.num_waiting - progress.n)
         progress.total = progress.n
@@ -136,6 +138,7 @@ class Counters:
         self._unopened = Counter(source_name(part.source) for part in parts)
         self.waiting: Counter[str] = Counter()
         self._seconds: Counter[str] = Counter()  # by stage, of all workers together
+        self._causes: Counter[str] = Counter()  # of the failures
 
     @property
     def is_complete(self) -> bool:
@@ -144,6 +147,10 @@ class Counters:
     def times_noted(self, message: str) -> int:
         """Count how often a message was noted, for any log."""
         return sum(count for (_, text), count in self.notes.items() if text == message)
+
+    def times_failed(self, message: str) -> int:
+        """Count how often something failed with a message like this one."""
+        return self._causes[_cause(message)]
 
     def add(self, event: Event) -> None:
         if isinstance(event, Noted):
@@ -160,6 +167,7 @@ class Counters:
             self._seconds.update(event.seconds)
         else:
             self.failures.append((event.name, event.message))
+            self._causes[_cause(event.message)] += 1
             is_frame = self.waiting[event.name] > 0
             self.num_failed += is_frame
             (self.waiting if is_frame else self._unopened)[event.name] -= 1
@@ -225,11 +233,23 @@ def format_report(report: dict[str, Any]) -> str:
 
 
 def format_missing(report: dict[str, Any]) -> str:
-    """List what is missing, a line each; "" if nothing is."""
-    failures = [f"  {name}: {message}" for name, message in report["failures"]]
-    lines = [*dict.fromkeys(failures), *(f"  {name}: not done" for name in report["waiting"])]  # parts of a log repeat
+    """List what is missing, a line each, and failures of one cause together; "" if nothing is."""
+    alike: dict[str, dict[str, str]] = {}  # cause -> frame or log -> message; parts of a log repeat it
+    for name, message in report["failures"]:
+        alike.setdefault(_cause(message), {}).setdefault(name, message)
+    lines = []
+    for failures in alike.values():
+        (first, message), *others = failures.items()
+        more = f" (and {len(others)} more, to {others[-1][0]})" if others else ""
+        lines.append(f"  {first}{more}: {message}")
+    lines += [f"  {name}: not done" for name in report["waiting"]]
     if len(lines) > _SHOWN_FAILURES:
         lines[_SHOWN_FAILURES:] = [f"  and {len(lines) - _SHOWN_FAILURES} more, all of them in the report"]
     if report["frames"]["unopened_parts"]:
         lines.append(f"  {report['frames']['unopened_parts']} logs or parts of logs: not begun")
     return "\n".join(lines)
+
+
+def _cause(message: str) -> str:
+    """Return a message without its numbers."""
+    return _NUMBER.sub("#", message)

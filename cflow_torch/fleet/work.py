@@ -21,6 +21,7 @@ from cflow_torch.data.flow_file import POINTS, write_flow
 from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.data.log_check import find_problems
 from cflow_torch.data.paths import as_path, safe_name
+from cflow_torch.diagnosis.inspection import MotionWatch, inactive_problems, pair_problem
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.executors import describe_error
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part, frame_name
@@ -28,7 +29,6 @@ from cflow_torch.fleet.manifest import checked_manifest, claim_log, complete_fra
 from cflow_torch.fleet.progress import show_warnings_as_lines
 from cflow_torch.stages import stage_seconds
 from cflow_torch.types import CFlowError, FlowResult, Window
-from cflow_torch.windows.inspection import inactive_problems, pair_problem
 from cflow_torch.windows.memory import keep_freed_memory
 
 _AHEAD = 2  # batches that are read ahead, and that wait to be written
@@ -40,6 +40,7 @@ class _Frame:
 
     timestamp: int
     content: Window | FlowResult | Exception | None = None
+    window: Window | None = None  # of the result
     points: Any = None  # of sweep t, if they are written
     problem: str = ""  # of the pair
     seconds: dict[str, float] = field(default_factory=dict)
@@ -100,7 +101,7 @@ class Worker:
                     for text in find_problems(log):
                         yield Noted(log.log_id, text)
             claim = lru_cache(partial(claim_log, folder, manifest))  # once, before the first frame
-            for frame in self._pass(log, partial(self._write, folder, claim), todo):
+            for frame in self._pass(log, partial(self._write, folder, claim, MotionWatch()), todo):
                 name = frame_name(log, frame.timestamp)
                 left.discard(name)
                 if checks and frame.problem:
@@ -167,9 +168,10 @@ class Worker:
                 self._compute([frame])
             return frames
         seconds = {"compute": time.perf_counter() - start, **{f"compute/{name}": s for name, s in stages.items()}}
-        for frame, result, problem in zip(good, results, problems):
-            if POINTS in self._job.contents and isinstance(frame.content, Window):
-                frame.points = frame.content.pc0.points
+        for frame, given, result, problem in zip(good, sweeps, results, problems):
+            if POINTS in self._job.contents:
+                frame.points = given.pc0.points
+            frame.window = given
             frame.content = CFlowError(problem) if problem else result
             frame.seconds.update({name: value / len(good) for name, value in seconds.items()})
         return frames
@@ -181,9 +183,12 @@ class Worker:
         except RuntimeError as error:
             raise BrokenExecutor(f"{self._device} can no longer be used: {describe_error(error)}") from error
 
-    def _write(self, folder: Path, claim: Callable[[], None], frame: _Frame) -> _Frame:
+    def _write(self, folder: Path, claim: Callable[[], None], watch: MotionWatch, frame: _Frame) -> _Frame:
         if isinstance(frame.content, FlowResult):
             result, frame.content = frame.content, None
+            window, frame.window = frame.window, None
+            if window is not None and not frame.problem:
+                frame.problem = watch(window, result)
             file = frame_file(folder, frame.timestamp)
             with _stage(frame, "write"):
                 claim()

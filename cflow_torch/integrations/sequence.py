@@ -13,13 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from cflow_torch.config import Config
+from cflow_torch.diagnosis.inspection import Inspection
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.ground.segmentation import find_ground, has_ground
 from cflow_torch.tensors import read_positions
 from cflow_torch.types import Array, Sweep, Window
 from cflow_torch.windows.ego_motion import compensate
-from cflow_torch.windows.inspection import Inspection
 
 
 @dataclass(frozen=True)

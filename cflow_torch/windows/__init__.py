@@ -1,1 +1,1 @@
-"""Input: check the sweeps of windows, say how they may be read, bring them into the frame of t+1, collate batches."""
+"""Input: check the sweeps of windows, bring them into the frame of t+1, collate batches."""

@@ -216,6 +216,12 @@ def test_repeated_stamps_are_named(tmp_path) -> None:
             log = BagLog(same.close())
         assert [time - 40_000_000 for time in log.timestamps] == list(same.stamps)
         assert len({tuple(sweep.points[0]) for sweep in log}) == 8
+    coarse = Recorder(tmp_path / "coarse")  # half of the clouds have the stamp of the one before
+    coarse.mount()
+    coarse.drive()
+    coarse.clouds(stamp=lambda stamp: coarse.stamps[coarse.stamps.index(stamp) // 4 * 4])
+    with pytest.warns(CFlowWarning, match="8 clouds have 2 different time stamps, so we use their times of arrival"):
+        assert len(BagLog(coarse.close())) == 8
     loop = Recorder(tmp_path / "loop")
     loop.mount()
     loop.drive()

@@ -66,7 +66,17 @@ def packed() -> bytes:
     return table.tobytes()
 
 
-@pytest.mark.parametrize("content", [packed(), street(4).tobytes()[:-4], b"a text " * 9000])
+def test_records_of_several_types_are_read_by_their_first_three_numbers(tmp_path) -> None:
+    (tmp_path / "a.bin").write_bytes(packed())
+    assert find_bin_layout(packed()) == BinLayout(3, "<f4", 6)
+    assert np.array_equal(read_cloud(tmp_path / "a.bin"), street(3))
+    assert BinLayout(3, "<f4", 6).fits(packed()) and not BinLayout(3, "<f4", 6).fits(street(4).tobytes()[: 18 * 1600])
+    (tmp_path / "b.bin").write_bytes(packed()[18:])
+    with pytest.warns(CFlowWarning, match="3 float32 and 6 other bytes per point"):
+        assert len(ArraysLog(tmp_path).sweep(1).points) == 2399
+
+
+@pytest.mark.parametrize("content", [packed()[:-3], street(4).tobytes()[:-4], street(4).T.tobytes(), b"a text " * 9000])
 def test_other_files_are_refused_and_the_setting_is_named(tmp_path, content: bytes) -> None:
     (tmp_path / "a.bin").write_bytes(content)
     with pytest.raises(CFlowError, match=r"a\.bin.*bin_columns"):
@@ -78,7 +88,8 @@ def test_a_folder_has_one_layout_which_is_said(tmp_path, recwarn: Any) -> None:
         (tmp_path / str(columns)).mkdir()
         for k in range(2):
             (tmp_path / str(columns) / f"{k}.bin").write_bytes(street(columns)[k:].tobytes())
-    assert len(ArraysLog(tmp_path / "4").sweep(1).points) == 2399 and not recwarn.list
+    assert len(ArraysLog(tmp_path / "4").sweep(1).points) == 2399
+    assert not [each for each in recwarn.list if issubclass(each.category, CFlowWarning)]
     with pytest.warns(CFlowWarning, match="log 5: its .bin files look like 5 float32 per point"):
         log = ArraysLog(tmp_path / "5")
     assert np.array_equal(log.sweep(1).points, street(5)[1:, :3]) and log.notes

@@ -19,13 +19,13 @@ from cflow_torch.data.arrays.poses_text import write_kitti_poses, write_times
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.deskewing import DeskewedLog
 from cflow_torch.data.log import FlowLabels, Log, LogWrapper
+from cflow_torch.diagnosis.stillness import Structure, static_rows, thinned_rows
 from cflow_torch.simulator.drive import Drive
 from cflow_torch.simulator.profiles import PROFILES
 from cflow_torch.simulator.street import build_street
 from cflow_torch.transforms import poses_at
 from cflow_torch.types import CFlowError, CFlowWarning, Sweep
 from cflow_torch.windows.deskewing import scan_fractions
-from cflow_torch.windows.stillness import Structure, static_rows, thinned_rows
 
 LIDAR = PROFILES["demo"].units[0]
 

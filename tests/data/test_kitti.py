@@ -193,6 +193,41 @@ def test_a_sweep_of_a_raw_drive_without_measurement_is_left_out(tmp_path: Path) 
     assert log.timestamps == whole.timestamps[::2] and np.allclose(log.poses, whole.poses[::2]) and log.gaps == {0}
 
 
+def test_a_raw_drive_with_an_empty_measurement_or_without_the_folder_data_is_read(tmp_path: Path) -> None:
+    folder = write_raw(tmp_path / "day" / "drive")
+    whole = KITTILog(folder)
+    (folder / "oxts" / "data" / "0000000001.txt").write_text("")  # of a download that was cut off
+    with pytest.warns(CFlowWarning, match="1 of 3 sweeps have no pose"):
+        assert np.allclose(KITTILog(folder).poses, whole.poses[::2])
+    (folder / "oxts" / "data" / "0000000001.txt").write_text(oxts(1))
+    for file in (folder / "velodyne_points" / "data").iterdir():
+        file.rename(folder / "velodyne_points" / file.name)
+    (folder / "velodyne_points" / "data").rmdir()
+    assert recognise(tmp_path) == "kitti"
+    (drive,) = find_kitti_drives(tmp_path)
+    assert drive.name == "drive" and np.allclose(KITTILog(drive).poses, whole.poses)
+
+
+def test_a_drive_that_is_not_synchronised_takes_poses_by_their_times(tmp_path: Path) -> None:
+    """Drives called _extract have clouds as texts, and ten measurements a sweep."""
+    folder = write_raw(tmp_path / "day" / "drive_extract")
+    whole = KITTILog(folder)
+    clouds, measured = folder / "velodyne_points" / "data", folder / "oxts" / "data"
+    for index in range(3):
+        (clouds / f"{index:010d}.bin").unlink()
+        np.savetxt(clouds / f"{index:010d}.txt", np.tile(cloud(index), (4, 1)), "%.3f")
+        (measured / f"{index:010d}.txt").unlink()
+    times = [0.594360375 + 0.0103 * index for index in range(21)]
+    for index in range(21):
+        (measured / f"{index:010d}.txt").write_text(oxts(index / 10))  # type: ignore[arg-type]
+    stamps = "".join(f"2011-09-26 13:02:{25 + time:.9f}\n" for time in times)
+    (folder / "oxts" / "timestamps.txt").write_text(stamps)
+    log = KITTILog(folder)
+    assert log.timestamps == whole.timestamps and np.allclose(log.poses, whole.poses, atol=1e-6)
+    assert log.trajectory is not None and len(log.trajectory[0]) == 21
+    assert np.allclose(log.sweep(1).points[:7], cloud(1)[:, :3], atol=1e-3)
+
+
 @pytest.mark.parametrize("first", [0, 5])
 def test_a_part_of_a_sequence_takes_its_rows_of_poses_and_times(first: int, tmp_path: Path) -> None:
     """The clouds of a few sweeps with the tables of all."""

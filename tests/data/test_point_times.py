@@ -68,6 +68,7 @@ def test_stray_values_are_found_and_change_no_other_time(stray: int) -> None:
     times = seconds_after(values, STAMP, 0.1)
     assert np.array_equal(times.is_stray, is_wrong)
     assert np.allclose(times.seconds[~is_wrong], SHARES[~is_wrong] * 0.1, atol=1e-6)
+    assert np.abs(times.seconds).max() < 0.2, "the model refuses sweeps with other times"
 
 
 def test_points_of_lost_packets_at_time_zero_are_stray_within_the_sweep() -> None:

@@ -16,6 +16,7 @@ from cflow_torch.data.arrays.cloud_file import write_cloud
 from cflow_torch.data.arrays.folder import find_array_logs
 from cflow_torch.data.arrays.reader import ArraysLog
 from cflow_torch.data.arrays.stamps import times_of_names
+from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.log import Log, window
 from cflow_torch.data.trajectory import Trajectory, fit_to_sweeps
 from cflow_torch.simulator import make_drive
@@ -523,6 +524,24 @@ def test_a_folder_with_a_file_per_pose_and_a_file_of_times(tmp_path) -> None:
     log = ArraysLog(tmp_path)
     assert np.allclose(log.poses, POSES) and log.timestamps[1] == 1_700_000_001_500_000_000
     assert log.notes == ["its poses are those of ego_pose", "the times of its sweeps are those of timestamps.txt"]
+
+
+def test_an_array_of_poses_is_found_by_its_contents(tmp_path) -> None:
+    clouds(tmp_path / "points", range(12))
+    np.save(tmp_path / "ego2global.npy", np.random.default_rng(0).normal(size=(500, 6)))  # of another length
+    assert ArraysLog(tmp_path).poses is None
+    np.save(tmp_path / "ego2global.npy", POSES)
+    with pytest.warns(CFlowWarning, match="its poses are those of ego2global.npy"):
+        assert np.allclose(ArraysLog(tmp_path).poses, POSES)
+
+
+def test_columns_may_be_called_theta_or_by_the_order_of_a_quaternion(tmp_path) -> None:
+    assert [role_of_name(name) for name in ("theta", "quaternion_xyzw.x", "orientation_wxyz.0")] == ["yaw", "qx", "q0"]
+    clouds(tmp_path / "points", range(12))
+    lines = [f"{0.4 * k};{0.0};{0.01 * k}" for k in range(12)]
+    (tmp_path / "pose2d.csv").write_text("\n".join(["x;y;theta", *lines]))
+    poses = ArraysLog(tmp_path).poses
+    assert np.allclose(poses[:, 0, 3], 0.4 * np.arange(12)) and np.allclose(poses[5, 1, 0], np.sin(0.05))
 
 
 def test_poses_of_missing_sweeps_are_skipped_by_number(tmp_path) -> None:

@@ -22,13 +22,13 @@ from small_logs import make_small_drive
 from cflow_torch import CFlowError, FlowResult, Window, make_config, make_model
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.log import LogWrapper
+from cflow_torch.diagnosis.inspection import REPEATED
 from cflow_torch.fleet import executors, parallel, work
 from cflow_torch.fleet.executors import Executor, InlineExecutor, ProcessExecutor
 from cflow_torch.fleet.job import Done, Event, Failed, Job, Noted, Opened, Part
 from cflow_torch.fleet.parallel import run_parallel
-from cflow_torch.fleet.run import Counters, format_missing, format_report
+from cflow_torch.fleet.run import Counters, _follow, format_missing, format_report
 from cflow_torch.fleet.work import Worker
-from cflow_torch.windows.inspection import REPEATED
 
 
 @pytest.fixture
@@ -415,6 +415,19 @@ def test_the_report_lists_what_is_missing():
     assert missing[:3] == ["  a/11: odd", "  b: no log", "  a/12: not done"]
     assert missing[-2:] == ["  and 10 more, all of them in the report", "  1 logs or parts of logs: not begun"]
     assert "interrupted by SIGTERM" in format_report(report)
+
+
+def test_failures_of_one_cause_are_shown_three_times_and_listed_once(capsys):
+    parts = parts_of(["a"])
+    counters = Counters(parts)
+    names = tuple(f"a/{stamp}" for stamp in range(9))
+    failures = [Failed(name, f"none of the {500 + k} points is active, x -1.5e-{k} m") for k, name in enumerate(names)]
+    _follow(iter([Opened("a", 9, names), Failed("a", "no log"), *failures]), counters, 1)
+    shown = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[1] for line in shown] == [" a", " a/0", " a/1", " a/2"]
+    report = counters.report(1.0, "")
+    assert len(report["failures"]) == 10
+    assert format_missing(report).splitlines()[1] == f"  a/0 (and 8 more, to a/8): {failures[0].message}"
 
 
 def test_a_stop_lets_started_frames_finish(fleet, tmp_path):

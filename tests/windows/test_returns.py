@@ -10,9 +10,9 @@ import torch
 
 from cflow_torch import FlowStream, Sweep, Window, estimate_flow
 from cflow_torch.data.arrays import ArraysLog
+from cflow_torch.diagnosis.inspection import Inspection
 from cflow_torch.simulator import make_drive
 from cflow_torch.types import CFlowWarning
-from cflow_torch.windows.inspection import Inspection
 from cflow_torch.windows.returns import missing_returns
 
 

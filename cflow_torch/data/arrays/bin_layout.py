@@ -13,6 +13,7 @@ _COLUMNS = (4, 3, 5, 6, 7, 8)
 _SMALLEST, _LARGEST = 1e-6, 1e7  # sizes that coordinates, intensities, rings and times have, besides 0
 _SHARE = 0.95  # of the numbers have such a size; of numbers read in a wrong type, less than 0.8
 _EXPLAINED, _AS_GOOD = 0.05, 0.9  # least share of the variance, and the share of the best that a smaller number needs
+_FARTHEST, _LONGEST_RECORD = 1e4, 64  # size of coordinates, and bytes of a record
 _FEWEST = 1000  # points of a file that tell its layout
 _MOST, _BLOCK = 1 << 17, 840  # numbers that we test; a multiple of all numbers of columns
 
@@ -22,22 +23,31 @@ class BinLayout(NamedTuple):
 
     columns: int = KITTI_COLUMNS
     kind: str = "<f4"
+    rest: int = 0  # bytes of numbers of other types after them
 
     @property
     def step(self) -> int:
         """Bytes per point."""
-        return self.columns * np.dtype(self.kind).itemsize
+        return self.columns * np.dtype(self.kind).itemsize + self.rest
+
+    def table(self, content: bytes) -> np.ndarray:
+        """Return the numbers in a file of whole points, (N, columns)."""
+        octets = np.frombuffer(content, np.uint8).reshape(-1, self.step)
+        return np.ascontiguousarray(octets[:, : self.step - self.rest]).view(self.kind)
 
     def fits(self, content: bytes) -> bool:
         """Test whether a file has this layout, by its first points. Files that are too short to tell have it."""
         if len(content) % self.step:
             return False
+        if self.rest:
+            return _are_records(content, self)
         start = content[: _BLOCK * 10 * np.dtype(self.kind).itemsize]
         return len(content) < _FEWEST * self.step or _explained(_numbers(start, self.kind), self.columns) >= _EXPLAINED
 
     def __str__(self) -> str:
         order = "big-endian " if self.kind[0] == ">" else ""
-        return f"{self.columns} {order}float{8 * np.dtype(self.kind).itemsize} per point"
+        rest = f" and {self.rest} other bytes" if self.rest else ""
+        return f"{self.columns} {order}float{8 * np.dtype(self.kind).itemsize}{rest} per point"
 
 
 def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
@@ -50,7 +60,8 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
     Convention: the type is the one, float32 or float64, little- or big-endian, in which numbers have sizes of
         coordinates. Columns differ in size (z is smaller than x and y, intensities are larger). We choose the number of
         columns, 3 to 8, that explains most of the variance of log sizes. Ties: the smallest. A file that is empty or
-        too short to tell is KITTI's.
+        too short to tell is KITTI's. If no type fits, points may be records of several types that begin with x, y, z
+        in float32 (ring and time after them are integers or float64): the fewest bytes in which they do.
 
     Raises:
         CFlowError: no layout fits. The message names `bin_columns`.
@@ -68,12 +79,28 @@ def find_bin_layout(content: bytes, columns: int | None = None) -> BinLayout:
         return min(good, key=lambda layout: layout.columns)
     if fitting and len(content) < _FEWEST * BinLayout().step and fitting[0] == BinLayout():
         return BinLayout()
+    records = (BinLayout(3, "<f4", rest) for rest in range(1, _LONGEST_RECORD - 11) if not kind)
+    record = next((layout for layout in records if _are_records(content, layout)), None)
+    if record is not None:
+        return record
     counts = ", ".join(map(str, sorted(_COLUMNS)))
     raise CFlowError(
         f"it has {len(content)} bytes, and does not look like points of {counts} float32 or float64 numbers, x, y, z "
-        "first. If it is complete, pass bin_columns, the numbers per point: 4 in KITTI, 5 in nuScenes. Convert packed "
-        "records of several types to .npy"
+        "first, or records that begin with these. If it is complete, pass bin_columns, the numbers per point: 4 in "
+        "KITTI, 5 in nuScenes"
     )
+
+
+def _are_records(content: bytes, layout: BinLayout) -> bool:
+    """Test whether points begin with x, y, z: as numbers of another place in a record, they would be of any size."""
+    if len(content) % layout.step or len(content) < _FEWEST * layout.step:
+        return False
+    with np.errstate(invalid="ignore"):  # numbers of another type may be signalling NaN
+        points = layout.table(content[: _FEWEST * layout.step]).astype(np.float64)
+    size = np.abs(points)
+    is_usual = ((size > _SMALLEST) & (size < _FARTHEST)) | (size == 0) | np.isnan(size)
+    # Columns of one number are padding or counters, read as floats.
+    return bool(is_usual.mean() >= _SHARE) and all(len(np.unique(column)) > _FEWEST // 4 for column in points.T)
 
 
 def _type_of(content: bytes) -> str:

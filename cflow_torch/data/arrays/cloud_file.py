@@ -280,7 +280,7 @@ def _read(path: Path, bin_columns: int | BinLayout | None) -> Mapping[str, np.nd
             f"it has {len(content)} bytes, not a multiple of {layout.step} ({layout}): it is truncated, or has another "
             "number of columns (bin_columns: 4 in KITTI, 5 in nuScenes)"
         )
-    return _array_columns(np.frombuffer(content, layout.kind).reshape(-1, layout.columns))
+    return _array_columns(layout.table(content))
 
 
 def _layout_of(content: bytes, expected: int | BinLayout | None) -> BinLayout:

@@ -21,7 +21,7 @@ from cflow_torch.data.arrays.tables import (
 from cflow_torch.data.column_names import role_of_name
 from cflow_torch.data.file_errors import file_errors
 from cflow_torch.data.folders import natural_key
-from cflow_torch.data.npy_file import read_npy
+from cflow_torch.data.npy_file import parse_npy
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.data.trajectory import Trajectory, checked_poses, positions_of_degrees
 from cflow_torch.transforms import as_matrix, poses_from_quaternions, rotations_of
@@ -35,8 +35,8 @@ _TUM = ("time", *_POSITION, "qx", "qy", "qz", "qw")
 # What columns without names hold, by their number; the last row of a matrix is ignored.
 _UNNAMED = {7: _TUM[1:], 8: _TUM, 12: MATRIX, 13: ("time", *MATRIX), 16: MATRIX, 17: ("time", *MATRIX)}
 _UNNAMED_ANGLES = ("time", *_POSITION, *_ANGLES)  # 7 numbers whose last four are not a quaternion; 6 have no time
-STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz")
-"""Suffixes of files whose values have names or nest, see `tables_of_values`."""
+STRUCTURED = (".json", ".jsonl", ".yaml", ".yml", ".npz", ".npy")
+"""Suffixes of files that must be whole to be read, see `tables_of_values`."""
 _NAMES = "write all digits, and name the sweeps in the order of their times"
 _LEAST_STEP = 0.1  # metres; shorter steps do not tell where the vehicle heads
 _INVERSE = ("extrinsic", "world2", "world_to", "w2c")  # in names of matrices that map the world to the sensor
@@ -67,13 +67,6 @@ def read_poses(path: PathLike) -> Trajectory:
         if not files or any(len(each) != 1 for each in poses):
             raise CFlowError(f"{path} is a folder: its files must have one pose each")
         return Trajectory(np.concatenate(poses), None, False, str(path), [file.stem for file in files])
-    if path.suffix == ".npy":
-        numbers = read_npy(path, "pass a .npy file of (K, 4, 4) numbers")
-        if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
-            numbers = numbers[None]
-        if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
-            return _poses_of_table(Table([], numbers.astype(str), []), path)
-        return Trajectory(checked_poses(numbers, str(path)), None, False, str(path))
     with file_errors(path):
         content = read_bytes(path)
     return parse_poses(content, path)
@@ -87,6 +80,13 @@ def files_of_poses(folder: Path) -> list[Path]:
 
 def parse_poses(content: bytes, path: Path) -> Trajectory:
     """Return the poses in the content of a file of text or `STRUCTURED`."""
+    if path.suffix == ".npy":
+        numbers = parse_npy(content, path, "pass a .npy file of (K, 4, 4) numbers")
+        if numbers.shape in ((3, 4), (4, 4)):  # of a folder with a file per pose
+            numbers = numbers[None]
+        if numbers.ndim == 2 and numbers.shape[1] in _UNNAMED and numbers.dtype.kind in "fiu":
+            return _poses_of_table(Table([], numbers.astype(str), []), path)
+        return Trajectory(checked_poses(numbers, str(path)), None, False, str(path))
     if path.suffix.lower() not in STRUCTURED:
         return _poses_of_table(parse_table(content, path), path)
     error = CFlowError(f"{path} has no list of poses: matrices of 16 or 12 numbers, or positions and rotations")

@@ -332,7 +332,9 @@ class BagLog(Log):
     def _arrivals(self, stamps: list[tuple[int, int]]) -> dict[int, int]:
         """Return the time of each cloud and its arrival, from header stamps and arrivals. We say if stamps repeat."""
         count = len({stamp for stamp, _ in stamps})
-        self._use_arrival = len(stamps) > 1 and count <= max(1, len(stamps) // 10)
+        # Of neighbours that arrive one after the other; clouds that are played twice have other neighbours.
+        num_equal = sum(a[0] == b[0] and a[1] < b[1] for a, b in zip(stamps, stamps[1:]))
+        self._use_arrival = num_equal > max(len(stamps) // 2 - 1, 0)
         if self._use_arrival:
             stamps = [(arrived, arrived) for _, arrived in stamps]
             self._note(f"its {len(stamps)} clouds have {count} different time stamps, so we use their times of arrival")

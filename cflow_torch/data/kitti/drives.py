@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Sequence
 
 from cflow_torch.data.folders import distinct_names, search
 from cflow_torch.data.paths import PathLike, as_path
@@ -17,7 +17,7 @@ class KITTIDrive(NamedTuple):
     """One drive: a source for `KITTILog`."""
 
     root: Path  # raw: folder of the drive; sequence: its folder; tracking: the folder of velodyne, calib and label_02
-    clouds: Path  # folder of the .bin files
+    clouds: Path  # folder of the clouds
     layout: str  # "raw", "sequence" or "tracking"
     name: str  # log_id
 
@@ -29,7 +29,8 @@ def find_kitti_drives(root: PathLike) -> list[KITTIDrive]:
     """Find all drives at most six levels below a folder, sorted by path.
 
     Convention:
-        - raw: `<drive>/velodyne_points/data/0000000000.bin`, named after the folder of the drive.
+        - raw: `<drive>/velodyne_points/data/0000000000.bin`, also without the folder `data`, or with texts (drives that
+          are called `_extract`). It is named after the folder of the drive.
         - sequence (odometry, SemanticKITTI): `<NN>/velodyne/000000.bin`, if the folder has calib.txt or labels, or lies
           in a folder `sequences`. It is named NN.
         - tracking: `velodyne/<NNNN>/000000.bin`, named NNNN.
@@ -47,9 +48,9 @@ def find_kitti_drives(root: PathLike) -> list[KITTIDrive]:
 
 def _drives_of(folder: Path) -> list[KITTIDrive]:
     """Return the drive whose folder this is, or the drives of a tracking set."""
-    raw = folder / "velodyne_points" / "data"
-    if _has_clouds(raw):
-        return [KITTIDrive(folder, raw, "raw", folder.resolve().name)]
+    for raw in (folder / "velodyne_points" / "data", folder / "velodyne_points"):
+        if _has_clouds(raw, (".bin", ".txt")):
+            return [KITTIDrive(folder, raw, "raw", folder.resolve().name)]
     clouds = folder / "velodyne"
     if not clouds.is_dir():
         return []
@@ -61,10 +62,10 @@ def _drives_of(folder: Path) -> list[KITTIDrive]:
     return [KITTIDrive(folder, drive, "tracking", drive.name) for drive in drives]
 
 
-def _has_clouds(folder: Path) -> bool:
+def _has_clouds(folder: Path, suffixes: Sequence[str] = (".bin",)) -> bool:
     if not folder.is_dir():
         return False
-    return any(path.suffix == ".bin" and _FRAME.fullmatch(path.stem) for path in folder.iterdir())
+    return any(path.suffix in suffixes and _FRAME.fullmatch(path.stem) for path in folder.iterdir())
 
 
 def _with_distinct_names(drives: list[KITTIDrive]) -> list[KITTIDrive]:

@@ -47,7 +47,8 @@ class KITTILog(ArraysLog):
     Convention:
         - Points are in the frame of the LiDAR: x ahead, y left, z up, 1.73 m above the road. There are no other frames.
         - Raw drives and the tracking set have poses from OXTS (GPS and IMU), moved to the LiDAR by the calibration
-          (calib_imu_to_velo.txt in the folder of the drive or of its day; calib/NNNN.txt). Without calibration or with
+          (calib_imu_to_velo.txt in the folder of the drive or of its day; calib/NNNN.txt). Drives that are not
+          synchronised (`_extract`) take them by the times in oxts/timestamps.txt. Without calibration or with
           measurements for less than half of the sweeps, we warn, and there are no poses. Other sweeps without one are
           left out, and we say so.
         - KITTI-360 has raw drives in `data_3d_raw`, and poses of the IMU in `data_poses/<drive>/poses.txt` (or of the
@@ -80,7 +81,7 @@ class KITTILog(ArraysLog):
                 calibration = "auto" if is_auto else None
                 super().__init__(root, poses, calibration=calibration, suffix=".bin")
             else:
-                super().__init__(source.clouds, None if is_auto else poses, times=None, ground=None, suffix=".bin")
+                super().__init__(source.clouds, None if is_auto else poses, times=None, ground=None)
         self.log_id = source.name
         self._frames = [int(file.stem) for file in self.files]
         if source.layout == "raw":
@@ -164,7 +165,10 @@ class KITTILog(ArraysLog):
         folder = root / "oxts" / "data" if is_raw else root / "oxts"
         wanted = [f"{file.stem}.txt" for file in self.files] if is_raw else [f"{name}.txt"]
         with remote_errors(root):
-            known = {file.name for file in folder.glob("*.txt")}
+            known = {file.name for file in folder.glob("*.txt") if file.stat().st_size > 0}
+        times = self._times_of_oxts() if is_raw else None
+        if times is not None:
+            wanted = [name for name in sorted(known) if int(Path(name).stem) < len(times)]
         found = [each for each in wanted if each in known]
         calibration = self._calibration("imu_to_velo")
         if 2 * len(found) <= len(wanted) or calibration is None:
@@ -180,8 +184,22 @@ class KITTILog(ArraysLog):
         poses = poses_from_oxts(table, folder / found[0])
         names = ("imu_to_velo.R imu_to_velo.T", "Tr_imu_velo", "Tr_imu_to_velo")
         T_world_lidar = poses @ np.linalg.inv(transform(calibration, root, *names))
+        poses = np.linalg.inv(T_world_lidar[0]) @ T_world_lidar
+        if times is not None:
+            return Trajectory(poses, times[[int(Path(name).stem) for name in found]], False, str(folder))
         labels = found if is_raw else [f"{frame:06d}" for frame in range(len(table))]
-        return Trajectory(np.linalg.inv(T_world_lidar[0]) @ T_world_lidar, None, False, str(folder), labels)
+        return Trajectory(poses, None, False, str(folder), labels)
+
+    def _times_of_oxts(self) -> np.ndarray | None:
+        """Return the nanoseconds of the measurements of a drive that is not synchronised; None = it is.
+
+        Then each measurement has the number of a sweep, and there are as many of both.
+        """
+        of_sweeps, of_oxts = (self.drive.root / name / "timestamps.txt" for name in ("velodyne_points", "oxts"))
+        if not self._has_times or not exist(of_oxts):
+            return None
+        times = read_times(of_oxts)
+        return None if len(times) == len(read_times(of_sweeps)) else times
 
     def _poses_of_kitti360(self) -> Trajectory | None:
         """Return the poses of the LiDAR, by number of the sweep; None, with a warning, if a file is missing."""

@@ -14,12 +14,12 @@ from torch import Tensor, nn
 from cflow_torch.config import WINDOW, Config, make_config
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.hdf5.frames import harness_pose_flow, residual_for_harness
+from cflow_torch.diagnosis.inspection import Inspection
 from cflow_torch.errors import warn
 from cflow_torch.estimate import make_model
 from cflow_torch.integrations.opensceneflow.batch import BatchSample, read_batch
 from cflow_torch.transforms import rigid_transform
 from cflow_torch.types import CFlowError, FlowResult
-from cflow_torch.windows.inspection import Inspection
 
 
 class CFlow(nn.Module):

@@ -15,9 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
-from cflow_torch.types import Array, Sweep, as_numpy
-from cflow_torch.windows.conventions import (
+from cflow_torch.diagnosis.conventions import (
     MIRRORED,
     MOUNT,
     MOUNTS,
@@ -33,8 +31,10 @@ from cflow_torch.windows.conventions import (
     Reading,
     scaled,
 )
+from cflow_torch.diagnosis.stillness import FEWEST_POINTS, LEAST_SHARE, Structure, cell_keys, structure_rows
+from cflow_torch.transforms import as_matrix, rigid_transform, rotations_about, transform_points
+from cflow_torch.types import Array, Sweep, as_numpy
 from cflow_torch.windows.deskewing import DIRECTIONS, INSTANTS, SCANS
-from cflow_torch.windows.stillness import Structure, cell_keys, structure_rows
 
 GIVEN = "as given"
 STEPS = ("steps", "steps_back")
@@ -47,12 +47,10 @@ _FEW_POINTS, _MOST_POINTS = 300, 1500  # of the source; readings not much worse 
 _MOST_AROUND = 5000  # points that tell what they lie around
 _TIMED_POINTS = 6000  # to compare points with times, moved and as they are: the better of both is used
 _NEAR_GIVEN = 0.7  # share of a reading over that as given
-FEWEST_POINTS = 150  # of source and target; fewer do not show anything
 _BLOCK, _FEWEST_BLOCKS = 5.0, 12  # metres; structure in fewer blocks may be a few moving objects
 _LEAST_MOTION, _ARM = 0.2, 20.0  # metres; poses that move points 20 m away by less do not show anything
 LEAST_DISTANCE = 3.0  # metres between pose and origin, to tell whose surroundings points are
 _LEAST_DIFFERENCE = 0.05  # metres; a pair shows only the readings that move these points otherwise by this
-LEAST_SHARE = 0.1  # of a reading that is better than as given
 _OPPOSITE = 0.97  # of the share as given: what the opposite of a near reading has at most, or half of what this has
 # After a shift along the path (metres), the share must be smaller by this factor: along smooth walls it is not.
 _SHIFT, _PEAK = 0.15, 1.2

@@ -40,7 +40,8 @@ AXES = {  # ego_T_stored of frames with other axes: x, y and z of the stored fra
     "z_first": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], float),  # z, x, y
 }
 MIRRORED = ("mirrored", "mirrored_back", "swapped", "swapped_back")  # left-handed
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048, "kilometres": 1e3}
+_DECIMAL = {"millimetres": 1e-3, "centimetres": 1e-2, "decimetres": 0.1, "kilometres": 1e3}
+UNITS = {**_DECIMAL, "inches": 0.0254, "feet": 0.3048}
 
 _Convert = Callable[[np.ndarray], np.ndarray]
 

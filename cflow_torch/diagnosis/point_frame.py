@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from cflow_torch.diagnosis.conventions import READINGS, UNITS
 from cflow_torch.ground.segmentation import find_ground, ground_side, has_ground
 from cflow_torch.transforms import rotations_about
 from cflow_torch.types import Array, as_numpy
-from cflow_torch.windows.conventions import READINGS, UNITS
 
 _FEWEST = 100  # points
 # Extent of the middle nine tenths of the points, in the units of the points. Clouds in metres have 5 to 200.
-_SMALLEST, _LARGEST, _MILLIMETRES = 2.0, 1000.0, 10_000.0
-_FAR = 50.0  # metres; a LiDAR has more than a twentieth of its points nearer than this
+_SMALLEST, _WIDE, _LARGEST, _MILLIMETRES = 2.0, 200.0, 1000.0, 10_000.0
+# Metres; a LiDAR has more than a twentieth of its points nearer than this. On the drives that we have, up to 9 m.
+_FAR, _NOT_NEAR = 50.0, 20.0
 _MOST_POINTS = 20_000
 _NEAR = 30.0  # metres
 # Metres of a sensor above the ground: cars have 1.5 to 2, trucks up to 4. In feet, cars have 4.5 to 8.
@@ -47,6 +48,8 @@ def frame_problem(points: Array) -> tuple[str, str]:
     if widest >= _LARGEST:
         unit, why = ("millimetres", "") if widest >= _MILLIMETRES else _small_unit(positions)
         return f"points_{unit}", f"{spans}: they seem to be in {unit}{why}, give points in metres"
+    if widest >= _WIDE and _NOT_NEAR <= nearest < widest / 2:
+        return "points_decimetres", f"{spans}, few less than {nearest:.0f} m away: they seem to be in decimetres"
     if max(widest, farthest) < _SMALLEST:
         if _SMALLEST <= widest * UNITS["kilometres"] < _LARGEST:
             return "points_kilometres", f"{spans}: they seem to be in kilometres, give points in metres"

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 
 from cflow_torch.config import Config
+from cflow_torch.diagnosis.conventions import INVERTED, STILL, WORLD
+from cflow_torch.diagnosis.point_frame import frame_problem
+from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judge, make_pair
+from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, share_in_place, structure_of
 from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import has_ground
 from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
-from cflow_torch.windows.conventions import INVERTED, STILL, WORLD
-from cflow_torch.windows.point_frame import frame_problem
-from cflow_torch.windows.readings import INACCURATE, NO_READING, UNKNOWN, judge, make_pair
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import have_same_points
 
@@ -34,6 +35,13 @@ _ADVICE = {
     NO_READING: "check frame, units and times of the poses (T_ego1_ego0)",
 }
 _ADVICE_ELSE = "convert the poses (T_ego1_ego0) to the frame of the points, in metres"
+_OTHER_TIME = (
+    "the second sweep does not fit the first one, which fits those before, so it has points or a pose of another time, "
+    "or sweeps are interchanged"
+)
+_MOVING = 0.05  # metres a sweep
+# A share of moving points is suspicious if it is this many times larger than the usual one and a slack.
+_SUSPICIOUS, _SLACK, _FEWEST_WATCHED = 1.5, 0.05, 500
 _FEWEST_REPEATED = 100  # this many equal points are no coincidence
 
 
@@ -71,6 +79,40 @@ class Inspection:
             self._has_seen_structure = bool(judgement.shares)
             if judgement.best:
                 warn(f"{judgement}: {_ADVICE.get(judgement.best[0], _ADVICE_ELSE)}")
+
+
+class MotionWatch:
+    """Finds the pairs of a log in which far more points move than in the pair before: sweeps or poses of another time.
+
+    The flow gives the suspicion, and the static structure must confirm it: it is in place in pc0, but not in pc1. Cost:
+    0.1 ms a pair, and 60 ms for a suspicious one.
+    """
+
+    def __init__(self) -> None:
+        self._usual: float | None = None  # share of the points that moved in the pair before
+
+    def __call__(self, window: Window, result: FlowResult) -> str:
+        """Return what is wrong with the next pair of the log; "" = nothing."""
+        count = int(result.is_valid.sum())
+        if count < _FEWEST_WATCHED:
+            return ""
+        moves = torch.linalg.vector_norm(result.residual_flow, dim=1) >= _MOVING
+        share = int((moves & result.is_valid).sum()) / count
+        if self._usual is not None and share > _SUSPICIOUS * (self._usual + _SLACK) and _misses_next(window):
+            return f"{share:.0%} of the points move, {self._usual:.0%} in the pair before: {_OTHER_TIME}"
+        self._usual = share
+        return ""
+
+
+def _misses_next(window: Window) -> bool:
+    """Test whether pc0 fits the sweep before it, but not pc1."""
+    before = window.pch[0] if window.pch else None
+    points0 = structure_of(window.pc0)
+    shares = [
+        share_in_place(window.pc0, points0, other, structure_of(other)) if other is not None else float("nan")
+        for other in (before, window.pc1)
+    ]
+    return shares[0] >= LEAST_SHARE and shares[1] < MISPLACED * shares[0]
 
 
 def pair_problem(pc0: Sweep, pc1: Sweep) -> str:

@@ -7,11 +7,16 @@ from typing import Any
 import numpy as np
 
 from cflow_torch.ground.segmentation import find_ground
+from cflow_torch.transforms import relative_transform
 from cflow_torch.types import Sweep, as_numpy
 
 NEAREST, FARTHEST = 3.0, 40.0  # metres from the origin in the plane: beyond the vehicle itself, and dense enough
 VOXEL = 0.3  # metres; one point per voxel, so that near surfaces do not outvote the rest
 IN_PLACE = 0.1  # metres; a point is in place if another is this near
+FEWEST_POINTS = 150  # of the structure of two sweeps; fewer do not show anything
+LEAST_SHARE = 0.1  # in place, of sweeps that fit
+MISPLACED = 0.5  # part of the usual share, below which sweeps do not fit
+_COMPARED = 300  # points of a sweep that tell whether it fits another one
 _KEY = np.array((1 << 42, 1 << 21, 1))  # of a cell: 21 bits for each of x, y and z, which varies fastest
 _OFFSETS = [int(_KEY @ (x, y, 0)) for x in (-1, 0, 1) for y in (-1, 0, 1)]  # keys of cells next to one another
 _MOST = 1e5  # metres; coordinates are clamped to it, so that absurd poses do not overflow
@@ -33,6 +38,20 @@ def structure_rows(sweep: Sweep, centre: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
     rows = rows[_are_in_tall_columns(points[rows])]
     rows = rows[thinned_rows(points[rows])]
     return rows[np.random.default_rng(0).permutation(len(rows))]
+
+
+def structure_of(sweep: Sweep) -> np.ndarray:
+    """Return the points of `structure_rows`, (K, 3) float64."""
+    return as_numpy(sweep.points)[structure_rows(sweep), :3].astype(np.float64)
+
+
+def share_in_place(pc0: Sweep | None, points0: np.ndarray, pc1: Sweep | None, points1: np.ndarray) -> float:
+    """Return the share of the structure of a sweep, (K, 3), in place in that of another; NaN = too little of it."""
+    if pc0 is None or pc1 is None or min(len(points0), len(points1)) < FEWEST_POINTS:
+        return float("nan")
+    has_poses = pc0.pose is not None and pc1.pose is not None
+    T = relative_transform(pc1.pose, pc0.pose) if has_poses else np.eye(4)
+    return Structure(points1).share(points0[:_COMPARED], T)
 
 
 def static_rows(points: np.ndarray, is_ground: Any = None) -> np.ndarray:

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from cflow_torch.diagnosis.stillness import IN_PLACE, Structure, static_rows, thinned_rows
 from cflow_torch.transforms import transform_points
-from cflow_torch.windows.stillness import IN_PLACE, Structure, static_rows, thinned_rows
 
 
 def test_the_share_equals_that_of_all_pairwise_distances():
