@@ -94,16 +94,19 @@ def _margins(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigid: Ri
 def _list_pixels(tree: Tree, objects: Objects, is_listed: Tensor) -> tuple[Tensor, Groups]:
     """List the pixels of the nodes of some objects, (G,) bool; of an object that is not a node, its own pixels.
 
+    A is the number of members of all nodes, and P' that of pixels.
+
     Returns:
         pixel: (K,) int64, positions in the list of pixels.
         of_object: the K pixels, grouped by object.
     """
-    is_node = objects.by_node.is_member
-    of_node = flat_nonzero(is_listed & is_node)  # [M], objects
-    pixel, members = tree.pixels_of(objects.by_node.of_item.index_select(0, of_node))
-    own = flat_nonzero(objects.by_object.spread(is_listed & ~is_node))
-    of_object = torch.cat((members.spread(of_node), objects.by_object.of_item.index_select(0, own)))
-    return torch.cat((pixel, own)), Groups(of_object, objects.count)
+    of_member = tree.members.spread(objects.by_node.first(), none=objects.count)  # [A], G = none
+    is_no_node = objects.by_object.spread(~objects.by_node.is_member)  # [P']
+    of_pixel = objects.by_object.where(is_no_node).of_item  # [P']
+    of_object = Groups(torch.cat((of_member, of_pixel)), objects.count)
+    listed = flat_nonzero(of_object.spread(is_listed))
+    every = torch.cat((tree.pixel, torch.arange(len(of_pixel), device=of_pixel.device)))
+    return every.index_select(0, listed), of_object[listed]
 
 
 def _test_with_copies(sweeps: HeightSlicedSweeps, pixels: Pixels, of_object: Groups, rigid: RigidMotion) -> Counts:
