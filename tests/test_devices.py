@@ -22,7 +22,7 @@ BOUNDS: dict[str, tuple[Config, int, int, int]] = {
     "paper, h = 4, 5 scales": (small("paper", num_history=4, pixel_sizes=SCALES), 3510, 129, 3539),
     "keypoints": (small("keypoints"), 868, 35, 898),
     "default": (small("default"), 3388, 105, 3425),
-    "offline": (small("offline"), 3811, 117, 3827),
+    "offline": (small("offline"), 3833, 118, 3849),
 }
 
 

@@ -52,8 +52,11 @@ class Progress(tqdm):  # type: ignore[type-arg]
 
 
 def log_line(text: str) -> None:
-    """Print a line on stderr, above the bar."""
-    tqdm.write(text, file=_STDERR)
+    """Print a line on stderr, on a terminal above the bar."""
+    if sys.stderr.isatty():
+        tqdm.write(text, file=_STDERR)
+    else:
+        print(text, file=sys.stderr, flush=True)
 
 
 def show_warnings_as_lines() -> None:

@@ -423,7 +423,7 @@ def test_failures_of_one_cause_are_shown_three_times_and_listed_once(capsys):
     names = tuple(f"a/{stamp}" for stamp in range(9))
     failures = [Failed(name, f"none of the {500 + k} points is active, x -1.5e-{k} m") for k, name in enumerate(names)]
     _follow(iter([Opened("a", 9, names), Failed("a", "no log"), *failures]), counters, 1)
-    shown = filter(str.strip, capsys.readouterr().err.splitlines())  # a line above the bar first clears the bar
+    shown = capsys.readouterr().err.splitlines()
     assert [line.split(":")[1] for line in shown] == [" a", " a/0", " a/1", " a/2"]
     report = counters.report(1.0, "")
     assert len(report["failures"]) == 10
