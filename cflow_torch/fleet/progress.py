@@ -56,7 +56,7 @@ def log_line(text: str) -> None:
     if sys.stderr.isatty():
         tqdm.write(text, file=_STDERR)
     else:
-        print(text, file=sys.stderr, flush=True)
+        _STDERR.write(f"{text}\n")
 
 
 def show_warnings_as_lines() -> None:
