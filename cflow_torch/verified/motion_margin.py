@@ -36,9 +36,9 @@ from cflow_torch.verified.selection import Objects
 
 _DISPLACEMENT = 0.4  # metres per interval, along x and along y
 _COPIES_Z = 1.0  # standard deviations of noise by which a motion must exceed its displaced copies
-# P(moving) of slow and fast objects of pairs, and of objects with history; an object that is less likely to move is
-# static. In pairs, wrong motions of fast objects are frequent, and large errors.
-_LEAST_LIKELY = (0.05, 0.15, 0.02)
+# P(moving) of slow and fast objects, in pairs, then with history; an object that is less likely to move is static. A
+# wrong motion of a fast object is a large error.
+_LEAST_LIKELY = (0.05, 0.15, 0.02, 0.04)
 
 
 class MotionMargin(NamedTuple):
@@ -63,7 +63,7 @@ def motion_margin(sweeps: HeightSlicedSweeps, tree: Tree, objects: Objects, rigi
     bins = Bins.moving + (4 * has_history + 2 * is_far + is_fast) * Bins.num_margins + bin_of(margin, TABLE["margin"])
 
     moving = constant(tuple(TABLE["moving"]), torch.float32, bins.device).index_select(0, bins)
-    least = constant(_LEAST_LIKELY, torch.float32, bins.device).index_select(0, torch.where(has_history, 2, is_fast))
+    least = constant(_LEAST_LIKELY, torch.float32, bins.device).index_select(0, 2 * has_history + is_fast)
     return MotionMargin(bins, (speed >= MOVING) & (moving >= least))
 
 

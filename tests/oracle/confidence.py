@@ -30,7 +30,7 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     deviations of what it wins and loses, over the root of the number of other sweeps. If a copy explains the sweeps as
     well, to a standard deviation, a line has no margin, and with history neither has an object that is found in place
     as often as that. An object moves if its motion is at least 0.05 m, and P(moving) of its bin at least 0.05, if it is
-    fast 0.15, and with history 0.02.
+    fast 0.15, with history 0.02 and 0.04.
     """
     if not any(rigid.flow):
         return 0, False
@@ -54,7 +54,7 @@ def margin(sweeps: SlicedSweeps, members: np.ndarray, rigid: RigidMotion) -> tup
     reached = (value >= np.array(TABLE["margin"])).sum()
     number = (4 * sweeps.has_history + 2 * is_far + is_fast) * (1 + len(TABLE["margin"])) + reached
     first = len(TABLE["moving"]) - 8 * (1 + len(TABLE["margin"]))
-    least = 0.02 if sweeps.has_history else 0.15 if is_fast else 0.05
+    least = (0.04 if is_fast else 0.02) if sweeps.has_history else (0.15 if is_fast else 0.05)
     return int(number), bool(speed >= 0.05 and TABLE["moving"][first + number] >= least)
 
 

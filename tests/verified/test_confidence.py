@@ -126,7 +126,7 @@ def test_a_wall_has_less_confidence_than_a_car(monkeypatch):
     car = np.concatenate((long_side, np.stack((np.full(300, -2.05), rng.uniform(-5, -3, 300), long_side[:, 2]), 1)))
     points = np.concatenate((wall, car))
     model = VerifiedFlow(MODEL)
-    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 3 * (0.0,))  # both are dynamic
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))  # both are dynamic
     model.verify = partial(verify, slides=lambda *given: torch.zeros(given[3].shape[:2], dtype=torch.bool))
     (result,) = model([Window(Sweep(points), Sweep(points + (0.3, 0.0, 0.0)))])
     assert result.residual_flow[:, 0].min() > 0.2
@@ -160,7 +160,7 @@ def test_a_motion_that_is_hardly_ever_right_is_dropped_and_its_probability_stays
     older, newer = (Sweep((places + rng.uniform(0, (0.5, 0.5, 1.5), (40, 12, 3))).reshape(-1, 3)) for _ in "ab")
     model = VerifiedFlow.from_preset()
     (result,) = model([Window(older, newer)])
-    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 3 * (0.0,))
+    monkeypatch.setattr(motion_margin, "_LEAST_LIKELY", 4 * (0.0,))
     (every,) = model([Window(older, newer)])
     is_dropped = every.residual_flow.any(1) & ~result.residual_flow.any(1)
     assert is_dropped.any() and (every.moving[is_dropped] < 0.15).all() and torch.equal(result.moving, every.moving)
