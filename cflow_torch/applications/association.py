@@ -72,8 +72,8 @@ def _make_pieces_static(groups: MovingGroups, box: Tensor, num_points: Tensor) -
     While the vehicle passes a stopped object, the visible outline of the object changes. A piece of the object then
     seems to move, and the track would follow this piece. We recognise a piece of an object of `num_points` points by
     the box of the object. It holds more than half of the points of the group, which has fewer points than a stopped
-    object, and more static points than the group has points. A person beside a wall has as many points as before, so
-    is not a piece.
+    object, and more static points than the group has points. A person next to a wall has as many points as before, so
+    a person is not a piece.
     """
     is_inside = box >= 0
     num_static = torch.bincount(box[is_inside & ~groups.moves], minlength=len(num_points))

@@ -60,7 +60,7 @@ _TOPICS = (
 _TWO_SENSORS = Finding(
     "sweeps",
     WRONG,
-    "each sweep fits the second next one, but not the next, so they seem to be those of two sensors in turns: give "
+    "each sweep fits the second next one, but not the next, so they seem to be those of two sensors, alternating: give "
     "those of one sensor (data.suffix, data.topic)",
     True,
 )
@@ -323,7 +323,7 @@ def _parts(log: Log) -> list[Finding]:
         if shared >= _LEAST_SHARED:
             return []
     text = f"neighbouring sweeps share {100 * shared:.0f} % of the directions in which they measure"
-    fix = "join the clouds of one turn or view, or give those of one sensor (data.suffix, data.topic)"
+    fix = "join the clouds of one rotation and view, or give those of one sensor (data.suffix, data.topic)"
     return [Finding("sweeps", WRONG, f"{text}: {fix}", True)]
 
 

@@ -13,7 +13,7 @@ from cflow_torch.errors import CFlowError
 from cflow_torch.types import as_numpy
 
 _AROUND = 10  # sweeps on each side that tell a usual share, or number of points
-_TURNS = 8  # sweeps that tell whether two sensors measure in turns
+_ALTERNATING = 8  # sweeps that tell whether two sensors alternate
 _FEW = 0.5  # part of the usual number of points, below which a sweep has few
 
 
@@ -79,11 +79,11 @@ class Neighbours(NamedTuple):
 
 
 def alternate(log: Log) -> bool:
-    """Test whether sweeps fit the second next one, but none fits the next: those of two sensors in turns.
+    """Test whether sweeps fit the second next one, but none fits the next: those of two sensors, alternating.
 
     We compare up to eight sweeps. False if one of them cannot be read.
     """
-    count = min(_TURNS, len(log.timestamps))
+    count = min(_ALTERNATING, len(log.timestamps))
     first = (len(log.timestamps) - count) // 2
     try:
         sweeps = [log.sweep(first + k) for k in range(count)]

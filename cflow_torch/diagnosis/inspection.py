@@ -14,7 +14,7 @@ from cflow_torch.diagnosis.readings import INACCURATE, NO_READING, UNKNOWN, judg
 from cflow_torch.diagnosis.stillness import LEAST_SHARE, MISPLACED, share_in_place, structure_of
 from cflow_torch.errors import warn
 from cflow_torch.ground.segmentation import has_ground
-from cflow_torch.types import Array, FlowResult, Sweep, Window, as_numpy
+from cflow_torch.types import MOVING, Array, FlowResult, Sweep, Window, as_numpy
 from cflow_torch.windows.returns import MISSING, without_missing
 from cflow_torch.windows.validation import have_same_points
 
@@ -39,7 +39,6 @@ _OTHER_TIME = (
     "the second sweep does not fit the first one, which fits those before, so it has points or a pose of another time, "
     "or sweeps are interchanged"
 )
-_MOVING = 0.05  # metres a sweep
 # A share of moving points is suspicious if it is this many times larger than the usual one and a slack.
 _SUSPICIOUS, _SLACK, _FEWEST_WATCHED = 1.5, 0.05, 500
 _FEWEST_REPEATED = 100  # this many equal points are no coincidence
@@ -96,7 +95,7 @@ class MotionWatch:
         count = int(result.is_valid.sum())
         if count < _FEWEST_WATCHED:
             return ""
-        moves = torch.linalg.vector_norm(result.residual_flow, dim=1) >= _MOVING
+        moves = torch.linalg.vector_norm(result.residual_flow, dim=1) >= MOVING
         share = int((moves & result.is_valid).sum()) / count
         if self._usual is not None and share > _SUSPICIOUS * (self._usual + _SLACK) and _misses_next(window):
             return f"{share:.0%} of the points move, {self._usual:.0%} in the pair before: {_OTHER_TIME}"
@@ -106,13 +105,13 @@ class MotionWatch:
 
 def _misses_next(window: Window) -> bool:
     """Test whether pc0 fits the sweep before it, but not pc1."""
-    before = window.pch[0] if window.pch else None
+    if not window.pch:
+        return False
     points0 = structure_of(window.pc0)
-    shares = [
-        share_in_place(window.pc0, points0, other, structure_of(other)) if other is not None else float("nan")
-        for other in (before, window.pc1)
-    ]
-    return shares[0] >= LEAST_SHARE and shares[1] < MISPLACED * shares[0]
+    before, next_one = (
+        share_in_place(window.pc0, points0, other, structure_of(other)) for other in (window.pch[0], window.pc1)
+    )
+    return before >= LEAST_SHARE and next_one < MISPLACED * before
 
 
 def pair_problem(pc0: Sweep, pc1: Sweep) -> str:

@@ -60,7 +60,7 @@ _OF_ERRORS = 1.2  # least share with another motion in each pair over that as gi
 _EXCUSE = 1.1  # share with another motion in each pair over that of a reading with a name
 _SLIGHT, _OBLIQUE = np.radians((2, 10))  # least angles between axes that are turned and those as given, or with a name
 _RESCALED = 1.05  # least factor between motions of another scale
-_DOUBTFUL = 0.15  # share of a pair as given, below which its motion is compared with that under which the points fit
+_UNCLEAR = 0.15  # share of a pair as given, below which its motion is compared with that under which the points fit
 # Metres of such a motion from that of the poses. Less in all pairs is within the cells of the search; more, or more
 # than half of the motion, is more than an error of measurement.
 _SMALLEST_ERROR, _LARGEST_ERROR = 0.08, 1.5
@@ -242,7 +242,7 @@ def judge(pairs: Iterable[Pair | None]) -> Judgement:
     scan, shares_of_scans = _best_scan(fast) if fast else (moving[0].scans[0], {})
     of_pairs = [pair.shares_of_poses(scan) for pair in moving]
     found: dict[str, Reading] = {}
-    if min(each[GIVEN] for each in of_pairs) < _DOUBTFUL and not any(WORLD in each for each in of_pairs):
+    if min(each[GIVEN] for each in of_pairs) < _UNCLEAR and not any(WORLD in each for each in of_pairs):
         found, of_found = _compare_motions(moving, scan)
         of_pairs = [{**each, **more} for each, more in zip(of_pairs, of_found)]
     shares, clear = _compare(of_pairs)

@@ -4,8 +4,8 @@ The margin is the result of the paired test for the whole node of an object: how
 sweeps than "static", in standard deviations of noise. An object may be a remnant of its node, whose other pixels follow
 another motion. A remnant often has pixels in a few sweeps only, so it would have no margin of its own.
 
-In a pair, a slow object still covers most of its position, and a sparse
-surface is hit at other positions in every sweep. There, we compare the motion with copies of it, displaced by 0.4 m.
+In a pair, a slow object still covers most of its position, and a sparse surface is hit at other positions in every
+sweep. There, we compare the motion with copies of it, displaced by 0.4 m.
 
 If the copies explain the sweeps as well, two kinds of objects have no margin: a line may be a rail, which beams hit at
 positions that move with the vehicle; and with history, a large surface that loses a few slices stays where it is.

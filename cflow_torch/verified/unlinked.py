@@ -54,6 +54,7 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         Parts have the pixels of a sweep that are missing, or of which every other sweep lacks a slice. A part of t
         takes its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least
         half of the older sweeps. A sweep before t-1 counts only if the velocity puts the part inside the region there.
+        A sweep that does not count may still confirm the velocity.
         Of the velocities of a part of t, or of t+1, the one that the fewest sweeps lack wins, then the one with the
         smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part belongs to its
         first node. The velocity of a node must win more slices near its targets than it loses.

@@ -651,7 +651,7 @@ def test_a_column_before_x_is_told_and_no_pose_is_blamed(drive, tmp_path, first)
 
 @pytest.mark.parametrize("has_poses", [True, False])
 def test_sweeps_that_measure_parts_of_a_turn_are_told(drive, has_poses):
-    """A cloud per packet, or two sensors in turns."""
+    """A cloud per packet, or two sensors, alternating."""
 
     class Part(Wrong):
         def sweep(self, index):
@@ -678,7 +678,7 @@ def test_sweeps_of_half_a_turn_are_told_once(whole):
 
 
 def test_sweeps_of_half_a_view_are_told_once(whole):
-    """Drivers that publish the upper and the lower beams in turns."""
+    """Drivers that publish the upper and the lower beams alternately."""
 
     class Half(Wrong):
         def sweep(self, index):
@@ -702,7 +702,7 @@ def test_two_sensors_in_turns_are_told_and_nothing_else(drive, angle):
             return replace(sweep, points=points.astype(np.float32))
 
     wrong = [finding for finding in examine(InTurns(drive)) if finding.status == WRONG]
-    assert [finding.topic for finding in wrong] == ["sweeps"] and "two sensors in turns" in wrong[0].text
+    assert [finding.topic for finding in wrong] == ["sweeps"] and "two sensors, alternating" in wrong[0].text
 
 
 def test_the_poses_of_a_trajectory_go_on_beyond_the_sweeps(drive):
