@@ -130,11 +130,7 @@ class Columns:
         is_column = mark(is_occupied, (flat_nonzero(is_occupied) + square).view(-1))
         position = _inside(is_column, grid)  # [C]
         for reach in range(2, spacing.most + 1):
-            # A neighbour of a pixel may be wide although the pixel itself is nearer.
-            near = flat_nonzero(spacing.are_wide(grid, *_split(grid, position), reach, margin=2.0))
-            around = (position.index_select(0, near) + square).view(-1)
-            wide = flat_nonzero(spacing.are_wide(grid, *_split(grid, around), reach))
-            position = _inside(mark(is_column, around.index_select(0, wide)), grid)
+            position = _grow(is_column, position, grid, spacing, reach)
         # Column 0 is said to be in the border, in the last place of its second row: it has only border around it.
         position = torch.cat((constant((2 * stride - 1,), torch.int64, device), position))
         reach_of, tall = _reach_and_tall(grid, position, spacing)
@@ -304,19 +300,24 @@ class Columns:
         return around.index_copy(0, self.tall, own | (above | below) & _OWN_OF_WORD)
 
     def _or_within_pixels(self, words: Tensor) -> Tensor:
-        around = self.or_around(words)
+        """Return the slices up to the reach of each column away, (C + 1, W) int64.
+
+        The slices up to r + 1 pixels away are those up to r away from the 3 x 3 columns around. So we widen the columns
+        of a larger reach pixel by pixel. A column beside one of reach r + 1 has at least reach r.
+        """
+        within = self.or_around(words)  # up to one pixel away
         if self.reach is None:
-            return around
-        wide = flat_nonzero(self.reach > 1)
-        reach = self.reach.index_select(0, wide)[:, None]
-        beside = self.position.index_select(0, wide) + _square(1, self.stride, wide.device)
-        beside = self.image.index_select(0, beside.view(-1))  # [9 wide]
-        for step in range(2, self.most_reach + 1):
-            # The columns beside one of this reach have at least the reach before.
-            near = around.index_select(0, beside).view(9, -1, around.shape[1])
-            wider = reduce(torch.bitwise_or, near.unbind(0))
-            around = around.index_copy(0, wide, torch.where(reach >= step, wider, near[4]))
-        return around
+            return within
+        wide = flat_nonzero(self.reach > 1)  # [K]
+        reach_of_wide = self.reach.index_select(0, wide)[:, None]  # [K, 1]
+        place = self.position.index_select(0, wide) + _square(1, self.stride, wide.device)
+        # The 3 x 3 columns around each one, which is in the middle: [9 K].
+        beside = self.image.index_select(0, place.view(-1))
+        for reach in range(2, self.most_reach + 1):
+            of_beside = within.index_select(0, beside).view(9, -1, words.shape[1])  # [9, K, W]
+            wider = reduce(torch.bitwise_or, of_beside.unbind(0))
+            within = within.index_copy(0, wide, torch.where(reach_of_wide >= reach, wider, of_beside[4]))
+        return within
 
     @cached_property
     def _neighbours(self) -> Tensor:
@@ -394,6 +395,19 @@ def _inside(is_column: Tensor, grid: Grid) -> Tensor:
     images[:, :BORDER] = images[:, -BORDER:] = False
     images[:, :, :BORDER] = images[:, :, -BORDER:] = False
     return flat_nonzero(is_column)
+
+
+def _grow(is_column: Tensor, position: Tensor, grid: Grid, spacing: Spacing, reach: int) -> Tensor:
+    """Add the positions next to columns where the reach is at least `reach`, and return the positions of all columns.
+
+    `is_column`, (B * area,) bool, which this overwrites, and `position`, (C,) int64, tell the same columns.
+    """
+    # A neighbour of a column may have this reach although the column itself is nearer.
+    candidates = flat_nonzero(spacing.are_wide(grid, *_split(grid, position), reach, margin=2.0))
+    square = _square(1, grid.width + 2 * BORDER, position.device)
+    around = (position.index_select(0, candidates) + square).view(-1)
+    wide = flat_nonzero(spacing.are_wide(grid, *_split(grid, around), reach))
+    return _inside(mark(is_column, around.index_select(0, wide)), grid)
 
 
 def _split(grid: Grid, position: Tensor) -> tuple[Tensor, Tensor]:

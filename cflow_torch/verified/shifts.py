@@ -38,9 +38,14 @@ class Shifts:
         elapsed = torch.stack((to_newest, -to_newest))  # [2, M, S], from each sweep to t+1, and from t+1 to each sweep
         displacement = motions[:, None] * elapsed[..., None, None]  # [2, M, S, C, 2]
         pair = (displacement + 0.5).floor().int().view(torch.int64)[..., 0]  # [2, M, S, C], y and x as one number
-        self.count, self._number, motion = _distinct(pair)
-        distinct = pair if motion is None else pair.gather(3, motion[:, None].expand_as(pair))
-        self._shift = distinct.flatten(0, 2)[..., None].view(torch.int32)  # [2 M S, C, 2]
+        num_motions = motions.shape[1]
+        if num_motions > 1 and pair.device.type == "cpu":
+            self.count, self._number, motion = _distinct(_first_equal(pair))
+            pair = pair.gather(3, motion[:, None].expand_as(pair))
+        else:  # motion c has shift c; on a GPU, the launches would cost more than the comparisons
+            self.count = torch.full_like(window, num_motions)
+            self._number = None
+        self._shift = pair.flatten(0, 2)[..., None].view(torch.int32)  # [2 M S, C, 2]
         is_far = torch.maximum(*self._shift.abs().unbind(2)) >= _FAR  # [2 M S, C]
         is_far |= is_wide[:, None].expand(2, -1, sweeps.num_steps).reshape(-1, 1)
         self._first_bit = is_far.view(torch.uint8) * NUM_SLICES
@@ -61,24 +66,29 @@ class Shifts:
         return values if self._number is None else F.pad(values, (1, 0)).gather(2, self._number.expand_as(values))
 
 
-def _distinct(shift: Tensor) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Number the distinct shifts of M groups; `shift` is (2, M, S, C) int64.
+def _distinct(same: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Number the distinct shifts of M groups.
+
+        motion                               1    2    3    4    5    6
+        pixels per sweep interval          0.0  2.1  0.0  1.9  2.1 -1.0
+        same                                 0    2    0    2    2    6
+        number of its shift                  0    1    0    1    1    2
+        a motion of each shift, from 0 on    1    5    .    .    .    .
+
+    Args:
+        same: (M, C) int64, see `_first_equal`.
 
     Returns:
         count: (M,) int64, the number of distinct shifts of each group.
-        number: (M, C) int64, the shift of each motion, from 1 on; 0 = the motion shifts nothing. None = motion c has
-            shift c: a single motion, and a GPU, where the launches cost more than the comparisons.
-        motion: (M, C) int64, a motion with each shift; undefined beyond `count`. None = as for `number`.
+        number: (M, C) int64, the shift of each motion, from 1 on; 0 = the motion shifts nothing.
+        motion: (M, C) int64, a motion with each shift, from 0 on; undefined beyond `count`.
     """
-    num_groups, num_motions = shift.shape[1], shift.shape[3]
-    if num_motions == 1 or shift.device.type != "cpu":
-        return shift.new_full((num_groups,), num_motions), None, None
-    same = _first_equal(shift)
-    motion = torch.arange(1, num_motions + 1, device=shift.device).expand_as(same)
+    motion = torch.arange(1, same.shape[1] + 1, device=same.device).expand_as(same)
     is_first = same == motion
-    number = is_first.cumsum(1) * is_first  # 0 = the motion shifts nothing, or an earlier one is equal
-    motion_of_number = F.pad(torch.zeros_like(number), (1, 0)).scatter_(1, number, motion - 1)
-    return is_first.sum(1), F.pad(number, (1, 0)).gather(1, same), motion_of_number[:, 1:]
+    number_of_first = is_first.cumsum(1) * is_first  # 0 for motions that are not the first with their shift
+    number = F.pad(number_of_first, (1, 0)).gather(1, same)
+    motion_of_number = F.pad(torch.zeros_like(same), (1, 0)).scatter_(1, number_of_first, motion - 1)
+    return is_first.sum(1), number, motion_of_number[:, 1:]
 
 
 def _first_equal(shift: Tensor) -> Tensor:

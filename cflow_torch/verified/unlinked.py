@@ -38,7 +38,6 @@ _ERROR = 0.7  # metres from that place to a part that confirms the velocity, at 
 _ERROR_SHARE = 0.05  # ... and further for each metre that the object has moved
 _FASTEST = 60.0  # m/s, if the settings have no bound
 _LEAST_MOVE = 0.5  # of the length of a part; a shorter motion leaves its pixels linked
-_LACKING = float(1 << 20)  # finest pixels, for a sweep without a part; longer than any sum of errors
 _LEAST_SIZE = 16  # of an unmatched component in a pair; smaller ones are mostly static (`confidence.json`)
 _LIKE = 2  # in a pair, the larger of two parts has at most this many times as many pixels as the other
 _NARROWEST = 0.4  # metres; a thin line that moves along itself may be a part of a longer line
@@ -181,25 +180,46 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     cells = _Map(sweeps, parts)
     of_t, other = _pairs(sweeps, parts, cells, max_speed)  # [H] each
     window = parts.window.index_select(0, of_t)
-    elapsed = sweeps.elapsed.index_select(0, window)  # [H, S]
-    before_t = elapsed - 1
+    before_t = sweeps.elapsed.index_select(0, window) - 1  # [H, S], sweep intervals to t
     interval = before_t.gather(1, parts.step.index_select(0, other)[:, None])[:, 0]
-    velocity = (take_columns(parts.centre, of_t) - take_columns(parts.centre, other)) / interval  # [2, H]
-    place = take_columns(parts.centre, of_t)[..., None] - velocity[..., None] * before_t  # [2, H, S]
+    centre = take_columns(parts.centre, of_t)
+    velocity = (centre - take_columns(parts.centre, other)) / interval  # [2, H]
+    place = centre[..., None] - velocity[..., None] * before_t  # [2, H, S]
     part, error = _follow(parts, cells, of_t, place)  # [H, S] each
-    moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()
+    moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()  # [H, S]
+    is_found, ranks = _judge(sweeps, window, error, moved, cells.contains(place))
+    kept = flat_nonzero(_are_best(ranks, part, len(parts)))
+    part, is_found, before_t = gather(kept, part, is_found, before_t)
+    return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
+
+
+def _judge(
+    sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Tensor, is_inside: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Tell which sweeps confirm H velocities, and rank these.
+
+    Args:
+        window: (H,) int64.
+        error: (H, S) float64, finest pixels, from where the velocity puts the part to the nearest part of each sweep.
+        moved: (H, S) float64, finest pixels, how far the part moves between t and each sweep.
+        is_inside: (H, S) bool, the velocity puts the part inside the region.
+
+    Returns:
+        is_found: (H, S) bool, the nearest part is near enough.
+        ranks: (2, H) float64, the number of sweeps that lack a part, and the sum of errors. The lowest number is the
+            best, and of equal numbers, the lowest sum. In a pair, all errors are 0, and the shortest way is the best.
+            Both are infinite without a part at t+1, or with parts in less than half of the older sweeps that count.
+    """
     is_given = sweeps.is_given.index_select(0, window)
     is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
     # Outside of the region, an older sweep can confirm nothing, so it does not count. Sweep t-1 always counts.
-    is_counted = is_given & cells.contains(place)
+    is_counted = is_given & is_inside
     is_counted[:, :3] = is_given[:, :3]
-    rank = _ranks(error, is_found, is_counted)
-    if sweeps.batch.has_pairs:
-        # There, all errors are 0, and the shortest way has the lowest rank.
-        rank += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
-    kept = flat_nonzero(_are_best(rank, part, len(parts)))
-    part, is_found, before_t = gather(kept, part, is_found, before_t)
-    return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
+    is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_counted[:, 2:].sum(1))
+    num_lacking = (is_counted & ~is_found).sum(1)
+    way = moved[:, 0] * ~sweeps.has_history.index_select(0, window)  # of pairs
+    total = error.masked_fill(~is_found, 0.0).sum(1) + way
+    return is_found, torch.stack((num_lacking.double(), total)).masked_fill(~is_confirmed, math.inf)
 
 
 def _follow(parts: _Parts, cells: _Map, of_t: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
@@ -217,18 +237,6 @@ def _follow(parts: _Parts, cells: _Map, of_t: Tensor, place: Tensor) -> tuple[Te
     part[:, 1] = of_t
     nearest[:, 1] = 0.0
     return part, nearest.sqrt_()
-
-
-def _ranks(error: Tensor, is_found: Tensor, is_counted: Tensor) -> Tensor:
-    """Rank velocities by the sweeps that confirm them, then by their errors, (H,) float64: the lowest is the best.
-
-    The arguments are (H, S). The rank is infinite without a part at t+1, or with parts in less than half of the older
-    sweeps that count.
-    """
-    is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_counted[:, 2:].sum(1))
-    num_lacking = (is_counted & ~is_found).sum(1)
-    rank = error.masked_fill(~is_found, 0.0).sum(1) + num_lacking * _LACKING
-    return rank.masked_fill(~is_confirmed, math.inf)
 
 
 def _median_velocity(parts: _Parts, part: Tensor, is_found: Tensor, before_t: Tensor) -> Tensor:
@@ -273,15 +281,21 @@ def _are_alike(sweeps: HeightSlicedSweeps, parts: _Parts, of_t: Tensor, other: T
     return is_like | sweeps.has_history.index_select(0, parts.window.index_select(0, of_t))[:, None]
 
 
-def _are_best(rank: Tensor, part: Tensor, num_parts: int) -> Tensor:
-    """Tell which tracks, (H,), have the lowest rank of their part of t and of their part of t+1. Ties: the first."""
-    is_best = rank < math.inf
-    for step in (1, 0):
-        same = Groups(part[:, step], num_parts)
-        is_best &= rank == same.spread(same.min(rank, empty=math.inf))
+def _are_best(ranks: Tensor, part: Tensor, num_parts: int) -> Tensor:
+    """Tell which tracks are the best of their part of t and of their part of t+1, (H,) bool. Ties: the first."""
+    is_best = _are_lowest(ranks, Groups(part[:, 1], num_parts)) & _are_lowest(ranks, Groups(part[:, 0], num_parts))
     same = Groups(part[:, 1], num_parts).where(is_best)
     first = same.spread(same.first(), none=-1)
     return first == torch.arange(len(first), device=first.device)
+
+
+def _are_lowest(ranks: Tensor, groups: Groups) -> Tensor:
+    """Tell which tracks have the lowest ranks of their group, by the first rank, then by the next, (H,) bool."""
+    is_lowest = ranks[0] < math.inf
+    for rank in ranks:
+        rank = rank.masked_fill(~is_lowest, math.inf)
+        is_lowest &= rank == groups.spread(groups.min(rank, empty=math.inf))
+    return is_lowest
 
 
 def _pixels_of(tracks: _Tracks, parts: _Parts) -> Groups:
