@@ -33,8 +33,6 @@ NUM_SLICES = 4
 OWN = (1 << NUM_SLICES) - 1  # the bits of the pixel itself
 BORDER = 2  # empty rows and columns around an image; no step searches farther around a pixel
 _COUNTS = tuple(bin(slices).count("1") for slices in range(OWN + 1))
-_SECOND = 32  # bits; where the second of two counts in one number begins
-_BOTH_COUNTS = tuple(low + (high << _SECOND) for high in _COUNTS for low in _COUNTS)
 _EMPTY = torch.iinfo(torch.int32).max  # where a table of pixels has none
 _WORD = 8  # sweeps whose slices make up one int64
 _OWN_OF_WORD = OWN * 0x0101010101010101  # the bits of the pixels themselves in a word
@@ -431,18 +429,3 @@ def count_slices(slices: Tensor) -> Tensor:
     """Count the slices in each value, (...) uint8 with bits 0 ... 3 only: (...) int64."""
     counts = constant(_COUNTS, torch.int64, slices.device)
     return counts.index_select(0, slices.reshape(-1).int()).view(slices.shape)
-
-
-def count_halves(slices: Tensor) -> Tensor:
-    """Count the slices in both halves of bytes, (...) uint8 to (...) int64; see `split_counts`.
-
-    Sums of the results are sums of both counts, so one sum takes the place of two.
-    """
-    counts = constant(_BOTH_COUNTS, torch.int64, slices.device)
-    return counts.index_select(0, slices.reshape(-1).int()).view(slices.shape)
-
-
-def split_counts(sums: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the sums for the lower halves and for the upper halves, (...) int64 each, from sums of `count_halves`."""
-    upper = sums >> _SECOND
-    return sums - (upper << _SECOND), upper
