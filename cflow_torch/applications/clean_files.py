@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Callable, NamedTuple
+from typing import Any, Callable, Mapping, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, copy_rows, stem_of
 from cflow_torch.data.arrays.writer import POINTS_FOLDER, SweepSides, write_sides, write_sweep
 from cflow_torch.data.atomic import new_folder
+from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
 from cflow_torch.data.npy_file import read_npy
 from cflow_torch.data.paths import GZ
@@ -19,6 +20,7 @@ from cflow_torch.diagnosis.conventions import OF_POINTS, WORLD
 from cflow_torch.types import CFlowError
 
 REMOVED_FOLDER = "removed"
+RECORD_FILE = "clean.json"  # what a folder was made by; one without it is not ours
 _WRITE_AGAIN = "give overwrite=true to write this log again"
 
 
@@ -35,7 +37,9 @@ class Removed(NamedTuple):
         return f"removed {self.moving:,} of {self.points:,} points ({share:.2%}){missing}"
 
 
-def write_clean_log(clean: CleanLog, log: Log, root: Path, suffix: str | None = None) -> Removed:
+def write_clean_log(
+    clean: CleanLog, log: Log, root: Path, suffix: str | None = None, record: Mapping[str, Any] | None = None
+) -> Removed:
     """Write a clean log to `root/<log_id>`, as `write_array_log` does, and `removed/NAME.npy` for each sweep.
 
     Args:
@@ -43,6 +47,7 @@ def write_clean_log(clean: CleanLog, log: Log, root: Path, suffix: str | None = 
         log: the drive.
         root: parent folder, created if it does not exist.
         suffix: suffix of the clouds; None = `own_suffix`.
+        record: content of `clean.json` in the folder, such as settings; None = it is not written.
 
     Convention: a mask has (N,) bool for the points of the sweep of `log`, True = not in the clean cloud. If the log is
         a folder of clouds with the same suffix, clouds keep their names, columns, types and VIEWPOINT, and the points
@@ -76,6 +81,8 @@ def write_clean_log(clean: CleanLog, log: Log, root: Path, suffix: str | None = 
                 write_sweep(file, clean, index, sweep, viewpoint)
             sides[name] = SweepSides.of(sweep)
         write_sides(folder, log.log_id, sides, has_viewpoints=viewpoint is not None)
+        if record is not None:
+            write_json(folder / RECORD_FILE, record)
     return total
 
 

@@ -9,7 +9,7 @@ from typing import Any, Callable
 
 import numpy as np
 
-from cflow_torch.applications.clean_files import own_suffix, stored_masks, write_clean_log
+from cflow_torch.applications.clean_files import RECORD_FILE, own_suffix, stored_masks, write_clean_log
 from cflow_torch.applications.cleaning import CleanLog, MaskedLog, static_map_with_intensity
 from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
@@ -20,15 +20,15 @@ from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.json_file import read_json, write_json
+from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import Log
 from cflow_torch.errors import import_optional
 from cflow_torch.estimate import make_model
-from cflow_torch.fleet.changes import OVERWRITE
 from cflow_torch.fleet.manifest import describe_log
 from cflow_torch.types import CFlowError
 from cflow_torch.viz.bev import plot_map, save_picture
 
+MAP_FILE = "map.ply"  # next to its picture, map.png
 _NEEDED = ("residual_flow", "cluster_id", "is_valid")  # of flow files
 
 
@@ -40,12 +40,17 @@ def task(cfg: Clean) -> None:
         import_optional("pypcd4", "suffix=.pcd needs pypcd4 (extra clouds): pip install pypcd4")
     clean = _cleaner(cfg)
     logs, failures = open_logs(cfg.data)
-    is_new = {log.log_id: _is_new(cfg, log, output) for log in logs}
+    is_written = {log.log_id: _is_written(cfg, log, output) for log in logs}
     write_config(cfg, ensure_writable(output))
     for log in logs:
         with collect_failures(failures, log.log_id):
-            _claim(cfg, log, output, is_new.pop(log.log_id, False))
-            _write(cfg, log, output, clean)
+            folder = output / log.log_id
+            if log.log_id not in is_written:
+                raise CFlowError(f"{folder} has another log of this run: rename one of two logs of this name")
+            removed = "it is complete" if is_written.pop(log.log_id) else _write(cfg, log, output, clean)
+            print(f"{folder}: {len(log.timestamps)} sweeps, {removed}{_how_to_read(log, cfg.suffix)}")
+            if cfg.map and not (folder / MAP_FILE).exists():
+                print(_write_map(cfg, log, folder))
     finish(failures)
 
 
@@ -58,33 +63,23 @@ def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
     return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped)
 
 
-def _is_new(cfg: Clean, log: Log, output: Path) -> bool:
-    """Test whether a log is to be written. A folder with results of other settings or sweeps is a `CFlowError`."""
-    if not (output / log.log_id).exists() or cfg.overwrite:
-        return True
-    _check(cfg, log, output)
-    return False
+def _is_written(cfg: Clean, log: Log, output: Path) -> bool:
+    """Test whether the folder of a log stays as it is.
 
-
-def _check(cfg: Clean, log: Log, output: Path) -> None:
-    """Raise a `CFlowError` if the folder of a log has results of other settings or sweeps."""
+    A folder that is not ours, that holds the log itself, or that has results of other settings or sweeps is a
+    `CFlowError`.
+    """
     folder = output / log.log_id
-    file = _record_file(folder)
-    before: dict[str, Any] = read_json(file) if file.exists() else {}
-    remedy = "rename one of two logs of this name" if cfg.overwrite else OVERWRITE
-    check_made_by(cfg, folder, before, _record(cfg, log), remedy)
-
-
-def _claim(cfg: Clean, log: Log, output: Path, is_new: bool) -> None:
-    """Remove the older results of a log that is to be written, and record its settings."""
-    folder = output / log.log_id
-    if not is_new:
-        _check(cfg, log, output)  # another log of this run may have its name
-        return
-    shutil.rmtree(folder, ignore_errors=True)
-    for suffix in (".ply", ".png"):
-        folder.with_name(f"{log.log_id}{suffix}").unlink(missing_ok=True)
-    write_json(_record_file(folder), _record(cfg, log))
+    if not folder.exists():
+        return False
+    if not (folder / RECORD_FILE).exists():
+        raise CFlowError(f"{folder} exists and is not a result of `cflow clean`: give output=FOLDER")
+    own = log.unwrapped
+    if isinstance(own, ArraysLog) and folder.resolve() in own.files[0].resolve().parents:
+        raise CFlowError(f"{folder} has the log that is to be cleaned: give output=FOLDER")
+    if not cfg.overwrite:
+        check_made_by(cfg, folder, read_json(folder / RECORD_FILE), _record(cfg, log))
+    return not cfg.overwrite
 
 
 def _record(cfg: Clean, log: Log) -> dict[str, Any]:
@@ -98,26 +93,22 @@ def _record(cfg: Clean, log: Log) -> dict[str, Any]:
     return made
 
 
-def _record_file(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.json")
+def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog]) -> str:
+    """Write the folder of a log in place of an older one of ours, and return what was removed."""
+    shutil.rmtree(output / log.log_id, ignore_errors=True)
+    clean_log = clean(log)
+    removed = write_clean_log(clean_log, log, output, cfg.suffix, _record(cfg, log))
+    if clean_log.num_stopped is None:
+        return str(removed)
+    return f"{removed}; remove_stopped removed {clean_log.num_stopped:,} of them"
 
 
-def _write(cfg: Clean, log: Log, output: Path, clean: Callable[[Log], CleanLog]) -> None:
-    """Write the folder and the map of a log, if they do not exist, and print them."""
-    folder = output / log.log_id
-    file = output / f"{log.log_id}.ply"
-    removed: Any = "it is complete"
-    stopped = ""
-    if not folder.exists():
-        clean_log = clean(log)
-        removed = write_clean_log(clean_log, log, output, cfg.suffix)
-        if clean_log.num_stopped is not None:
-            stopped = f"; remove_stopped removed {clean_log.num_stopped:,} of them"
-    print(f"{folder}: {len(log.timestamps)} sweeps, {removed}{stopped}{_how_to_read(log, cfg.suffix)}")
-    if cfg.map and not file.exists():
-        points, intensity = static_map_with_intensity(MaskedLog(log, stored_masks(folder, log)), cfg.voxel_size)
-        write_cloud(file, points, None if intensity is None else {"intensity": intensity})
-        print(f"{file}: {len(points):,} points{_draw(points, file.with_suffix('.png'))}")
+def _write_map(cfg: Clean, log: Log, folder: Path) -> str:
+    """Write the map of a log into its folder, and return a line with its files."""
+    file = folder / MAP_FILE
+    points, intensity = static_map_with_intensity(MaskedLog(log, stored_masks(folder, log)), cfg.voxel_size)
+    write_cloud(file, points, None if intensity is None else {"intensity": intensity})
+    return f"{file}: {len(points):,} points{_draw(points, log.log_id, file.with_suffix('.png'))}"
 
 
 def _how_to_read(log: Log, suffix: str | None) -> str:
@@ -132,9 +123,9 @@ def _how_to_read(log: Log, suffix: str | None) -> str:
     return "" if columns == KITTI_COLUMNS else f"; read them with data.bin_columns={columns}"
 
 
-def _draw(points: np.ndarray, file: Path) -> str:
+def _draw(points: np.ndarray, title: str, file: Path) -> str:
     """Draw the map if matplotlib is installed, and name the picture."""
     try:
-        return f", drawn in {save_picture(plot_map(points, file.stem), file)}"
+        return f", drawn in {save_picture(plot_map(points, title), file)}"
     except CFlowError as error:
         return f" (no picture: {error})"

@@ -519,8 +519,8 @@ class Clean(Command):
     data=arrays reads such a folder. A point is dynamic if its flow is at least 0.05 m per sweep and P(moving) at least
     0.5. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other columns
     of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True = not
-    in the clean cloud. A log is written as a whole or not at all. Run the command again to write the missing logs.
-    Results of other logs in OUTPUT stay.
+    in the clean cloud, and clean.json the settings. All files of a log are in its folder, which is written as a whole
+    or not at all. Run the command again to write the missing logs. Other files in OUTPUT stay, except config.yaml.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag
@@ -540,7 +540,7 @@ class Clean(Command):
         "format of the clouds: .npy | .ply | .pcd | .bin | ...; null = that of the log's own clouds, else .npy"
     )
     map: bool = setting(
-        False, "also write the static points in the world, one per voxel, to <log id>.ply, and a picture", free=True
+        False, "also write the static points in the world, one per voxel, to <log id>/map.ply, and a picture", free=True
     )
     voxel_size: float = _above_0(0.1, "side of a voxel of the map, in metres")
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Sequence
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from cflow_torch.cli.info import processor
 from cflow_torch.data.atomic import ensure_writable, write_text
 from cflow_torch.data.json_file import json_ready
 from cflow_torch.data.paths import as_path, is_remote
-from cflow_torch.fleet.changes import OVERWRITE, check_same_run, nearest_preset
+from cflow_torch.fleet.changes import check_same_run, nearest_preset
 from cflow_torch.types import CFlowError
 
 
@@ -85,20 +86,29 @@ def made_by(cfg: Command, **more: Any) -> dict[str, Any]:
     return json_ready({**settings_record(cfg), "versions": versions(), **more})  # type: ignore[no-any-return]
 
 
-def check_made_by(cfg: Command, folder: Path, before: Any, now: Any, remedy: str = OVERWRITE) -> None:
+def check_made_by(cfg: Command, folder: Path, before: Any, now: Any) -> None:
     """Raise a `CFlowError` if the results in a folder follow from something else than `made_by` says now.
 
     Settings that are `free` may differ.
     """
     known = known_settings(type(cfg))
     free = [name for name, owners in known.items() if any(limits and limits["free"] for limits in owners.values())]
-    check_same_run(folder, json_ready(before), now, free, remedy)
+    check_same_run(folder, json_ready(before), now, free)
 
 
-def claim_output(cfg: Submit, folder: Path) -> None:
-    """Reject a folder whose config.yaml is that of other results, unless `cfg.overwrite`; write config.yaml."""
+def claim_output(cfg: Submit, folder: Path, results: Sequence[Path]) -> None:
+    """Reject a folder with results of other settings, or with `results` that have no config.yaml; write config.yaml.
+
+    With `cfg.overwrite`, we remove older results, but not what is not ours.
+    """
     file = ensure_writable(folder) / "config.yaml"
-    if file.exists() and not cfg.overwrite:
-        before = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    before: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.exists() else {}
+    for path in results:
+        if path.exists() and "cflow_torch" not in before.get("versions", {}):
+            raise CFlowError(f"{path} exists and is not a result of `cflow submit`: give output=FOLDER")
+    if cfg.overwrite:
+        for path in results:
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    elif before:
         check_made_by(cfg, folder, before, made_by(cfg))
     write_config(cfg, folder)

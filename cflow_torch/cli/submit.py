@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any, List, Mapping, Optional, Sequence, Tuple
 
@@ -42,10 +41,7 @@ def task(cfg: Submit) -> None:
         _check(cfg.archive, version, plan)
         return
     folder, file = output / f"v{version.number}", output / f"v{version.number}.zip"
-    if cfg.overwrite:
-        shutil.rmtree(folder, ignore_errors=True)
-        file.unlink(missing_ok=True)
-    claim_output(cfg, output)
+    claim_output(cfg, output, (folder, file))
     failures += _write(plan, model, version, masks, folder)
     finish(failures)
     _check(folder, version, plan)

@@ -191,7 +191,7 @@ def test_the_command_counts_what_it_removes_and_writes_a_map_that_is_missing(
         text = capsys.readouterr().out
         assert f"4 sweeps, {expected.format(removed, total)}" in text and 0 < removed < total
         assert "data.bin_columns=5" in text
-        file = tmp_path / "clean" / "drive.ply"
+        file = tmp_path / "clean" / "drive" / "map.ply"
         assert b"property float intensity" in file.read_bytes()[:300]
         file.unlink()
 

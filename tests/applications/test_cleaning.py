@@ -148,13 +148,13 @@ def test_the_command_resumes_and_refuses_changed_settings(tmp_path: Path, capsys
     call = calls_on_a_drive(tmp_path)
     settings = ("map=true", "voxel_size=0.5", "suffix=.ply")
     assert call("clean", "clean", *settings) == 0
-    (file,) = (tmp_path / "clean").glob("*.ply")
-    log = ArraysLog(tmp_path / "clean" / file.stem)
+    (file,) = (tmp_path / "clean").glob("*/map.ply")
+    log = ArraysLog(file.parent)
     assert len(log) == 4 and len(log[0].points) > 1000 and log[0].is_ground is not None
     before = file.read_bytes()
     picture = file.with_suffix(".png")
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    given = ArraysLog(tmp_path / "clean" / file.stem).columns(0)
+    given = log.columns(0)
     assert set(given) == {"intensity", "laser_number", "offset_ns"} and len(given["intensity"]) == len(log[0].points)
     file.unlink()
     capsys.readouterr()

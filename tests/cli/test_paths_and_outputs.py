@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, Callable
 
 import pytest
-from small_logs import write_small_log
+from small_logs import make_small_drive, write_small_log
 
 from cflow_torch.cli import flow
+from cflow_torch.data.arrays import write_array_log
 from cflow_torch.errors import CFlowError, warn
 from cflow_torch.fleet.progress import show_warnings_as_lines
 
@@ -72,7 +73,7 @@ def test_flow_touches_only_the_logs_of_its_run(drives, tmp_path, cflow, capsys):
 def test_clean_resumes_and_overwrites_as_flow_does(drives, tmp_path, cflow, capsys):
     out = tmp_path / "out"
     call = ("clean", *SMALL, f"output={out}")
-    assert cflow(*call, drives[0], "map=true", "voxel_size=0.2") == 0 and (out / "drive_1.ply").exists()
+    assert cflow(*call, drives[0], "map=true", "voxel_size=0.2") == 0 and (out / "drive_1" / "map.ply").exists()
     first = times(out / "drive_1")
     assert cflow(*call, *drives, "voxel_size=0.2") == 0
     assert times(out / "drive_1") == first and (out / "drive_2" / "points").is_dir()
@@ -81,13 +82,41 @@ def test_clean_resumes_and_overwrites_as_flow_does(drives, tmp_path, cflow, caps
     error = capsys.readouterr().err
     assert "remove_stopped was False, is True" in error and "overwrite=true" in error
     assert cflow(*call, drives[0], "remove_stopped=true", "overwrite=true") == 0
-    assert times(out / "drive_1").values() != first.values() and not (out / "drive_1.ply").exists()
+    assert times(out / "drive_1").values() != first.values() and not (out / "drive_1" / "map.ply").exists()
     assert times(out / "drive_2") == second
     shutil.rmtree(drives[1])
     shutil.copytree(drives[0], drives[1])
     next((drives[1] / "sensors" / "lidar").iterdir()).unlink()
     assert cflow(*call, drives[1], "voxel_size=0.2") == 2, "another log of this name"
     assert times(out / "drive_2") == second
+
+
+def files_of(folder: Path) -> dict[Path, bytes]:
+    return {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_clean_removes_nothing_that_it_has_not_written(tmp_path, cflow, capsys):
+    """The parent of the drive as the output, with and without overwrite: the raw data and other files stay."""
+    write_array_log(make_small_drive(num_sweeps=3), tmp_path, ".npy")
+    (drive,) = tmp_path.iterdir()
+    for suffix in (".ply", ".png", ".json"):
+        drive.with_name(f"{drive.name}{suffix}").write_text("of the user")
+    before = files_of(tmp_path)
+    call = ("clean", *SMALL, "map=true", "voxel_size=0.5")
+    for more in ((), ("overwrite=true",)):
+        assert cflow(*call, drive, f"output={tmp_path}", *more) == 2
+        error = capsys.readouterr().err
+        assert "is not a result of `cflow clean`: give output=FOLDER" in error and "overwrite" not in error
+    assert files_of(tmp_path) == before
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / f"{drive.name}.ply").write_text("of the user")
+    for more in ((), ("overwrite=true",)):
+        assert cflow(*call, drive, f"output={results}", *more) == 0
+    assert {path.name for path in results.iterdir()} == {drive.name, f"{drive.name}.ply", "config.yaml"}
+    clean = files_of(results)
+    assert cflow(*call, results / drive.name, f"output={results}", "overwrite=true") == 2, "its own input"
+    assert "has the log that is to be cleaned" in capsys.readouterr().err and files_of(results) == clean
 
 
 def test_clean_names_a_second_log_of_a_name(drives, tmp_path, cflow, capsys):

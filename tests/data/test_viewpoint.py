@@ -65,7 +65,7 @@ def test_cleaned_clouds_have_the_same_form(tmp_path, frame: str) -> None:
     assert np.array_equal(kept, given[~np.load(folder / "removed" / "2.npy")])
     log = open_log("arrays", folder)
     assert np.allclose(log.poses, poses, atol=1e-6) and log.readings == (("world",) if frame == "world" else ())
-    world = read_cloud(tmp_path / "out" / "drive.ply")
+    world = read_cloud(tmp_path / "out" / "drive" / "map.ply")
     assert abs(np.median(world[:, 0]) - 300) < 60, "the map is in the world"
 
 

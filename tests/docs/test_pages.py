@@ -142,7 +142,7 @@ def test_three_commands_of_the_readme_make_actors_and_a_clean_map(folder: Path, 
     kinds = {str(number): str(kind) for number, kind in zip(table["id"], table["class"])}
     is_soft = {actor["id"]: actor["class_name"] == "Cyclist" for actor in actors.values()}
     assert is_soft == {number: kind in ("pedestrian", "cyclist") for number, kind in kinds.items()}
-    points = read_columns("outputs/clean/my_drive.ply")["intensity"]
+    points = read_columns("outputs/clean/my_drive/map.ply")["intensity"]
     kept = [read_cloud(f"outputs/clean/my_drive/points/scan_{index}.pcd") for index in range(6)]
     assert 1000 < len(points) < sum(map(len, kept)) < 0.95 * sum(map(len, clouds))
 

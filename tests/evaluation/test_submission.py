@@ -277,6 +277,9 @@ def test_command_makes_checks_resumes(log: AV2Log, tmp_path: Path, capsys: pytes
     assert cflow(*call) == 1, "an unknown file is reported"
     assert "notes.txt" in capsys.readouterr().err
     assert cflow(*call, "overwrite=true", "model.connectivity=4") == 0
+    (tmp_path / "config.yaml").unlink()
+    assert cflow(*call, "overwrite=true") == 2, "a folder of somebody else"
+    assert "v3 exists and is not a result of `cflow submit`" in capsys.readouterr().err and (tmp_path / "v3").exists()
 
 
 def test_av2_accepts_the_real_pair_with_its_masks(av2_tools: Any, av2_folder: Path, tmp_path: Path) -> None:
