@@ -14,7 +14,7 @@ from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.tracking import Tracker
 from cflow_torch.config import make_config
-from cflow_torch.data.log import CachedLog, Log, window
+from cflow_torch.data.log import CachedLog, Log, TimedLog, window
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.transforms import transform_points
@@ -81,6 +81,7 @@ class CleanLog(MaskedLog):
             has it, moving, and with `remove_stopped` also is_valid.
         remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
             finds them. It takes a pass over the log before the first sweep is returned, and 1 bit of memory per point.
+        sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
 
     Attributes:
         log_id, timestamps, gaps: those of the log.
@@ -96,6 +97,7 @@ class CleanLog(MaskedLog):
         model: SceneFlowModel | None = None,
         flow: Callable[[int], FlowResult] | None = None,
         remove_stopped: bool = False,
+        sweep_interval: float = 0.1,
     ) -> None:
         if len(log.timestamps) < 2:
             raise CFlowError(f"log {log.log_id} has {len(log.timestamps)} sweeps: give a log of at least two")
@@ -106,6 +108,7 @@ class CleanLog(MaskedLog):
         self._bits: list[np.ndarray] | None = None
         self.num_stopped: int | None = None
         self._tracks_objects = remove_stopped
+        self._timed = TimedLog(self._log, sweep_interval)
 
     def _moving_or_missing(self, index: int) -> np.ndarray:
         points = as_numpy(self._log.sweep(index).points)[:, :3]
@@ -166,7 +169,7 @@ class CleanLog(MaskedLog):
             removed = self._moves(index)
             num_moving += int(removed.sum())
             if self._has_flow(index):
-                table, track_id = tracker.push(window(self._log, index), self._flow(index))
+                table, track_id = tracker.push(window(self._timed, index), self._flow(index))
                 tables.append({**table, "sweep": np.full(len(table["id"]), index)})
                 has_stopped = table["is_confirmed"] & ~table["is_moving"]
                 removed = removed | np.isin(track_id, table["id"][has_stopped])

@@ -78,10 +78,10 @@ def _nuscenes_box(table: Table, row: int, token: str) -> dict[str, Any]:
 def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
     """Write a pickle of a list with a dictionary per sweep of the log, as OpenPCDet writes its detections.
 
-    Each has `frame_id`, the sweep as "000000"; `name` (K,), `score` (K,) and `boxes_lidar` (K, 7) float32 of the K
-    tracks: centre, length, width and height in metres, and heading in radians, in the frame of the sweep's points;
-    `pred_labels` (K,), 1 to 4 as in `KITTI_NAMES`; and `track_id` (K,). OpenPCDet's fields of the camera image are left
-    out.
+    Each has `frame_id`, the number of the sweep (`Log.frame_number`) as "000000"; `name` (K,), `score` (K,) and
+    `boxes_lidar` (K, 7) float32 of the K tracks: centre, length, width and height in metres, and heading in radians, in
+    the frame of the sweep's points; `pred_labels` (K,), 1 to 4 as in `KITTI_NAMES`; and `track_id` (K,). OpenPCDet's
+    fields of the camera image are left out.
     """
     names = list(KITTI_NAMES)
     centre, heading = boxes_in_sweeps(table, log)
@@ -94,7 +94,7 @@ def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
         rows = np.flatnonzero(table["sweep"] == sweep)
         frames.append(
             {
-                "frame_id": f"{sweep:06d}",
+                "frame_id": f"{log.frame_number(sweep):06d}",
                 "name": kitti_name[rows],
                 "score": score[rows],
                 "boxes_lidar": box[rows],

@@ -11,7 +11,7 @@ from cflow_torch.applications.masks import DynamicShapes, check_cameras, write_m
 from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import Table, class_of
 from cflow_torch.data.json_file import write_json
-from cflow_torch.data.log import Log
+from cflow_torch.data.log import Log, TimedLog
 from cflow_torch.data.paths import PathLike, as_path
 from cflow_torch.transforms import upright_poses
 from cflow_torch.types import CENTRE, SIZE, FlowResult, vectors
@@ -119,13 +119,15 @@ def write_drivestudio_masks(
     Convention: frames are those of `write_drivestudio`. The loader needs a file for each of them. Where a sweep has no
         flow, such as the last one, we move the points and boxes of the sweep before to its time.
     """
+    log = TimedLog(log)
+    seconds = log.sweep_times()
     shapes = {index: DynamicShapes.of(log, index, result, table) for index, result in results}
     if not shapes:
         return
     for frame, sweep in enumerate(_sweep_of_frames(log).tolist()):
         source = max((index for index in shapes if index <= sweep), default=min(shapes))
         T_sweep_source = np.linalg.inv(pose_of(log.sweep(sweep))) @ pose_of(log.sweep(source))
-        later = (log.timestamps[sweep] - log.timestamps[source]) * 1e-9
+        later = seconds[sweep] - seconds[source]
         kinds = {
             "all": shapes[source],
             "human": shapes[source].boxes(_DEFORMABLE),

@@ -85,7 +85,8 @@ def find_labels(
         after the 32,767th have the number 0.
 
     Raises:
-        CFlowError: a result has no confidence or not one row per point, results are missing, or SciPy is not installed.
+        CFlowError: a sweep has no ground mask, a result has no confidence or not one row per point, results are
+            missing, or SciPy is not installed.
 
     Cost: reads the log twice. Each sweep takes a nearest-neighbour search of all points, and two of the moving points.
     """
@@ -93,6 +94,7 @@ def find_labels(
         "scipy.spatial", "labels need SciPy (extra label): pip install scipy"
     ).cKDTree
     log = CachedLog(log, 3)
+    seconds = log.sweep_times(model.config.sweep_interval)
     dynamic: list[DynamicPoints] = []
     groups: list[np.ndarray] = []
     neighbours = [*range(1, len(log)), len(log) - 2]  # index of the sweep to which the flow of each sweep leads
@@ -104,8 +106,13 @@ def find_labels(
                 f"flow {index} of log {log.log_id} has no confidence, or rows of another sweep: labels need the flow "
                 "of each of its pairs by the preset offline or default"
             )
+        if sweep.is_ground is None:
+            raise CFlowError(
+                f"sweep {index} of log {log.log_id} has no ground mask, which labels need: open the log with "
+                "find_ground='grid'"
+            )
         groups.append(as_numpy(result.cluster_id, np.int32))
-        dynamic.append(_dynamic_points(sweep, other, result))
+        dynamic.append(_dynamic_points(sweep, other, result, seconds[[index, neighbours[index]]]))
     trees = [tree(each.positions) for each in dynamic]
     for index, stamp in enumerate(log.timestamps):
         sweep = log.sweep(index)
@@ -152,20 +159,16 @@ def _with_last(log: Log, flows: Iterable[FlowResult], model: SceneFlowModel) -> 
     yield flow_back(log, model)
 
 
-def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult) -> DynamicPoints:
+def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult, seconds: np.ndarray) -> DynamicPoints:
+    """Collect the moving points of a sweep whose flow leads to another one; `seconds` are the times of both."""
     residual = as_numpy(result.residual_flow, np.float64)
     group = as_numpy(result.cluster_id)
     rows = np.flatnonzero(as_numpy(result.is_moving) & (group >= 0))
-    interval = _seconds(other) - _seconds(sweep)  # negative where the flow leads to the sweep before
+    interval = seconds[1] - seconds[0]  # negative where the flow leads to the sweep before
     velocity = residual[rows] @ pose_of(other)[:3, :3].T / interval
     confidence = as_numpy(result.confidence, np.float64)[rows]  # type: ignore[arg-type]  # checked before
     positions = transform_points(as_numpy(sweep.points)[rows, :3], pose_of(sweep))
-    return DynamicPoints(rows, positions, velocity, group[rows], confidence, _seconds(sweep))
-
-
-def _seconds(sweep: Sweep) -> float:
-    """Time of a sweep, to 0.1 microseconds."""
-    return float(sweep.timestamp_ns or 0) / 1e9
+    return DynamicPoints(rows, positions, velocity, group[rows], confidence, float(seconds[0]))
 
 
 def _is_confirmed(dynamic: Sequence[DynamicPoints], trees: Sequence[Any], index: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from cflow_torch.applications.moving_groups import MovingGroups, pose_of
 from cflow_torch.applications.track_table import Table, box_corners, boxes_in_sweeps, class_of
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.camera import Camera
-from cflow_torch.data.log import Log
+from cflow_torch.data.log import Log, TimedLog
 from cflow_torch.errors import import_optional
 from cflow_torch.types import SIZE, VELOCITY, CFlowError, FlowResult, Window, as_numpy, vectors
 
@@ -28,7 +28,8 @@ def write_masks(folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]
 
     Args:
         folder: created if it does not exist.
-        log: a log whose reader knows the calibration of its cameras (`Log.cameras`).
+        log: a log whose reader knows the calibration of its cameras (`Log.cameras`). If its sweeps have no time stamps,
+            give a `TimedLog`; else we take them for 0.1 s apart.
         results: (index, flow of sweep `index` to `index + 1`).
         table: tracks of the log, see `track`.
 
@@ -39,6 +40,7 @@ def write_masks(folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]
     Raises:
         CFlowError: the log has no calibration of cameras, or Pillow is not installed.
     """
+    log = TimedLog(log)
     for index, result in results:
         cameras = log.cameras(index)
         check_cameras(log, cameras)
@@ -67,7 +69,7 @@ class DynamicShapes(NamedTuple):
 
     @classmethod
     def of(cls, log: Log, index: int, result: FlowResult, table: Table) -> DynamicShapes:
-        """Collect those of sweep `index` of a log, given its flow and the table of tracks."""
+        """Collect those of sweep `index` of a `TimedLog`, given its flow and the table of tracks."""
         rows = {name: values[table["sweep"] == index] for name, values in table.items()}
         kind = np.array([class_of(rows, row) for row in range(len(rows["sweep"]))], dtype=np.str_)
         return cls(*_moving_points(log, index, result), *_corners(log, rows), kind)
@@ -141,9 +143,7 @@ def _moving_points(log: Log, index: int, result: FlowResult) -> tuple[np.ndarray
     moves[as_numpy(groups.row[of_own_vehicle(groups, sweeps)])] = False
     rotation = pose_of(sweep)[:3, :3].T @ pose_of(after)[:3, :3]  # from the axes of t+1 to those of t
     flow = as_numpy(result.residual_flow, np.float64)[moves] @ rotation.T
-    seconds = 0.1
-    if sweep.timestamp_ns is not None and after.timestamp_ns is not None:
-        seconds = (after.timestamp_ns - sweep.timestamp_ns) * 1e-9
+    seconds = (after.timestamp_ns - sweep.timestamp_ns) * 1e-9  # type: ignore[operator]  # of a `TimedLog`
     return points[moves], flow / seconds
 
 

@@ -30,7 +30,7 @@ def write_moving_labels(folder: PathLike, log: Log, results: Iterable[tuple[int,
 
     Args:
         folder: `sequences/<sequence>/predictions` of the evaluators, created if it does not exist.
-        log: the drive. Files are numbered by its sweeps.
+        log: the drive. Files have the numbers of its sweeps in the data set (`Log.frame_number`).
         results: (index, flow of sweep `index` to `index + 1`). In sweeps without a flow, such as the last one, all
             points have class 0, which the evaluators do not score.
     """
@@ -38,11 +38,11 @@ def write_moving_labels(folder: PathLike, log: Log, results: Iterable[tuple[int,
     without_flow = set(range(len(log.timestamps)))
     for index, result in results:
         without_flow.discard(index)
-        _write(folder, index, moving_classes(result))
+        _write(folder, log.frame_number(index), moving_classes(result))
     for index in sorted(without_flow):
-        _write(folder, index, np.full(len(log.sweep(index).points), UNLABELLED_CLASS))
+        _write(folder, log.frame_number(index), np.full(len(log.sweep(index).points), UNLABELLED_CLASS))
 
 
-def _write(folder: Path, index: int, classes: np.ndarray) -> None:
-    with atomic_file(folder / f"{index:06d}.label") as file:
+def _write(folder: Path, frame: int, classes: np.ndarray) -> None:
+    with atomic_file(folder / f"{frame:06d}.label") as file:
         file.write(classes.astype("<i4").tobytes())

@@ -20,12 +20,13 @@ from cflow_torch.applications.track_state import Times, TrackStates
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds_and_sizes, turned
 from cflow_torch.config import make_config
-from cflow_torch.data.log import CachedLog, Log, window, windows
+from cflow_torch.data.log import CachedLog, Log, TimedLog, window, windows
 from cflow_torch.estimate import make_model
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.types import CENTRE, SIZE, VELOCITY, CFlowError, FlowResult, Sweep, Window
 
 _MAX_MISSED = 3  # sweeps that a track survives unseen
+_LONGEST_PAUSE = 1.0  # seconds without a sweep that a track survives, if that is more than `_MAX_MISSED` intervals
 _REST_NOISE = 0.1  # metres, standard deviation of the place of a stopped object
 _UNKNOWN = 1e6  # variance of a new track, before its first measurement
 _MOST_STATIC = 0.5  # share of the points of a track in one sweep; pieces of walls have more
@@ -60,6 +61,9 @@ class _TrackPoints(NamedTuple):
         return _TrackPoints(self.position[track >= 0], track[track >= 0])
 
 
+_NO_POINTS = _TrackPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64))
+
+
 class _SeenEdges(NamedTuple):
     """Visible edges of tracks in one sweep, relative to their paths."""
 
@@ -79,7 +83,8 @@ class Tracker:
 
     The flow moves the points of a group to the next sweep. There, the group that shares the most voxels with them is
     the same object. We track a stopped object as long as there are points in its box. If an object is not seen for up
-    to three sweeps, we predict its position from its velocity. Memory: the points of the current tracks.
+    to three sweeps, or if sweeps are missing for up to three intervals, or a second if that is more, we predict its
+    position from its velocity. Memory: the points of the current tracks.
 
     Args:
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
@@ -102,7 +107,7 @@ class Tracker:
         self._tracks = TrackStates()
         self._recent: deque[_SeenEdges] = deque(maxlen=_RECENT)
         # Points of the tracks, at their predicted positions in the next sweep.
-        self._points = _TrackPoints(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int64))
+        self._points = _NO_POINTS
 
     @one_thread()
     def push(self, sweeps: Window | tuple[Sweep, Sweep], result: FlowResult) -> Tracked:
@@ -116,8 +121,8 @@ class Tracker:
             The tracks at t. Tracks that are not (yet) `is_confirmed` are mostly noise of the static world.
 
         Raises:
-            CFlowError: the sweep is not later than the one before, or the result has another number of rows or lacks
-                a field.
+            CFlowError: the sweep is not later than the one before, t+1 is not later than t, or the result has another
+                number of rows or lacks a field.
         """
         sweeps = sweeps if isinstance(sweeps, Window) else Window(*sweeps)
         if any(getattr(result, name) is None for name in ("residual_flow", "cluster_id", "is_valid")):
@@ -161,23 +166,29 @@ class Tracker:
         if begin is not None and end is not None:
             now = begin * 1e-9
             interval = (end - begin) * 1e-9
+        elapsed = interval if last is None else now - last
+        if not (interval > 0 and elapsed > 0):
+            raise CFlowError(
+                f"sweep t is {elapsed:.3f} s later than the last one, and t+1 {interval:.3f} s later than t: push "
+                "sweeps in the order of time"
+            )
         self._clock = now, now + interval
-        if last is None:
-            return Times(now, interval, elapsed=interval, late=0.0)
-        if now <= last:
-            raise CFlowError(f"this sweep is {last - now:.3f} s before the last one: push sweeps in the order of time")
-        return Times(now, interval, elapsed=now - last, late=now - due)
+        return Times(now, interval, elapsed, late=0.0 if last is None else now - due)
 
     def _predict(self, times: Times, device: torch.device) -> tuple[TrackStates, _TrackPoints]:
         """Move the tracks and their points to t.
 
-        The last flow has already moved boxes and points. If the sweep is late, their velocity moves them further.
+        The last flow has already moved boxes and points. If the sweep is late, their velocity moves them further. If it
+        is later than tracks survive, there are none.
         """
+        if _is_after_pause(times):
+            self._tracks = TrackStates()
+            self._points = _NO_POINTS
         tracks = self._tracks.map(lambda values: values.to(device))
         position, track = (values.to(device) for values in self._points)
         late = times.late * tracks.motion.velocity
         points = _TrackPoints(position + late[track], track)
-        tracks = tracks._replace(box=tracks.box + late, path=tracks.path + late)
+        tracks = tracks._replace(box=tracks.box + late, path=tracks.path + late, travel=tracks.travel + late)
         return tracks.predict(times.elapsed), points
 
     def _update(
@@ -283,6 +294,11 @@ class Tracker:
         }
 
 
+def _is_after_pause(times: Times) -> bool:
+    """Test whether no sweep came for so long that tracks and their velocities are worth nothing."""
+    return times.late > max(_MAX_MISSED * times.interval, _LONGEST_PAUSE)
+
+
 def _track_of_point(groups: MovingGroups, matches: TrackMatches, track_of_group: Tensor) -> Tensor:
     """Return the track of each point that moves or lies in the box of a stopped object, (P,) int64; -1 = none."""
     track = torch.full_like(groups.group, -1)
@@ -320,7 +336,8 @@ def track(
     Returns:
         Column -> (R,) array, which `pandas.DataFrame(table)` takes. There is a row for each track and sweep in which it
         is seen, sorted by sweep, then id. In up to three sweeps before its flow begins, and in such gaps, it is seen
-        where enough points are in the place from which its flow comes. The columns are:
+        where enough points are in the place from which its flow comes. No track goes on after a pause of three
+        intervals and a second. The columns are:
         `sweep`, `timestamp_ns`, `id`;
         x, y, z: smoothed centre of the whole box, metres in the world; vx, vy, vz: its velocity over ground, m/s;
         `velocity_std`: m/s, standard deviation of each of vx, vy and vz, if errors are independent;
@@ -380,7 +397,7 @@ class LogTracker:
     """
 
     def __init__(self, log: Log, sweep_interval: float = 0.1) -> None:
-        self._log = log
+        self._log = TimedLog(log, sweep_interval)
         self._tracker = Tracker(sweep_interval)
         self._sweeps: list[SweepTracks] = []
         self._last: dict[int, int] = {}  # id -> number of the last sweep in which the track is seen
@@ -389,6 +406,9 @@ class LogTracker:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
+        if _is_after_pause(self._tracker.times):
+            for each in self._sweeps[-_MAX_MISSED:]:
+                each.free = None  # new tracks were not there
         points = TrackedPoints.of(index, sweeps, result, track_id, self._tracker.times, self._tracker.floor)
         free = FreePoints.of(sweeps, result, points)
         now = SweepTracks(table, points, int(self._log.timestamps[index]), free)

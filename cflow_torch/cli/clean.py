@@ -15,7 +15,7 @@ from cflow_torch.cli.commands import Clean
 from cflow_torch.cli.failures import collect_failures, finish
 from cflow_torch.cli.logs import open_logs
 from cflow_torch.cli.outputs import check_made_by, local_folder, made_by, write_config
-from cflow_torch.cli.stored_flow import method_of_flow, stored_flow
+from cflow_torch.cli.stored_flow import interval_of_flow, method_of_flow, stored_flow
 from cflow_torch.data.arrays import ArraysLog
 from cflow_torch.data.arrays.bin_layout import KITTI_COLUMNS
 from cflow_torch.data.arrays.cloud_file import SUFFIXES, write_cloud
@@ -58,9 +58,9 @@ def _cleaner(cfg: Clean) -> Callable[[Log], CleanLog]:
     """Return a function that makes the clean log, by the flow of earlier files or by the method."""
     if cfg.flow is None:
         model = make_model(cfg.model, cfg.device)
-        return lambda log: CleanLog(log, model, None, cfg.remove_stopped)
+        return lambda log: CleanLog(log, model, None, cfg.remove_stopped, cfg.model.sweep_interval)
     stored = stored_flow(cfg.flow, _NEEDED)
-    return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped)
+    return lambda log: CleanLog(log, None, partial(stored, log), cfg.remove_stopped, interval_of_flow(cfg, log.log_id))
 
 
 def _is_written(cfg: Clean, log: Log, output: Path) -> bool:

@@ -109,12 +109,13 @@ def _animate(cfg: Animation, model: SceneFlowModel, log: Log, output: Path) -> P
     if not pairs:
         raise CFlowError(f"data.first={cfg.data['first']}: log {log.log_id} has pairs 0 to {len(log.timestamps) - 2}")
     ensure_writable(output)
+    seconds = log.sweep_times(model.config.sweep_interval)
     frames: list[AnimatedPair] = []
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:
         flow = result.residual_flow
         result = replace(result, pose_flow=flow, flow=flow)  # frees the flow that is not drawn
-        title = f"{log.log_id}, {(log.timestamps[index] - log.timestamps[pairs[0]]) / 1e9:.1f} s"
+        title = f"{log.log_id}, {seconds[index] - seconds[pairs[0]]:.1f} s"
         frames.append(AnimatedPair(sweeps.pc0.points, result, sweeps.pc0.is_ground, title))
 
     finish(for_each_pair([(log, index) for index in pairs], model, keep))

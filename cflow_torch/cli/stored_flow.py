@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Callable, Sequence
 
+from cflow_torch.cli.commands import Clean, View
 from cflow_torch.data.flow_file import read_flow
 from cflow_torch.data.json_file import read_json
 from cflow_torch.data.log import Log
@@ -33,3 +34,9 @@ def method_of_flow(folder: Any, log_id: str) -> dict[str, Any] | None:
     """Return the settings of the method that made the flow files of a log; None = they have no manifest."""
     manifest = as_path(folder) / log_id / MANIFEST
     return read_json(manifest).get("run", {}).get("method") if manifest.exists() else None
+
+
+def interval_of_flow(cfg: Clean | View, log_id: str) -> float:
+    """Return the seconds from sweep to sweep without time stamps: those of the stored flow, or of the model."""
+    method = (cfg.flow is not None and method_of_flow(cfg.flow, log_id)) or {}
+    return float(method.get("sweep_interval", cfg.model.sweep_interval))

@@ -40,11 +40,11 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
         before; "interval": median seconds between sweeps, None without `pace`; "in_time": share of results that were
         ready before the next sweep; "rate": sweeps per second.
     """
-    stamps = np.array(log.timestamps[:count], dtype=np.int64)
-    due = None if pace is None else (stamps - stamps[0]) / 1e9 / pace
+    seconds = log.sweep_times(stream.config.sweep_interval)[:count]
+    due = None if pace is None else seconds / pace
     latencies: list[float] = []
     begin = time.perf_counter()
-    progress = tqdm(range(len(stamps)), desc=f"stream {log.log_id}", unit="sweep", disable=None)
+    progress = tqdm(range(len(seconds)), desc=f"stream {log.log_id}", unit="sweep", disable=None)
     for index in progress:
         sweep = log.sweep(index)
         arrival = time.perf_counter() if due is None else begin + due[index]
@@ -54,16 +54,16 @@ def play(stream: FlowStream, log: Log, pace: Any = None, count: Any = None) -> d
             result.is_valid.any().item()  # waits for the GPU
             latencies.append(time.perf_counter() - arrival)
             progress.set_postfix_str(f"latency {1000 * latencies[-1]:.0f} ms")
-    seconds = time.perf_counter() - begin
+    elapsed = time.perf_counter() - begin
     p50, p99 = np.percentile(latencies or [np.nan], (50, 99)).tolist()
     interval = None if due is None or len(due) < 2 else float(np.median(np.diff(due)))
     return {
-        "sweeps": len(stamps),
+        "sweeps": len(seconds),
         "results": len(latencies),
         "latency": {"p50": p50, "p99": p99},
         "interval": interval,
         "in_time": None if interval is None else float(np.mean(np.array(latencies) <= interval)),
-        "rate": len(stamps) / seconds,
+        "rate": len(seconds) / elapsed,
     }
 
 

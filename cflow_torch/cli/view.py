@@ -14,9 +14,9 @@ from cflow_torch.cli.commands import View
 from cflow_torch.cli.failures import Failures, collect_failures, finish
 from cflow_torch.cli.logs import chosen_pairs, open_logs
 from cflow_torch.cli.outputs import chosen_preset, local_folder, write_config
-from cflow_torch.cli.stored_flow import method_of_flow, stored_flow
+from cflow_torch.cli.stored_flow import interval_of_flow, method_of_flow, stored_flow
 from cflow_torch.data.atomic import ensure_writable
-from cflow_torch.data.log import CachedLog, Log, window
+from cflow_torch.data.log import CachedLog, Log, TimedLog, window
 from cflow_torch.data.paths import as_path
 from cflow_torch.estimate import make_model
 from cflow_torch.fleet.changes import nearest_preset
@@ -41,12 +41,13 @@ def task(cfg: View) -> None:
                 raise CFlowError(f"{file} exists for another log of this name: give a data.root= with one of them")
             pairs = chosen_pairs(log, cfg.data, cfg.count)
             results = _results(recent, pairs, flow, failures)
+            timed = TimedLog(recent, interval_of_flow(cfg, log.log_id))
             stored = None if cfg.flow is None else as_path(cfg.flow) / log.log_id / TRACKS_FILE
             table = None if stored is None or not stored.exists() else read_tracks(stored)
             if cfg.format == "html":
-                count = _save_page(cfg, recent, results, file, table)
+                count = _save_page(cfg, timed, results, file, table)
             else:
-                count = record_log(recent, results, file, max_flow=cfg.max_flow, tracks=table)
+                count = record_log(timed, results, file, max_flow=cfg.max_flow, tracks=table)
             files.append(file)
             print(f"{file}: {count} pair{'' if count == 1 else 's'}, {file.stat().st_size / 1e6:,.1f} MB")
     if files and not cfg.show:

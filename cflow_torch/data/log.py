@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Callable, Iterator, Mapping, Sequence, TypeVar, overload
 
@@ -163,6 +163,24 @@ class Log(ABC):
     def T_camera0_lidar(self) -> np.ndarray | None:
         """(4, 4) float64, from the LiDAR to KITTI's rectified camera 0; None = the log has no such camera."""
         return None
+
+    def frame_number(self, index: int) -> int:
+        """Return the number of sweep `index` in the data set, such as that of its file; the index if it has none."""
+        self._timestamp(index)
+        return index
+
+    def sweep_times(self, sweep_interval: float = 0.1) -> np.ndarray:
+        """Return the (K,) float64 seconds of all sweeps, 0 for the first. Reads one sweep.
+
+        Without time stamps, sweeps are `sweep_interval` seconds apart. Where sweeps are missing by their numbers
+        (`frame_number`), the time goes on.
+        """
+        if self.sweep(0).timestamp_ns is not None:
+            stamps = np.array(self.timestamps, np.int64)
+            return (stamps - stamps[0]) * 1e-9  # type: ignore[no-any-return]
+        frames = np.array([self.frame_number(index) for index in range(len(self))])
+        usual = np.median(np.diff(frames)) if len(frames) > 1 else 1
+        return sweep_interval * (frames - frames[0]) / usual  # type: ignore[no-any-return]
 
     def sweep_name(self, index: int) -> str:
         """Return the name of sweep `index` in the data set and in its submissions."""
@@ -384,10 +402,29 @@ class _OfLog:
 for _name in (
     *("labels", "columns", "cameras", "poses", "trajectory", "readings", "surrounds_poses", "judgement", "findings"),
     *("eval_mask", "stored_motion", "moving", "units", "boxes", "T_camera0_lidar", "sample_tokens"),
-    "sweep_name",
+    *("sweep_name", "frame_number", "sweep_times"),
     *("notes", "_note", "close", "unwrapped"),
 ):
     setattr(LogWrapper, _name, _OfLog(_name))  # `__getattr__` is not asked for members that `Log` has
+
+
+class TimedLog(LogWrapper):
+    """A log whose sweeps all have a `timestamp_ns`: their own, or one by `Log.sweep_times`. `timestamps` stay."""
+
+    def __init__(self, log: Log, sweep_interval: float = 0.1) -> None:
+        super().__init__(log)
+        self._sweep_interval = sweep_interval
+
+    def sweep(self, index: int) -> Sweep:
+        sweep = self.log.sweep(index)
+        return sweep if sweep.timestamp_ns is not None else replace(sweep, timestamp_ns=self._stamps[index])
+
+    def sweep_times(self, sweep_interval: float = 0.1) -> np.ndarray:
+        return self.log.sweep_times(self._sweep_interval)
+
+    @cached_property
+    def _stamps(self) -> list[int]:
+        return [round(1e9 * seconds) for seconds in self.sweep_times().tolist()]
 
 
 class CachedLog(LogWrapper):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Sequence
 
@@ -144,6 +145,17 @@ class ArraysLog(Log):
         pose = None if self.poses is None else self.poses[index].copy()
         seconds = None if times is None else times.seconds
         return Sweep(in_single(points), is_ground, pose, time, seconds)
+
+    def frame_number(self, index: int) -> int:
+        """Return the number of the file of sweep `index`; the index if the files are not numbered regularly."""
+        self._timestamp(index)
+        return self._frame_numbers[index]
+
+    @cached_property
+    def _frame_numbers(self) -> Sequence[int]:
+        stems = [stem_of(path) for path in self.files]
+        numbers = [_number_of(stem) for stem in stems]
+        return numbers if times_of_names(stems) is None and _are_regular(numbers) else range(len(numbers))
 
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Read the columns of cloud `index` besides x, y, z, see `cloud_file.read_columns`."""
@@ -307,14 +319,20 @@ class ArraysLog(Log):
 
     def _gaps_in_numbers(self) -> list[int]:
         """Return the indices of files without times after which others are missing, by the numbers in their names."""
-        steps = np.diff([_number_of(stem_of(path)) for path in self.files])
-        usual = np.median(steps)
-        gaps = [gap for gap in np.flatnonzero(steps > usual).tolist() if gap not in self.gaps]
-        if self._has_times or not gaps or steps.min() <= 0 or (steps == usual).mean() <= _LEAST_USUAL:
+        numbers = [_number_of(stem_of(path)) for path in self.files]
+        steps = np.diff(numbers)
+        gaps = [gap for gap in np.flatnonzero(steps > np.median(steps)).tolist() if gap not in self.gaps]
+        if self._has_times or not gaps or not _are_regular(numbers):
             return []
         first = self.files[gaps[0]].name
         self._note(f"sweeps are missing by the numbers of its files, first after {first}; no window reaches over them")
         return gaps  # type: ignore[no-any-return]
+
+
+def _are_regular(numbers: Sequence[int]) -> bool:
+    """Test whether numbers of files ascend, most by the same step."""
+    steps = np.diff(numbers)
+    return bool(steps.min() > 0 and (steps == np.median(steps)).mean() > _LEAST_USUAL)
 
 
 def _number_of(stem: str) -> int:

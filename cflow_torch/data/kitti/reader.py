@@ -93,6 +93,10 @@ class KITTILog(ArraysLog):
             self.poses = self._pose_per_sweep(trajectory, list(self.timestamps) if self._has_times else None)
             self._frames = [int(file.stem) for file in self.files]
 
+    def frame_number(self, index: int) -> int:
+        self._timestamp(index)
+        return self._frames[index]
+
     def _gaps_in_numbers(self) -> list[int]:
         return [] if self.drive.layout == "raw" else super()._gaps_in_numbers()  # raw drives have times
 
