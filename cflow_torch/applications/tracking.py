@@ -20,7 +20,7 @@ from cflow_torch.applications.track_state import Times, TrackStates
 from cflow_torch.applications.track_table import confirmed, join_tables
 from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds_and_sizes, turned
 from cflow_torch.config import make_config
-from cflow_torch.data.log import CachedLog, Log, TimedLog, window, windows
+from cflow_torch.data.log import CachedLog, Log, TimedLog, window
 from cflow_torch.estimate import make_model
 from cflow_torch.ops.threads import one_thread
 from cflow_torch.types import CENTRE, SIZE, VELOCITY, CFlowError, FlowResult, Sweep, Window
@@ -330,7 +330,7 @@ def track(
     Args:
         log: the drive. Without poses, we assume that all sweeps are in one frame, the world.
         results: (index, flow of sweep `index` to `index + 1`), ascending; sweeps without a result are bridged. None =
-            estimate the flow with the preset `default`.
+            estimate the flow of `log.pairs` with the preset `default`.
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
 
     Returns:
@@ -376,7 +376,8 @@ def track_points(
     if results is None:
         model = make_model(make_config("default"))
         log = CachedLog(log, model.config.num_sweeps)
-        results = enumerate(model([sweeps])[0] for sweeps in windows(log, model.config.num_history))
+        num_history = model.config.num_history
+        results = ((index, model([window(log, index, num_history)])[0]) for index in log.pairs)
     tracker = LogTracker(CachedLog(log, 2), sweep_interval)
     for pair in results:
         if not (isinstance(pair, tuple) and len(pair) == 2):

@@ -18,7 +18,6 @@ from cflow_torch.applications.tracking import track_points
 from cflow_torch.cli.commands import Flow
 from cflow_torch.cli.failures import Failures, collect_failures
 from cflow_torch.cli.flow_run import FlowRun
-from cflow_torch.cli.logs import all_pairs
 from cflow_torch.cli.stored_flow import stored_flow
 from cflow_torch.cli.track_formats import TRACK_FORMATS
 from cflow_torch.data.catalog import Logs, source_name
@@ -106,7 +105,7 @@ def _write_logs(cfg: Flow, run: FlowRun) -> Failures:
     for part in tqdm(run.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
             log = TimedLog(logs.open(part.source), cfg.model.sweep_interval)
-            pairs = all_pairs(log)  # the pair over a gap has no flow
+            pairs = log.pairs  # the pair over a gap has no flow
             if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
                 continue
             results = partial(_read_all, stored, log, pairs)
@@ -135,7 +134,7 @@ def _write_tracks(
 
     `results` reads the flow files. Returns a line with the files.
     """
-    frames = (frame_file(folder, log.timestamps[index]) for index in all_pairs(log))
+    frames = (frame_file(folder, log.timestamps[index]) for index in log.pairs)
     if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, frames)):
         table, points = track_points(log, results())
         for each in points:

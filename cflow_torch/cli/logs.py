@@ -46,15 +46,10 @@ def paths_of(data: dict[str, Any]) -> list[Any]:
     return list(root) if isinstance(root, (list, tuple)) else [root]
 
 
-def all_pairs(log: Log) -> list[int]:
-    """Return the indices of the pairs of a log, none over a gap."""
-    return [index for index in range(len(log.timestamps) - 1) if index not in log.gaps]
-
-
 def chosen_pairs(log: Log, data: Mapping[str, Any], count: int | None = None) -> list[int]:
     """Return the indices of at most `count` pairs of a log, every `data.step`-th from `data.first` on."""
     chosen = range(data["first"], len(log.timestamps) - 1, data["step"])
-    return [index for index in all_pairs(log) if index in chosen][:count]
+    return [index for index in log.pairs if index in chosen][:count]
 
 
 def check_pair(pair: int, log: Log) -> None:

@@ -52,7 +52,7 @@ class Log(ABC):
         log_id: name of the log, safe as a folder name; the name of its file or folder unless the reader says otherwise.
         timestamps: sweep times, nanoseconds, ascending; other ascending numbers if the sweeps have no `timestamp_ns`.
         gaps: indices of sweeps after which the reader left out sweeps. No window reaches over a gap for its history or
-            future, and `cflow flow` leaves out the pair over it.
+            future, and `cflow flow` and `track` leave out the pair over it (`pairs`).
         is_compensated: True = the format is known to be compensated for ego motion within a sweep.
         has_raw_times: True = sweeps with `point_times` are expected not to be compensated.
         has_sparse_poses: True = most poses are interpolated between sweeps.
@@ -191,8 +191,16 @@ class Log(ABC):
         """Names of the sweeps in files of nuScenes; None = the sweep of a scene of nuScenes is not a key frame."""
         return [f"{self.log_id}_{timestamp}" for timestamp in self.timestamps]
 
+    @property
+    def pairs(self) -> list[int]:
+        """The indices of all sweeps t whose next one is t+1: without the last sweep, and those before gaps."""
+        return [index for index in range(len(self) - 1) if index not in self.gaps]
+
     def windows(self, num_history: int = 0, num_future: int = 0) -> Iterator[Window]:
-        """Iterate over the windows of all pairs, in order; each sweep is read once. See `window`."""
+        """Iterate over the windows of all sweeps but the last one, also of those before gaps; each is read once.
+
+        See `window`.
+        """
         return windows(self, num_history, num_future)
 
     @property

@@ -14,7 +14,8 @@ from command_line import cflow
 from small_logs import make_small_drive
 from staged_cars import Staged, straight
 
-from cflow_torch import CFlowError, FlowResult, FlowStream, Sweep, Tracker, Window, make_model, track
+from cflow_torch import CFlowError, FlowResult, FlowStream, Sweep, Tracker, Window, make_config, make_model, track
+from cflow_torch.applications import tracking
 from cflow_torch.applications.detection_files import write_openpcdet
 from cflow_torch.applications.kitti_tracks import write_kitti
 from cflow_torch.applications.labels import find_labels
@@ -84,6 +85,21 @@ def test_pairs_far_apart_confirm_a_track_and_a_long_pause_ends_it() -> None:
     late = Staged([straight((0, 0), (0.1, 0.0), 60)])
     assert len(set(track(late, [pair for pair in late.results() if not 20 <= pair[0] < 28])["id"])) == 1
     assert len(set(track(late, [pair for pair in late.results() if not 20 <= pair[0] < 40])["id"])) == 2
+
+
+def test_the_pair_over_a_gap_is_not_estimated(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = Numbered([0, 1, 2, 5, 6, 7, 8])
+
+    class Known:
+        config = make_config("default", num_history=0)
+
+        def __call__(self, sweeps: list[Window]) -> list[FlowResult]:
+            (index,) = (k for k in range(len(log)) if np.array_equal(log.sweep(k).points, sweeps[0].pc0.points))
+            assert index not in log.gaps
+            return [log.result(index)]
+
+    monkeypatch.setattr(tracking, "make_model", lambda *_: Known())
+    assert log.pairs == [0, 1, 3, 4, 5] and set(track(log)["sweep"]) == set(log.pairs)
 
 
 def test_pairs_that_do_not_go_forward_in_time_are_an_error() -> None:
