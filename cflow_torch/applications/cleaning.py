@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any, Callable, Mapping
+from typing import Any, Callable, Mapping, NamedTuple, Sequence
 
 import numpy as np
 import torch
 
 from cflow_torch.applications.association import box_of_point, enclosing_boxes
+from cflow_torch.applications.completion import TrackedPoints
 from cflow_torch.applications.moving_groups import pose_of
-from cflow_torch.applications.track_table import confirmed, join_tables
-from cflow_torch.applications.tracking import Tracker
+from cflow_torch.applications.track_table import Table
+from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, TimedLog, window
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.transforms import transform_points
-from cflow_torch.types import CENTRE, SIZE, CFlowError, FlowResult, Sweep, as_numpy, check_array, vectors
+from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_array
 
 _MARGIN = 0.2  # metres, added to the sides of the box around the visible part of an object
 _SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
@@ -70,9 +71,8 @@ class MaskedLog(Log):
 class CleanLog(MaskedLog):
     """A log without its moving points, and without points that have no position (NaN).
 
-    A point moves by `FlowResult.is_moving`. The last sweep, and one before a gap of the log,
-    have no flow. There, we take the boxes of the objects that move in the sweep before, shift them by the flow, and
-    remove the points inside.
+    A point moves by `FlowResult.is_moving`. The last sweep, and one before a gap of the log, have no flow. There, we
+    take the boxes of the objects that move in the sweep before, shift them by the flow, and remove the points inside.
 
     Args:
         log: any log. Sweeps are read one after the other, and only a few are held in memory.
@@ -80,7 +80,8 @@ class CleanLog(MaskedLog):
         flow: index -> flow of that pair, in place of a model. We use residual_flow, cluster_id and, if it
             has it, moving, and with `remove_stopped` also is_valid.
         remove_stopped: also remove objects before they start and after they stop, such as cars at a light. Tracking
-            finds them. It takes a pass over the log before the first sweep is returned, and 1 bit of memory per point.
+            finds them, also in a sweep without flow. It takes a pass over the log before the first sweep is returned,
+            and the memory of 1 bit per point and of the points of tracks.
         sweep_interval: seconds from sweep to sweep where sweeps have no time stamps.
 
     Attributes:
@@ -161,40 +162,56 @@ class CleanLog(MaskedLog):
 
     def _track(self) -> list[np.ndarray]:
         """Packed bits of `moving` for every sweep: points of objects that move, have stopped, or have yet to start."""
-        tracker = Tracker()
-        tables = []
+        tracker = LogTracker(self._timed)
         bits = []
-        num_moving = 0
         for index in range(len(self.timestamps)):
-            removed = self._moves(index)
-            num_moving += int(removed.sum())
+            bits.append(np.packbits(self._moves(index)))
             if self._has_flow(index):
-                table, track_id = tracker.push(window(self._timed, index), self._flow(index))
-                tables.append({**table, "sweep": np.full(len(table["id"]), index)})
-                has_stopped = table["is_confirmed"] & ~table["is_moving"]
-                removed = removed | np.isin(track_id, table["id"][has_stopped])
-            bits.append(np.packbits(removed))
-        start = _slow_starts(confirmed(join_tables(tables)))
-        for index in range(int(start["sweep"].max(initial=0))):
+                tracker.push(index, self._flow(index))
+        num_moving = _count(bits)
+        table = tracker.table()
+        has_no_flow = table["cluster_id"] < 0
+        for each in tracker.points:
+            ids = table["id"][has_no_flow & (table["sweep"] == each.sweep)]
+            bits[each.sweep] |= np.packbits(each.track_id(ids) >= 0)
+        start = _slow_starts(table, tracker.points)
+        for index in range(int(start.sweep.max(initial=0))):
             bits[index] |= np.packbits(self._waits(index, start))
-        self.num_stopped = sum(int(np.unpackbits(each).sum()) for each in bits) - num_moving
+        self.num_stopped = _count(bits) - num_moving
         return bits
 
-    def _waits(self, index: int, start: dict[str, np.ndarray]) -> np.ndarray:
+    def _waits(self, index: int, start: _Starts) -> np.ndarray:
         """(N,) bool, points of a sweep in the boxes where objects near the vehicle start later."""
         sweep = self._log.sweep(index)
-        x, y = pose_of(sweep)[:2, 3]
-        is_near = np.hypot(start["x"] - x, start["y"] - y) < _MAX_DISTANCE
-        waiting = {name: values[is_near & (start["sweep"] > index)] for name, values in start.items()}
-        boxes = (vectors(waiting, CENTRE), vectors(waiting, SIZE), waiting["heading"])
-        return _inside(sweep, *map(torch.from_numpy, boxes))
+        distance = np.linalg.norm(start.centre[:, :2] - pose_of(sweep)[:2, 3], axis=1)
+        is_waiting = (distance < _MAX_DISTANCE) & (start.sweep > index)
+        return _inside(sweep, *(torch.from_numpy(values[is_waiting]) for values in start[1:]))
 
 
-def _slow_starts(tracks: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the first row of each track that is slow there."""
-    first = np.unique(tracks["id"], return_index=True)[1]
-    is_slow = np.hypot(tracks["vx"][first], tracks["vy"][first]) < _SLOW
-    return {name: values[first[is_slow]] for name, values in tracks.items()}
+class _Starts(NamedTuple):
+    """Where K tracks begin."""
+
+    sweep: np.ndarray  # (K,) int64
+    centre: np.ndarray  # (K, 3) float64 metres, world, of the box around the points
+    size: np.ndarray  # (K, 3) float64 metres
+    heading: np.ndarray  # (K,) float64 radians
+
+
+def _count(bits: Sequence[np.ndarray]) -> int:
+    return sum(int(np.unpackbits(each).sum()) for each in bits)
+
+
+def _slow_starts(table: Table, seen: Sequence[TrackedPoints]) -> _Starts:
+    """Return where tracks begin that are slow there."""
+    first = np.unique(table["id"], return_index=True)[1]
+    rows = first[np.hypot(table["vx"][first], table["vy"][first]) < _SLOW]
+    of_sweep = {each.sweep: each for each in seen}
+    points = [of_sweep[table["sweep"][row]].of_track(table["id"][row])[0] for row in rows.tolist()]
+    group = np.repeat(np.arange(len(rows)), [len(each) for each in points])
+    heading = table["heading"][rows]
+    position = np.concatenate([np.zeros((0, 3)), *points])
+    centre, size = enclosing_boxes(*map(torch.from_numpy, (position, group, heading)))
+    return _Starts(table["sweep"][rows], centre.numpy(), size.numpy(), heading)
 
 
 def static_map(log: Log, voxel_size: float = 0.1) -> np.ndarray:

@@ -61,7 +61,7 @@ def write_drivestudio(
     """Write `folder/instances_info.json` and `folder/frame_instances.json`.
 
     The first has, for each track, the frames in which it is seen, `T_world_box` (4, 4) and length, width, height in
-    metres. The second has the tracks of each frame, and none for the last one.
+    metres. The second has the tracks of each frame.
 
     Args:
         folder: created if it does not exist. DriveStudio reads `<scene>/instances`.

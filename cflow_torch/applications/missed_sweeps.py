@@ -1,4 +1,4 @@
-"""Find moving objects in the sweeps just before their flow begins, and in short gaps of their tracks."""
+"""Find moving objects where they have no flow: just before it begins, in short gaps, and in a sweep after the last."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from torch import Tensor
 
 from cflow_torch.applications.association import MIN_STOPPED_SHARE, box_of_point, enclosing_boxes
 from cflow_torch.applications.completion import TrackedPoints
+from cflow_torch.applications.floor import Floor
 from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of
 from cflow_torch.applications.static_places import cells_of
 from cflow_torch.applications.track_table import Table
 from cflow_torch.transforms import transform_points
-from cflow_torch.types import FlowResult, Window, as_numpy
+from cflow_torch.types import Sweep, as_numpy
 
 _MARGIN = 0.2  # metres, added to length, width and height of a box
 
@@ -26,13 +27,13 @@ class FreePoints(NamedTuple):
     position: np.ndarray  # (F, 3) float64 metres in the world
 
     @classmethod
-    def of(cls, sweeps: Window, result: FlowResult, points: TrackedPoints) -> FreePoints:
-        """Collect them from sweep t of a window."""
-        cloud = as_numpy(sweeps.pc0.points)[:, :3]
-        is_free = as_numpy(result.is_valid) & np.isfinite(cloud).all(axis=1)
-        is_free[points.row] = False
+    def of(cls, sweep: Sweep, is_valid: np.ndarray, taken: np.ndarray) -> FreePoints:
+        """Collect those of a sweep that are valid, (N,) bool, without the rows of tracks."""
+        cloud = as_numpy(sweep.points)[:, :3]
+        is_free = is_valid & np.isfinite(cloud).all(axis=1)
+        is_free[taken] = False
         row = np.flatnonzero(is_free)
-        position = transform_points(cloud[row], pose_of(sweeps.pc0))
+        position = transform_points(cloud[row], pose_of(sweep))
         order = np.argsort(position[:, 0])
         return cls(row[order], position[order])
 
@@ -69,26 +70,49 @@ class SweepTracks:
         self._where = {"sweep": points.sweep, "timestamp_ns": timestamp_ns}
         self.table = {**table, **{name: np.full(len(table["id"]), value) for name, value in self._where.items()}}
 
-    def find(self, later: SweepTracks, row: int) -> bool:
-        """Look for the track in a row of a later sweep where its flow there says that it was.
+    @classmethod
+    def after(cls, before: SweepTracks, sweep: Sweep, timestamp_ns: int) -> SweepTracks:
+        """Look for the tracks of a sweep in the next one, which has no flow; it is of a `TimedLog`."""
+        cloud = as_numpy(sweep.points)
+        is_valid = ~as_numpy(sweep.is_ground, bool) if sweep.is_ground is not None else np.ones(len(cloud), bool)
+        points = before.points.renumber(
+            np.full(len(before.points.id), -1)
+        )._replace(
+            sweep=before.points.sweep + 1,
+            num_points=len(cloud),
+            seconds=sweep.timestamp_ns * 1e-9,  # type: ignore[operator]
+            sensor=pose_of(sweep)[:3, 3],
+            floor=Floor.of(sweep),
+        )
+        no_rows = {name: column[:0] for name, column in before.table.items()}
+        tracks = cls(no_rows, points, timestamp_ns, FreePoints.of(sweep, is_valid, points.row))
+        for row in range(len(before.table["id"])):
+            tracks.find(before, row)
+        tracks.static = np.unique(cells_of(tracks.free.position))  # type: ignore[union-attr]
+        return tracks
+
+    def find(self, other: SweepTracks, row: int) -> bool:
+        """Look for the track in a row of another sweep where its flow there says that it was, or will be.
 
         We add the track to this sweep if its box holds enough points: the share that we ask of stopped objects. If the
-        box of the later sweep holds more, the object has not started yet.
+        box of a later sweep holds more, the object has not started yet.
         """
         if self.free is None:
             return False
-        number = int(later.table["id"][row])
-        _, velocity = later.points.of_track(number)
-        centre, size, heading = later.box(row)
+        number = int(other.table["id"][row])
+        _, velocity = other.points.of_track(number)
+        centre, size, heading = other.box(row)
         size = size + _MARGIN
-        step = torch.from_numpy((self.points.seconds - later.points.seconds) * velocity)
-        index = self.free.inside(centre + step, size, heading)
-        num_there = len(self.free.inside(centre, size, heading))
-        if len(index) < max(MIN_POINTS, MIN_STOPPED_SHARE * later.table["num_points"][row], num_there):
+        seconds = self.points.seconds - other.points.seconds
+        index = self.free.inside(centre + torch.from_numpy(seconds * velocity), size, heading)
+        num_there = len(self.free.inside(centre, size, heading)) if seconds < 0 else 0
+        if len(index) < max(MIN_POINTS, MIN_STOPPED_SHARE * other.table["num_points"][row], num_there):
             return False
         at = int(np.searchsorted(self.table["id"], number))
-        values = {name: column[row] for name, column in later.table.items()}
-        values.update(self._where, num_points=len(index), cluster_id=-1, is_confirmed=False)
+        values = {name: column[row] for name, column in other.table.items()}
+        values.update(self._where, num_points=len(index), cluster_id=-1)
+        if seconds < 0:
+            values["is_confirmed"] = False
         self.table = {name: np.insert(column, at, values[name]) for name, column in self.table.items()}
         self.points = self.points.followed_by(number, self.free.row[index], self.free.position[index], velocity)
         self.free = self.free.without(index)

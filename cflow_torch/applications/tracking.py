@@ -23,7 +23,7 @@ from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, TimedLog, window
 from cflow_torch.estimate import make_model
 from cflow_torch.ops.threads import one_thread
-from cflow_torch.types import CENTRE, SIZE, VELOCITY, CFlowError, FlowResult, Sweep, Window
+from cflow_torch.types import CENTRE, SIZE, VELOCITY, CFlowError, FlowResult, Sweep, Window, as_numpy
 
 _MAX_MISSED = 3  # sweeps that a track survives unseen
 _LONGEST_PAUSE = 1.0  # seconds without a sweep that a track survives, if that is more than `_MAX_MISSED` intervals
@@ -336,8 +336,9 @@ def track(
     Returns:
         Column -> (R,) array, which `pandas.DataFrame(table)` takes. There is a row for each track and sweep in which it
         is seen, sorted by sweep, then id. In up to three sweeps before its flow begins, and in such gaps, it is seen
-        where enough points are in the place from which its flow comes. No track goes on after a pause of three
-        intervals and a second. The columns are:
+        where enough points are in the place from which its flow comes. In the last sweep, and in another one without a
+        result after one with it, it is seen where enough points are in the place to which its flow leads. No track goes
+        on after a pause of three intervals and a second. The columns are:
         `sweep`, `timestamp_ns`, `id`;
         x, y, z: smoothed centre of the whole box, metres in the world; vx, vy, vz: its velocity over ground, m/s;
         `velocity_std`: m/s, standard deviation of each of vx, vy and vz, if errors are independent;
@@ -370,8 +371,9 @@ def track_points(
 ) -> tuple[dict[str, np.ndarray], list[TrackedPoints]]:
     """Track the moving objects of a drive, and return the table of `track` and the points of the tracks.
 
-    Arguments and errors are those of `track`. There is a `TrackedPoints` for each result, in order. They also have the
-    ids of tracks that are never confirmed; `each.track_id(table["id"])` leaves these out.
+    Arguments and errors are those of `track`. There is a `TrackedPoints` for each sweep with a result, and for the
+    sweep after it if that has none, in order. They also have the ids of tracks that are never confirmed;
+    `each.track_id(table["id"])` leaves these out.
     """
     if results is None:
         model = make_model(make_config("default"))
@@ -394,29 +396,46 @@ class LogTracker:
     """Track the moving objects of a log as its flow arrives, and complete their boxes at the end.
 
     Arguments are those of `track`. The flow of an object often begins a few sweeps late, or has gaps. So we look for
-    each track in up to three sweeps before, where its flow says that it was.
+    each track in up to three sweeps before, where its flow says that it was. After the last flow, and before a gap, we
+    look for each track in the next sweep, where its flow says that it will be.
     """
 
     def __init__(self, log: Log, sweep_interval: float = 0.1) -> None:
         self._log = TimedLog(log, sweep_interval)
         self._tracker = Tracker(sweep_interval)
         self._sweeps: list[SweepTracks] = []
+        self._next_without_flow = 0  # index of the sweep after the last one that was pushed
         self._last: dict[int, int] = {}  # id -> number of the last sweep in which the track is seen
 
     def push(self, index: int, result: FlowResult) -> None:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
+        if self._sweeps and self._next_without_flow < index:
+            self.find_after()
+        self._next_without_flow = index + 1
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
         if _is_after_pause(self._tracker.times):
             for each in self._sweeps[-_MAX_MISSED:]:
                 each.free = None  # new tracks were not there
         points = TrackedPoints.of(index, sweeps, result, track_id, self._tracker.times, self._tracker.floor)
-        free = FreePoints.of(sweeps, result, points)
+        free = FreePoints.of(sweeps.pc0, as_numpy(result.is_valid), points.row)
         now = SweepTracks(table, points, int(self._log.timestamps[index]), free)
         self._find_before(now)
+        self._append(now)
+
+    def _append(self, now: SweepTracks) -> None:
         self._sweeps.append(now)
         if len(self._sweeps) > _MAX_MISSED:
             self._sweeps[-_MAX_MISSED - 1].free = None  # to save memory
+
+    def find_after(self) -> TrackedPoints:
+        """Look for all tracks in the sweep after the last one that was pushed, unless that was done."""
+        index = self._next_without_flow
+        if self._sweeps[-1].points.sweep < index:
+            now = SweepTracks.after(self._sweeps[-1], self._log.sweep(index), int(self._log.timestamps[index]))
+            self._last.update(dict.fromkeys(now.table["id"].tolist(), len(self._sweeps)))
+            self._append(now)
+        return self._sweeps[-1].points
 
     def _find_before(self, now: SweepTracks) -> None:
         """Look for tracks that move now in the sweeps before, up to three, in which they were not seen."""
@@ -431,12 +450,14 @@ class LogTracker:
 
     @property
     def points(self) -> list[TrackedPoints]:
-        """The points of the tracks of each sweep that was pushed."""
+        """The points of the tracks of each sweep that was pushed, and of those that followed without a flow."""
         return [each.points for each in self._sweeps]
 
     @one_thread()
     def table(self) -> dict[str, np.ndarray]:
         """Return the table of `track`."""
+        if self._sweeps:
+            self.find_after()
         self._take_out_static_points()
         table = self._whole()
         return self._whole() if divide_people(self._sweeps, table) else table

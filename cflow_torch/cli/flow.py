@@ -98,9 +98,7 @@ def _write_logs(cfg: Flow, run: FlowRun) -> Failures:
     failures: Failures = []
     output = run.output
     stored = stored_flow(output, ())
-    # The flow files say which points are valid, so nothing here needs ground masks, and the log was checked before.
-    cheap = {"check": False, "find_ground": None}
-    logs = Logs(run.logs.name, run.logs.sources, {**run.logs.settings, **cheap})
+    logs = Logs(run.logs.name, run.logs.sources, {**run.logs.settings, "check": False})  # it was checked before
     wanted = [name for name in ("tracks", "labels", "masks") if getattr(cfg, name)]
     for part in tqdm(run.parts, desc=" and ".join(wanted), unit="log", disable=None):
         with collect_failures(failures, source_name(part.source)):
@@ -134,11 +132,12 @@ def _write_tracks(
 
     `results` reads the flow files. Returns a line with the files.
     """
-    frames = (frame_file(folder, log.timestamps[index]) for index in log.pairs)
-    if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, frames)):
+    frames = {index: frame_file(folder, log.timestamps[index]) for index in log.pairs}
+    if not (folder / TRACKS_FILE).exists() or not all(map(has_track_ids, frames.values())):
         table, points = track_points(log, results())
         for each in points:
-            add_track_ids(frame_file(folder, log.timestamps[each.sweep]), each.track_id(table["id"]))
+            if each.sweep in frames:  # others have no flow
+                add_track_ids(frames[each.sweep], each.track_id(table["id"]))
         write_tracks(folder / TRACKS_FILE, table)  # last, so that a killed run begins again
     table = read_tracks(folder / TRACKS_FILE)
     files = [TRACKS_FILE]

@@ -48,14 +48,16 @@ def test_the_pair_over_a_gap_of_the_log_is_not_used() -> None:
     assert not cleaned(log).moving(2).any(), "no pair has flow for it"
 
 
-def test_waiting_cars_are_removed_by_their_tracks_and_parked_cars_stay() -> None:
+@pytest.mark.parametrize("gap", [3, 13])
+def test_waiting_cars_are_removed_by_their_tracks_and_parked_cars_stay(gap: int) -> None:
     """A car that waits for eight sweeps and starts, a car that stops, and a parked car that never moves."""
     start = np.cumsum([0.0] * 8 + [0.1, 0.2, 0.4, 0.7, 1.0, 1.0, 1.0, 1.0])
     stop = np.cumsum([1.0, 1.0, 1.0, 1.0, 0.7, 0.4, 0.2, 0.1] + [0.0] * 8)
     moving = [np.stack([start, 0 * start], 1), np.stack([stop, 0 * stop + 5], 1)]
     log = Staged([*moving, straight((25, 0), (0, 0), 16)])
+    log.gaps = frozenset([gap])
     by_flow, by_tracks = cleaned(log), cleaned(log, remove_stopped=True)
-    for index in range(len(log) - 1):
+    for index in range(len(log)):  # the last sweep, and the one before the gap, have no flow
         car = log.world(index)[2]
         assert np.array_equal(by_tracks.moving(index), (car == 0) | (car == 1)), index
     removed = sum(int(by_tracks.moving(k).sum()) - int(by_flow.moving(k).sum()) for k in range(len(log)))

@@ -124,13 +124,17 @@ def test_openpcdet_reads_boxes_in_the_frame_of_the_points(tmp_path: Path) -> Non
     frames = pickle.loads((tmp_path / "result.pkl").read_bytes())
     assert [frame["frame_id"] for frame in frames] == [f"{sweep:06d}" for sweep in range(12)]
     assert frames[2]["name"].tolist() == ["Cyclist"] and frames[2]["pred_labels"].tolist() == [3]
-    for frame in (*frames[:2], *frames[3:11]):
+    for frame in (*frames[:2], *frames[3:]):
         assert frame["name"].tolist() == ["Car"] and frame["pred_labels"].tolist() == [1]
         assert frame["score"].shape == (1,) and frame["boxes_lidar"].dtype == np.float32
+    for sweep in (6, 11):
+        points = log.sweep(sweep).points
+        car = points[log.world(sweep)[2] == 0]
+        box = frames[sweep]["boxes_lidar"][0]
+        np.testing.assert_allclose(box[:3], (car.min(0) + car.max(0)) / 2, atol=0.1)
+        np.testing.assert_allclose(box[3:6], SIZE, atol=0.01)
+        assert box[6] == pytest.approx(-np.pi / 2, abs=0.02), "the car drives to the right of the vehicle"
+    empty = {name: values[:0] for name, values in table.items()}
+    write_openpcdet(tmp_path / "result.pkl", empty, log)
+    frames = pickle.loads((tmp_path / "result.pkl").read_bytes())
     assert frames[11]["boxes_lidar"].shape == (0, 7) and len(frames[11]["name"]) == 0
-    points = log.sweep(6).points
-    car = points[log.world(6)[2] == 0]
-    box = frames[6]["boxes_lidar"][0]
-    np.testing.assert_allclose(box[:3], (car.min(0) + car.max(0)) / 2, atol=0.1)
-    np.testing.assert_allclose(box[3:6], SIZE, atol=0.01)
-    assert box[6] == pytest.approx(-np.pi / 2, abs=0.02), "the car drives to the right of the vehicle"

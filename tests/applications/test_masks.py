@@ -72,7 +72,7 @@ class Filmed(Staged):
 def test_masks_follow_objects_to_the_time_of_the_image(tmp_path: Path) -> None:
     """A car crosses to the left at 9 m/s, so 0.45 m until the image; the vehicle looks along the world's y axis."""
     vehicle = pose(0, -20, np.pi / 2, 0)
-    log = Filmed([straight((2, -8), (-0.9, 0.0))], np.tile(vehicle, (12, 1, 1)))
+    log = Filmed([straight((2.05, -8), (-0.9, 0.0))], np.tile(vehicle, (12, 1, 1)))
     table = track(log, log.results())
     write_masks(tmp_path, log, [(3, log.result(3))], table)
     later, now = (np.asarray(Image.open(tmp_path / name)) for name in ("front/003.png", "other/3.png"))

@@ -84,7 +84,7 @@ def test_each_person_of_a_group_has_a_track() -> None:
     results = [(index, log.result(index)) for index in range(COUNT - 1)]
     table, points = track_points(log, results)
     assert set(table["class"]) == {"pedestrian"} and len(set(table["id"])) == 2
-    for number, side, count in ((0, -0.4, COUNT - 1), (1, 0.4, COUNT - 4)):
+    for number, side, count in ((0, -0.4, COUNT), (1, 0.4, COUNT - 4)):
         rows = np.flatnonzero(np.abs(table["y"] - side) < 0.15)
         assert len(set(table["id"][rows])) == 1 and table["sweep"][rows].tolist() == list(range(count)), number
         assert np.allclose(table["width"][rows], 0.4 + 0.16, atol=0.02)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any, Callable
 
@@ -22,6 +23,7 @@ from cflow_torch.applications.instance_files import write_drivestudio
 from cflow_torch.applications.kitti_tracks import write_kitti
 from cflow_torch.applications.track_table import join_tables, read_tracks, write_mot, write_tracks
 from cflow_torch.applications.tracking import track_points
+from cflow_torch.data.arrays import write_array_log
 from cflow_torch.data.av2 import AV2Log
 from cflow_torch.data.camera import Camera, intrinsic_matrix
 from cflow_torch.data.catalog import find_sources, open_log
@@ -33,7 +35,7 @@ from cflow_torch.simulator.writers.av2 import write_av2_log
 def ids_of(log: Staged, table: dict[str, np.ndarray], car: int) -> list[int]:
     """Ids of the rows that lie on a car, in order."""
     ids = []
-    for index in range(len(log) - 1):
+    for index in range(len(log)):
         centre = log.middle(car)[index]
         here = table["sweep"] == index
         near = np.hypot(table["x"] - centre[0], table["y"] - centre[1]) < 1.0
@@ -46,11 +48,11 @@ def test_two_crossing_cars_keep_their_ids_and_velocities() -> None:
     table = track(log, log.results())
     first, second = ids_of(log, table, 0), ids_of(log, table, 1)
     assert len(set(first)) == len(set(second)) == 1 and first[0] != second[0]
-    assert len(first) == len(second) == 11 and len(table["id"]) == 22
-    last = table["sweep"] == 10
+    assert len(first) == len(second) == 12 and len(table["id"]) == 24, "the last sweep has no flow"
+    last = table["sweep"] == 11
     velocity = np.stack([table["vx"], table["vy"]], 1)[last & (table["id"] == second[0])][0]
     assert np.allclose(velocity, (8, -8), atol=0.01)
-    assert np.allclose(table["age"][last], 1.0) and np.all(np.diff(table["sweep"]) >= 0)
+    assert np.allclose(table["age"][last], 1.1) and np.all(np.diff(table["sweep"]) >= 0)
     assert np.all(table["velocity_std"] < 0.5) and np.allclose(table["heading"][table["id"] == first[0]], np.pi / 4)
 
 
@@ -60,7 +62,7 @@ def test_a_short_occlusion_is_bridged_and_a_long_one_starts_another_track(gap: i
     path[5 : 5 + gap] = np.nan
     log = Staged([path])
     table = track(log, log.results())
-    assert len(set(table["id"])) == count and len(table["id"]) == 19 - gap
+    assert len(set(table["id"])) == count and len(table["id"]) == 20 - gap
     assert not np.isin(table["sweep"], range(5, 5 + gap)).any()
 
 
@@ -70,12 +72,12 @@ def test_a_track_has_the_sweeps_before_its_flow_begins_and_those_where_it_is_mis
     for index in (0, 1, 2, 4):
         results[index][1].residual_flow[:] = 0
     table, points = track_points(log, results)
-    assert table["sweep"].tolist() == list(range(11)) and len(set(table["id"])) == 1 and table["is_moving"].all()
-    assert np.array_equal(table["cluster_id"] < 0, np.isin(table["sweep"], (0, 1, 2, 4)))
-    centre = log.middle(0)[:11, :2]
+    assert table["sweep"].tolist() == list(range(12)) and len(set(table["id"])) == 1 and table["is_moving"].all()
+    assert np.array_equal(table["cluster_id"] < 0, np.isin(table["sweep"], (0, 1, 2, 4, 11)))
+    centre = log.middle(0)[:, :2]
     assert np.allclose(np.stack([table["x"], table["y"]], 1), centre, atol=0.05)
-    assert np.allclose(table["vx"], 8, atol=0.2) and np.allclose(table["age"], np.arange(11) * 0.1)
-    for index in (1, 4):
+    assert np.allclose(table["vx"], 8, atol=0.2) and np.allclose(table["age"], np.arange(12) * 0.1)
+    for index in (1, 4, 11):
         track_id = points[index].track_id(table["id"])
         assert np.array_equal(track_id == table["id"][0], log.world(index)[2] == 0)
 
@@ -93,7 +95,7 @@ def test_a_car_that_stops_keeps_its_id() -> None:
     steps = [1.0] * 6 + [0.7, 0.4, 0.2] + [0.0] * 8 + [0.2, 0.5, 0.8, 1.0]
     log = Staged([np.stack([np.cumsum([0.0, *steps]), np.zeros(len(steps) + 1)], 1)])
     table = track(log, log.results())
-    assert set(table["id"]) == {table["id"][0]} and len(table["id"]) == len(steps)
+    assert set(table["id"]) == {table["id"][0]} and len(table["id"]) == len(log)
     is_static = np.isin(table["sweep"], range(9, 17))
     assert np.array_equal(~table["is_moving"], is_static) and np.all(table["cluster_id"][is_static] == -1)
     assert np.hypot(table["vx"], table["vy"])[table["sweep"] == 14] < 0.1
@@ -116,7 +118,7 @@ def test_returns_of_the_own_vehicle_are_not_a_track() -> None:
     beside = straight((-2.0, 1.6), (0.9, 0.0))
     log = Staged([roof, beside], np.stack([pose(0.9 * k, 0, 0.0) for k in range(12)]))
     table = track(log, log.results())
-    assert len(set(table["id"])) == 1 and len(ids_of(log, table, 1)) == 11
+    assert len(set(table["id"])) == 1 and len(ids_of(log, table, 1)) == 12
 
 
 @pytest.mark.parametrize(("step", "place", "is_own"), [(0.9, 1.3, True), (0.9, 3.0, False), (0.1, 1.3, False)])
@@ -266,7 +268,7 @@ def test_two_cars_in_one_cluster_keep_their_ids() -> None:
     for _, result in results[5:7]:
         result.cluster_id[result.cluster_id == 2] = 1
     table = track(log, results)
-    assert len(table["id"]) == 22 and len(set(table["id"])) == 2
+    assert len(table["id"]) == 24 and len(set(table["id"])) == 2
     for car in (0, 1):
         assert len(set(ids_of(log, table, car))) == 1
     assert np.allclose(table["vx"][table["sweep"] > 5], 8, atol=0.05) and np.allclose(
@@ -299,7 +301,7 @@ def test_low_confidence_confirms_only_long_motion_that_fits_and_missing_confiden
     for _, result in unsure:
         object.__setattr__(result, "confidence", None)
     table = track(log, unsure)
-    assert len(table["id"]) == 11 and np.isnan(table["confidence"]).all() and table["is_confirmed"].sum() == 9
+    assert len(table["id"]) == 12 and np.isnan(table["confidence"]).all() and table["is_confirmed"].sum() == 10
 
 
 def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then_on() -> None:
@@ -313,8 +315,8 @@ def test_a_car_that_comes_into_view_at_once_is_confirmed_by_its_motion_from_then
 
     log = Hidden([straight((0, 0), (0.17, 0.0), 14)])
     table = track(log, log.results())
-    assert len(table["id"]) == 13 and len(set(table["id"])) == 1
-    assert np.array_equal(table["is_confirmed"], np.arange(13) >= 6)
+    assert len(table["id"]) == 14 and len(set(table["id"])) == 1
+    assert np.array_equal(table["is_confirmed"], np.arange(14) >= 6)
 
 
 @pytest.mark.parametrize("is_shown", [True, False])
@@ -451,19 +453,19 @@ def test_tracks_are_written_as_text(tmp_path: Path) -> None:
     table = track(log, log.results())
     write_mot(tmp_path / "mot.txt", table, log)
     mot = np.loadtxt(tmp_path / "mot.txt", delimiter=",", ndmin=2)
-    assert np.array_equal(mot[:, :6], [[frame, 1, -1, -1, -1, -1] for frame in range(1, 12)])
+    assert np.array_equal(mot[:, :6], [[frame, 1, -1, -1, -1, -1] for frame in range(1, 13)])
     assert np.allclose(mot[:, 6], 0.9)
     assert np.allclose(mot[:, 7:], np.stack([table[axis] for axis in "xyz"], 1), atol=1e-3)
 
     write_kitti(tmp_path / "kitti.txt", table, log)
     lines = [line.split() for line in (tmp_path / "kitti.txt").read_text().splitlines()]
-    assert [line[:5] for line in lines] == [[str(index), "0", "Car", "-1", "-1"] for index in range(11)]
+    assert [line[:5] for line in lines] == [[str(index), "0", "Car", "-1", "-1"] for index in range(12)]
     height, width, length, x, y, z, rotation, score = np.array([line[10:] for line in lines], float).T
     assert np.allclose(height, 1.2) and np.allclose(score, 0.9, atol=1e-6)
     assert np.allclose(width, 1.9, atol=1e-5) and np.allclose(length, 4.5, atol=1e-5), "a whole car"
     # Its middle is 8 - .95 m to the right, first 5 + 2.25 m ahead, and its lower face is 1 m below the origin.
     assert np.allclose(x, 7.05, atol=0.01) and np.allclose(y, 1, atol=1e-5)
-    assert np.allclose(z, 7.25 + 0.9 * np.arange(11), atol=0.05)
+    assert np.allclose(z, 7.25 + 0.9 * np.arange(12), atol=0.05)
     assert np.allclose(rotation, -np.pi / 2, atol=1e-5), "KITTI: 0 = along x of the camera, negative to the left"
     alpha = np.array([line[5] for line in lines], float)
     assert np.allclose(alpha, rotation - np.arctan2(x, z), atol=1e-4)
@@ -488,16 +490,16 @@ def test_tracks_of_a_calibrated_drive_are_in_the_frame_of_kittis_labels(tmp_path
     table = track(log, log.results())
     write_kitti(tmp_path / "kitti.txt", table, log)
     numbers = np.array([line.split()[5:] for line in (tmp_path / "kitti.txt").read_text().splitlines()], float)
-    middle = log.middle(0)[:11]
+    middle = log.middle(0)
     u = 620 + 720 * (middle[:, 0] + 0.07) / (middle[:, 1] + 20 - 0.27)
-    assert len(numbers) == ((u > -100) & (u < 1342)).sum() == 11
+    assert len(numbers) == ((u > -100) & (u < 1342)).sum() == 12
     x, y, z, rotation = numbers[:, 8:12].T
     np.testing.assert_allclose(x, middle[:, 0] + 0.01, atol=0.05)
     np.testing.assert_allclose(y, 1 - 0.07, atol=1e-5)
     np.testing.assert_allclose(z, middle[:, 1] + 20 - 0.27, atol=0.05)
     np.testing.assert_allclose(rotation, 0, atol=1e-5)
     rectangle = numbers[:, 1:5]
-    for index in range(11):
+    for index in range(12):
         points = log.cameras(0)[0].see(log.sweep(index).points[log.world(index)[2] == 0])
         pixels = log.cameras(0)[0].project(points).clip(0, (1241, 374))
         np.testing.assert_allclose(rectangle[index], [*pixels.min(0), *pixels.max(0)], atol=3)
@@ -540,9 +542,9 @@ def test_tracks_are_written_for_the_loaders_of_drivestudio(tmp_path: Path) -> No
     person = {**table, "class": np.where(table["id"] == table["id"].max(), "pedestrian", "truck")}
     write_drivestudio(tmp_path / "people", person, log, "vehicle.car", "vehicle.bicycle")
     assert read_instances(tmp_path / "people")[2] == ["vehicle.car", "vehicle.bicycle"]
-    assert np.isfinite(poses[:, :, 0, 0]).sum(0).tolist() == [11, 7] and np.isnan(poses[11]).all()
+    assert np.isfinite(poses[:, :, 0, 0]).sum(0).tolist() == [12, 8]
     middle = np.stack([log.middle(car) for car in range(2)], 1)
-    assert np.allclose(poses[4:11, :, :2, 3], middle[4:11], atol=0.1), "the middle of the box"
+    assert np.allclose(poses[4:, :, :2, 3], middle[4:], atol=0.1), "the middle of the box"
     assert np.allclose(poses[10, 0, :3, 0], (1, 0, 0), atol=0.01), "x along its length"
     assert np.allclose(poses[10, 1, :3, 0], (0, 1, 0), atol=0.01)
     assert np.allclose(sizes, SIZE, atol=1e-4)
@@ -578,7 +580,7 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert call("flow", "whole", *run) == 0
     (file,) = (tmp_path / "whole").glob("*/tracks.parquet")
     whole = read_tracks(file)
-    assert len(whole["id"]) > 4 and set(whole["sweep"]) <= set(range(4)) and not np.isnan(whole["confidence"]).any()
+    assert len(whole["id"]) > 4 and set(whole["sweep"]) <= set(range(5)) and not np.isnan(whole["confidence"]).any()
     model = make_model(make_config(num_history=0, pixel_sizes=(0.4, 0.2), point_cloud_range=RANGE))
     (source,) = find_sources("av2", tmp_path / "data")
     log = open_log("av2", source)
@@ -625,13 +627,28 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
     assert "add confidence" in capsys.readouterr().err
 
 
+def test_boxes_stand_on_the_ground_that_we_find(tmp_path: Path) -> None:
+    """The log has no ground masks. The command and Python give the same boxes."""
+    drive = make_small_drive(5)
+    write_array_log(drive, tmp_path / "data", ".npy")
+    (folder,) = (tmp_path / "data").iterdir()
+    shutil.rmtree(folder / "ground")
+    call = (folder, f"output={tmp_path / 'out'}", "data.check=false", *FAST, "engine.workers=1", "tracks=true")
+    assert cflow("flow", *call) == 0
+    written = read_tracks(tmp_path / "out" / folder.name / "tracks.parquet")
+    log = open_log("arrays", folder, check=False)
+    results = [(k, read_flow(tmp_path / "out" / folder.name / f"{log.timestamps[k]}.feather")) for k in range(4)]
+    expected = track(log, results)
+    assert len(expected["id"]) and all(np.array_equal(written[name], expected[name]) for name in expected)
+
+
 def test_a_log_with_a_gap_has_tracks_before_and_behind_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(AV2Log, "gaps", frozenset([2]))
     call = calls_on_a_drive(tmp_path, num_sweeps=6)
     assert call("flow", "flow", "tracks=true", "engine.workers=1") == 0
     (file,) = (tmp_path / "flow").glob("*/tracks.parquet")
     assert len(list(file.parent.glob("*.feather"))) == 4, "the pair over the gap has no flow"
-    assert set(read_tracks(file)["sweep"]) >= {0, 1, 3, 4}
+    assert set(read_tracks(file)["sweep"]) == set(range(6))
 
 
 def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -645,5 +662,6 @@ def test_the_viewer_shows_all_tracks(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert call("view", "view", "format=rerun", f"flow={tmp_path / 'flow'}") == 0
     (file,) = (tmp_path / "flow").glob("*/tracks.parquet")
     ids = np.concatenate([rows["id"] for rows in shown])
-    assert len(shown) == 5 and np.array_equal(ids, read_tracks(file)["id"]) and len(ids) > 3
+    table = read_tracks(file)
+    assert len(shown) == 5 and np.array_equal(ids, table["id"][table["sweep"] < 5]) and len(ids) > 3
     assert len(list((tmp_path / "view").glob("*.rrd"))) == 1
