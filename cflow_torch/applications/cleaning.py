@@ -15,7 +15,7 @@ from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import Table
 from cflow_torch.applications.tracking import LogTracker
 from cflow_torch.config import make_config
-from cflow_torch.data.log import CachedLog, Log, TimedLog, window
+from cflow_torch.data.log import CachedLog, FlowLabels, Log, LogWrapper, TimedLog, window
 from cflow_torch.estimate import make_model
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.transforms import transform_points
@@ -28,22 +28,18 @@ _INTENSITIES = ("intensity", "reflectance", "reflectivity", "remission", "i", "c
 _MAX_VOXELS = 1 << 20  # voxels in x, y and z from the first sweep to a point of a map, at most
 
 
-class MaskedLog(Log):
+class MaskedLog(LogWrapper):
     """A log without some rows of its sweeps. Every command, writer and loader accepts it like any other log.
+
+    Cameras, poses and all else that has no rows are those of the log. Labels and masks lose the same rows.
 
     Args:
         log: any log. Its sweeps are read when they are asked for.
         mask: index -> (N,) bool, True for the rows of sweep `index` that are removed.
-
-    Attributes:
-        log_id, timestamps, gaps: those of the log.
     """
 
     def __init__(self, log: Log, mask: Callable[[int], np.ndarray]) -> None:
-        self.log_id = log.log_id
-        self.timestamps = log.timestamps
-        self.gaps = log.gaps
-        self._log = log
+        super().__init__(log)
         self._mask = mask
 
     def removed(self, index: int) -> np.ndarray:
@@ -52,7 +48,7 @@ class MaskedLog(Log):
 
     def sweep(self, index: int) -> Sweep:
         """Sweep number `index` without the removed rows; pose and time as in the log."""
-        sweep = self._log.sweep(index)
+        sweep = self.log.sweep(index)
         is_kept = ~self.removed(index)
         given = {name: getattr(sweep, name) for name in ("points", "is_ground", "point_times")}
         kept = {name: as_numpy(values)[is_kept] for name, values in given.items() if values is not None}
@@ -61,11 +57,29 @@ class MaskedLog(Log):
     def columns(self, index: int) -> dict[str, np.ndarray]:
         """Other columns of sweep `index`, such as intensity, without the removed rows."""
         is_kept = ~self.removed(index)
-        columns = self._log.columns(index)
+        columns = self.log.columns(index)
         for name, values in columns.items():
             what = f"column {name} of sweep {index}"
             check_array(values, what, is_kept.shape, "biuf", f"({len(is_kept)},) numbers, one per point")
         return {name: values[is_kept] for name, values in columns.items()}
+
+    def labels(self, index: int) -> FlowLabels | None:
+        """Truth of the pair (index, index + 1) without the removed rows."""
+        labels = self.log.labels(index)
+        is_kept = ~self.removed(index)
+        return labels and FlowLabels(labels.flow[is_kept], labels.category[is_kept], labels.is_valid[is_kept])
+
+    def eval_mask(self, index: int) -> np.ndarray | None:
+        return self._kept(self.log.eval_mask(index), index)
+
+    def moving(self, index: int) -> np.ndarray | None:
+        return self._kept(self.log.moving(index), index)
+
+    def units(self, index: int) -> None:
+        """None, because the returns of each LiDAR are not known any more."""
+
+    def _kept(self, values: np.ndarray | None, index: int) -> np.ndarray | None:
+        return None if values is None else values[~self.removed(index)]
 
 
 class CleanLog(MaskedLog):
@@ -109,10 +123,10 @@ class CleanLog(MaskedLog):
         self._bits: list[np.ndarray] | None = None
         self.num_stopped: int | None = None
         self._tracks_objects = remove_stopped
-        self._timed = TimedLog(self._log, sweep_interval)
+        self._timed = TimedLog(self.log, sweep_interval)
 
     def _moving_or_missing(self, index: int) -> np.ndarray:
-        points = as_numpy(self._log.sweep(index).points)[:, :3]
+        points = as_numpy(self.log.sweep(index).points)[:, :3]
         return self.moving(index) | ~np.isfinite(points).all(axis=1)
 
     def moving(self, index: int) -> np.ndarray:
@@ -125,15 +139,15 @@ class CleanLog(MaskedLog):
             return self._moves(index)
         if self._bits is None:
             self._bits = self._track()
-        return np.unpackbits(self._bits[index], count=len(self._log.sweep(index).points)).astype(bool)
+        return np.unpackbits(self._bits[index], count=len(self.log.sweep(index).points)).astype(bool)
 
     def _estimate(self, model: Any, index: int) -> FlowResult:
-        sweeps = window(self._log, index, model.config.num_history, model.config.num_future)
+        sweeps = window(self.log, index, model.config.num_history, model.config.num_future)
         return model([sweeps])[0]  # type: ignore[no-any-return]
 
     def _moves(self, index: int) -> np.ndarray:
         """(N,) bool, True for the points that move according to their flow."""
-        sweep = self._log.sweep(index)
+        sweep = self.log.sweep(index)
         if not self._has_flow(index):
             return self._reached(sweep, index) if self._has_flow(index - 1) else np.zeros(len(sweep.points), bool)
         moves = as_numpy(self._flow(index).is_moving)
@@ -151,7 +165,7 @@ class CleanLog(MaskedLog):
         """(N,) bool, points of the last sweep in the boxes to which the clusters of the sweep before have moved."""
         result = self._flow(index - 1)
         moves = self._moves(index - 1)
-        before = _world(self._log.sweep(index - 1))[moves]
+        before = _world(self.log.sweep(index - 1))[moves]
         step = as_numpy(result.residual_flow, np.float64)[moves] @ pose_of(sweep)[:3, :3].T
         clusters, group = np.unique(as_numpy(result.cluster_id)[moves], return_inverse=True)
         total = np.zeros((len(clusters), 3))
@@ -182,7 +196,7 @@ class CleanLog(MaskedLog):
 
     def _waits(self, index: int, start: _Starts) -> np.ndarray:
         """(N,) bool, points of a sweep in the boxes where objects near the vehicle start later."""
-        sweep = self._log.sweep(index)
+        sweep = self.log.sweep(index)
         distance = np.linalg.norm(start.centre[:, :2] - pose_of(sweep)[:2, 3], axis=1)
         is_waiting = (distance < _MAX_DISTANCE) & (start.sweep > index)
         return _inside(sweep, *(torch.from_numpy(values[is_waiting]) for values in start[1:]))

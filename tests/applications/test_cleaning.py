@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 import torch
 from scenes import pose
+from small_logs import make_small_drive
 from staged_cars import Staged, straight
 from test_tracking import calls_on_a_drive
 
 from cflow_torch import CFlowError, CleanLog, FlowResult, Sweep, static_map
+from cflow_torch.applications.cleaning import MaskedLog
 from cflow_torch.data.arrays import ArraysLog, write_array_log
-from cflow_torch.data.log import Log
+from cflow_torch.data.camera import Camera
+from cflow_torch.data.log import CachedLog, Log
 
 
 def cleaned(log: Staged, **more: Any) -> CleanLog:
@@ -166,3 +169,20 @@ def test_the_command_resumes_and_refuses_changed_settings(tmp_path: Path, capsys
     assert call("clean", "clean", "remove_stopped=true") == 2
     assert "remove_stopped was" in capsys.readouterr().err
     assert call("clean", "other", "suffix=.xyz") == 2 and ".ply" in capsys.readouterr().err
+
+
+def test_all_else_of_a_log_stays_with_its_rows() -> None:
+    drive = CachedLog(make_small_drive(3), 3)
+    camera = Camera("front", "0", (2, 1), np.eye(3), np.eye(4))
+    drive.cameras, drive.T_camera0_lidar = lambda index: [camera], np.eye(4)
+    drive.moving = lambda index: np.arange(len(drive.sweep(index).points)) % 3 == 0
+    drive.eval_mask = lambda index: np.arange(len(drive.sweep(index).points)) % 5 == 0
+    masked = MaskedLog(drive, lambda index: np.arange(len(drive.sweep(index).points)) % 2 == 0)
+    assert masked.cameras(1) == [camera] and np.array_equal(masked.T_camera0_lidar, np.eye(4))
+    assert np.array_equal(masked.poses, drive.poses) and masked.sample_tokens == drive.sample_tokens
+    rows = np.arange(len(drive.sweep(1).points))[1::2]
+    labels, given = masked.labels(1), drive.labels(1)
+    assert len(rows) == len(masked.sweep(1).points) and np.array_equal(labels.flow, given.flow[rows])
+    assert np.array_equal(labels.category, given.category[rows]) and masked.labels(2) is None
+    assert np.array_equal(masked.moving(1), rows % 3 == 0) and np.array_equal(masked.eval_mask(1), rows % 5 == 0)
+    assert masked.units(1) is None
