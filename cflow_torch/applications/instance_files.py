@@ -102,7 +102,11 @@ def write_drivestudio(
 
 
 def write_drivestudio_masks(
-    folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]], table: Table, cameras: Sequence[str]
+    folder: Path,
+    log: Log,
+    results: Iterable[tuple[int, FlowResult]],
+    table: Table,
+    cameras: Sequence[str] | None = None,
 ) -> None:
     """Write `folder/KIND/FRAME_CAMERA.png`, as DriveStudio's loader reads them from `<scene>/dynamic_masks`.
 
@@ -114,12 +118,14 @@ def write_drivestudio_masks(
         log: a log whose reader knows the calibration of its cameras (`Log.cameras`).
         results: (index, flow of sweep `index` to `index + 1`).
         table: tracks of the log, see `track`.
-        cameras: names of the cameras 0, 1, 2, ...; the log's other cameras have no masks.
+        cameras: names of the cameras 0, 1, 2, ...; the log's other cameras have no masks. None = all, in the order of
+            the log.
 
     Convention: frames are those of `write_drivestudio`. The loader needs a file for each of them. Where a sweep has no
         flow, such as the last one, we move the points and boxes of the sweep before to its time.
     """
     log = TimedLog(log)
+    cameras = [camera.name for camera in log.cameras(0)] if cameras is None else cameras
     seconds = log.sweep_times()
     shapes = {index: DynamicShapes.of(log, index, result, table) for index, result in results}
     if not shapes:

@@ -75,14 +75,16 @@ def _seen_by_camera(table: Table, log: Log, size: np.ndarray) -> _Boxes:
 def _rectangles(log: Log, corners: np.ndarray) -> np.ndarray:
     """Return the rectangles around boxes in the image, (R, 4) pixels; without area for a box outside of it.
 
-    The corners are (R, 8, 3) metres. Corners behind the camera are ignored.
+    The corners are (R, 8, 3) metres. What is behind the camera is cut off.
     """
     (camera,) = (each for each in log.cameras(0) if each.name == _ANNOTATED_CAMERA)
-    pixels = camera.project(camera.see(corners.reshape(-1, 3))).reshape(-1, 8, 2)
-    last = np.array(camera.size) - 1.0
-    low = np.where(np.isnan(pixels), np.inf, pixels).min(axis=1)
-    high = np.where(np.isnan(pixels), -np.inf, pixels).max(axis=1)
-    return np.concatenate([low.clip(0, last), high.clip(0, last)], 1)
+    rectangles = np.zeros((len(corners), 4))
+    for rectangle, box in zip(rectangles, corners):
+        faces = camera.project_box(box)
+        if faces:
+            pixels = np.concatenate(faces).clip(0, np.array(camera.size) - 1.0)
+            rectangle[:] = *pixels.min(axis=0), *pixels.max(axis=0)
+    return rectangles
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from cflow_torch.applications.association import of_own_vehicle
 from cflow_torch.applications.moving_groups import MovingGroups, pose_of
 from cflow_torch.applications.track_table import Table, box_corners, boxes_in_sweeps, class_of
 from cflow_torch.data.atomic import atomic_file
-from cflow_torch.data.camera import Camera
+from cflow_torch.data.camera import NEAREST, Camera
 from cflow_torch.data.log import Log, TimedLog
 from cflow_torch.errors import import_optional
 from cflow_torch.types import SIZE, VELOCITY, CFlowError, FlowResult, Window, as_numpy, vectors
@@ -19,8 +19,6 @@ from cflow_torch.types import SIZE, VELOCITY, CFlowError, FlowResult, Window, as
 DYNAMIC, STATIC = 255, 0  # values of pixels
 _RADIUS = 0.15  # metres around a moving point
 _MARGIN = 0.1  # metres, added to each side of a box
-_NEAREST = 0.1  # metres from the camera; we cut off what is nearer
-_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))  # rows of `box_corners`
 
 
 def write_masks(folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]], table: Table) -> None:
@@ -35,18 +33,23 @@ def write_masks(folder: Path, log: Log, results: Iterable[tuple[int, FlowResult]
 
     Convention: a pixel is dynamic if it shows a disc of 0.15 m around a moving point (`FlowResult.is_moving`), or the
         box of a track, 0.1 m larger on each side, which may be at rest in this sweep. Points and boxes are moved to the
-        time of the image by their velocities. We do not test whether something hides them.
+        time of the image by their velocities. We do not test whether something hides them. If an image is that of
+        several sweeps, because a camera is slower than the LiDAR, it has the mask of the sweep that is nearest in time.
 
     Raises:
         CFlowError: the log has no calibration of cameras, or Pillow is not installed.
     """
     log = TimedLog(log)
+    distance: dict[Path, float] = {}  # seconds from an image to the nearest sweep so far
     for index, result in results:
         cameras = log.cameras(index)
         check_cameras(log, cameras)
         shapes = DynamicShapes.of(log, index, result, table)
         for camera in cameras:
-            write_mask(folder / camera.name / f"{camera.image}.png", shapes.draw(camera))
+            file = folder / camera.name / f"{camera.image}.png"
+            if abs(camera.seconds) < distance.get(file, np.inf):
+                distance[file] = abs(camera.seconds)
+                write_mask(file, shapes.draw(camera))
 
 
 def check_cameras(log: Log, cameras: Sequence[Camera]) -> None:
@@ -97,37 +100,22 @@ def write_mask(path: Path, mask: np.ndarray) -> None:
 def dynamic_mask(camera: Camera, points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Draw moving points, (P, 3), and boxes, (K, 8, 3) corners, both in metres in the frame of the sweep's points.
 
-    Corners are in the order of x, y and z: the last one changes fastest. Returns (height, width) uint8.
+    Corners are in the order of `box_corners`. Returns (height, width) uint8.
     """
     image = _pillow().new("L", camera.size, STATIC)
     brush = import_optional("PIL.ImageDraw", _NEEDS_PILLOW).Draw(image)
     width, height = camera.size
     positions = camera.see(points)
     pixels = camera.project(positions)
-    radius = _RADIUS * camera.matrix[0, 0] / np.maximum(positions[:, 2], _NEAREST)
+    radius = _RADIUS * camera.matrix[0, 0] / np.maximum(positions[:, 2], NEAREST)
     nearest = np.clip(pixels, 0, (width, height))
     is_seen = np.abs(pixels - nearest).max(axis=1, initial=0) <= radius  # False for NaN
     for (x, y), r in zip(pixels[is_seen].tolist(), radius[is_seen].tolist()):
         brush.ellipse((x - r, y - r, x + r, y + r), fill=DYNAMIC)
     for box in corners:
-        for face in _FACES:
-            polygon = _in_front(camera.see(box[list(face)]))
-            if len(polygon) > 2:
-                brush.polygon([tuple(pixel) for pixel in camera.project(polygon).tolist()], fill=DYNAMIC)
+        for polygon in camera.project_box(box):
+            brush.polygon([tuple(pixel) for pixel in polygon.tolist()], fill=DYNAMIC)
     return np.asarray(image)
-
-
-def _in_front(polygon: np.ndarray) -> np.ndarray:
-    """Cut off what is nearer to the camera than `_NEAREST`; (N, 3) vertices in its frame."""
-    kept = []
-    for here, there in zip(polygon, np.roll(polygon, -1, axis=0)):
-        is_near, is_next_near = here[2] <= _NEAREST, there[2] <= _NEAREST
-        if not is_near:
-            kept.append(here)
-        if is_near != is_next_near:
-            share = (1.001 * _NEAREST - here[2]) / (there[2] - here[2])
-            kept.append(here + share * (there - here))
-    return np.array(kept).reshape(-1, 3)
 
 
 def _moving_points(log: Log, index: int, result: FlowResult) -> tuple[np.ndarray, np.ndarray]:

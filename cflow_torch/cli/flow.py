@@ -154,7 +154,7 @@ def _write_masks(
     tracks = read_tracks(output / log.log_id / TRACKS_FILE)
     if is_for_drivestudio:
         folder = drivestudio_masks_folder(output, log.log_id)
-        write_drivestudio_masks(folder, log, results, tracks, CAMERAS_OF_READER.get(reader, ()))
+        write_drivestudio_masks(folder, log, results, tracks, CAMERAS_OF_READER.get(reader))
     else:
         folder = masks_folder(output, log.log_id)
         write_masks(folder, log, results, tracks)

@@ -8,7 +8,8 @@ import numpy as np
 
 from cflow_torch.transforms import transform_points
 
-_NEAREST = 0.1  # metres; nearer points are not projected
+NEAREST = 0.1  # metres; nearer points are not projected
+_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))  # corners of a box
 
 
 class Camera(NamedTuple):
@@ -37,9 +38,32 @@ class Camera(NamedTuple):
 
     def project(self, positions: np.ndarray) -> np.ndarray:
         """Return (N, 2) float64 pixels, column and row, of positions in the frame of the camera; NaN = behind it."""
-        depth = np.where(positions[:, 2:] > _NEAREST, positions[:, 2:], np.nan)
+        depth = np.where(positions[:, 2:] > NEAREST, positions[:, 2:], np.nan)
         pixels: np.ndarray = (positions @ self.matrix.T)[:, :2] / depth
         return pixels
+
+    def project_box(self, corners: np.ndarray) -> list[np.ndarray]:
+        """Return the faces of a box in front of the camera: polygons of (V, 2) float64 pixels.
+
+        The corners are (8, 3) metres in the frame of the sweep's points, in the order of x, y and z: the last one
+        changes fastest. What is nearer than 0.1 m, or behind the camera, is cut off.
+        """
+        positions = self.see(corners)
+        polygons = [_in_front(positions[list(face)]) for face in _FACES]
+        return [self.project(polygon) for polygon in polygons if len(polygon) > 2]
+
+
+def _in_front(polygon: np.ndarray) -> np.ndarray:
+    """Cut off what is nearer to the camera than `NEAREST`; (N, 3) vertices in its frame."""
+    kept = []
+    for here, there in zip(polygon, np.roll(polygon, -1, axis=0)):
+        is_near, is_next_near = here[2] <= NEAREST, there[2] <= NEAREST
+        if not is_near:
+            kept.append(here)
+        if is_near != is_next_near:
+            share = (1.001 * NEAREST - here[2]) / (there[2] - here[2])
+            kept.append(here + share * (there - here))
+    return np.array(kept).reshape(-1, 3)
 
 
 def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:

@@ -118,6 +118,26 @@ def test_masks_of_drivestudio_have_its_names_and_every_frame(tmp_path: Path) -> 
     write_drivestudio_masks(tmp_path / "people", log, log.results()[:1], person, ("front",))
     assert not np.asarray(Image.open(tmp_path / "people" / "vehicle" / "000_0.png")).any()
     assert np.asarray(Image.open(tmp_path / "people" / "human" / "000_0.png")).any()
+    write_drivestudio_masks(tmp_path / "any", log, log.results(), table)
+    assert {file.name for file in (tmp_path / "any" / "all").iterdir()} == names, "all cameras, in their order"
+
+
+def test_an_image_of_several_sweeps_has_the_mask_of_the_nearest(tmp_path: Path) -> None:
+    """A camera of 4 Hz: its image is taken with sweep 3, and is the nearest one of sweeps 2 and 4, too."""
+
+    class Slow(Staged):
+        def cameras(self, index: int) -> list[Camera]:
+            seconds = 0.1 * (3 - index)
+            return [CAMERA._replace(image="slow" if index in (2, 3, 4) else f"{index}", seconds=seconds)]
+
+    log = Slow([straight((2, -8), (-0.9, 0.0))], np.tile(pose(0, -20, np.pi / 2, 0), (12, 1, 1)))
+    results = log.results()
+    results[4][1].residual_flow[:] = 0
+    empty = {name: values[:0] for name, values in track(log, results).items()}
+    write_masks(tmp_path / "all", log, results[2:5], empty)
+    write_masks(tmp_path / "one", log, results[3:4], empty)
+    masks = [np.asarray(Image.open(tmp_path / name / "front" / "slow.png")) for name in ("all", "one")]
+    assert np.array_equal(*masks) and masks[0].any()
 
 
 def test_a_log_without_cameras_is_an_error(tmp_path: Path) -> None:

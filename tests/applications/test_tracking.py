@@ -505,6 +505,18 @@ def test_tracks_of_a_calibrated_drive_are_in_the_frame_of_kittis_labels(tmp_path
         np.testing.assert_allclose(rectangle[index], [*pixels.min(0), *pixels.max(0)], atol=3)
 
 
+def test_the_rectangle_of_a_car_that_reaches_behind_the_camera_is_cut_off_by_the_image(tmp_path: Path) -> None:
+    """A car overtakes on the left: its front is ahead of the camera while its rear is behind."""
+    log = Calibrated([straight((-1.5, -30), (0.0, 0.9), 14)], np.tile(pose(0, -20, np.pi / 2, 1), (14, 1, 1)))
+    write_kitti(tmp_path / "kitti.txt", track(log, log.results()), log)
+    lines = [line.split() for line in (tmp_path / "kitti.txt").read_text().splitlines()]
+    rectangles = {int(line[0]): np.array(line[6:10], float) for line in lines}
+    for sweep in (9, 10, 11):
+        front = -30 + 0.9 * sweep + SIZE[0]
+        right = 620 + 720 * (-1.5 + 0.07) / (front + 20 - 0.27)
+        np.testing.assert_allclose(rectangles[sweep], [0, 0, right, 374], atol=3)
+
+
 def read_instances(folder: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Read the files by the steps of DriveStudio's loaders.
 
