@@ -102,5 +102,8 @@ def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
                 "track_id": table["id"][rows],
             }
         )
+    # NumPy 2 names modules that NumPy 1, which OpenPCDet uses, does not have; both read the older names. In protocol 2,
+    # names are plain text.
+    content = pickle.dumps(frames, protocol=2).replace(b"cnumpy._core.", b"cnumpy.core.")
     with atomic_file(path) as file:
-        pickle.dump(frames, file, protocol=4)
+        file.write(content)

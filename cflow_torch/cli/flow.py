@@ -105,6 +105,7 @@ def _write_logs(cfg: Flow, run: FlowRun) -> Failures:
             log = TimedLog(logs.open(part.source), cfg.model.sweep_interval)
             pairs = log.pairs  # the pair over a gap has no flow
             if not complete_frames(output / log.log_id) >= {int(log.timestamps[index]) for index in pairs}:
+                tqdm.write(f"{log.log_id}: no {' and '.join(wanted)}, because frames are missing")
                 continue
             results = partial(_read_all, stored, log, pairs)
             if cfg.tracks or cfg.masks:

@@ -612,7 +612,9 @@ def test_resumed_and_sharded_runs_write_the_same_table(tmp_path: Path, capsys: p
             assert (cluster[ids == track_id] == of_flow).all()
     for index in (0, 1):
         assert not list((tmp_path / "shards").glob("*/tracks.parquet")), "half of the frames are not a whole log"
+        capsys.readouterr()
         assert call("flow", "shards", *run, f"shard.index={index}", "shard.count=2") == 0
+        assert (": no tracks, because frames are missing" in capsys.readouterr().out) == (index == 0)
     (other,) = (tmp_path / "shards").glob("*/tracks.parquet")
     assert other.read_bytes() == file.read_bytes()
 
