@@ -455,3 +455,42 @@ def test_a_notebook_shows_the_page_inline(browser: Any, tmp_path: Path) -> None:
     tab.goto((tmp_path / "cell.html").as_uri())
     tab.frame_locator("iframe").locator("#now:has-text('sweep 0 of 0')").wait_for(timeout=60_000)
     tab.close()
+
+
+def test_keys_stay_with_the_control_that_has_the_focus(browser: Any, drive_page: Path) -> None:
+    tab = browser.new_page()
+    tab.goto(drive_page.as_uri())
+    tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+    for name, value in (("#show-rings", "rings"), ("#show-labels", "labels")):
+        before = tab.evaluate(f"viewer.state.{value}")
+        tab.locator(name).focus()
+        tab.keyboard.press("Space")
+        assert tab.evaluate(f"viewer.state.{value}") is not before and tab.evaluate("viewer.state.timer") is None
+    camera = "viewer.K3D.getWorld().controls.getCameraArray()"
+    start = tab.evaluate(camera)
+    tab.locator("#coloring").focus()
+    tab.keyboard.press("t")
+    assert np.allclose(tab.evaluate(camera), start), "the list searches for a name with t"
+    tab.locator("#above").focus()
+    tab.keyboard.press("Space")
+    assert tab.evaluate("viewer.state.timer") is None and not np.allclose(tab.evaluate(camera), start)
+    tab.close()
+
+
+def test_a_page_of_every_fifth_pair_plays_at_the_pace_of_the_drive(
+    browser: Any, drive_page: Path, tmp_path: Path
+) -> None:
+    text = drive_page.read_text(encoding="utf-8")
+    data = content_of(text)
+    for frame in data["frames"]:
+        frame["sweep"] *= 5
+    script = re.search(r'<script id="data"[^>]*>(.*?)</script>', text, re.DOTALL)
+    (tmp_path / "page.html").write_text(text.replace(script[1], json.dumps(data)), encoding="utf-8")
+    tab = browser.new_page()
+    pauses = []
+    for page in (drive_page, tmp_path / "page.html"):
+        tab.goto(page.as_uri())
+        tab.wait_for_function("window.viewer && viewer.ready", timeout=60_000)
+        pauses.append(tab.evaluate("viewer.pause()"))
+    assert pauses == pytest.approx([0.1, 0.5])
+    tab.close()
