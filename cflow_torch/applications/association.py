@@ -16,7 +16,7 @@ from cflow_torch.types import Window
 _MIN_OVERLAP = 0.1  # least intersection over union of the voxels of two groups that match
 _MIN_CLAIM = 0.5  # a track of N points claims a group if its box holds at least 0.5 N points of the group
 MIN_STOPPED_SHARE = 0.3  # a track of N points has stopped if its box holds at least 0.3 N static points
-_MARGIN = 0.2  # metres, added to length, width and height of these boxes
+MARGIN = 0.2  # metres, added to length, width and height of boxes around the visible points of an object
 _ORIGIN_INSIDE = 0.5  # metres, at least, from the origin of a vehicle to its sides
 _REACH = 2.7  # metres from the origin of the vehicle to the farthest of its returns
 _LEAST_RIDE, _RIDE_ERROR = 0.2, 0.1  # metres per sweep, faster than people walk; share by which flow is off
@@ -37,7 +37,7 @@ class TrackMatches(NamedTuple):
 def regroup(groups: MovingGroups, tracks: TrackStates) -> MovingGroups:
     """Correct the moving groups of a sweep with the predicted boxes of confirmed tracks."""
     known = tracks.take(tracks.is_confirmed)
-    box = box_of_point(groups.point, known.box, known.size + _MARGIN, known.heading)
+    box = box_of_point(groups.point, known.box, known.size + MARGIN, known.heading)
     return _divide(_make_pieces_static(groups, box, known.num_points), box, known.num_points)
 
 
@@ -53,8 +53,7 @@ def of_own_vehicle(groups: MovingGroups, sweeps: Window) -> Tensor:
     heading = torch.atan2(flow[:, 1], flow[:, 0])
     centre, size = enclosing_boxes(*groups.moving, heading)
     T_world_ego0, T_world_ego1 = (centre.new_tensor(pose_of(sweep)) for sweep in (sweeps.pc0, sweeps.pc1))
-    x, y, _ = (T_world_ego0[:3, 3] - centre).unbind(1)
-    offset = torch.stack(rotate_about_z(x, y, -heading), 1).abs()
+    offset = turned(T_world_ego0[:3, 3] - centre, -heading)[:, :2].abs()
     holds_origin = (offset <= size[:, :2] / 2 + _ORIGIN_INSIDE).all(1)
 
     motion = T_world_ego1 @ torch.linalg.inv(T_world_ego0)
@@ -111,7 +110,7 @@ def match(tracks: TrackStates, points: Tensor, track_of_point: Tensor, groups: M
     may_have_stopped[track] = False
     candidate = may_have_stopped.nonzero()[:, 0]
     candidates = tracks.take(candidate)
-    box = box_of_point(groups.point[~groups.moves], candidates.box, candidates.size + _MARGIN, candidates.heading)
+    box = box_of_point(groups.point[~groups.moves], candidates.box, candidates.size + MARGIN, candidates.heading)
     count = torch.bincount(box[box >= 0], minlength=len(candidate))
     has_stopped = count >= (MIN_STOPPED_SHARE * candidates.num_points).clamp(min=MIN_POINTS)
     return TrackMatches(
@@ -178,10 +177,8 @@ def box_of_point(points: Tensor, centre: Tensor, size: Tensor, heading: Tensor) 
 
     The (K, 3) sizes are length, width, height; the length is along `heading`, (K,) radians. Cost: K * N comparisons.
     """
-    offset = points[None] - centre[:, None]
-    along, across = rotate_about_z(offset[..., 0], offset[..., 1], -heading[:, None])
-    is_inside = (along.abs() <= size[:, None, 0] / 2) & (across.abs() <= size[:, None, 1] / 2)
-    is_inside &= offset[..., 2].abs() <= size[:, None, 2] / 2
+    offset = turned(points[None] - centre[:, None], -heading[:, None])
+    is_inside = (offset.abs() <= size[:, None] / 2).all(2)
     is_outside = ~is_inside.any(0, keepdim=True)
     return torch.cat([is_outside, is_inside]).to(torch.uint8).argmax(0) - 1
 
@@ -191,18 +188,18 @@ def enclosing_boxes(points: Tensor, group: Tensor, heading: Tensor) -> tuple[Ten
 
     `group` is the group of each point, (N,), and `heading` the direction of each box, (K,) radians. No group is empty.
     """
-    along, across = rotate_about_z(points[:, 0], points[:, 1], -heading[group])
-    local = torch.stack([along, across, points[:, 2]], 1)
+    local = turned(points, -heading[group])
     index = group[:, None].expand(-1, 3)
     extremes = local.new_zeros(len(heading), 3)
     low = extremes.scatter_reduce(0, index, local, "amin", include_self=False)
     high = extremes.scatter_reduce(0, index, local, "amax", include_self=False)
     middle = (low + high) / 2
-    return torch.stack([*rotate_about_z(middle[:, 0], middle[:, 1], heading), middle[:, 2]], 1), high - low
+    return turned(middle, heading), high - low
 
 
-def rotate_about_z(x: Tensor, y: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotate x, y by `angle` radians, counter-clockwise."""
+def turned(values: Tensor, angle: Tensor) -> Tensor:
+    """Rotate (..., 3) vectors by (...) angles about z, counter-clockwise, radians."""
+    x, y, z = values.unbind(-1)
     cos = angle.cos()
     sin = angle.sin()
-    return cos * x - sin * y, sin * x + cos * y
+    return torch.stack([cos * x - sin * y, sin * x + cos * y, z], -1)

@@ -9,7 +9,7 @@ from typing import Any, Callable, Mapping, NamedTuple, Sequence
 import numpy as np
 import torch
 
-from cflow_torch.applications.association import box_of_point, enclosing_boxes
+from cflow_torch.applications.association import MARGIN, box_of_point, enclosing_boxes
 from cflow_torch.applications.completion import TrackedPoints
 from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.applications.track_table import Table
@@ -21,7 +21,6 @@ from cflow_torch.model import SceneFlowModel
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import CFlowError, FlowResult, Sweep, as_numpy, check_array
 
-_MARGIN = 0.2  # metres, added to the sides of the box around the visible part of an object
 _SLOW = 3.0  # m/s; an object that is faster in its first sweep did not wait there before
 _MAX_DISTANCE = 100.0  # metres from the vehicle to a box, at most
 _INTENSITIES = ("intensity", "reflectance", "reflectivity", "remission", "i", "column_3")
@@ -296,7 +295,7 @@ def _intensity(columns: Mapping[str, np.ndarray]) -> np.ndarray | None:
 
 def _inside(sweep: Sweep, centre: torch.Tensor, size: torch.Tensor, heading: torch.Tensor) -> np.ndarray:
     """(N,) bool, points of a sweep that are not ground and lie in one of the boxes (world frame)."""
-    is_inside = box_of_point(torch.from_numpy(_world(sweep)), centre, size + _MARGIN, heading).numpy() >= 0
+    is_inside = box_of_point(torch.from_numpy(_world(sweep)), centre, size + MARGIN, heading).numpy() >= 0
     return is_inside if sweep.is_ground is None else is_inside & ~as_numpy(sweep.is_ground).astype(bool)
 
 

@@ -94,7 +94,7 @@ class DynamicShapes(NamedTuple):
 def write_mask(path: Path, mask: np.ndarray) -> None:
     """Write a mask, (height, width) uint8, as PNG."""
     with atomic_file(path) as file:
-        _pillow().fromarray(mask).save(file, "PNG")
+        load_pillow().fromarray(mask).save(file, "PNG")
 
 
 def dynamic_mask(camera: Camera, points: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -102,7 +102,7 @@ def dynamic_mask(camera: Camera, points: np.ndarray, corners: np.ndarray) -> np.
 
     Corners are in the order of `box_corners`. Returns (height, width) uint8.
     """
-    image = _pillow().new("L", camera.size, STATIC)
+    image = load_pillow().new("L", camera.size, STATIC)
     brush = import_optional("PIL.ImageDraw", _NEEDS_PILLOW).Draw(image)
     width, height = camera.size
     positions = camera.see(points)
@@ -147,10 +147,6 @@ def _corners(log: Log, rows: Table) -> tuple[np.ndarray, np.ndarray]:
 _NEEDS_PILLOW = "masks need Pillow (extra viz): pip install Pillow"
 
 
-def _pillow() -> Any:
+def load_pillow() -> Any:
+    """Import Pillow's images; a missing package is a `CFlowError`."""
     return import_optional("PIL.Image", _NEEDS_PILLOW)
-
-
-def check_pillow() -> None:
-    """Raise the error of a missing Pillow before anything is computed."""
-    _pillow()

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import MIN_STOPPED_SHARE, box_of_point, enclosing_boxes
+from cflow_torch.applications.association import MARGIN, MIN_STOPPED_SHARE, box_of_point, enclosing_boxes
 from cflow_torch.applications.completion import TrackedPoints
 from cflow_torch.applications.floor import Floor
 from cflow_torch.applications.moving_groups import MIN_POINTS, pose_of
@@ -16,8 +16,6 @@ from cflow_torch.applications.static_places import cells_of
 from cflow_torch.applications.track_table import Table
 from cflow_torch.transforms import transform_points
 from cflow_torch.types import Sweep, as_numpy
-
-_MARGIN = 0.2  # metres, added to length, width and height of a box
 
 
 class FreePoints(NamedTuple):
@@ -102,7 +100,7 @@ class SweepTracks:
         number = int(other.table["id"][row])
         _, velocity = other.points.of_track(number)
         centre, size, heading = other.box(row)
-        size = size + _MARGIN
+        size = size + MARGIN
         seconds = self.points.seconds - other.points.seconds
         index = self.free.inside(centre + torch.from_numpy(seconds * velocity), size, heading)
         num_there = len(self.free.inside(centre, size, heading)) if seconds < 0 else 0

@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cflow_torch.applications.association import turned
 from cflow_torch.applications.missed_sweeps import SweepTracks
 from cflow_torch.applications.moving_groups import MIN_POINTS
 from cflow_torch.applications.track_table import Table
-from cflow_torch.applications.whole_boxes import RUNNING, turned
+from cflow_torch.applications.whole_boxes import RUNNING
 from cflow_torch.ops.labeling import connected_components
 from cflow_torch.ops.nearest import nearest_set_pixel
 from cflow_torch.types import CENTRE

@@ -203,4 +203,4 @@ def _nanoseconds(time: int | float) -> int:
     """Convert a time in nanoseconds (int) or seconds (float)."""
     with suppress(TypeError, ValueError, OverflowError):
         return round(time * 1e9) if isinstance(time, float) else operator.index(time)
-    raise CFlowError(f"time={time!r}: give whole nanoseconds (int) or seconds (float)")
+    raise CFlowError(f"time={time!r}: give whole nanoseconds (int) or seconds (float), such as float(time)")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, of_own_vehicle, regroup
+from cflow_torch.applications.association import TrackMatches, enclosing_boxes, match, of_own_vehicle, regroup, turned
 from cflow_torch.applications.completion import TrackedPoints, complete
 from cflow_torch.applications.floor import UNKNOWN_FLOOR, Floor
 from cflow_torch.applications.missed_sweeps import FreePoints, SweepTracks
@@ -18,7 +18,7 @@ from cflow_torch.applications.people import divide_people
 from cflow_torch.applications.static_places import Sighting, static_points
 from cflow_torch.applications.track_state import Times, TrackStates
 from cflow_torch.applications.track_table import confirmed, join_tables
-from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds_and_sizes, turned
+from cflow_torch.applications.whole_boxes import FLOW_NOISE, KINDS, Edges, kinds_and_sizes
 from cflow_torch.config import make_config
 from cflow_torch.data.log import CachedLog, Log, TimedLog, window
 from cflow_torch.estimate import make_model
@@ -345,7 +345,8 @@ def track(
         length (along the heading), width, height: metres, of the whole box, the same in all rows of a track;
         `heading`: radians in the world from +x to the left, from the motion, kept at rest;
         `class`: pedestrian, cyclist, car or truck, by size and speed alone;
-        `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved;
+        `age`: seconds since the track was first seen; `num_moving`: sweeps so far in which it moved, where its flow is
+        missing that of the sweep in which we looked for it;
         `is_moving`: False = the track moved before, and is static now;
         `cluster_id`: of this sweep's flow, -1 while it is static or where its flow is missing; `num_points`;
         `confidence`: of the flow when it last moved, NaN where the method has none;

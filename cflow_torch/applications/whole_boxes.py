@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from cflow_torch.applications.association import rotate_about_z
+from cflow_torch.applications.association import turned
 from cflow_torch.applications.smoothing import MotionState, smooth
 
 PEDESTRIAN, CYCLIST, CAR, TRUCK = range(4)
@@ -251,11 +251,6 @@ def headings(velocity: Tensor, track: Tensor, otherwise: Tensor) -> Tensor:
     after = torch.where(is_fast, index, len(track)).flip(0).cummin(0).values.flip(0).clamp(max=len(track) - 1)
     heading = torch.where(is_fast[after] & (track[after] == track), direction[after], otherwise)
     return torch.where(is_fast[before] & (track[before] == track), direction[before], heading)
-
-
-def turned(values: Tensor, angle: Tensor) -> Tensor:
-    """Rotate (N, 3) vectors by (N,) angles about z, counter-clockwise, radians."""
-    return torch.stack([*rotate_about_z(values[:, 0], values[:, 1], angle), values[:, 2]], 1)
 
 
 def quantiles(values: Tensor, group: Tensor, count: int, *shares: float) -> list[Tensor]:

@@ -262,7 +262,7 @@ class Flow(FlowFiles):
 
 @dataclass(frozen=True)
 class Label(FlowFiles):
-    """Writes pseudo-labels into OpenSceneFlow's HDF5 scenes, for the training of SeFlow, SeFlow++ and TeFlow.
+    """Labels HDF5 scenes for the training of SeFlow, SeFlow++ and TeFlow, without annotations.
 
     Each sweep gets the keys dufo (dynamic), dufocluster, cluster and nnd. It gets ground_mask if it has none. Types and
     meanings are those of OpenSceneFlow's own scripts. First, the command estimates the flow like `cflow flow`, with the

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from cflow_torch.applications.instance_files import CAMERAS_OF_READER, write_drivestudio_masks
-from cflow_torch.applications.masks import check_cameras, check_pillow, write_masks
+from cflow_torch.applications.masks import check_cameras, load_pillow, write_masks
 from cflow_torch.applications.moving_labels import write_moving_labels
 from cflow_torch.applications.track_table import TRACKS_FILE, read_tracks, write_tracks
 from cflow_torch.applications.tracking import track_points
@@ -54,7 +54,7 @@ def task(cfg: Flow) -> None:
 
 def _check_results(cfg: Flow, run: FlowRun) -> None:
     if cfg.masks:
-        check_pillow()
+        load_pillow()  # fails now if it is missing
         for log in islice(run.open_logs(), 1):
             check_cameras(log, log.cameras(0))
     if cfg.result_name is None:
