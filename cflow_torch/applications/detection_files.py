@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cflow_torch.applications.track_table import KITTI_NAMES, Table, boxes_in_sweeps, class_of, score_of
+from cflow_torch.applications.track_table import KITTI_NAMES, Table, boxes_in_sweeps, score_of
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log
@@ -53,7 +53,7 @@ def write_nuscenes(folder: PathLike, table: Table, log: Log) -> None:
         token = tokens[int(table["sweep"][row])]
         if token is None or len(detections[token]) == _MOST_BOXES:
             continue
-        name = NUSCENES_NAMES[class_of(table, row)]
+        name = NUSCENES_NAMES[str(table["class"][row])]
         box = _nuscenes_box(table, row, token)
         attribute = _ATTRIBUTES[name][0 if table["is_moving"][row] else 1]
         detection = {"detection_name": name, "detection_score": score[row], "attribute_name": attribute}
@@ -87,7 +87,7 @@ def write_openpcdet(path: PathLike, table: Table, log: Log) -> None:
     centre, heading = boxes_in_sweeps(table, log)
     box = np.concatenate([centre, vectors(table, SIZE), heading[:, None]], 1).astype(np.float32)
     score = score_of(table).astype(np.float32)
-    label = np.array([1 + names.index(class_of(table, row)) for row in range(len(score))], np.int64)
+    label = np.array([1 + names.index(kind) for kind in table["class"].tolist()], np.int64)
     kitti_name = np.array([KITTI_NAMES[names[number - 1]] for number in label.tolist()], "<U10")
     frames = []
     for sweep in range(len(log.timestamps)):

@@ -8,8 +8,7 @@ from typing import Any, Iterable, Sequence
 import numpy as np
 
 from cflow_torch.applications.masks import DynamicShapes, check_cameras, write_mask
-from cflow_torch.applications.moving_groups import pose_of
-from cflow_torch.applications.track_table import Table, class_of
+from cflow_torch.applications.track_table import Table, poses_of
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, TimedLog
 from cflow_torch.data.paths import PathLike, as_path
@@ -86,7 +85,7 @@ def write_drivestudio(
     for number, track_id in enumerate(ids.tolist()):
         is_here = instance == number
         rows = row[is_here]
-        is_deformable = class_of(table, int(rows[0])) in _DEFORMABLE
+        is_deformable = table["class"][rows[0]] in _DEFORMABLE
         infos[str(number)] = {
             "id": str(track_id),
             "class_name": deformable_class if is_deformable and deformable_class is not None else class_name,
@@ -132,7 +131,8 @@ def write_drivestudio_masks(
         return
     for frame, sweep in enumerate(_sweep_of_frames(log).tolist()):
         source = max((index for index in shapes if index <= sweep), default=min(shapes))
-        T_sweep_source = np.linalg.inv(pose_of(log.sweep(sweep))) @ pose_of(log.sweep(source))
+        T_world_sweep, T_world_source = poses_of(log, (sweep, source))
+        T_sweep_source = np.linalg.inv(T_world_sweep) @ T_world_source
         later = seconds[sweep] - seconds[source]
         kinds = {
             "all": shapes[source],

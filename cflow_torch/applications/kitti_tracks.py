@@ -29,8 +29,7 @@ class _Boxes(NamedTuple):
 def write_kitti(path: PathLike, table: Table, log: Log) -> None:
     """Write tracks as text of KITTI's tracking benchmark: a line of 18 columns per row.
 
-    Frames are numbered by `Log.frame_number`, ids from 0; the type is Misc where the class is unknown; unknown columns
-    are -1.
+    Frames are numbered by `Log.frame_number`, ids from 0; unknown columns are -1.
 
     Args:
         path: the file.
@@ -50,7 +49,7 @@ def write_kitti(path: PathLike, table: Table, log: Log) -> None:
     numbers = np.column_stack(columns)
     lines = []
     for row in np.flatnonzero(boxes.is_seen).tolist():
-        kind = KITTI_NAMES.get(str(table["class"][row]), "Misc") if "class" in table else "Misc"
+        kind = KITTI_NAMES[str(table["class"][row])]
         values = " ".join(f"{value:.6f}" for value in numbers[row])
         frame = log.frame_number(int(table["sweep"][row]))
         lines.append(f"{frame} {table['id'][row]} {kind} -1 -1 {values}\n")

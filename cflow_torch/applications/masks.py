@@ -9,7 +9,7 @@ import numpy as np
 
 from cflow_torch.applications.association import of_own_vehicle
 from cflow_torch.applications.moving_groups import MovingGroups, pose_of
-from cflow_torch.applications.track_table import Table, box_corners, boxes_in_sweeps, class_of
+from cflow_torch.applications.track_table import Table, box_corners, boxes_in_sweeps, poses_of
 from cflow_torch.data.atomic import atomic_file
 from cflow_torch.data.camera import NEAREST, Camera
 from cflow_torch.data.log import Log, TimedLog
@@ -74,8 +74,7 @@ class DynamicShapes(NamedTuple):
     def of(cls, log: Log, index: int, result: FlowResult, table: Table) -> DynamicShapes:
         """Collect those of sweep `index` of a `TimedLog`, given its flow and the table of tracks."""
         rows = {name: values[table["sweep"] == index] for name, values in table.items()}
-        kind = np.array([class_of(rows, row) for row in range(len(rows["sweep"]))], dtype=np.str_)
-        return cls(*_moving_points(log, index, result), *_corners(log, rows), kind)
+        return cls(*_moving_points(log, index, result), *_corners(log, rows), rows["class"])
 
     def boxes(self, kinds: Sequence[str]) -> DynamicShapes:
         """Keep the boxes of tracks of some classes, and no points."""
@@ -141,7 +140,7 @@ def _corners(log: Log, rows: Table) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, 8, 3)), np.zeros((0, 3))
     centre, heading = boxes_in_sweeps(rows, log)
     corners = box_corners(centre, heading, vectors(rows, SIZE) + 2 * _MARGIN)
-    return corners, vectors(rows, VELOCITY) @ pose_of(log.sweep(int(rows["sweep"][0])))[:3, :3]
+    return corners, vectors(rows, VELOCITY) @ poses_of(log, rows["sweep"][:1].tolist())[0, :3, :3]
 
 
 _NEEDS_PILLOW = "masks need Pillow (extra viz): pip install Pillow"

@@ -12,7 +12,7 @@ from pyarrow import parquet
 from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.data.atomic import atomic_file, write_text
 from cflow_torch.data.file_errors import check_columns, file_errors
-from cflow_torch.data.log import Log
+from cflow_torch.data.log import Log, known_poses
 from cflow_torch.data.paths import PathLike, as_path, read_bytes
 from cflow_torch.transforms import transform_each, transform_points, upright_poses
 from cflow_torch.types import CENTRE, SIZE, VELOCITY, vectors
@@ -30,7 +30,6 @@ COLUMNS = {
 }
 
 
-UNKNOWN = "unknown"  # class of tracks of older tables
 KITTI_NAMES = {"car": "Car", "pedestrian": "Pedestrian", "cyclist": "Cyclist", "truck": "Truck"}
 """Class of a track -> name in KITTI and OpenPCDet, in the order of OpenPCDet's labels 1, 2, 3, 4."""
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -57,17 +56,12 @@ def write_tracks(path: PathLike, table: Table) -> None:
 
 
 def read_tracks(path: PathLike) -> Table:
-    """Read a table that `write_tracks` wrote; a missing file, or one without its columns, is a `CFlowError`.
-
-    Tables of version 0.4.0 have no classes, so the class is "unknown", and boxes of the visible part.
-    """
+    """Read a table that `write_tracks` wrote; a missing file, or one without its columns, is a `CFlowError`."""
     path = as_path(path)
     hint = "give a table that `cflow flow tracks=true` wrote"
     with file_errors(path, hint):
         table = parquet.read_table(pa.BufferReader(read_bytes(path)), use_threads=False)
-    check_columns(path, table.column_names, [name for name in COLUMNS if name != "class"], hint)
-    if "class" not in table.column_names:
-        table = table.append_column("class", [[UNKNOWN] * len(table)])
+    check_columns(path, table.column_names, list(COLUMNS), hint)
     return {name: table.column(name).to_numpy().astype(dtype) for name, dtype in COLUMNS.items()}
 
 
@@ -81,12 +75,6 @@ def write_mot(path: PathLike, table: Table, log: Log) -> None:
     _write_lines(path, "%d,%d,-1,-1,-1,-1,%.3f,%.3f,%.3f,%.3f", *columns, table["x"], table["y"], table["z"])
 
 
-def class_of(table: Table, row: int) -> str:
-    """Return the class of a row; a car where it is unknown."""
-    name = str(table["class"][row]) if "class" in table else UNKNOWN
-    return "car" if name == UNKNOWN else name
-
-
 def score_of(table: Table) -> np.ndarray:
     """Return the mean confidence of the track of each row, (R,) float64; 1 where the method has none."""
     _, track = np.unique(table["id"], return_inverse=True)
@@ -97,11 +85,17 @@ def score_of(table: Table) -> np.ndarray:
 def boxes_in_sweeps(table: Table, log: Log) -> tuple[np.ndarray, np.ndarray]:
     """Return centres, (R, 3) metres, and headings, (R,) radians, in the frame of the points of each row's sweep."""
     sweeps, row = np.unique(table["sweep"], return_inverse=True)
-    poses = [np.linalg.inv(pose_of(log.sweep(sweep))) for sweep in sweeps.tolist()]
-    T_ego_world = np.reshape(poses, (-1, 4, 4))[row]
+    T_ego_world = np.linalg.inv(poses_of(log, sweeps.tolist()))[row]
     direction = np.stack([np.cos(table["heading"]), np.sin(table["heading"])], 1)
     ahead = np.einsum("nij,nj->ni", T_ego_world[:, :2, :2], direction)
     return transform_each(vectors(table, CENTRE), T_ego_world), np.arctan2(ahead[:, 1], ahead[:, 0])
+
+
+def poses_of(log: Log, sweeps: Sequence[int]) -> np.ndarray:
+    """Return (K, 4, 4) float64 `T_world_ego` of some sweeps. The points are only read if poses come with them."""
+    known = known_poses(log)
+    poses = [pose_of(log.sweep(sweep)) if known is None else known[sweep] for sweep in sweeps]
+    return np.reshape(poses, (-1, 4, 4))
 
 
 def box_corners(centre: np.ndarray, heading: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -126,6 +126,7 @@ class PackedDrive:
             clusters = rows["cluster_id"].tolist()
             columns = {
                 "id": rows["id"].tolist(),
+                "kind": rows["class"].tolist(),
                 "centre": _rounded(centre),
                 "size": _rounded(vectors(rows, SIZE)),
                 "heading": np.round(heading, 3).tolist(),
@@ -133,8 +134,6 @@ class PackedDrive:
                 "points": rows["num_points"].tolist(),
                 "moving": [moving.get(number) for number in clusters],
             }
-            if "class" in rows:
-                columns["kind"] = rows["class"].tolist()
             frame["boxes"] = _records(columns)
             for track, number in zip(columns["id"], clusters):
                 if number >= 0:

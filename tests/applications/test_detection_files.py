@@ -16,7 +16,7 @@ from writers.nuscenes import write_nuscenes as write_scene
 
 from cflow_torch import track
 from cflow_torch.applications.detection_files import write_nuscenes, write_openpcdet
-from cflow_torch.applications.track_table import COLUMNS, Table, score_of
+from cflow_torch.applications.track_table import COLUMNS, Table, boxes_in_sweeps, score_of
 from cflow_torch.data.nuscenes.reader import NuScenesLog, find_nuscenes_scenes
 
 
@@ -140,3 +140,13 @@ def test_openpcdet_reads_boxes_in_the_frame_of_the_points(tmp_path: Path) -> Non
     write_openpcdet(tmp_path / "result.pkl", empty, log)
     frames = pickle.loads((tmp_path / "result.pkl").read_bytes())
     assert frames[11]["boxes_lidar"].shape == (0, 7) and len(frames[11]["name"]) == 0
+
+
+def test_boxes_in_sweeps_of_known_poses_read_no_points() -> None:
+    vehicle = np.stack([pose(0.5 * k, 0, 0.1 * k) for k in range(12)])
+    log = Staged([straight((10, -6), (0.8, 0.0))], vehicle)
+    table = track(log, log.results())
+    expected = boxes_in_sweeps(table, log)
+    log.sweep = lambda index: pytest.fail("a cloud is read")  # type: ignore[method-assign]
+    assert all(map(np.array_equal, boxes_in_sweeps(table, log), expected))
+    assert np.ptp(expected[0][:, 0]) > 1

@@ -433,18 +433,12 @@ def test_an_empty_table_comes_back_from_disk_and_a_broken_one_is_refused(tmp_pat
             read_tracks(tmp_path / name)
 
 
-def test_a_table_without_classes_is_read_and_written_for_others(tmp_path: Path) -> None:
+def test_a_table_that_lacks_a_column_is_refused(tmp_path: Path) -> None:
     log = Staged([straight((0, 0), (0.9, 0.0))])
     table = track(log, log.results())
     write_tracks(tmp_path / "tracks.parquet", {name: values for name, values in table.items() if name != "class"})
-    old = read_tracks(tmp_path / "tracks.parquet")
-    assert set(old["class"]) == {"unknown"} and np.array_equal(old["x"], table["x"])
-    write_kitti(tmp_path / "kitti.txt", old, log)
-    assert {line.split()[2] for line in (tmp_path / "kitti.txt").read_text().splitlines()} == {"Misc"}
-    write_drivestudio(tmp_path, old, log, "Car", None)
-    assert {each["class_name"] for each in json.loads((tmp_path / "instances_info.json").read_text()).values()} == {
-        "Car"
-    }
+    with pytest.raises(CFlowError, match="class.*tracks=true"):
+        read_tracks(tmp_path / "tracks.parquet")
 
 
 def test_tracks_are_written_as_text(tmp_path: Path) -> None:

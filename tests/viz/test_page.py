@@ -133,13 +133,18 @@ def test_tracks_have_boxes_and_one_colour_in_all_sweeps() -> None:
     columns = ("x", "y", "z", "length", "width", "height", "heading", "vx", "vy")
     table = {name: np.array([1.0, 2.0]) for name in columns}
     table.update(id=np.array([47, 47]), sweep=np.array([0, 1]), cluster_id=np.array([3, 3]))
-    table.update(num_points=np.array([20, 21]))
+    table.update({"num_points": np.array([20, 21]), "class": np.array(["car", "car"])})
     moving = torch.linspace(0, 1, len(results[1].residual_flow))
     results[1] = replace(results[1], moving=moving)
     data = content_of(show(sweeps, results, tracks=table).html)
     for frame in range(2):
         (box,) = data["frames"][frame]["boxes"]
-        assert box["id"] == 47 and box["size"] == [frame + 1.0] * 3 and box["points"] == 20 + frame
+        assert (
+            box["id"] == 47
+            and box["kind"] == "car"
+            and box["size"] == [frame + 1.0] * 3
+            and box["points"] == 20 + frame
+        )
         assert box["speed"] == round(np.hypot(1, 1) * (frame + 1), 1)
         cars = moving[CAR].mean().item()
         assert box["moving"] == (None if frame == 0 else pytest.approx(cars, abs=0.006))
