@@ -218,7 +218,7 @@ def _judge(
     is_counted = is_given & is_inside
     is_counted[:, :3] = is_given[:, :3]
     is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_counted[:, 2:].sum(1))
-    cost = ((error / limit).square().clamp(max=1.0) * is_counted).sum(1)
+    cost = (error / limit).square().clamp(max=1.0).sum(1)
     cost += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
     return is_found, cost.masked_fill(~is_confirmed, math.inf)
 
