@@ -206,10 +206,9 @@ def _judge(
 
     Returns:
         is_found: (H, S) bool, the nearest part is near enough.
-        cost: (H,) float64, the lowest is the best: over the sweeps that count, the sum of the squares of errors, in
-            parts of the largest error that confirms the velocity, each at most 1. In a pair, all errors are 0, and the
-            cost is the distance. It is infinite without a part at t+1, or with parts in less than half of the older
-            sweeps that count.
+        cost: (H,) float64, the lowest is the best: the sum of the squares of errors, as parts of the largest error that
+            confirms the velocity, each at most 1. In a pair, all errors are 0, and the cost is the distance. It is
+            infinite without a part at t+1, or with parts in less than half of the older sweeps that count.
     """
     is_given = sweeps.is_given.index_select(0, window)
     limit = _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved
@@ -218,7 +217,7 @@ def _judge(
     is_counted = is_given & is_inside
     is_counted[:, :3] = is_given[:, :3]
     is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_counted[:, 2:].sum(1))
-    cost = (error / limit).square().clamp(max=1.0).sum(1)
+    cost = ((error / limit).square().clamp(max=1.0) * is_given).sum(1)
     cost += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
     return is_found, cost.masked_fill(~is_confirmed, math.inf)
 

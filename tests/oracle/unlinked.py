@@ -133,7 +133,6 @@ def follow(sweeps, i, velocity, centres, since, around) -> tuple[float, dict[int
             continue
         if math.sqrt(square) <= bound:
             track[step] = part
-        if is_counted:
-            cost += min((math.sqrt(square) / bound) ** 2, 1)
+        cost += min((math.sqrt(square) / bound) ** 2, 1)
     found = sum(step >= 2 for step in track)
     return (cost if 0 in track and 2 * found >= num_older else math.inf), track
