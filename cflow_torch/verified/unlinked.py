@@ -54,9 +54,9 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
         takes its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least
         half of the older sweeps. A sweep before t-1 counts only if the velocity puts the part inside the region there.
         A sweep that does not count may still confirm the velocity.
-        Of the velocities of a part of t, or of t+1, the one that the fewest sweeps lack wins, then the one with the
-        smallest errors. In a pair, parts are unmatched components, and the lowest velocity wins. A part belongs to its
-        first node. The velocity of a node must win more slices near its targets than it loses.
+        Of the velocities of a part of t, or of t+1, the one with the smallest errors wins; a sweep without a part has
+        the largest error. In a pair, parts are unmatched components, and the lowest velocity wins. A part belongs to
+        its first node. The velocity of a node must win more slices near its targets than it loses.
 
     Cost: 289 lookups for each part of t, 25 for each sweep and pair of near parts.
     """
@@ -187,8 +187,8 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     place = centre[..., None] - velocity[..., None] * before_t  # [2, H, S]
     part, error = _follow(parts, cells, of_t, place)  # [H, S] each
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()  # [H, S]
-    is_found, ranks = _judge(sweeps, window, error, moved, cells.contains(place))
-    kept = flat_nonzero(_are_best(ranks, part, len(parts)))
+    is_found, cost = _judge(sweeps, window, error, moved, cells.contains(place))
+    kept = flat_nonzero(_are_best(cost, part, len(parts)))
     part, is_found, before_t = gather(kept, part, is_found, before_t)
     return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
 
@@ -196,7 +196,7 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
 def _judge(
     sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Tensor, is_inside: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Tell which sweeps confirm H velocities, and rank these.
+    """Tell which sweeps confirm H velocities, and what these cost.
 
     Args:
         window: (H,) int64.
@@ -206,20 +206,20 @@ def _judge(
 
     Returns:
         is_found: (H, S) bool, the nearest part is near enough.
-        ranks: (2, H) float64, the number of sweeps that lack a part, and the sum of errors. The lowest number is the
-            best, and of equal numbers, the lowest sum. In a pair, all errors are 0, and the shortest way is the best.
-            Both are infinite without a part at t+1, or with parts in less than half of the older sweeps that count.
+        cost: (H,) float64, the lowest is the best: the sum of the squares of errors, as parts of the largest error that
+            confirms the velocity, each at most 1. In a pair, all errors are 0, and the cost is the distance. It is
+            infinite without a part at t+1, or with parts in less than half of the older sweeps that count.
     """
     is_given = sweeps.is_given.index_select(0, window)
-    is_found = is_given & (error <= _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved)
+    limit = _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved
+    is_found = is_given & (error <= limit)
     # Outside of the region, an older sweep can confirm nothing, so it does not count. Sweep t-1 always counts.
     is_counted = is_given & is_inside
     is_counted[:, :3] = is_given[:, :3]
     is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_counted[:, 2:].sum(1))
-    num_lacking = (is_counted & ~is_found).sum(1)
-    way = moved[:, 0] * ~sweeps.has_history.index_select(0, window)  # of pairs
-    total = error.masked_fill(~is_found, 0.0).sum(1) + way
-    return is_found, torch.stack((num_lacking.double(), total)).masked_fill(~is_confirmed, math.inf)
+    cost = ((error / limit).square().clamp(max=1.0) * is_given).sum(1)
+    cost += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
+    return is_found, cost.masked_fill(~is_confirmed, math.inf)
 
 
 def _follow(parts: _Parts, cells: _Map, of_t: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
@@ -281,21 +281,15 @@ def _are_alike(sweeps: HeightSlicedSweeps, parts: _Parts, of_t: Tensor, other: T
     return is_like | sweeps.has_history.index_select(0, parts.window.index_select(0, of_t))[:, None]
 
 
-def _are_best(ranks: Tensor, part: Tensor, num_parts: int) -> Tensor:
-    """Tell which tracks are the best of their part of t and of their part of t+1, (H,) bool. Ties: the first."""
-    is_best = _are_lowest(ranks, Groups(part[:, 1], num_parts)) & _are_lowest(ranks, Groups(part[:, 0], num_parts))
+def _are_best(cost: Tensor, part: Tensor, num_parts: int) -> Tensor:
+    """Tell which tracks, (H,), have the lowest cost of their part of t and of their part of t+1. Ties: the first."""
+    is_best = cost < math.inf
+    for step in (1, 0):
+        same = Groups(part[:, step], num_parts)
+        is_best &= cost == same.spread(same.min(cost, empty=math.inf))
     same = Groups(part[:, 1], num_parts).where(is_best)
     first = same.spread(same.first(), none=-1)
     return first == torch.arange(len(first), device=first.device)
-
-
-def _are_lowest(ranks: Tensor, groups: Groups) -> Tensor:
-    """Tell which tracks have the lowest ranks of their group, by the first rank, then by the next, (H,) bool."""
-    is_lowest = ranks[0] < math.inf
-    for rank in ranks:
-        rank = rank.masked_fill(~is_lowest, math.inf)
-        is_lowest &= rank == groups.spread(groups.min(rank, empty=math.inf))
-    return is_lowest
 
 
 def _pixels_of(tracks: _Tracks, parts: _Parts) -> Groups:
