@@ -17,7 +17,7 @@ import numpy as np
 from cflow_torch.applications.moving_groups import pose_of
 from cflow_torch.data.catalog import open_log
 from cflow_torch.data.hdf5.writer import write_hdf5_labels
-from cflow_torch.data.log import CachedLog, Log, windows
+from cflow_torch.data.log import CachedLog, Log, window
 from cflow_torch.errors import import_optional
 from cflow_torch.model import SceneFlowModel
 from cflow_torch.transforms import transform_points
@@ -28,6 +28,7 @@ _MAX_DISTANCE = 0.5  # metres from the predicted position of a point to the near
 _SIMILAR = (0.1, 0.5)  # largest difference of motions that agree: metres, or share of the motion if that is more
 _MIN_POINTS = 20  # of a static group, as in OpenSceneFlow's own recipe
 _MAX_GROUPS = 32_767  # the largest int16
+_WRONG_NUMBER = "log {} has {} pairs and {} flows: give one for each pair, in order"
 _NND = (0.14, 4.4)  # metres from a point to the nearest one of the next sweep: 5 to 160 km/h at 10 Hz
 
 
@@ -56,7 +57,9 @@ def label_scene(file: str | Path, model: SceneFlowModel, find_ground: str = "gri
             file is then unchanged.
     """
     log = open_log("hdf5", file, find_ground=find_ground)
-    flows = (model([each])[0] for each in windows(log, model.config.num_history, model.config.num_future))
+    cached = CachedLog(log, model.config.num_sweeps)
+    sweeps = (window(cached, index, model.config.num_history, model.config.num_future) for index in log.pairs)
+    flows = (model([each])[0] for each in sweeps)
     return write_hdf5_labels(file, find_labels(log, flows, model), overwrite=overwrite)
 
 
@@ -67,8 +70,9 @@ def find_labels(
 
     Args:
         log: its sweeps have ground masks and poses.
-        flows: results of all pairs, in order, by the verified method.
-        model: the method that computed `flows`. It also estimates the flow from the last sweep to the one before.
+        flows: results of all pairs (`log.pairs`), in order, by the verified method.
+        model: the method that computed `flows`. It also estimates the flow from the last sweep to the one before, and
+            from the last one before each gap.
         workers: threads of the nearest-neighbour search for `nnd`.
 
     Yields:
@@ -81,8 +85,8 @@ def find_labels(
         `nnd` (N,) uint8, 1 = the nearest point of the next sweep is 0.14 m to 4.4 m away after compensation of ego
         motion. Ground points have it, too.
 
-    Convention: the last sweep has no successor, so its flow and its `nnd` lead to the sweep before. Groups of a sweep
-        after the 32,767th have the number 0.
+    Convention: the last sweep, and one before a gap, has no successor, so its flow and its `nnd` lead to the sweep
+        before. In a sweep between two gaps, nothing moves. Groups of a sweep after the 32,767th have the number 0.
 
     Raises:
         CFlowError: a sweep has no ground mask, a result has no confidence or not one row per point, results are
@@ -94,13 +98,28 @@ def find_labels(
         "scipy.spatial", "labels need SciPy (extra label): pip install scipy"
     ).cKDTree
     log = CachedLog(log, 3)
+    last = [*sorted(log.gaps), len(log) - 1]
+    parts = [range(begin, end + 1) for begin, end in zip([0, *(index + 1 for index in last)], last)]
+    given = iter(flows)
+    for part in parts:
+        yield from _label_part(log, part, given, model, tree, workers)
+    if next(given, None) is not None:
+        raise CFlowError(_WRONG_NUMBER.format(log.log_id, len(log.pairs), "more"))
+
+
+def _label_part(
+    log: Log, part: range, flows: Iterator[FlowResult], model: SceneFlowModel, tree: Callable[..., Any], workers: int
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Yield the labels of sweeps without a gap, see `find_labels`; `flows` goes on to those of later parts."""
     seconds = log.sweep_times(model.config.sweep_interval)
     dynamic: list[DynamicPoints] = []
     groups: list[np.ndarray] = []
-    neighbours = [*range(1, len(log)), len(log) - 2]  # index of the sweep to which the flow of each sweep leads
-    for index, result in enumerate(_with_last(log, flows, model)):
+    others = [*part[1:], part[-2:][0]]  # index of the sweep to which the flow of each sweep leads
+    for index, other in zip(part, others):
         sweep = log.sweep(index)
-        other = log.sweep(neighbours[index])
+        result = flow_back(log, model, part) if index == part[-1] else next(flows, None)
+        if result is None:
+            raise CFlowError(_WRONG_NUMBER.format(log.log_id, len(log.pairs), "fewer"))
         if result.confidence is None or len(result.cluster_id) != len(sweep.points):
             raise CFlowError(
                 f"flow {index} of log {log.log_id} has no confidence, or rows of another sweep: labels need the flow "
@@ -112,35 +131,37 @@ def find_labels(
                 "find_ground='grid'"
             )
         groups.append(as_numpy(result.cluster_id, np.int32))
-        dynamic.append(_dynamic_points(sweep, other, result, seconds[[index, neighbours[index]]]))
+        dynamic.append(_dynamic_points(sweep, log.sweep(other), result, seconds[[index, other]]))
     trees = [tree(each.positions) for each in dynamic]
-    for index, stamp in enumerate(log.timestamps):
+    for number, (index, other) in enumerate(zip(part, others)):
         sweep = log.sweep(index)
-        is_ground = as_numpy(sweep.is_ground, bool)  # type: ignore[arg-type]  # `find_labels` requires masks
+        is_ground = as_numpy(sweep.is_ground, bool)  # type: ignore[arg-type]  # checked above
         moves = np.zeros(len(is_ground), bool)
-        moves[dynamic[index].rows[_is_confirmed(dynamic, trees, index)]] = True
+        moves[dynamic[number].rows[_is_confirmed(dynamic, trees, number)]] = True
         moves &= ~is_ground
-        cluster = _number_groups(groups[index], moves, is_ground)
+        cluster = _number_groups(groups[number], moves, is_ground)
         yield (
-            int(stamp),
+            int(log.timestamps[index]),
             {
                 "ground_mask": is_ground,
                 "dufo": moves.astype(np.uint8),
                 "cluster": cluster,
                 "dufocluster": np.where(moves, cluster, np.int16(0)),
-                "nnd": _has_moved_by_nearest(tree, sweep, log.sweep(neighbours[index]), workers),
+                "nnd": _has_moved_by_nearest(tree, sweep, log.sweep(other), workers),
             },
         )
 
 
-def flow_back(log: Log, model: SceneFlowModel) -> FlowResult:
-    """Estimate the flow of the last sweep to the one before it, by playing the log backwards.
+def flow_back(log: Log, model: SceneFlowModel, part: range) -> FlowResult:
+    """Estimate the flow of the last sweep of a part to the one before it, by playing the part backwards.
 
-    Up to `num_future` earlier sweeps take the place of `pcf`. The flow has the axes of the sweep before the last.
+    Up to `num_future` earlier sweeps take the place of `pcf`. The flow has the axes of the sweep before the last. In a
+    part of one sweep, nothing moves.
     """
-    last = len(log.timestamps) - 1
-    first = max(last - 1 - model.config.num_future, 0)
-    pc0, pc1, *rest = (_played_backwards(log.sweep(index)) for index in range(last, first - 1, -1))
+    played = [_played_backwards(log.sweep(index)) for index in part[::-1][: 2 + model.config.num_future]]
+    if len(played) == 1:
+        played = 2 * [replace(played[0], timestamp_ns=None, point_times=None)]
+    pc0, pc1, *rest = played
     return model([Window(pc0, pc1, (), tuple(rest))])[0]
 
 
@@ -148,15 +169,6 @@ def _played_backwards(sweep: Sweep) -> Sweep:
     stamp = None if sweep.timestamp_ns is None else -sweep.timestamp_ns
     times = None if sweep.point_times is None else -as_numpy(sweep.point_times)
     return replace(sweep, timestamp_ns=stamp, point_times=times)
-
-
-def _with_last(log: Log, flows: Iterable[FlowResult], model: SceneFlowModel) -> Iterator[FlowResult]:
-    count = 0
-    for count, result in enumerate(flows, 1):  # noqa: B007 (the last one counts)
-        yield result
-    if count != len(log) - 1:
-        raise CFlowError(f"log {log.log_id} of {len(log)} sweeps has {count} flows: give one for every pair, in order")
-    yield flow_back(log, model)
 
 
 def _dynamic_points(sweep: Sweep, other: Sweep, result: FlowResult, seconds: np.ndarray) -> DynamicPoints:

@@ -68,11 +68,10 @@ def _label(cfg: Label, run: FlowRun, report: dict[str, Any]) -> Failures:
             if labelled_by(scene) == run.job.identity["hash"] and not run.job.redo:
                 continue
             log = run.logs.open(scene)
-            stamps = log.timestamps[:-1]
-            if not set(stamps) <= complete_frames(folder):
+            if not {int(log.timestamps[index]) for index in log.pairs} <= complete_frames(folder):
                 waiting.append(scene.name)  # failed frames are in the report; others belong to another shard
                 continue
-            flows = (stored(log, index) for index in range(len(stamps)))
+            flows = (stored(log, index) for index in log.pairs)
             labels = find_labels(log, flows, model, workers)
             write_hdf5_labels(scene, labels, run.job.identity["hash"], overwrite=run.job.redo)
             labelled.append(scene.name)

@@ -228,6 +228,24 @@ def test_broken_scenes_are_reported_and_the_others_labelled(scenes: Path, tmp_pa
     assert single.read_bytes() == before and "dufo" in stored(scenes / "scene-2.h5")[0]
 
 
+def test_a_scene_with_gaps_is_labelled_part_by_part(tmp_path: Path, capsys: Any) -> None:
+    """Sweeps 0 to 3, then 10 alone, then 17 to 19: the labels of the parts are those of scenes of their own."""
+    drive = make_small_drive(20, 1)
+    for name, kept in (("whole", [*range(4), 10, *range(17, 20)]), ("first", range(4)), ("last", range(17, 20))):
+        write_hdf5_scene(drive, tmp_path / "scenes" / f"{name}.h5")
+        with h5py.File(tmp_path / "scenes" / f"{name}.h5", "r+") as scene:
+            for index in set(range(20)) - set(kept):
+                del scene[str(drive.timestamps[index])]
+    assert label(tmp_path / "scenes", f"output={tmp_path / 'out'}") == 0
+    assert "scenes labelled: 3, scenes without complete flow yet: 0" in capsys.readouterr().out
+    whole, first, last = (stored(tmp_path / "scenes" / f"{name}.h5") for name in ("whole", "first", "last"))
+    for part, expected in ((whole[:4], first), (whole[5:], last)):
+        assert len(part) == len(expected) and any(sweep["dufo"].any() for sweep in part)
+        for sweep, other in zip(part, expected):
+            assert all(np.array_equal(sweep[key], other[key]) for key in KEYS)
+    assert not whole[4]["dufo"].any() and not whole[4]["nnd"].any() and whole[4]["cluster"].any()
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -247,7 +265,11 @@ def test_flow_of_another_log_is_refused(scenes: Path) -> None:
     model = make_model(ONLINE, "cpu")
     with HDF5Log(scenes / "scene-1.h5") as log:
         flows = [model([each])[0] for each in windows(log, 2)]
-        for wrong, message in ((flows[:-1], "has 2 flows"), ([*flows[1:], flows[0]], "rows of another sweep")):
+        for wrong, message in (
+            (flows[:-1], "3 pairs and fewer flows"),
+            ([*flows, flows[0]], "3 pairs and more flows"),
+            ([*flows[1:], flows[0]], "rows of another sweep"),
+        ):
             with pytest.raises(CFlowError, match=message):
                 list(find_labels(log, wrong, model))
     with pytest.raises(CFlowError, match="key of the scenes themselves"):
