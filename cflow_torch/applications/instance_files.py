@@ -9,6 +9,7 @@ import numpy as np
 
 from cflow_torch.applications.masks import DynamicShapes, check_cameras, write_mask
 from cflow_torch.applications.track_table import Table, poses_of
+from cflow_torch.data.camera import Camera
 from cflow_torch.data.json_file import write_json
 from cflow_torch.data.log import Log, TimedLog
 from cflow_torch.data.paths import PathLike, as_path
@@ -131,24 +132,28 @@ def write_drivestudio_masks(
         return
     for frame, sweep in enumerate(_sweep_of_frames(log).tolist()):
         source = max((index for index in shapes if index <= sweep), default=min(shapes))
-        T_world_sweep, T_world_source = poses_of(log, (sweep, source))
-        T_sweep_source = np.linalg.inv(T_world_sweep) @ T_world_source
-        later = seconds[sweep] - seconds[source]
         kinds = {
             "all": shapes[source],
             "human": shapes[source].boxes(_DEFORMABLE),
             "vehicle": shapes[source].boxes(_RIGID),
         }
-        seen = log.cameras(sweep)
-        check_cameras(log, seen)
-        for camera in seen:
+        for camera in _cameras_at(log, sweep, source, seconds[sweep] - seconds[source]):
             if camera.name in cameras:
-                at_frame = camera._replace(
-                    T_camera_ego=camera.T_camera_ego @ T_sweep_source, seconds=camera.seconds + later
-                )
+                name = f"{frame:03d}_{cameras.index(camera.name)}.png"
                 for kind, drawn in kinds.items():
-                    name = f"{frame:03d}_{cameras.index(camera.name)}.png"
-                    write_mask(folder / kind / name, drawn.draw(at_frame))
+                    write_mask(folder / kind / name, drawn.draw(camera))
+
+
+def _cameras_at(log: Log, sweep: int, source: int, later: float) -> list[Camera]:
+    """Return the cameras of a sweep for the points of another one, the source, from which it is `later` seconds."""
+    seen = log.cameras(sweep)
+    check_cameras(log, seen)
+    T_world_sweep, T_world_source = poses_of(log, (sweep, source))
+    T_sweep_source = np.linalg.inv(T_world_sweep) @ T_world_source
+    return [
+        camera._replace(T_camera_ego=camera.T_camera_ego @ T_sweep_source, seconds=camera.seconds + later)
+        for camera in seen
+    ]
 
 
 def _sweep_of_frames(log: Log) -> np.ndarray:
