@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -278,6 +279,20 @@ def test_a_tracking_drive_is_read_in_the_frame_of_the_lidar(tmp_path: Path) -> N
     u = 720 * 5 / 12 + 621
     assert 900 < u < 950, "a point of the wall is in a region DontCare"
     assert log.labels(0).is_valid.tolist() == [True] * 3 + [False, True, False, True]
+
+
+def test_a_tracking_drive_that_lacks_sweeps_has_their_numbers_and_a_gap(tmp_path: Path) -> None:
+    """As sequence 0001, which lacks sweeps 177 to 180."""
+    root = write_tracking(tmp_path)
+    shutil.rmtree(root / "velodyne" / "0003")
+    write_clouds(root / "velodyne" / "0003", 12)
+    (root / "oxts" / "0003.txt").write_text("".join(map(oxts, range(12))))
+    for number in (5, 6, 7):
+        (root / "velodyne" / "0003" / f"{number:06d}.bin").unlink()
+    log = KITTILog(root)
+    assert [log.frame_number(index) for index in range(9)] == [0, 1, 2, 3, 4, 8, 9, 10, 11]
+    assert log.gaps == {4} and log.poses is not None
+    assert np.allclose(log.sweep_times(0.1), 0.1 * np.array([0, 1, 2, 3, 4, 8, 9, 10, 11]))
 
 
 @pytest.mark.parametrize("are_of_camera", [True, False])

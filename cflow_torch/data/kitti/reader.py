@@ -92,6 +92,7 @@ class KITTILog(ArraysLog):
         if trajectory is not None:
             self.poses = self._pose_per_sweep(trajectory, list(self.timestamps) if self._has_times else None)
             self._frames = [int(file.stem) for file in self.files]
+            self.gaps |= frozenset(self._gaps_in_numbers())
 
     def frame_number(self, index: int) -> int:
         self._timestamp(index)
