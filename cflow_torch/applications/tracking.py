@@ -405,14 +405,14 @@ class LogTracker:
         self._log = TimedLog(log, sweep_interval)
         self._tracker = Tracker(sweep_interval)
         self._sweeps: list[SweepTracks] = []
-        self._next_without_flow = 0  # index of the sweep after the last one that was pushed
+        self._after: int | None = None  # index of the sweep after the last one that was pushed; None = we looked there
         self._last: dict[int, int] = {}  # id -> number of the last sweep in which the track is seen
 
     def push(self, index: int, result: FlowResult) -> None:
         """Continue the tracks by the flow of sweep `index`; indices ascend."""
-        if self._sweeps and self._next_without_flow < index:
-            self.find_after()
-        self._next_without_flow = index + 1
+        if self._after != index:
+            self._find_after()
+        self._after = index + 1
         sweeps = window(self._log, index)
         table, track_id = self._tracker.push(sweeps, result)
         if _is_after_pause(self._tracker.times):
@@ -429,14 +429,14 @@ class LogTracker:
         if len(self._sweeps) > _MAX_MISSED:
             self._sweeps[-_MAX_MISSED - 1].free = None  # to save memory
 
-    def find_after(self) -> TrackedPoints:
-        """Look for all tracks in the sweep after the last one that was pushed, unless that was done."""
-        index = self._next_without_flow
-        if self._sweeps[-1].points.sweep < index:
-            now = SweepTracks.after(self._sweeps[-1], self._log.sweep(index), int(self._log.timestamps[index]))
+    def _find_after(self) -> None:
+        """Look for all tracks in the sweep after the last one that was pushed, which has no flow."""
+        if self._after is not None:
+            sweep = self._log.sweep(self._after)
+            now = SweepTracks.after(self._sweeps[-1], sweep, int(self._log.timestamps[self._after]))
             self._last.update(dict.fromkeys(now.table["id"].tolist(), len(self._sweeps)))
             self._append(now)
-        return self._sweeps[-1].points
+            self._after = None
 
     def _find_before(self, now: SweepTracks) -> None:
         """Look for tracks that move now in the sweeps before, up to three, in which they were not seen."""
@@ -457,8 +457,7 @@ class LogTracker:
     @one_thread()
     def table(self) -> dict[str, np.ndarray]:
         """Return the table of `track`."""
-        if self._sweeps:
-            self.find_after()
+        self._find_after()
         self._take_out_static_points()
         table = self._whole()
         return self._whole() if divide_people(self._sweeps, table) else table
