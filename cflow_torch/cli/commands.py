@@ -520,7 +520,7 @@ class Clean(Command):
     0.5. Clouds of a folder keep their names, columns and types, and poses in VIEWPOINT. We also keep the other columns
     of bags, Argoverse 2 and PandaSet, such as intensity. removed/NAME.npy has a bool per point of a sweep, True = not
     in the clean cloud, and clean.json the settings. All files of a log are in its folder, which is written as a whole
-    or not at all. Run the command again to write the missing logs. Other files in OUTPUT stay, except config.yaml.
+    or not at all. Run the command again to write the missing logs. Other files in OUTPUT stay.
 
     examples:
       cflow clean /data/drive map=true voxel_size=0.2            any recognised format, such as a bag

@@ -9,7 +9,7 @@ from cflow_torch.cli.commands import Demo
 from cflow_torch.cli.eval import Scores
 from cflow_torch.cli.failures import finish
 from cflow_torch.cli.logs import check_pair, open_logs
-from cflow_torch.cli.outputs import chosen_preset, local_folder
+from cflow_torch.cli.outputs import chosen_preset, local_folder, read_config
 from cflow_torch.cli.pairs import for_each_pair
 from cflow_torch.data.atomic import ensure_writable, remove_stale
 from cflow_torch.data.flow_file import write_flow
@@ -32,7 +32,7 @@ def task(cfg: Demo) -> None:
     logs, failures = open_logs(cfg.data)
     if logs:
         check_pair(cfg.pair, logs[0])
-    ensure_writable(output)
+    read_config(ensure_writable(output))  # one of others fails now, not after the work
     results: list[tuple[int, FlowResult]] = []
 
     def keep(log: Log, index: int, sweeps: Window, result: FlowResult) -> None:

@@ -20,6 +20,7 @@ from cflow_torch.cli.outputs import (
     machine,
     made_by,
     output_folder,
+    read_config,
     settings_record,
     versions,
     write_config,
@@ -48,7 +49,7 @@ def task(cfg: Eval) -> float:
     scores = Scores(cfg)
     model = make_model(cfg.model, cfg.device)
     logs, failures = open_logs(cfg.data)
-    ensure_writable(output)
+    read_config(ensure_writable(output))  # one of others fails now, not after the work
     pairs = [(log, index) for log in logs for index in chosen_pairs(log, cfg.data)]
     times: list[CallTime] = []
     failures += for_each_pair(pairs, model, scores.add, times)

@@ -12,7 +12,7 @@ from typing import Any, Callable, Iterator, Sequence
 from cflow_torch.cli.commands import FlowFiles
 from cflow_torch.cli.failures import Failures, end_unfinished
 from cflow_torch.cli.logs import find_logs
-from cflow_torch.cli.outputs import output_folder, settings_record, versions, write_config
+from cflow_torch.cli.outputs import output_folder, read_config, settings_record, versions, write_config
 from cflow_torch.cli.track_formats import TRACK_FILES
 from cflow_torch.data.atomic import ensure_writable
 from cflow_torch.data.catalog import source_name
@@ -72,7 +72,7 @@ class FlowRun:
 
     def compute(self) -> dict[str, Any]:
         """Write the flow files of this shard, and return the report of `run_fleet`."""
-        ensure_writable(self.output)
+        read_config(ensure_writable(self.output))  # one of others fails now, not when logs are cleared
         self._check_output()
         if self._cfg.overwrite and self.shard.count == 1:
             for log in self.open_logs():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import shutil
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Sequence
@@ -24,6 +25,8 @@ from cflow_torch.data.json_file import json_ready
 from cflow_torch.data.paths import as_path, is_remote
 from cflow_torch.fleet.changes import check_same_run, nearest_preset
 from cflow_torch.types import CFlowError
+
+_CONFIG = "config.yaml"
 
 
 def versions() -> dict[str, str]:
@@ -75,10 +78,21 @@ def settings_record(cfg: Command) -> dict[str, Any]:
 
 
 def write_config(cfg: Command, folder: Path) -> None:
-    """Write the settings and versions to `folder/config.yaml`."""
-    write_text(
-        folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create({**settings_record(cfg), "versions": versions()}))
-    )
+    """Write the settings and versions to `folder/config.yaml`, in place of those of an earlier run only."""
+    read_config(folder)
+    write_text(folder / _CONFIG, OmegaConf.to_yaml(OmegaConf.create({**settings_record(cfg), "versions": versions()})))
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Read the settings and versions of an earlier run; {} = there are none. A file of others is a `CFlowError`."""
+    file = folder / _CONFIG
+    if not file.exists():
+        return {}
+    with suppress(Exception):  # whatever a file of others holds
+        config: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+        if "cflow_torch" in config["versions"]:
+            return config  # type: ignore[no-any-return]
+    raise CFlowError(f"{file} is not a record of cflow, and we do not replace it: give output=FOLDER")
 
 
 def made_by(cfg: Command, **more: Any) -> dict[str, Any]:
@@ -101,10 +115,9 @@ def claim_output(cfg: Submit, folder: Path, results: Sequence[Path]) -> None:
 
     With `cfg.overwrite`, we remove older results, but not what is not ours.
     """
-    file = ensure_writable(folder) / "config.yaml"
-    before: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.exists() else {}
+    before = read_config(ensure_writable(folder))
     for path in results:
-        if path.exists() and "cflow_torch" not in before.get("versions", {}):
+        if path.exists() and not before:
             raise CFlowError(f"{path} exists and is not a result of `cflow submit`: give output=FOLDER")
     if cfg.overwrite:
         for path in results:

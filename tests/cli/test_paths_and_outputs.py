@@ -119,6 +119,16 @@ def test_clean_removes_nothing_that_it_has_not_written(tmp_path, cflow, capsys):
     assert "has the log that is to be cleaned" in capsys.readouterr().err and files_of(results) == clean
 
 
+@pytest.mark.parametrize("command", ["flow", "clean", "eval"])
+@pytest.mark.parametrize("content", ["name: mine\n", "{", "- 1\n"])
+def test_a_config_of_another_program_is_not_replaced(command, content, drives, tmp_path, cflow, capsys):
+    config = tmp_path / "out" / "config.yaml"
+    config.parent.mkdir()
+    config.write_text(content)
+    assert cflow(command, *SMALL, drives[0], f"output={config.parent}", "overwrite=true") == 2
+    assert "is not a record of cflow" in capsys.readouterr().err and config.read_text() == content
+
+
 def test_clean_names_a_second_log_of_a_name(drives, tmp_path, cflow, capsys):
     twin = Path(shutil.copytree(drives[0], tmp_path / "elsewhere" / "drive_1"))
     next((twin / "sensors" / "lidar").iterdir()).unlink()
