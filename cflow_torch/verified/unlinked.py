@@ -51,9 +51,8 @@ def link_unlinked(sweeps: HeightSlicedSweeps, components: Components, tree: Tree
 
     Convention:
         Parts have the pixels of a sweep that are missing, or of which every other sweep lacks a slice. A part of t
-        takes its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and in at least
-        half of the older sweeps. A sweep before t-1 counts only if the velocity puts the part inside the region there.
-        A sweep that does not count may still confirm the velocity.
+        takes its velocity from one part of t+1 or t-1. Other parts must lie where it puts them: at t+1, and at t-1 or
+        in at least half of the older sweeps.
         Of the velocities of a part of t, or of t+1, the one with the smallest errors wins; a sweep without a part has
         the largest error. In a pair, parts are unmatched components, and the lowest velocity wins. A part belongs to
         its first node. The velocity of a node must win more slices near its targets than it loses.
@@ -151,13 +150,6 @@ class _Map:
         part = self._part.index_select(0, place.view(-1)).view_as(place)
         return (part - 1).clamp_(min=0).long(), part > 0
 
-    def contains(self, centre: Tensor) -> Tensor:
-        """Tell which places, (2, ...), finest pixels, are in the region, a cell or more from its border, (...) bool."""
-        cell = (centre / self._cell).floor_()
-        last_row_col = (self._height - 2 * _REACH - 2, self._width - 2 * _REACH - 2)
-        last = constant(last_row_col, cell.dtype, cell.device).view(2, *[1] * (cell.ndim - 1))
-        return (cell == torch.minimum(cell.clamp(min=1), last)).all(0)
-
     def _place(self, window: Tensor, step: Tensor, centre: Tensor) -> Tensor:
         """Return the cells of places; the nearest cells for places outside of the region."""
         row, col = (centre / self._cell).floor_().long() + _REACH
@@ -187,36 +179,31 @@ def _tracks(sweeps: HeightSlicedSweeps, parts: _Parts, max_speed: float) -> _Tra
     place = centre[..., None] - velocity[..., None] * before_t  # [2, H, S]
     part, error = _follow(parts, cells, of_t, place)  # [H, S] each
     moved = velocity.square().sum(0).sqrt()[:, None] * before_t.abs()  # [H, S]
-    is_found, cost = _judge(sweeps, window, error, moved, cells.contains(place))
+    is_found, cost = _judge(sweeps, window, error, moved)
     kept = flat_nonzero(_are_best(cost, part, len(parts)))
     part, is_found, before_t = gather(kept, part, is_found, before_t)
     return _Tracks(part, is_found, _median_velocity(parts, part, is_found, before_t))
 
 
-def _judge(
-    sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Tensor, is_inside: Tensor
-) -> tuple[Tensor, Tensor]:
+def _judge(sweeps: HeightSlicedSweeps, window: Tensor, error: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
     """Tell which sweeps confirm H velocities, and what these cost.
 
     Args:
         window: (H,) int64.
         error: (H, S) float64, finest pixels, from where the velocity puts the part to the nearest part of each sweep.
         moved: (H, S) float64, finest pixels, how far the part moves between t and each sweep.
-        is_inside: (H, S) bool, the velocity puts the part inside the region.
 
     Returns:
         is_found: (H, S) bool, the nearest part is near enough.
         cost: (H,) float64, the lowest is the best: the sum of the squares of errors, as parts of the largest error that
             confirms the velocity, each at most 1. In a pair, all errors are 0, and the cost is the distance. It is
-            infinite without a part at t+1, or with parts in less than half of the older sweeps that count.
+            infinite without a part at t+1, or with none at t-1 and in less than half of the older sweeps.
     """
     is_given = sweeps.is_given.index_select(0, window)
     limit = _ERROR / sweeps.grid.pixel_size + _ERROR_SHARE * moved
     is_found = is_given & (error <= limit)
-    # Outside of the region, an older sweep can confirm nothing, so it does not count. Sweep t-1 always counts.
-    is_counted = is_given & is_inside
-    is_counted[:, :3] = is_given[:, :3]
-    is_confirmed = is_found[:, 0] & (2 * is_found[:, 2:].sum(1) >= is_counted[:, 2:].sum(1))
+    is_in_half = 2 * is_found[:, 2:].sum(1) >= is_given[:, 2:].sum(1)
+    is_confirmed = is_found[:, 0] & (is_found[:, 2:3].any(1) | is_in_half)
     cost = ((error / limit).square().clamp(max=1.0) * is_given).sum(1)
     cost += moved[:, 0] * ~sweeps.has_history.index_select(0, window)
     return is_found, cost.masked_fill(~is_confirmed, math.inf)

@@ -118,21 +118,16 @@ def link_unlinked(sweeps: SlicedSweeps, may_be_fast: np.ndarray, tree: Tree) -> 
 
 def follow(sweeps, i, velocity, centres, since, around) -> tuple[float, dict[int, int]]:  # type: ignore[no-untyped-def]
     """The cost of a velocity of part i, infinite if too few parts confirm it, and its part in each sweep."""
-    track, cost, num_older = {1: i}, 0.0, 0
-    cell = max(1, round(CELL / sweeps.size))
-    most = (np.array(sweeps.image.shape[1:]) - 1) // cell
+    track, cost = {1: i}, 0.0
     for step in range(len(since)):
         expected = centres[i] - velocity * since[step]
         distances = [(float(((centres[p] - expected) ** 2).sum()), p) for p in around(step, expected, NEAR)]
         square, part = min(distances, key=lambda pair: pair[0], default=(math.inf, -1))
         bound = ERROR / sweeps.size + SHARE * math.hypot(*velocity) * abs(since[step])
-        where = np.floor(expected / cell)
-        is_counted = step <= 2 or ((where >= 1) & (where < most)).all()  # a cell or more from the border of the region
-        num_older += step >= 2 and is_counted
         if step == 1:
             continue
         if math.sqrt(square) <= bound:
             track[step] = part
         cost += min((math.sqrt(square) / bound) ** 2, 1)
-    found = sum(step >= 2 for step in track)
-    return (cost if 0 in track and 2 * found >= num_older else math.inf), track
+    is_in_half = 2 * sum(step >= 2 for step in track) >= len(since) - 2
+    return (cost if 0 in track and (2 in track or is_in_half) else math.inf), track
