@@ -14,7 +14,7 @@ from tiny_recording import TinyRecording
 
 from cflow_torch import CFlowError
 from cflow_torch.data.bags import BagLog, find_bags
-from cflow_torch.data.bags.messages import cloud_columns
+from cflow_torch.data.bags.messages import cloud_columns, points_of
 from cflow_torch.data.catalog import recognise
 from cflow_torch.types import CFlowWarning
 
@@ -310,10 +310,17 @@ def test_unfinished_recordings_say_what_to_do(tmp_path) -> None:
         BagLog(bag)
 
 
+@pytest.mark.parametrize("missing", [0.0, np.inf, np.nan])
 @pytest.mark.parametrize("order", "<>")
-def test_a_wrong_byte_order_is_found(tmp_path, order: str) -> None:
+def test_a_wrong_byte_order_is_found(tmp_path, order: str, missing: float) -> None:
     writer, points = BagWriter(tmp_path, "ros1"), np.random.default_rng(0).normal(0, 20, (50, 3)).astype(np.float32)
+    points[:20] = missing
     message: Any = SimpleNamespace(**vars(writer.make(CLOUD, *writer.cloud(0, points, None, order))))
     for message.is_bigendian in (False, True):
-        columns = cloud_columns(message)
-        assert np.array_equal(np.stack([columns[axis] for axis in "xyz"], 1).astype(np.float32), points)
+        assert np.array_equal(points_of(cloud_columns(message)).astype(np.float32), points[20:])
+
+
+def test_a_cloud_of_no_usual_numbers_has_the_byte_order_that_it_states(tmp_path) -> None:
+    writer = BagWriter(tmp_path, "ros1")
+    message = writer.make(CLOUD, *writer.cloud(0, np.full((50, 3), 1e-9) * np.arange(1, 51)[:, None], None))
+    assert np.abs(points_of(cloud_columns(message))).max() < 1e-6

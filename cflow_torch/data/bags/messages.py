@@ -20,8 +20,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 def cloud_columns(message: Any) -> dict[str, np.ndarray]:
     """Return the fields of a PointCloud2 or of Livox' CustomMsg, x, y, z and others: name -> (N,) numbers as stored.
 
-    We leave out `missing_returns`. A cloud without x, y or
-    z, or with less data than it states, is a ValueError.
+    We leave out `missing_returns`. A cloud without x, y or z, or with less data than it states, is a ValueError.
     """
     if hasattr(message, "points"):
         return _livox_columns(message)
@@ -34,21 +33,25 @@ def cloud_columns(message: Any) -> dict[str, np.ndarray]:
     row_step = message.row_step or message.width * step
     rows = np.frombuffer(message.data, np.uint8, message.height * row_step).reshape(message.height, row_step)
     octets = np.ascontiguousarray(rows[:, : message.width * step])
+    tables = []
     for order in "><" if message.is_bigendian else "<>":  # some drivers state the wrong order
         kinds = [order + _TYPES[fields[name].datatype] for name in names]
         kind = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": step})
-        table = octets.view(kind).reshape(-1)
-        points = np.stack([table[axis] for axis in "xyz"], axis=1)
-        if are_plausible(points):
-            break
-    table = table[~missing_returns(points)]
+        tables.append(octets.view(kind).reshape(-1))
+    table = next((table for table in tables if are_plausible(points_of(table))), tables[0])
+    table = table[~missing_returns(points_of(table))]
     return {name: table[name].astype(table[name].dtype.newbyteorder("=")) for name in names}
+
+
+def points_of(columns: Any) -> np.ndarray:
+    """Return (N, 3) points in the frame of the cloud."""
+    return np.stack([columns[axis] for axis in "xyz"], axis=1)
 
 
 def _livox_columns(message: Any) -> dict[str, np.ndarray]:
     kinds = {"x": "f4", "y": "f4", "z": "f4", "offset_time": "u4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
     columns = {name: np.array([getattr(p, name) for p in message.points], kind) for name, kind in kinds.items()}
-    kept = ~missing_returns(np.stack([columns[axis] for axis in "xyz"], axis=1))
+    kept = ~missing_returns(points_of(columns))
     return {name: values[kept] for name, values in columns.items()}
 
 

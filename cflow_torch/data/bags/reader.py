@@ -12,7 +12,7 @@ import numpy as np
 
 from cflow_torch.data.arrays.folder import find_poses_near
 from cflow_torch.data.arrays.poses_text import read_poses
-from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, is_pose, sample, sorted_poses
+from cflow_torch.data.bags.messages import Frames, Sample, cloud_columns, is_pose, points_of, sample, sorted_poses
 from cflow_torch.data.file_errors import file_errors, shortened
 from cflow_torch.data.folders import search
 from cflow_torch.data.log import Log
@@ -189,7 +189,7 @@ class BagLog(Log):
     def sweep(self, index: int) -> Sweep:
         time = self._timestamp(index)
         columns, times = self._timed_cloud(time)
-        points = transform_points(_points(columns), self._mount_at(time))
+        points = transform_points(points_of(columns), self._mount_at(time))
         pose = None if self.poses is None else self.poses[index].copy()
         return Sweep(points.astype(np.float32), None, pose, time, times)
 
@@ -201,7 +201,7 @@ class BagLog(Log):
     def _timed_cloud(self, time: int) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Read a cloud and the (N,) seconds of its points; None = unknown. We leave out points of stray times."""
         columns = self._cloud(time)
-        times = find_times(columns, time - self._shift, self._period, _points(columns), self._note)
+        times = find_times(columns, time - self._shift, self._period, points_of(columns), self._note)
         if times is None or times.seconds is None:
             return columns, None
         kept = ~times.is_stray
@@ -414,11 +414,6 @@ def _name_of(path: Path, has_parts: bool) -> str:
 
 def _middle(values: list[int]) -> int:
     return sorted(values)[len(values) // 2] if values else 0
-
-
-def _points(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """Return (N, 3) points in the frame of the cloud."""
-    return np.stack([columns[axis] for axis in "xyz"], axis=1)
 
 
 def _stamp(message: Any, arrived: int) -> int:
